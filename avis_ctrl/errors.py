@@ -1,0 +1,41 @@
+"""The two ways in which a command of avis_ctrl can refuse, with the exit codes of the contract.
+
+A message says what failed, the measured number, the likely cause and the next step.
+"""
+
+from __future__ import annotations
+
+
+class AvisError(Exception):
+    """Base of every error that avis_ctrl raises on purpose."""
+
+    exit_code = 1
+
+
+class InputError(AvisError, ValueError):
+    """The input is wrong (exit code 2): one line naming file, field, value and what was expected."""
+
+    exit_code = 2
+
+    def __init__(self, expected: str, *, file: object = None, field: str | None = None, value: object = None):
+        where = [str(file)] if file is not None else []
+        if field is not None:
+            where.append(field if value is None else f"{field} = {value!r}")
+        super().__init__(": ".join([*where, expected]))
+        self.file, self.field, self.value, self.expected = file, field, value, expected
+
+    def in_file(self, file: object) -> InputError:
+        """The same complaint, with the file named."""
+        return InputError(self.expected, file=file, field=self.field, value=self.value)
+
+
+class ComputationError(AvisError, ArithmeticError):
+    """A computation failed (exit code 3): what failed, the measured number, the likely cause, the next step."""
+
+    exit_code = 3
+
+    def __init__(self, failed: str, *, measured: str = "", cause: str = "", next_step: str = ""):
+        parts = [failed, measured and f"measured: {measured}", cause and f"likely cause: {cause}",
+                 next_step and f"next: {next_step}"]
+        super().__init__("; ".join(part for part in parts if part))
+        self.failed, self.measured, self.cause, self.next_step = failed, measured, cause, next_step

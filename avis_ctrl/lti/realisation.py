@@ -1,0 +1,118 @@
+"""Realisations: scaling, minimal parts, balanced truncation, discretisation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti.statespace import StateSpace
+
+
+def balance(system: StateSpace) -> StateSpace:
+    """Diagonal state scaling (powers of two) that evens out [A B; C 0]; exact, transfer matrix unchanged."""
+    n = system.nstates
+    if not n:
+        return system
+    norm_B = np.linalg.norm(system.B, axis=1)
+    norm_C = np.linalg.norm(system.C, axis=0)
+    scale = np.ones(n)
+    A = np.abs(system.A - np.diag(np.diag(system.A)))
+    for _ in range(30):
+        Ak = A / scale[:, None] * scale
+        rows = np.sqrt(np.sum(Ak ** 2, axis=1) + (norm_B / scale) ** 2)
+        cols = np.sqrt(np.sum(Ak ** 2, axis=0) + (norm_C * scale) ** 2)
+        step = np.where((rows > 0) & (cols > 0), np.sqrt(np.divide(rows, cols, out=np.ones(n), where=cols > 0)), 1.0)
+        step = 2.0 ** np.round(np.log2(step) * 0.8)
+        if np.all(step == 1.0):
+            break
+        scale *= step
+    return replace(system, A=system.A / scale[:, None] * scale, B=system.B / scale[:, None], C=system.C * scale)
+
+
+def gramian_factors(system: StateSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Square-root factors L_c, L_o of the controllability and observability Gramians of a stable system."""
+    if not system.is_stable():
+        raise ComputationError("Gramians exist for stable systems only",
+                               measured=f"largest real part {np.max(system.poles().real):.3g} rad/s")
+    if system.dt:
+        Wc = la.solve_discrete_lyapunov(system.A, system.B @ system.B.T)
+        Wo = la.solve_discrete_lyapunov(system.A.T, system.C.T @ system.C)
+    else:
+        Wc = la.solve_continuous_lyapunov(system.A, -system.B @ system.B.T)
+        Wo = la.solve_continuous_lyapunov(system.A.T, -system.C.T @ system.C)
+
+    def factor(W: np.ndarray) -> np.ndarray:
+        values, vectors = la.eigh((W + W.T) / 2)
+        return vectors * np.sqrt(np.maximum(values, 0.0))
+    return factor(Wc), factor(Wo)
+
+
+def hankel_singular_values(system: StateSpace) -> np.ndarray:
+    """Hankel singular values of a stable system, descending."""
+    Lc, Lo = gramian_factors(balance(system))
+    return la.svdvals(Lo.T @ Lc)
+
+
+def balanced_truncation(system: StateSpace, order: int | None = None, tolerance: float | None = None) -> StateSpace:
+    """Balanced truncation (square-root method; Tombs and Postlethwaite 1987) of a stable system.
+
+    Keeps `order` states, or those whose Hankel singular value exceeds `tolerance` times the largest.
+    The error is at most twice the sum of the values dropped.
+    """
+    if not system.nstates:
+        return system
+    Lc, Lo = gramian_factors(balance(system))
+    base = balance(system)
+    U, sigma, Vt = la.svd(Lo.T @ Lc)
+    limit = 1e-13 if tolerance is None else tolerance
+    kept = int(np.sum(sigma > limit * sigma[0])) if sigma[0] > 0 else 0
+    kept = min(order, kept) if order is not None else kept
+    root = np.sqrt(sigma[:kept])
+    T = Lc @ Vt[:kept].T / root
+    Ti = (U[:, :kept] / root).T @ Lo.T
+    return replace(system, A=Ti @ base.A @ T, B=Ti @ base.B, C=base.C @ T, states=())
+
+
+def minimal(system: StateSpace, tolerance: float = 1e-9) -> StateSpace:
+    """Removes states that inputs do not reach or outputs do not see (staircase by SVD on the balanced system)."""
+    def reachable(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+        size = np.linalg.norm(A, 2)
+        Q, s, _ = la.svd(B, full_matrices=False) if B.size else (np.zeros((A.shape[0], 0)), np.zeros(0), None)
+        basis = Q[:, s > tolerance * (s[0] if s.size else 1.0)]
+        new = basis
+        while new.shape[1] and basis.shape[1] < A.shape[0]:
+            step = A @ new
+            step = step - basis @ (basis.T @ step)
+            step = step - basis @ (basis.T @ step)
+            Q, s, _ = la.svd(step, full_matrices=False)
+            new = Q[:, s > tolerance * size]
+            basis = np.hstack([basis, new])
+        return basis
+    if not system.nstates:
+        return system
+    base = balance(system)
+    V = reachable(base.A, base.B)
+    A, B, C = V.T @ base.A @ V, V.T @ base.B, base.C @ V
+    W = reachable(A.T, C.T)
+    return replace(system, A=W.T @ A @ W, B=W.T @ B, C=C @ W, states=())
+
+
+def discretise(system: StateSpace, dt: float, method: Literal["zoh", "tustin"] = "tustin") -> StateSpace:
+    """Sampled system of period dt [s]: zero-order hold on the inputs, or the bilinear (Tustin) map."""
+    if system.dt:
+        raise InputError(f"the system is already sampled at {system.dt:g} s")
+    if not (np.isfinite(dt) and dt > 0):
+        raise InputError(f"the sample time must be positive, not {dt!r}")
+    n, m = system.nstates, system.ninputs
+    if not n:
+        return replace(system, dt=dt)
+    if method == "zoh":
+        block = la.expm(np.block([[system.A, system.B], [np.zeros((m, n + m))]]) * dt)
+        return replace(system, A=block[:n, :n], B=block[:n, n:], dt=dt)
+    inverse = np.linalg.inv(np.eye(n) - system.A * dt / 2)
+    return replace(system, A=inverse @ (np.eye(n) + system.A * dt / 2), B=inverse @ system.B * dt,
+                   C=system.C @ inverse, D=system.D + system.C @ inverse @ system.B * dt / 2, dt=dt)

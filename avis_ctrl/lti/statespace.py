@@ -1,0 +1,307 @@
+"""Linear time-invariant systems in state space, with named signals.
+
+    x' = A x + B u        (dt = 0)      or      x[k+1] = A x[k] + B u[k]     (dt > 0)
+    y  = C x + D u
+
+Plain numpy arrays, frozen and picklable, so that a system can cross a process boundary.
+Operators keep the signal names, which python-control's do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.errors import InputError
+
+Names = tuple[str, ...]
+Selector = str | int | slice | Sequence[str] | Sequence[int] | np.ndarray
+
+
+def _names(given: Iterable[str] | None, count: int, prefix: str, what: str) -> Names:
+    if given is None or (count and not (names := tuple(given))):
+        return tuple(f"{prefix}{k}" for k in range(count))
+    names = tuple(str(name) for name in given)
+    if len(names) != count:
+        raise InputError(f"expected {count} {what} names, got {len(names)}: {names}")
+    if len(set(names)) != count:
+        twice = sorted({name for name in names if names.count(name) > 1})
+        raise InputError(f"{what} names must differ; {twice} appear more than once")
+    return names
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpace:
+    """State-space model with named inputs, outputs and states.
+
+    Parameters
+    ----------
+    A, B, C, D : (n, n), (n, n_u), (n_y, n), (n_y, n_u) real arrays.
+    dt : sample time in seconds; 0 for continuous time.
+    inputs, outputs, states : names; numbered u0.., y0.., x0.. when absent.
+
+    Raises
+    ------
+    InputError : shapes that do not fit, entries that are not finite, names that repeat.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    dt: float = 0.0
+    inputs: Names = field(default=())
+    outputs: Names = field(default=())
+    states: Names = field(default=())
+
+    def __post_init__(self) -> None:
+        D = np.atleast_2d(np.asarray(self.D, dtype=float))
+        n_y, n_u = D.shape
+        A = np.asarray(self.A, dtype=float)
+        A = A.reshape(0, 0) if A.size == 0 else np.atleast_2d(A)
+        n = A.shape[0]
+        B = np.asarray(self.B, dtype=float)
+        C = np.asarray(self.C, dtype=float)
+        B = B.reshape(n, n_u) if B.size == 0 else B
+        C = C.reshape(n_y, n) if C.size == 0 else C
+        if A.shape != (n, n) or B.shape != (n, n_u) or C.shape != (n_y, n):
+            raise InputError(f"shapes do not fit: A {A.shape}, B {B.shape}, C {C.shape}, D {D.shape}")
+        for name, matrix in (("A", A), ("B", B), ("C", C), ("D", D)):
+            if not np.all(np.isfinite(matrix)):
+                raise InputError(f"matrix {name} has entries that are not finite")
+            matrix = matrix.copy()
+            matrix.setflags(write=False)
+            object.__setattr__(self, name, matrix)
+        if not (np.isfinite(self.dt) and self.dt >= 0):
+            raise InputError(f"dt must be 0 (continuous) or a positive number of seconds, not {self.dt!r}")
+        object.__setattr__(self, "dt", float(self.dt))
+        object.__setattr__(self, "inputs", _names(self.inputs, n_u, "u", "input"))
+        object.__setattr__(self, "outputs", _names(self.outputs, n_y, "y", "output"))
+        # States are for reading only: after a connection two parts may bring the same name.
+        states = tuple(self.states) if len(tuple(self.states)) == n else tuple(f"x{k}" for k in range(n))
+        object.__setattr__(self, "states", states)
+
+    # -- sizes and properties -------------------------------------------------------------
+    @property
+    def nstates(self) -> int:
+        return self.A.shape[0]
+
+    @property
+    def ninputs(self) -> int:
+        return self.D.shape[1]
+
+    @property
+    def noutputs(self) -> int:
+        return self.D.shape[0]
+
+    def poles(self) -> np.ndarray:
+        """Eigenvalues of A [rad/s, or in the z plane when dt > 0]."""
+        return np.asarray(la.eigvals(self.A)) if self.nstates else np.zeros(0, complex)
+
+    def is_stable(self) -> bool:
+        """All poles in the open left half plane (inside the unit circle when dt > 0)."""
+        poles = self.poles()
+        return bool(np.all(np.abs(poles) < 1)) if self.dt else bool(np.all(poles.real < 0))
+
+    # -- evaluation -----------------------------------------------------------------------
+    def __call__(self, s: complex) -> np.ndarray:
+        """Transfer matrix (n_y, n_u) at the complex point s (or z)."""
+        if not self.nstates:
+            return self.D.astype(complex)
+        if np.isinf(s):
+            return self.D.astype(complex)
+        return self.C @ np.linalg.solve(s * np.eye(self.nstates) - self.A, self.B.astype(complex)) + self.D
+
+    def frequency_response(self, omega: np.ndarray) -> np.ndarray:
+        """Transfer matrices (n_omega, n_y, n_u) at the frequencies omega [rad/s]; inf gives D."""
+        omega = np.atleast_1d(np.asarray(omega, dtype=float))
+        response = np.broadcast_to(self.D.astype(complex), (omega.size, *self.D.shape)).copy()
+        finite = np.isfinite(omega)
+        if self.nstates and np.any(finite):
+            points = np.exp(1j * omega[finite] * self.dt) if self.dt else 1j * omega[finite]
+            response[finite] += _resolvent(self.A, self.B, self.C, points)
+        return response
+
+    def dcgain(self) -> np.ndarray:
+        """Real transfer matrix at zero frequency."""
+        return self(1.0 if self.dt else 0.0).real
+
+    # -- algebra --------------------------------------------------------------------------
+    def __matmul__(self, other: StateSpace) -> StateSpace:
+        """Series connection: `self @ other` feeds other's outputs into self's inputs, in order."""
+        if self.ninputs != other.noutputs:
+            raise InputError(f"series connection of {other.noutputs} outputs into {self.ninputs} inputs")
+        dt = _common_dt(self, other)
+        A = np.block([[self.A, self.B @ other.C],
+                      [np.zeros((other.nstates, self.nstates)), other.A]])
+        return StateSpace(A, np.vstack([self.B @ other.D, other.B]), np.hstack([self.C, self.D @ other.C]),
+                          self.D @ other.D, dt, other.inputs, self.outputs, self.states + other.states)
+
+    def __add__(self, other: StateSpace) -> StateSpace:
+        """Parallel connection of two systems with the same inputs and outputs."""
+        if self.D.shape != other.D.shape:
+            raise InputError(f"parallel connection of shapes {self.D.shape} and {other.D.shape}")
+        return StateSpace(la.block_diag(self.A, other.A), np.vstack([self.B, other.B]),
+                          np.hstack([self.C, other.C]), self.D + other.D, _common_dt(self, other),
+                          self.inputs, self.outputs, self.states + other.states)
+
+    def __neg__(self) -> StateSpace:
+        return replace(self, C=-self.C, D=-self.D)
+
+    def __sub__(self, other: StateSpace) -> StateSpace:
+        return self + (-other)
+
+    def scaled(self, left: np.ndarray | float = 1.0, right: np.ndarray | float = 1.0) -> StateSpace:
+        """`left @ self @ right` with vectors read as diagonals, scalars as multiples of identity.
+
+        Square factors keep the signal names.
+        """
+        L, R = _as_matrix(left, self.noutputs), _as_matrix(right, self.ninputs)
+        outputs = self.outputs if L.shape[0] == self.noutputs else ()
+        inputs = self.inputs if R.shape[1] == self.ninputs else ()
+        return StateSpace(self.A, self.B @ R, L @ self.C, L @ self.D @ R, self.dt, inputs, outputs, self.states)
+
+    def renamed(self, inputs: Sequence[str] | dict[str, str] | None = None,
+                outputs: Sequence[str] | dict[str, str] | None = None) -> StateSpace:
+        """The same system under other signal names (a full list, or a map from old to new)."""
+        def new(old: Names, given: Sequence[str] | dict[str, str] | None) -> Names:
+            if given is None:
+                return old
+            if isinstance(given, dict):
+                if missing := [name for name in given if name not in old]:
+                    raise InputError(f"no signal {missing} among {old}")
+                return tuple(given.get(name, name) for name in old)
+            return tuple(given)
+        return replace(self, inputs=new(self.inputs, inputs), outputs=new(self.outputs, outputs))
+
+    def select(self, outputs: Selector | None = None, inputs: Selector | None = None) -> StateSpace:
+        """The subsystem from some inputs to some outputs, by name or position, in the order asked."""
+        rows = _positions(self.outputs, outputs, "output")
+        cols = _positions(self.inputs, inputs, "input")
+        return StateSpace(self.A, self.B[:, cols], self.C[rows], self.D[np.ix_(rows, cols)], self.dt,
+                          tuple(self.inputs[k] for k in cols), tuple(self.outputs[k] for k in rows), self.states)
+
+    def similar(self, T: np.ndarray) -> StateSpace:
+        """The same transfer matrix in the state coordinates x_new = inv(T) x."""
+        return replace(self, A=np.linalg.solve(T, self.A @ T), B=np.linalg.solve(T, self.B), C=self.C @ T, states=())
+
+    # -- python-control -------------------------------------------------------------------
+    def to_control(self) -> Any:
+        """The python-control StateSpace (imports control, which takes about two seconds)."""
+        import control
+
+        return control.ss(self.A, self.B, self.C, self.D, self.dt, inputs=list(self.inputs),
+                          outputs=list(self.outputs), remove_useless_states=False)
+
+    @staticmethod
+    def from_control(system: Any) -> StateSpace:
+        """From a python-control StateSpace or TransferFunction."""
+        if not hasattr(system, "A"):
+            import control
+
+            system = control.ss(system)
+        return StateSpace(system.A, system.B, system.C, system.D, float(system.dt or 0.0),
+                          tuple(system.input_labels), tuple(system.output_labels))
+
+    def __repr__(self) -> str:
+        clock = f"dt = {self.dt:g} s" if self.dt else "continuous"
+        return (f"StateSpace({self.nstates} states, {clock}, "
+                f"{list(self.inputs)} -> {list(self.outputs)})")
+
+
+def gain(matrix: np.ndarray | float, inputs: Sequence[str] = (), outputs: Sequence[str] = (),
+         dt: float = 0.0) -> StateSpace:
+    """A static gain as a system without states."""
+    D = np.atleast_2d(np.asarray(matrix, dtype=float))
+    return StateSpace(np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((D.shape[0], 0)), D, dt,
+                      tuple(inputs), tuple(outputs))
+
+
+def tf(numerator: Sequence[float], denominator: Sequence[float], inputs: Sequence[str] = (),
+       outputs: Sequence[str] = ()) -> StateSpace:
+    """A proper scalar transfer function, coefficients by descending power of s, in a balanced companion form.
+
+    Raises InputError when it is improper (more zeros than poles).
+    """
+    num = np.trim_zeros(np.atleast_1d(np.asarray(numerator, float)), "f")
+    den = np.trim_zeros(np.atleast_1d(np.asarray(denominator, float)), "f")
+    if den.size == 0:
+        raise InputError("the denominator is zero")
+    if num.size > den.size:
+        raise InputError(f"improper: numerator of degree {num.size - 1} over denominator of degree {den.size - 1}")
+    num, den = num / den[0], den / den[0]
+    n = den.size - 1
+    num = np.concatenate([np.zeros(n + 1 - num.size), num])
+    d = num[0]
+    if n == 0:
+        return gain(d, inputs, outputs)
+    A = np.zeros((n, n))
+    A[:-1, 1:] = np.eye(n - 1)
+    A[-1] = -den[:0:-1]
+    B = np.zeros((n, 1))
+    B[-1] = 1.0
+    C = (num[1:] - d * den[1:])[::-1][None, :]
+    # Equal magnitudes along the chain: state k scaled by w0^k, w0 the geometric mean of the poles.
+    w0 = abs(den[-1]) ** (1.0 / n) if den[-1] else max(np.max(np.abs(np.roots(den)), initial=0.0), 1.0)
+    T = np.diag(w0 ** np.arange(n))
+    system = StateSpace(A, B, C, [[d]], 0.0, tuple(inputs), tuple(outputs)).similar(T)
+    size = np.sqrt(np.linalg.norm(system.B) * np.linalg.norm(system.C)) or 1.0
+    return system.similar(np.eye(n) * (np.linalg.norm(system.B) / size if np.linalg.norm(system.C) else 1.0))
+
+
+def append(*systems: StateSpace) -> StateSpace:
+    """Block-diagonal stack of systems, with all their signals."""
+    return StateSpace(la.block_diag(*(s.A for s in systems)), la.block_diag(*(s.B for s in systems)),
+                      la.block_diag(*(s.C for s in systems)), la.block_diag(*(s.D for s in systems)),
+                      _common_dt(*systems), sum((s.inputs for s in systems), ()),
+                      sum((s.outputs for s in systems), ()), sum((s.states for s in systems), ()))
+
+
+def _as_matrix(factor: np.ndarray | float, size: int) -> np.ndarray:
+    factor = np.asarray(factor, dtype=float)
+    return factor * np.eye(size) if factor.ndim == 0 else np.diag(factor) if factor.ndim == 1 else factor
+
+
+def _common_dt(*systems: StateSpace) -> float:
+    # A static gain belongs to every clock.
+    clocks = {s.dt for s in systems if s.nstates} or {s.dt for s in systems}
+    if len(clocks) > 1:
+        raise InputError(f"systems of different sample times cannot be connected: {sorted(clocks)} s")
+    return clocks.pop()
+
+
+def _positions(names: Names, asked: Selector | None, what: str) -> list[int]:
+    if asked is None:
+        return list(range(len(names)))
+    if isinstance(asked, slice):
+        return list(range(len(names)))[asked]
+    if isinstance(asked, (str, int, np.integer)):
+        asked = [asked]  # type: ignore[list-item]
+    positions = []
+    for one in asked:
+        if isinstance(one, str):
+            if one not in names:
+                raise InputError(f"no {what} named {one!r}; there are {list(names)}")
+            positions.append(names.index(one))
+        else:
+            positions.append(int(one))
+    return positions
+
+
+def _resolvent(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """C inv(s I - A) B at many points s, through one complex Schur form and batched back substitution."""
+    n = A.shape[0]
+    if points.size < 4:
+        return np.stack([C @ np.linalg.solve(s * np.eye(n) - A, B.astype(complex)) for s in points])
+    balanced, (scale, _) = la.matrix_balance(A, permute=False, separate=True)
+    T, U = la.schur(balanced, output="complex")
+    rhs = U.conj().T @ (B / scale[:, None])
+    left = (C * scale) @ U
+    x = np.zeros((points.size, n, B.shape[1]), complex)
+    for k in range(n - 1, -1, -1):
+        x[:, k] = (rhs[k] + np.einsum("j,pju->pu", T[k, k + 1:], x[:, k + 1:])) / (points - T[k, k])[:, None]
+    return left @ x

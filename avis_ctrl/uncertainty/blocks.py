@@ -1,0 +1,165 @@
+"""Blocks of a structured perturbation Delta, mapping z_delta to w_delta: w_delta = Delta z_delta.
+
+A block of r rows and c columns takes c entries of z_delta and gives r entries of w_delta, so that
+the matrix M seen by Delta (z_delta = M w_delta) has sum(cols) rows and sum(rows) columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+
+Kind = Literal["real", "complex", "full"]
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block of Delta; use RealScalar, ComplexScalar or ComplexFull."""
+
+    rows: int
+    cols: int
+    name: str = ""
+    kind: ClassVar[Kind]
+
+    def __post_init__(self) -> None:
+        for label, size in (("rows", self.rows), ("cols", self.cols)):
+            if int(size) != size or size < 1:
+                raise InputError("a block needs a whole number of at least 1", field=label, value=size)
+
+    @property
+    def repeated(self) -> bool:
+        """delta I with more than one copy: its scaling is a full matrix."""
+        return self.kind != "full" and self.rows > 1
+
+    @property
+    def is_scalar_delta(self) -> bool:
+        return self.kind != "full"
+
+    def as_dict(self) -> dict[str, object]:
+        """The contract's JSON form."""
+        return {"kind": self.kind, "rows": self.rows, "cols": self.cols, "name": self.name}
+
+
+class RealScalar(Block):
+    """delta I_n with delta real: a physical parameter."""
+
+    kind = "real"
+
+    def __init__(self, n: int = 1, name: str = ""):
+        super().__init__(n, n, name)
+
+
+class ComplexScalar(Block):
+    """delta I_n with delta complex: one neglected dynamic that acts n times."""
+
+    kind = "complex"
+
+    def __init__(self, n: int = 1, name: str = ""):
+        super().__init__(n, n, name)
+
+
+class ComplexFull(Block):
+    """A full complex matrix of rows x cols: neglected dynamics, or a performance channel."""
+
+    kind = "full"
+
+    def __init__(self, rows: int, cols: int | None = None, name: str = ""):
+        super().__init__(rows, rows if cols is None else cols, name)
+
+
+@dataclass(frozen=True)
+class BlockStructure:
+    """The blocks of Delta in order, with their places in z_delta and w_delta."""
+
+    blocks: tuple[Block, ...]
+
+    @staticmethod
+    def of(blocks: BlockStructure | Sequence[Block]) -> BlockStructure:
+        """From any sequence of blocks; an InputError where something else is in it."""
+        if isinstance(blocks, BlockStructure):
+            return blocks
+        blocks = (blocks,) if isinstance(blocks, Block) else tuple(blocks)
+        for block in blocks:
+            if not isinstance(block, Block):
+                raise InputError("expected RealScalar, ComplexScalar or ComplexFull", field="blocks", value=block)
+        return BlockStructure(blocks)
+
+    @staticmethod
+    def from_dicts(items: Sequence[dict[str, object]]) -> BlockStructure:
+        """From the contract's JSON form."""
+        made: list[Block] = []
+        for item in items:
+            kind, rows, cols, name = (item.get(key) for key in ("kind", "rows", "cols", "name"))
+            if kind == "full":
+                made.append(ComplexFull(int(rows), int(cols), str(name or "")))  # type: ignore[arg-type]
+            elif kind in ("real", "complex") and rows == cols:
+                scalar = RealScalar if kind == "real" else ComplexScalar
+                made.append(scalar(int(rows), str(name or "")))  # type: ignore[arg-type]
+            else:
+                raise InputError("expected kind real, complex (rows = cols) or full", field="blocks", value=item)
+        return BlockStructure(tuple(made))
+
+    @property
+    def n_w(self) -> int:
+        """Length of w_delta: the number of columns of M."""
+        return sum(block.rows for block in self.blocks)
+
+    @property
+    def n_z(self) -> int:
+        """Length of z_delta: the number of rows of M."""
+        return sum(block.cols for block in self.blocks)
+
+    def slices(self) -> Iterator[tuple[Block, slice, slice]]:
+        """(block, its rows of Delta i.e. place in w_delta, its columns i.e. place in z_delta)."""
+        w = z = 0
+        for block in self.blocks:
+            yield block, slice(w, w + block.rows), slice(z, z + block.cols)
+            w, z = w + block.rows, z + block.cols
+
+    def with_performance(self, n_w: int, n_z: int) -> BlockStructure:
+        """These blocks followed by a full performance block that closes n_z outputs z onto n_w inputs w."""
+        return BlockStructure((*self.blocks, ComplexFull(n_w, n_z, "performance")))
+
+    def complexified(self) -> BlockStructure:
+        """Every real scalar replaced by a complex one: a superset of perturbations."""
+        return BlockStructure(tuple(ComplexScalar(b.rows, b.name) if b.kind == "real" else b for b in self.blocks))
+
+    def assemble(self, values: Sequence[complex | np.ndarray]) -> np.ndarray:
+        """Delta (n_w, n_z) from one value a block: a number for scalars, an array for full blocks."""
+        delta = np.zeros((self.n_w, self.n_z), complex)
+        for value, (block, w, z) in zip(values, self.slices(), strict=True):
+            delta[w, z] = np.eye(block.rows) * value if block.is_scalar_delta else value
+        return delta
+
+    def values(self, delta: np.ndarray) -> list[complex | np.ndarray]:
+        """Inverse of `assemble`."""
+        return [delta[w, z] if not block.is_scalar_delta else complex(delta[w.start, z.start])
+                for block, w, z in self.slices()]
+
+    def contains(self, delta: np.ndarray, tolerance: float = 1e-9) -> bool:
+        """Whether a matrix has this structure (zero outside, repeated, real where it must be)."""
+        if delta.shape != (self.n_w, self.n_z):
+            return False
+        rebuilt = self.assemble([np.real(v) if b.kind == "real" else v
+                                 for v, b in zip(self.values(delta), self.blocks, strict=True)])
+        return bool(np.max(np.abs(rebuilt - delta), initial=0.0) <= tolerance * max(np.max(np.abs(delta), initial=0), 1))
+
+    def random(self, rng: np.random.Generator, norm: float = 1.0, real: bool = False) -> np.ndarray:
+        """A random Delta whose largest block norm is at most `norm` (real=True: without phases)."""
+        values: list[complex | np.ndarray] = []
+        for block in self.blocks:
+            if block.kind == "full":
+                value = rng.standard_normal((block.rows, block.cols))
+                if not real:
+                    value = value + 1j * rng.standard_normal(value.shape)
+                values.append(norm * rng.uniform() * value / np.linalg.norm(value, 2))
+            elif block.kind == "real" or real:
+                values.append(norm * rng.uniform(-1, 1))
+            else:
+                values.append(norm * np.sqrt(rng.uniform()) * np.exp(2j * np.pi * rng.uniform()))
+        return self.assemble(values)
