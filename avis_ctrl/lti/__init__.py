@@ -1,7 +1,7 @@
 """Linear systems: state space with named signals, connection by name, norms, realisations."""
 
 from avis_ctrl.lti.connect import connect, lft_lower, lft_upper, summing_junction
-from avis_ctrl.lti.norms import hinf_norm, h2_norm
+from avis_ctrl.lti.norms import h2_norm, hinf_norm
 from avis_ctrl.lti.realisation import balance, balanced_truncation, discretise, minimal
 from avis_ctrl.lti.statespace import StateSpace, append, gain, tf
 

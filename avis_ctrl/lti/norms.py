@@ -34,8 +34,8 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
     if system.dt:
         continuous = _bilinear(system)
         peak = hinf_norm(continuous, tolerance)
-        omega = 2.0 / system.dt * np.arctan(peak.omega * system.dt / 2.0) if np.isfinite(peak.omega) else np.pi / system.dt
-        return PeakGain(peak.gain, omega)
+        # arctan(inf) is pi/2: the direct term of the bilinear image is the Nyquist frequency.
+        return PeakGain(peak.gain, 2.0 / system.dt * float(np.arctan(peak.omega * system.dt / 2.0)))
     if not system.ninputs or not system.noutputs:
         return PeakGain(0.0, 0.0)
     poles = system.poles()

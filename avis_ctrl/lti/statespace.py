@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg as la
+from numpy.typing import ArrayLike
 
 from avis_ctrl.errors import InputError
 
@@ -213,7 +214,7 @@ class StateSpace:
                 f"{list(self.inputs)} -> {list(self.outputs)})")
 
 
-def gain(matrix: np.ndarray | float, inputs: Sequence[str] = (), outputs: Sequence[str] = (),
+def gain(matrix: ArrayLike, inputs: Sequence[str] = (), outputs: Sequence[str] = (),
          dt: float = 0.0) -> StateSpace:
     """A static gain as a system without states."""
     D = np.atleast_2d(np.asarray(matrix, dtype=float))
@@ -248,7 +249,7 @@ def tf(numerator: Sequence[float], denominator: Sequence[float], inputs: Sequenc
     # Equal magnitudes along the chain: state k scaled by w0^k, w0 the geometric mean of the poles.
     w0 = abs(den[-1]) ** (1.0 / n) if den[-1] else max(np.max(np.abs(np.roots(den)), initial=0.0), 1.0)
     T = np.diag(w0 ** np.arange(n))
-    system = StateSpace(A, B, C, [[d]], 0.0, tuple(inputs), tuple(outputs)).similar(T)
+    system = StateSpace(A, B, C, np.array([[d]]), 0.0, tuple(inputs), tuple(outputs)).similar(T)
     size = np.sqrt(np.linalg.norm(system.B) * np.linalg.norm(system.C)) or 1.0
     return system.similar(np.eye(n) * (np.linalg.norm(system.B) / size if np.linalg.norm(system.C) else 1.0))
 
@@ -279,10 +280,9 @@ def _positions(names: Names, asked: Selector | None, what: str) -> list[int]:
         return list(range(len(names)))
     if isinstance(asked, slice):
         return list(range(len(names)))[asked]
-    if isinstance(asked, (str, int, np.integer)):
-        asked = [asked]  # type: ignore[list-item]
+    wanted: list[Any] = [asked] if isinstance(asked, (str, int, np.integer)) else list(asked)
     positions = []
-    for one in asked:
+    for one in wanted:
         if isinstance(one, str):
             if one not in names:
                 raise InputError(f"no {what} named {one!r}; there are {list(names)}")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -40,7 +40,7 @@ class Block:
     def is_scalar_delta(self) -> bool:
         return self.kind != "full"
 
-    def as_dict(self) -> dict[str, object]:
+    def as_dict(self) -> dict[str, Any]:
         """The contract's JSON form."""
         return {"kind": self.kind, "rows": self.rows, "cols": self.cols, "name": self.name}
 
@@ -90,16 +90,16 @@ class BlockStructure:
         return BlockStructure(blocks)
 
     @staticmethod
-    def from_dicts(items: Sequence[dict[str, object]]) -> BlockStructure:
+    def from_dicts(items: Sequence[dict[str, Any]]) -> BlockStructure:
         """From the contract's JSON form."""
         made: list[Block] = []
         for item in items:
             kind, rows, cols, name = (item.get(key) for key in ("kind", "rows", "cols", "name"))
             if kind == "full":
-                made.append(ComplexFull(int(rows), int(cols), str(name or "")))  # type: ignore[arg-type]
+                made.append(ComplexFull(int(rows), int(cols), str(name or "")))
             elif kind in ("real", "complex") and rows == cols:
                 scalar = RealScalar if kind == "real" else ComplexScalar
-                made.append(scalar(int(rows), str(name or "")))  # type: ignore[arg-type]
+                made.append(scalar(int(rows), str(name or "")))
             else:
                 raise InputError("expected kind real, complex (rows = cols) or full", field="blocks", value=item)
         return BlockStructure(tuple(made))
@@ -147,7 +147,8 @@ class BlockStructure:
             return False
         rebuilt = self.assemble([np.real(v) if b.kind == "real" else v
                                  for v, b in zip(self.values(delta), self.blocks, strict=True)])
-        return bool(np.max(np.abs(rebuilt - delta), initial=0.0) <= tolerance * max(np.max(np.abs(delta), initial=0), 1))
+        error = np.max(np.abs(rebuilt - delta), initial=0.0)
+        return bool(error <= tolerance * max(1.0, np.max(np.abs(delta), initial=0.0)))
 
     def random(self, rng: np.random.Generator, norm: float = 1.0, real: bool = False) -> np.ndarray:
         """A random Delta whose largest block norm is at most `norm` (real=True: without phases)."""
