@@ -94,12 +94,12 @@ class BlockStructure:
         """From the contract's JSON form."""
         made: list[Block] = []
         for item in items:
-            kind, rows, cols, name = (item.get(key) for key in ("kind", "rows", "cols", "name"))
+            kind, name = item.get("kind"), str(item.get("name") or "")
+            rows, cols = item.get("rows", 0), item.get("cols", 0)
             if kind == "full":
-                made.append(ComplexFull(int(rows), int(cols), str(name or "")))
+                made.append(ComplexFull(rows, cols, name))
             elif kind in ("real", "complex") and rows == cols:
-                scalar = RealScalar if kind == "real" else ComplexScalar
-                made.append(scalar(int(rows), str(name or "")))
+                made.append(RealScalar(rows, name) if kind == "real" else ComplexScalar(rows, name))
             else:
                 raise InputError("expected kind real, complex (rows = cols) or full", field="blocks", value=item)
         return BlockStructure(tuple(made))
