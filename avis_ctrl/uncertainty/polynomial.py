@@ -1,0 +1,98 @@
+"""Exact polynomial dependence of a matrix on normalised parameters, found by evaluating it.
+
+The matrices of a rig are polynomials of low degree in its physical parameters (stiffness enters K
+linearly, a load's position enters M quadratically, its mass multiplies both). Reading the
+coefficients off the rig's own equations keeps one source of truth: there is no second, hand-written
+list of derivatives that could disagree with the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError
+
+Exponents = tuple[int, ...]
+MatrixFunction = Callable[[np.ndarray], np.ndarray]
+
+
+def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float = 1e-11,
+                            seed: int = 0) -> dict[Exponents, np.ndarray]:
+    """Coefficients N_a of function(delta) = sum_a delta^a N_a, delta in [-1, 1]^n.
+
+    Exponents go up to 2 in one parameter and to 3 in all. Entries smaller than `tolerance` times the
+    largest variation are set to zero. A fresh random sample checks the result.
+
+    Raises
+    ------
+    ComputationError : the function is not such a polynomial (error measured).
+    """
+    base = function(np.zeros(n))
+    if n == 0:
+        return {(): base}
+    monomials = _monomials(function, n, base)
+    rng = np.random.default_rng(seed)
+    samples = rng.uniform(-1, 1, (2 * len(monomials) + 2, n))
+    powers = np.stack([np.prod(samples ** np.array(a), axis=1) for a in monomials], axis=1)
+    values = np.stack([function(delta) - base for delta in samples])
+    coefficients, *_ = np.linalg.lstsq(powers, values.reshape(len(samples), -1), rcond=None)
+    # Each entry has its own unit: compare with the largest variation of that entry's row and column kind.
+    size = np.max(np.abs(values), axis=0)
+    found = {(0,) * n: base}
+    for exponents, coefficient in zip(monomials, coefficients, strict=True):
+        matrix = coefficient.reshape(base.shape)
+        matrix = np.where(np.abs(matrix) > tolerance * size, matrix, 0.0)
+        if np.any(matrix):
+            found[exponents] = matrix
+    _check(function, found, rng.uniform(-1, 1, (5, n)), size)
+    return found
+
+
+def _monomials(function: MatrixFunction, n: int, base: np.ndarray) -> list[Exponents]:
+    """Exponents that may occur: single parameters, and products of those that interact."""
+    def unit(*which: int) -> np.ndarray:
+        delta = np.zeros(n)
+        delta[list(which)] = [0.83 + 0.05 * k for k in range(len(which))]
+        return delta
+    single = [function(unit(i)) - base for i in range(n)]
+    scale = np.max(np.abs(single), axis=0, initial=0.0) + np.abs(base)
+    interacting = set()
+    for i, j in combinations(range(n), 2):
+        delta = np.zeros(n)
+        delta[i] = delta[j] = 0.83
+        mixed = function(delta) - base - single[i] - single[j]
+        if np.any(np.abs(mixed) > 1e-12 * scale):
+            interacting.add((i, j))
+    exponents = []
+    for i in range(n):
+        exponents += [_exponent(n, {i: 1}), _exponent(n, {i: 2})]
+    for i, j in sorted(interacting):
+        exponents += [_exponent(n, {i: 1, j: 1}), _exponent(n, {i: 2, j: 1}), _exponent(n, {i: 1, j: 2})]
+    for i, j, k in combinations(range(n), 3):
+        if {(i, j), (i, k), (j, k)} <= interacting:
+            exponents.append(_exponent(n, {i: 1, j: 1, k: 1}))
+    return exponents
+
+
+def _exponent(n: int, powers: dict[int, int]) -> Exponents:
+    return tuple(powers.get(k, 0) for k in range(n))
+
+
+def evaluate(coefficients: dict[Exponents, np.ndarray], delta: np.ndarray) -> np.ndarray:
+    """sum_a delta^a N_a."""
+    return np.sum([np.prod(np.asarray(delta) ** np.array(a)) * N for a, N in coefficients.items()], axis=0)
+
+
+def _check(function: MatrixFunction, found: dict[Exponents, np.ndarray], samples: np.ndarray,
+           size: np.ndarray) -> None:
+    for delta in samples:
+        error = np.max(np.abs(function(delta) - evaluate(found, delta)) / (np.abs(found[(0,) * len(delta)]) + size
+                                                                           + np.finfo(float).tiny))
+        if error > 1e-10:
+            raise ComputationError("the rig's matrices are not polynomials of degree 2 in these parameters",
+                                   measured=f"relative error {error:.1e} at a random sample",
+                                   cause="a parameter that enters through a division or a trigonometric function",
+                                   next_step="choose parameters such as mass, inertia, stiffness, damping or position")

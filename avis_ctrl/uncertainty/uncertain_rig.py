@@ -1,0 +1,242 @@
+"""A rig with uncertain physical parameters, as an exact linear fractional transformation.
+
+With the velocity v of the payload, its displacement r relative to the floor, and a floor that moves with
+velocity v_f, the equations of motion (eq. 15 of the Halcyonics source, eq. 2.36 of the AVIS source with the
+chassis motion kept) need neither a derivative nor an integral of the floor motion:
+
+    r' = v - v_f
+    M(delta) v' + C(delta) (v - v_f) + K(delta) r - T(delta) u = f
+
+so that one matrix N(delta) = [M, C, K, -T], acting on s = (v', v - v_f, r, u), holds all that is uncertain.
+Each monomial delta^a of its polynomial is factored into L_a R_a of minimal rank and pulled out: z = R_a s,
+w = delta z, force -L_a w. No inverse of M is expanded, hence no approximation: closing the loop with any
+delta gives the rig rebuilt with the perturbed parameters. Floor and payload velocities have the ratio of the
+displacements, so transmissibility is read from v_f to v.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.uncertainty.blocks import BlockStructure, RealScalar
+from avis_ctrl.uncertainty.polynomial import Exponents, polynomial_coefficients
+
+
+class Rig(Protocol):
+    """What this module needs of a rig."""
+
+    @property
+    def edge_m(self) -> float: ...
+    def parameters(self) -> dict[str, Any]: ...
+    def with_parameters(self, values: dict[str, float]) -> Any: ...
+    def equations_of_motion(self) -> Any: ...
+    def sensor_rows(self) -> tuple[Any, np.ndarray]: ...
+
+
+@dataclass(frozen=True)
+class UncertainParameter:
+    """A physical parameter known to within +- spread (a fraction of its value, or absolute in its unit)."""
+
+    name: str
+    spread: float
+    absolute: bool = False
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.spread) and self.spread > 0):
+            raise InputError("an uncertainty must be a positive number", field=f"{self.name} spread", value=self.spread)
+        if not self.absolute and self.spread >= 1:
+            raise InputError("a relative uncertainty must stay below 1 (100 %), or the parameter changes sign",
+                             field=f"{self.name} spread", value=self.spread)
+
+    def half_range(self, nominal: float) -> float:
+        """Half width of the interval in the parameter's unit."""
+        if not self.absolute and nominal == 0.0:
+            raise InputError(f"the nominal value of {self.name} is zero: give its uncertainty in absolute terms",
+                             field=self.name, value=nominal)
+        return self.spread if self.absolute else self.spread * abs(nominal)
+
+    def describe(self, delta: float, nominal: float, unit: str = "") -> str:
+        """A value of delta in physical words: "isolator2.k_z at +15 %"."""
+        if self.absolute:
+            return f"{self.name} at {nominal + delta * self.spread:.4g} {unit}".rstrip()
+        return f"{self.name} at {100 * delta * self.spread:+.3g} %"
+
+
+@dataclass(frozen=True)
+class UncertainRig:
+    """The rig's LFT, from w_delta, actuators, floor and forces to z_delta and motion.
+
+    Attributes
+    ----------
+    system : inputs "w:NAME", actuators [V], "floor_COORD_dot" [m/s], "force_COORD" [N]; outputs "z:NAME",
+        "COORD_rel" relative to the floor [m], "COORD_dot" [m/s], "COORD_ddot" [m/s^2] absolute, and
+        "SENSOR_dot", "SENSOR_ddot" along each sensor.
+    blocks : one real repeated scalar a parameter, in the order of w_delta.
+    parameters, nominal, units : what each delta means.
+    coordinates : names kept; rotations are displacements of the edge [m] and end in "_edge".
+    """
+
+    system: StateSpace
+    blocks: BlockStructure
+    parameters: tuple[UncertainParameter, ...]
+    nominal: dict[str, float]
+    units: dict[str, str]
+    coordinates: tuple[str, ...]
+
+    def describe(self, deltas: Sequence[float]) -> list[str]:
+        """Each parameter's perturbation in physical words."""
+        return [p.describe(float(d), self.nominal[p.name], self.units[p.name])
+                for p, d in zip(self.parameters, deltas, strict=True)]
+
+    def values(self, deltas: Sequence[float]) -> dict[str, float]:
+        """Physical values at normalised deltas, for `rig.with_parameters`."""
+        return {p.name: self.nominal[p.name] + float(d) * p.half_range(self.nominal[p.name])
+                for p, d in zip(self.parameters, deltas, strict=True)}
+
+
+def edge_name(coordinate: str) -> str:
+    """Name of a coordinate once rotations are expressed as displacements of the edge."""
+    return f"{coordinate}_edge" if coordinate.startswith("phi") else coordinate
+
+
+def uncertain_rig(rig: Rig, parameters: Sequence[UncertainParameter], keep: Sequence[str] = ("z", "phi_x"),
+                  sensor_names: Sequence[str] | None = None) -> UncertainRig:
+    """Pull uncertain parameters out of a rig; coordinates not kept are locked at rest.
+
+    Parameters
+    ----------
+    parameters : uncertain ones, by the rig's own names (`rig.parameters()`).
+    keep : coordinates that move.
+    sensor_names : sensors along which velocity and acceleration are brought out.
+
+    Raises
+    ------
+    InputError : unknown parameter or coordinate, a parameter twice.
+    """
+    known = rig.parameters()
+    for parameter in parameters:
+        if parameter.name not in known:
+            raise InputError(f"the rig has no such parameter; it has {sorted(known)}", field="uncertain parameter",
+                             value=parameter.name)
+    if len({p.name for p in parameters}) != len(parameters):
+        raise InputError("a parameter is listed twice", field="uncertain parameters",
+                         value=[p.name for p in parameters])
+    equations = rig.equations_of_motion()
+    if unknown := [name for name in keep if name not in equations.coordinates]:
+        raise InputError(f"expected some of {list(equations.coordinates)}", field="keep", value=unknown)
+    if not (np.allclose(equations.K, equations.K_floor) and np.allclose(equations.C, equations.C_floor)):
+        raise InputError("expected chassis points equal to payload points, so that relative motion is q - q_floor",
+                         field="chassis points")
+    kept = [equations.coordinates.index(name) for name in keep]
+    nominal = {p.name: float(known[p.name].value) for p in parameters}
+    half = np.array([p.half_range(nominal[p.name]) for p in parameters])
+    scale = np.array([1.0 / rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
+
+    def N(delta: np.ndarray) -> np.ndarray:
+        values = {p.name: nominal[p.name] + d * h for p, d, h in zip(parameters, delta, half, strict=True)}
+        return _stacked(rig.with_parameters(values).equations_of_motion() if values else equations, kept, scale)
+
+    coefficients = polynomial_coefficients(N, len(parameters))
+    rows = _sensor_rows(rig, sensor_names, kept, scale)
+    names = tuple(edge_name(name) for name in keep)
+    system, copies = _realise(coefficients, names, equations.actuators, rows, [p.name for p in parameters])
+    blocks = BlockStructure(tuple(RealScalar(copies[p.name], p.name) for p in parameters if copies[p.name]))
+    moving = tuple(p for p in parameters if copies[p.name])
+    return UncertainRig(system, blocks, moving, nominal, {p.name: known[p.name].unit for p in parameters}, names)
+
+
+def _stacked(equations: Any, kept: list[int], scale: np.ndarray) -> np.ndarray:
+    """N(delta) = [M, C, K, -T], rotations in edge displacements."""
+    S = np.diag(scale)
+    squares = [S @ X[np.ix_(kept, kept)] @ S for X in (equations.M, equations.C, equations.K)]
+    return np.hstack([*squares, -S @ equations.T[kept]])
+
+
+def _sensor_rows(rig: Rig, names: Sequence[str] | None, kept: list[int],
+                 scale: np.ndarray) -> dict[str, np.ndarray]:
+    if not names:
+        return {}
+    available, rows = rig.sensor_rows()
+    if missing := [name for name in names if name not in available]:
+        raise InputError(f"the rig's sensors are {list(available)}", field="sensors", value=missing)
+    return {name: rows[list(available).index(name)][kept] * scale for name in names}
+
+
+def _factor(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """L R = matrix with the fewest inner columns, evenly scaled."""
+    rows = np.linalg.norm(matrix, axis=1, keepdims=True)
+    rows[rows == 0] = 1.0
+    U, sigma, Vt = np.linalg.svd(matrix / rows, full_matrices=False)
+    rank = int(np.sum(sigma > 1e-10 * sigma[0]))
+    root = np.sqrt(sigma[:rank])
+    L, R = rows * U[:, :rank] * root, (Vt[:rank].T * root).T
+    size = np.sqrt(np.linalg.norm(L) / np.linalg.norm(R))
+    return L / size, R * size
+
+
+def _realise(coefficients: dict[Exponents, np.ndarray], coordinates: tuple[str, ...], actuators: Sequence[str],
+             rows: dict[str, np.ndarray], parameters: list[str]) -> tuple[StateSpace, dict[str, int]]:
+    """State space of the LFT with x = (r, v), and how often each delta is repeated."""
+    n, m = len(coordinates), len(actuators)
+    base = coefficients[(0,) * len(parameters)]
+    # One link a power of a parameter: it reads either s (first link of a monomial) or the previous link.
+    chains: list[tuple[list[int], np.ndarray, np.ndarray]] = []
+    for exponents, matrix in coefficients.items():
+        powers = [k for k, exponent in enumerate(exponents) for _ in range(exponent)]
+        if powers:
+            chains.append((powers, *_factor(matrix)))
+    links = sorted((parameter, chain, position) for chain, (powers, *_) in enumerate(chains)
+                   for position, parameter in enumerate(powers))
+    width = {link: chains[link[1]][1].shape[1] for link in links}
+    start, total = {}, 0
+    for link in links:
+        start[link], total = total, total + width[link]
+    place = {(chain, position): slice(start[link], start[link] + width[link])
+             for link in links for _, chain, position in [link]}
+
+    L = np.zeros((n, total))           # force of w_delta
+    R = np.zeros((total, 3 * n + m))   # z_delta read from s
+    W = np.zeros((total, total))       # z_delta read from w_delta: further links of a monomial
+    for chain, (powers, left, right) in enumerate(chains):
+        R[place[chain, 0]] = right
+        for position in range(1, len(powers)):
+            W[place[chain, position], place[chain, position - 1]] = np.eye(left.shape[1])
+        L[:, place[chain, len(powers) - 1]] += left
+
+    # s = S_x (r, v) + S_e e with the inputs e = (w_delta, u, v_f, f); its first rows solve for v'.
+    M, N_rest = base[:, :n], base[:, n:]
+    n_e, Mi = total + m + 2 * n, np.linalg.inv(M)
+    w, u, v_f, f = np.split(np.arange(n_e), [total, total + m, total + m + n])
+    S_x, S_e = np.zeros((3 * n + m, 2 * n)), np.zeros((3 * n + m, n_e))
+    S_x[n:2 * n, n:], S_x[2 * n:3 * n, :n] = np.eye(n), np.eye(n)
+    S_e[n:2 * n, v_f], S_e[3 * n:, u] = -np.eye(n), np.eye(m)
+    S_x[:n] = -Mi @ N_rest @ S_x[n:]
+    S_e[:n] = -Mi @ N_rest @ S_e[n:]
+    S_e[:n, w] -= Mi @ L
+    S_e[:n, f] += Mi
+    # The outputs of motion, each a selection from s and from the floor's velocity.
+    velocity_x, velocity_e = S_x[n:2 * n], S_e[n:2 * n].copy()
+    velocity_e[:, v_f] += np.eye(n)
+    sense = np.array(list(rows.values())).reshape(len(rows), n)
+    z_e = R @ S_e
+    z_e[:, w] += W
+    A = np.vstack([S_x[n:2 * n], S_x[:n]])
+    B = np.vstack([S_e[n:2 * n], S_e[:n]])
+    C = np.vstack([R @ S_x, S_x[2 * n:3 * n], velocity_x, S_x[:n], sense @ velocity_x, sense @ S_x[:n]])
+    D = np.vstack([z_e, S_e[2 * n:3 * n], velocity_e, S_e[:n], sense @ velocity_e, sense @ S_e[:n]])
+
+    copies = {name: sum(width[link] for link in links if link[0] == k) for k, name in enumerate(parameters)}
+    tags = [f"{name}[{c}]" if copies[name] > 1 else name for name in parameters for c in range(copies[name])]
+    inputs = [*(f"w:{tag}" for tag in tags), *actuators, *(f"floor_{name}_dot" for name in coordinates),
+              *(f"force_{name}" for name in coordinates)]
+    outputs = [*(f"z:{tag}" for tag in tags), *(f"{name}_rel" for name in coordinates),
+               *(f"{name}_dot" for name in coordinates), *(f"{name}_ddot" for name in coordinates),
+               *(f"{name}_dot" for name in rows), *(f"{name}_ddot" for name in rows)]
+    states = [*(f"{name}_rel" for name in coordinates), *(f"{name}_dot" for name in coordinates)]
+    return StateSpace(A, B, C, D, 0.0, tuple(inputs), tuple(outputs), tuple(states)), copies
