@@ -192,11 +192,15 @@ class StateSpace:
 
     # -- python-control -------------------------------------------------------------------
     def to_control(self) -> Any:
-        """The python-control StateSpace (imports control, which takes about two seconds)."""
+        """The python-control StateSpace (imports control, which takes about two seconds).
+
+        python-control forbids dots in signal names: they become underscores.
+        """
         import control
 
-        return control.ss(self.A, self.B, self.C, self.D, self.dt, inputs=list(self.inputs),
-                          outputs=list(self.outputs), remove_useless_states=False)
+        return control.ss(self.A, self.B, self.C, self.D, self.dt, remove_useless_states=False,
+                          inputs=[name.replace(".", "_") for name in self.inputs],
+                          outputs=[name.replace(".", "_") for name in self.outputs])
 
     @staticmethod
     def from_control(system: Any) -> StateSpace:
