@@ -1,0 +1,168 @@
+r"""The generalized plant, assembled by signal name.
+
+                 +-----------+
+     z_delta <---|           |<--- w_delta        Delta: what the model does not know
+                 |           |
+           z <---|     P     |<--- w              what is asked of the loop
+                 |           |
+        +-- y <--|           |<--- u <--+
+        |        +-----------+          |
+        +------------> K ---------------+         u = K y (positive feedback)
+
+A `Diagram` collects parts whose inputs and outputs carry signal names; it knows which signals are
+w_delta/z_delta (they come with an uncertainty block), w, z, u and y. Nothing is ever found by index.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.connect import connect, lft_lower, lft_upper, signal_sources
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.uncertainty.blocks import Block, BlockStructure
+
+Role = Literal["w", "z", "u", "y"]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A line of the connection table."""
+
+    name: str
+    meaning: str
+    unit: str
+    source: str
+    readers: tuple[str, ...]
+    role: str  # "w_delta", "z_delta", "w", "z", "u", "y" or "internal"
+
+
+@dataclass(frozen=True, eq=False)
+class GeneralizedPlant:
+    """P with inputs (w_delta, w, u) and outputs (z_delta, z, y), its blocks and its connection table.
+
+    Attributes
+    ----------
+    P : StateSpace, signals named.
+    blocks : uncertainty blocks in the order of w_delta.
+    w, z, u, y : names of the remaining signals.
+    signals : the connection table.
+    parts : (name, kind) of each part with its system, for the drawn block diagram.
+    units : unit of each signal where known.
+    """
+
+    P: StateSpace
+    blocks: BlockStructure
+    w: tuple[str, ...]
+    z: tuple[str, ...]
+    u: tuple[str, ...]
+    y: tuple[str, ...]
+    signals: tuple[Signal, ...] = ()
+    parts: tuple[Part, ...] = ()
+    units: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def nmeas(self) -> int:
+        return len(self.y)
+
+    @property
+    def ncon(self) -> int:
+        return len(self.u)
+
+    @property
+    def all_blocks(self) -> BlockStructure:
+        """Uncertainty blocks and the performance block."""
+        return self.blocks.with_performance(len(self.w), len(self.z))
+
+    def closed(self, K: StateSpace | None) -> StateSpace:
+        """N = F_l(P, K); without a controller, P with its actuators at rest (u = 0)."""
+        outputs, inputs = self.P.outputs[:self.P.noutputs - self.nmeas], self.P.inputs[:self.P.ninputs - self.ncon]
+        if K is None:
+            return self.P.select(list(outputs), list(inputs))
+        return lft_lower(self.P, K)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's avis-plant JSON form."""
+        P = self.P
+        return {"format": "avis-plant", "version": 1, "A": P.A.tolist(), "B": P.B.tolist(), "C": P.C.tolist(),
+                "D": P.D.tolist(), "dt": P.dt, "inputs": list(P.inputs), "outputs": list(P.outputs),
+                "nmeas": self.nmeas, "ncon": self.ncon, "blocks": [b.as_dict() for b in self.blocks.blocks],
+                "performance": {"rows": len(self.w), "cols": len(self.z)}}
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One box of the block diagram."""
+
+    name: str
+    kind: str  # "rig", "actuator", "sensor", "weight", "uncertainty", "allocation", ...
+    system: StateSpace
+
+
+class Diagram:
+    """Collects parts and signals, then closes the connection.
+
+    >>> diagram = Diagram()
+    >>> diagram.add("rig", rig_system, kind="rig")
+    >>> diagram.add("W_T z", weight, kind="weight")
+    >>> plant = diagram.plant(w=["floor_z_dot"], z=["e_z"], u=["force_z"], y=["seen_z"])
+    """
+
+    def __init__(self) -> None:
+        self._parts: list[Part] = []
+        self._blocks: list[tuple[Block, list[str], list[str]]] = []
+        self._meaning: dict[str, tuple[str, str]] = {}
+
+    def add(self, name: str, system: StateSpace, kind: str = "system") -> None:
+        """Add a part; its inputs read, and its outputs drive, the signals of those names."""
+        if any(part.name == name for part in self._parts):
+            raise InputError("two parts of this name", field="diagram", value=name)
+        self._parts.append(Part(name, kind, system))
+
+    def uncertain(self, block: Block, w: Sequence[str], z: Sequence[str]) -> None:
+        """Declare that `block` closes the signals z onto the signals w."""
+        if (len(w), len(z)) != (block.rows, block.cols):
+            raise InputError(f"block of {block.rows} x {block.cols} given {len(w)} w and {len(z)} z signals",
+                             field="uncertainty", value=block.name)
+        self._blocks.append((block, list(w), list(z)))
+
+    def means(self, signal: str, meaning: str, unit: str) -> None:
+        """Say what a signal is, for the table of the report."""
+        self._meaning[signal] = (meaning, unit)
+
+    def plant(self, w: Sequence[str], z: Sequence[str], u: Sequence[str], y: Sequence[str]) -> GeneralizedPlant:
+        """Close the connection.
+
+        Raises
+        ------
+        InputError : a signal driven twice, driven by nothing, or made but read by nobody.
+        """
+        parts = {part.name: part.system for part in self._parts}
+        w_delta = [name for _, names, _ in self._blocks for name in names]
+        z_delta = [name for _, _, names in self._blocks for name in names]
+        inputs, outputs = [*w_delta, *w, *u], [*z_delta, *z, *y]
+        source = signal_sources(parts, inputs)
+        readers = {name: [p.name for p in self._parts if name in p.system.inputs] for name in source}
+        if unread := [name for name in source if not readers[name] and name not in outputs]:
+            raise InputError(f"it is driven by {source[unread[0]]} but read by nothing, and is no output",
+                             field="signal", value=unread[0])
+        roles = {**dict.fromkeys(w_delta, "w_delta"), **dict.fromkeys(z_delta, "z_delta"), **dict.fromkeys(w, "w"),
+                 **dict.fromkeys(z, "z"), **dict.fromkeys(u, "u"), **dict.fromkeys(y, "y")}
+        table = tuple(Signal(name, *self._meaning.get(name, ("", "")), source[name], tuple(readers[name]),
+                             roles.get(name, "internal")) for name in source)
+        return GeneralizedPlant(connect(parts, inputs, outputs), BlockStructure(tuple(b for b, _, _ in self._blocks)),
+                                tuple(w), tuple(z), tuple(u), tuple(y), table, tuple(self._parts),
+                                {name: unit for name, (_, unit) in self._meaning.items()})
+
+
+def sample_lft(system: StateSpace, blocks: BlockStructure, delta: np.ndarray) -> StateSpace:
+    """F_u(system, Delta): one plant of the set (the first signals are z_delta and w_delta)."""
+    if not blocks.contains(delta):
+        raise InputError("Delta does not have the structure of the blocks", field="delta")
+    if np.any(np.abs(delta.imag) > 0):
+        raise InputError("a sampled Delta must be real; realise a complex one as a system first", field="delta")
+    return lft_upper(system, delta.real)
