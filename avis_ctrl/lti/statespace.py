@@ -259,11 +259,14 @@ def tf(numerator: Sequence[float], denominator: Sequence[float], inputs: Sequenc
 
 
 def append(*systems: StateSpace) -> StateSpace:
-    """Block-diagonal stack of systems, with all their signals."""
+    """Block-diagonal stack of systems, with all their signals (numbered afresh where names repeat)."""
+    def joined(names: Iterable[Names]) -> Names:
+        together = sum(names, ())
+        return together if len(set(together)) == len(together) else ()
     return StateSpace(la.block_diag(*(s.A for s in systems)), la.block_diag(*(s.B for s in systems)),
                       la.block_diag(*(s.C for s in systems)), la.block_diag(*(s.D for s in systems)),
-                      _common_dt(*systems), sum((s.inputs for s in systems), ()),
-                      sum((s.outputs for s in systems), ()), sum((s.states for s in systems), ()))
+                      _common_dt(*systems), joined(s.inputs for s in systems),
+                      joined(s.outputs for s in systems), sum((s.states for s in systems), ()))
 
 
 def _as_matrix(factor: np.ndarray | float, size: int) -> np.ndarray:
