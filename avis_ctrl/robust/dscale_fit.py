@@ -1,0 +1,246 @@
+"""LMI fit of a magnitude by a stable, minimum-phase d(s) with stable inverse, in the log-Chebyshev sense.
+
+|d(j omega)|^2 = p(y) / q(y) with y = omega^2 and p, q polynomials of degree n that are positive on y >= 0.
+For a given t the conditions
+
+    1/t <= p / (q |d_k|^2) <= t   at the points,      p, q positive on the whole axis
+
+are linear in (p, q) and in the Gram matrices of the sums of squares p = s0 + y s1 (Boyd and Vandenberghe,
+Convex Optimization, sections 3.4.2 and 4.2.5; the certificate is that of Markov and Lukacs for a half line):
+a semidefinite feasibility problem inside a bisection on log t. Spectral factorisation then takes the left
+half plane roots of p(-s^2) and q(-s^2).
+
+Eight decades of frequency are sixteen of y, so monomials are hopeless. The powers are scaled by the
+coefficients of prod(y + |y_i|), y_i the roots of the best fit so far: every basis function is then a bump of
+height at most one in log y, and the basis follows the solution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import clarabel
+import numpy as np
+import scipy.sparse as sp
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.robust.scalings import ScalarScaling
+
+# p and q stay this far above zero, relative to prod(y + |y_i|): zeros and poles keep clear of the axis.
+POSITIVITY_MARGIN = 1e-7
+# log t / weight beyond which a point constrains nothing that doubles can express.
+SLACK_LIMIT = 25.0
+
+
+@dataclass(frozen=True)
+class MagnitudeFit:
+    """A fitted d(s) with its error recomputed from the realised roots.
+
+    error : max over the points of weight |log(|d| / target)|.
+    error_bound : no d(s) of this order has a smaller one (the bisection proved it infeasible).
+    solves : conic problems solved.
+    """
+
+    scaling: ScalarScaling
+    error: float
+    error_bound: float
+    solves: int
+
+
+def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: np.ndarray | None = None,
+                  tolerance: float = 1e-3) -> MagnitudeFit:
+    """Best log-Chebyshev fit of |d| at the frequencies by a d(s) of the given order.
+
+    Parameters
+    ----------
+    omega, magnitude : (n_omega,) rad/s and |d| > 0.
+    order : number of poles, and of zeros.
+    weight : (n_omega,) in 0..1, what a logarithmic misfit costs at each point; all one when absent.
+    tolerance : gap between the error and its proven bound at which the bisection ends.
+
+    Raises
+    ------
+    InputError : shapes that differ, magnitudes or frequencies that are not positive and finite, a negative order.
+    ComputationError : the conic solver gives no answer.
+    """
+    omega, target, weight = _checked(omega, magnitude, order, weight)
+    best, error = _constant_fit(target, weight)
+    if order == 0 or error <= tolerance:
+        return MagnitudeFit(best, error, error if order == 0 else 0.0, 0)
+    unit = float(np.exp(np.mean(np.log(omega))))
+    problem = _Feasibility((omega / unit) ** 2, 2 * target, weight, order, _initial_roots(omega / unit, target, order))
+    lower, solves = 0.0, 0
+    while error - lower > tolerance and solves < 40:
+        level = (lower + error) / 2
+        candidate = problem.solve(2 * level)
+        solves += 1
+        if candidate is None:
+            lower = level
+            continue
+        p, q = candidate
+        fitted = _spectral_factor(p, q, unit)
+        achieved = float(np.max(weight * np.abs(fitted.log_magnitude(omega) - target)))
+        if achieved >= error:
+            # Feasible on paper but not after factorisation: doubles end here.
+            break
+        best, error = fitted, achieved
+        problem = problem.recentred(np.roots(p[::-1]), np.roots(q[::-1]))
+    return MagnitudeFit(best, error, lower, solves)
+
+
+def _checked(omega: np.ndarray, magnitude: np.ndarray, order: int,
+             weight: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frequencies, log magnitudes and weights as float arrays."""
+    omega, magnitude = np.atleast_1d(np.asarray(omega, float)), np.atleast_1d(np.asarray(magnitude, float))
+    weight = np.ones(omega.size) if weight is None else np.atleast_1d(np.asarray(weight, float))
+    if omega.ndim != 1 or omega.shape != magnitude.shape or omega.shape != weight.shape or not omega.size:
+        raise InputError(f"omega {omega.shape}, magnitude {magnitude.shape} and weight {weight.shape} must be equal")
+    for field, array in (("omega", omega), ("magnitude", magnitude)):
+        if not np.all(np.isfinite(array) & (array > 0)):
+            raise InputError("expected positive finite numbers", field=field,
+                             value=float(array[~(np.isfinite(array) & (array > 0))][0]))
+    if not np.all((weight >= 0) & (weight <= 1)) or not np.any(weight > 0):
+        raise InputError("expected weights in 0..1, not all zero", field="weight")
+    if int(order) != order or order < 0:
+        raise InputError("expected a whole number of at least 0", field="order", value=order)
+    return omega, np.log(magnitude), weight
+
+
+def _constant_fit(target: np.ndarray, weight: np.ndarray) -> tuple[ScalarScaling, float]:
+    """Constant d of least weighted log-Chebyshev error: two points pull it from either side."""
+    # error e with target_i - e/w_i <= c <= target_j + e/w_j for all i, j
+    difference = target[:, None] - target[None, :]
+    pull = np.divide(1.0, weight, out=np.full(weight.size, np.inf), where=weight > 0)
+    needed = np.maximum(difference, 0) / (pull[:, None] + pull[None, :])
+    i, j = np.unravel_index(np.argmax(needed), needed.shape)
+    level = float(needed[i, j])
+    c = target[i] - level * pull[i] if level > 0 else float(target[np.argmax(weight)])
+    return ScalarScaling(np.array([c])), float(np.max(weight * np.abs(target - c)))
+
+
+def _initial_roots(omega: np.ndarray, target: np.ndarray, order: int) -> np.ndarray:
+    """Roots -y_i of the first basis, spread over the band in proportion to how much the target varies."""
+    position = np.log(omega)
+    arrange = np.argsort(position)
+    position, target = position[arrange], target[arrange]
+    step = np.abs(np.diff(target)) + 0.05 * np.diff(position) + 1e-9
+    share = np.concatenate([[0.0], np.cumsum(step)]) / np.sum(step) if step.size else np.zeros(1)
+    return -np.exp(2 * np.interp((np.arange(order) + 0.5) / order, share, position)).astype(complex)
+
+
+class _Feasibility:
+    """The semidefinite problem at a level t, in a basis around given roots of p and q."""
+
+    def __init__(self, y: np.ndarray, log_target: np.ndarray, weight: np.ndarray, order: int, zeros: np.ndarray,
+                 poles: np.ndarray | None = None, ratio: np.ndarray | None = None):
+        self.y, self.log_target, self.weight, self.order = y, log_target, weight, order
+        self.poles = zeros if poles is None else poles
+        self.e_p, self.e_q = _basis_scale(zeros), _basis_scale(self.poles)
+        log_p, log_q = (np.sum(np.log(y[:, None] + np.abs(r)), axis=1) for r in (zeros, self.poles))
+        # In the scaled variables P = p / prod, Q = q / prod the target reads T' = T prod_q / prod_p.
+        self.shift = float(np.mean(log_target + log_q - log_p))
+        self.log_scaled_target = log_target + log_q - log_p - self.shift
+        self.rows_p, self.gram_p = _value_rows(y, log_p, self.e_p)
+        self.rows_q, self.gram_q = _value_rows(y, log_q, self.e_q)
+        self.centre = np.ones(y.size) if ratio is None else ratio
+
+    def recentred(self, zeros: np.ndarray, poles: np.ndarray) -> _Feasibility:
+        """The same problem in a basis around the latest solution."""
+        ratio = np.prod(np.abs(self.y[:, None] - poles) / (self.y[:, None] + np.abs(poles)), axis=1)
+        return _Feasibility(self.y, self.log_target, self.weight, self.order, zeros, poles, np.maximum(ratio, 1e-6))
+
+    def solve(self, log_t: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Coefficients of p and q, ascending in y, or None where the level is infeasible."""
+        log_t_k = np.divide(log_t, self.weight, out=np.full(self.y.size, np.inf), where=self.weight > 0)
+        kept = log_t_k < SLACK_LIMIT
+        inverse_t = np.exp(-log_t_k[kept])[:, None]
+        # Rows are divided by the current value of q, so that each is of order one (differential correction).
+        Q = self.rows_q[kept] / self.centre[kept, None]
+        P = self.rows_p[kept] * np.exp(-self.log_scaled_target[kept])[:, None] / self.centre[kept, None]
+        margin_q = POSITIVITY_MARGIN / self.centre[kept]
+        margin_p = POSITIVITY_MARGIN * np.exp(-self.log_scaled_target[kept]) / self.centre[kept]
+        n_p, n_q = P.shape[1], Q.shape[1]
+        ones = np.ones((P.shape[0], 1))
+        # T Q - P / t >= s and P - T Q / t >= s (divided by T), s maximal
+        upper = np.hstack([inverse_t * P, -Q, ones])
+        lower = np.hstack([-P, inverse_t * Q, ones])
+        bound = np.concatenate([margin_q - inverse_t[:, 0] * margin_p, margin_p - inverse_t[:, 0] * margin_q])
+        normal = np.concatenate([np.zeros(n_p), np.mean(Q, axis=0), [0.0]])[None, :]
+        cones: list[Any] = [clarabel.ZeroConeT(1), clarabel.NonnegativeConeT(bound.size)]
+        cones += [_gram_cone(size) for size in (*self.gram_p, *self.gram_q) if size]
+        A = sp.csc_matrix(np.vstack([normal, upper, lower, -np.eye(n_p + n_q, n_p + n_q + 1)]))
+        b = np.concatenate([[1.0], bound, np.zeros(n_p + n_q)])
+        x = _maximise_last(A, b, cones)
+        if x is None or x[-1] <= 0:
+            return None
+        p = _coefficients(x[:n_p], self.gram_p, self.e_p) * np.exp(self.shift)
+        return p, _coefficients(x[n_p:-1], self.gram_q, self.e_q)
+
+
+def _basis_scale(roots: np.ndarray) -> np.ndarray:
+    """Coefficients e_k of prod(y + |y_i|), ascending."""
+    return np.poly(-np.abs(roots)).real[::-1]
+
+
+def _value_rows(y: np.ndarray, log_scale: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+    """Rows that map the stacked Gram vectors to p(y) / prod(y + |y_i|), and the Gram sizes."""
+    degree = e.size - 1
+    sizes = (degree // 2 + 1, (degree + 1) // 2)
+    rows = []
+    for odd, size in enumerate(sizes):
+        if size:
+            power = np.arange(size) + odd / 2
+            m = np.exp(0.5 * np.log(e[odd::2][:size]) + np.log(y)[:, None] * power - 0.5 * log_scale[:, None])
+            i, j = _triangle(size)
+            rows.append(m[:, i] * m[:, j] * np.where(i == j, 1.0, np.sqrt(2.0)))
+    return np.hstack(rows), sizes
+
+
+def _coefficients(x: np.ndarray, sizes: tuple[int, int], e: np.ndarray) -> np.ndarray:
+    """Coefficients of s0(y) + y s1(y) + margin, ascending, from the stacked Gram vectors."""
+    coefficients = POSITIVITY_MARGIN * e
+    start = 0
+    for odd, size in enumerate(sizes):
+        scale = np.sqrt(e[odd::2][:size])
+        for i, j in zip(*_triangle(size), strict=True):
+            coefficients[i + j + odd] += x[start] * scale[i] * scale[j] * (1.0 if i == j else np.sqrt(2.0))
+            start += 1
+    return coefficients
+
+
+def _triangle(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Upper triangle, column by column: the solver's order of a symmetric matrix."""
+    j, i = np.tril_indices(size)
+    return i, j
+
+
+def _gram_cone(size: int) -> Any:
+    return clarabel.NonnegativeConeT(1) if size == 1 else clarabel.PSDTriangleConeT(size)
+
+
+def _maximise_last(A: sp.csc_matrix, b: np.ndarray, cones: list[Any]) -> np.ndarray | None:
+    """Solution of max x[-1] subject to b - A x in the cones; None where the solver stops without one."""
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_threads = 1
+    size = A.shape[1]
+    cost = np.zeros(size)
+    cost[-1] = -1.0
+    solution = clarabel.DefaultSolver(sp.csc_matrix((size, size)), cost, A, b, cones, settings).solve()
+    accepted = (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved)
+    return np.asarray(solution.x) if solution.status in accepted else None
+
+
+def _spectral_factor(p: np.ndarray, q: np.ndarray, unit: float) -> ScalarScaling:
+    """d(s) with |d(j omega)|^2 = p / q at y = (omega / unit)^2, all roots in the left half plane."""
+    roots = []
+    for polynomial in (p, q):
+        y = np.roots(polynomial[::-1])
+        if np.any((np.abs(y.imag) <= 1e-12 * np.abs(y)) & (y.real >= 0)):
+            raise ComputationError("a positive polynomial came out of factorisation with a root on the axis",
+                                   measured=f"y = {y[y.real >= 0][0]:.3g}",
+                                   cause="frequencies spanning too many decades",
+                                   next_step="a lower order or a narrower band")
+        roots.append(-np.sqrt(-y) * unit)
+    return ScalarScaling.from_roots(float(np.sqrt(p[-1] / q[-1])), *roots)
