@@ -1,0 +1,205 @@
+"""Real geophones from SEED RESP text files, and whether each file agrees with its own name.
+
+A file of the IRIS Nominal Response Library is named RESP.<network>.<station>.<location>.<channel>.<model>.<...>.
+What follows the model is coil ohm, shunt ohm (or NONE), corner Hz, gain V s/m; models without a shunt give only corner
+and gain, and the GS-11D gives its corner first. An underscore stands for the decimal point.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.geophone import Geophone
+
+VELOCITY_UNIT, VOLT_UNIT = "M/S", "V"
+
+
+@dataclass(frozen=True)
+class CatalogueEntry:
+    """One RESP file: what its lines say, and what its name says.
+
+    `corner_Hz`, `damping` and `gain_Vs_per_m` come from poles and stage gains; the fields that start with `named_`, the
+    coil and the shunt from the file's name (None: not given there).
+    """
+
+    file: str
+    model: str
+    corner_Hz: float
+    damping: float
+    gain_Vs_per_m: float
+    overall_sensitivity: float
+    normalisation: float
+    normalisation_Hz: float
+    coil_ohm: float | None
+    shunt_ohm: float | None
+    named_corner_Hz: float
+    named_gain_Vs_per_m: float
+
+    def geophone(self) -> Geophone:
+        """The geophone that the file's lines describe."""
+        return Geophone(self.corner_Hz, self.damping, self.gain_Vs_per_m, self.coil_ohm, self.shunt_ohm)
+
+
+def check_against_name(entry: CatalogueEntry, tolerance: float = 0.02) -> list[str]:
+    """What in the file contradicts its name or itself, in words with both numbers; empty when all agrees.
+
+    Compared, each to the relative tolerance: corner from the poles, gain, the product of the stage gains with the overall
+    sensitivity, and the normalisation factor with the poles' response at its frequency.
+    """
+    s = 2j * np.pi * entry.normalisation_Hz
+    w = 2 * np.pi * entry.corner_Hz
+    response = abs(s ** 2 / (s ** 2 + 2 * entry.damping * w * s + w ** 2))
+    pairs = [("corner from the poles", entry.corner_Hz, "the name's", entry.named_corner_Hz, "Hz"),
+             ("gain", entry.gain_Vs_per_m, "the name's", entry.named_gain_Vs_per_m, "V s/m"),
+             ("gain of stage 1", entry.gain_Vs_per_m, "the overall sensitivity", entry.overall_sensitivity, "V s/m"),
+             ("normalisation factor", entry.normalisation, "what the poles imply", 1 / response, "")]
+    return [f"{what} is {value:.4g} {unit}".rstrip() + f", {against} {other:.4g} {unit}".rstrip()
+            for what, value, against, other, unit in pairs if abs(value - other) > tolerance * abs(other)]
+
+
+def loaded_gain_prediction(entry: CatalogueEntry, others: Sequence[CatalogueEntry]) -> float | None:
+    """The gain [V s/m] that the voltage divider coil/shunt predicts from other files of the same model and coil.
+
+    The shunt R loads the open-circuit gain G to G R / (R + coil). The median open-circuit gain of the other entries is
+    used; None where there are none. It tells which of two contradicting numbers is right.
+    """
+    def divider(e: CatalogueEntry) -> float:
+        return 1.0 if e.shunt_ohm is None else e.shunt_ohm / (e.shunt_ohm + (e.coil_ohm or 0.0))
+    opened = [e.gain_Vs_per_m / divider(e) for e in others
+              if e.file != entry.file and (e.model, e.coil_ohm) == (entry.model, entry.coil_ohm)]
+    return float(np.median(opened) * divider(entry)) if opened else None
+
+
+def read_catalogue(folder: str | Path) -> tuple[CatalogueEntry, ...]:
+    """Every RESP.* file of a folder, by name.
+
+    Raises InputError when the folder holds none, or a file cannot be read (naming file and field).
+    """
+    folder = Path(folder)
+    files = sorted(folder.glob("RESP.*")) if folder.is_dir() else []
+    if not files:
+        raise InputError("a folder with RESP.* files", file=folder)
+    return tuple(read_response(path) for path in files)
+
+
+def contradictions(entries: Sequence[CatalogueEntry]) -> dict[str, list[str]]:
+    """The files that contradict themselves, with what is wrong in each."""
+    return {entry.file: found for entry in entries if (found := check_against_name(entry))}
+
+
+def read_response(path: str | Path) -> CatalogueEntry:
+    """One RESP file of a second-order velocity sensor.
+
+    Raises
+    ------
+    InputError : unreadable or truncated, a wrong unit or transfer-function type, poles or zeros that are missing,
+        not finite, unstable or not a conjugate pair, a name that cannot be read.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"a readable ASCII file ({error})", file=path) from error
+    try:
+        return _parse(text, path.name)
+    except InputError as error:
+        raise error.in_file(path) from None
+
+
+def _parse(text: str, name: str) -> CatalogueEntry:
+    stage = _poles_and_zeros_stage(text)
+    if (kind := _word(stage, "B053F03", "transfer function type")) != "A":
+        raise InputError("type A (Laplace, rad/s)", field="B053F03", value=kind)
+    for code, unit in (("B053F05", VELOCITY_UNIT), ("B053F06", VOLT_UNIT)):
+        if (found := _word(stage, code, "unit")) != unit:
+            raise InputError(f"unit {unit}", field=code, value=found)
+    zeros = _roots(stage, "B053F10-13", int(_number(stage, "B053F09")), "zeros")
+    poles = _roots(stage, "B053F15-18", int(_number(stage, "B053F14")), "poles")
+    if zeros.size != 2 or np.any(zeros != 0):
+        raise InputError("two zeros at s = 0", field="B053F10-13 (zeros)", value=zeros.tolist())
+    if poles.size != 2 or np.any(poles.real >= 0) or abs(np.sum(poles.imag)) > 1e-6 * abs(poles[0]):
+        raise InputError("two stable poles, real or a conjugate pair", field="B053F15-18 (poles)", value=poles.tolist())
+    w = float(np.sqrt(abs(np.prod(poles))))
+    gains = _stage_gains(text)
+    analogue = float(np.prod([value for stage_number, value in gains.items() if stage_number > 0]))
+    return CatalogueEntry(file=name, corner_Hz=w / (2 * np.pi), damping=float(-np.sum(poles.real) / (2 * w)),
+                          gain_Vs_per_m=analogue, overall_sensitivity=gains[0],
+                          normalisation=_number(stage, "B053F07"), normalisation_Hz=_number(stage, "B053F08"),
+                          **_from_name(name))
+
+
+def _poles_and_zeros_stage(text: str) -> str:
+    """The lines of the first stage's blockette 53 and what follows, or the complaint that they are not there."""
+    start = text.find("B053F03")
+    if start < 0:
+        raise InputError("a poles-and-zeros stage (is the file truncated?)", field="B053F03")
+    return text[start:]
+
+
+def _word(text: str, code: str, what: str) -> str:
+    found = re.search(rf"^{re.escape(code)}\s+[^:\n]*:\s*(\S+)", text, re.MULTILINE)
+    if not found:
+        raise InputError(f"a {what} (is the file truncated?)", field=code)
+    return found[1]
+
+
+def _number(text: str, code: str) -> float:
+    return _float(_word(text, code, "number"), code)
+
+
+def _float(word: str, field: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise InputError("a finite number", field=field, value=word)
+    return value
+
+
+def _roots(text: str, code: str, count: int, what: str) -> np.ndarray:
+    rows = re.findall(rf"^{re.escape(code)}\s+\d+\s+(\S+)\s+(\S+)", text, re.MULTILINE)
+    if len(rows) != count:
+        raise InputError(f"{count} {what}, the file holds {len(rows)}", field=f"{code} ({what})")
+    return np.array([complex(_float(re_, code), _float(im, code)) for re_, im in rows])
+
+
+def _stage_gains(text: str) -> dict[int, float]:
+    """Gain by stage number; stage 0 is the overall sensitivity."""
+    rows = re.findall(r"^B058F03\s+[^:\n]*:\s*(\S+)\s*\nB058F04\s+[^:\n]*:\s*(\S+)", text, re.MULTILINE)
+    gains = {int(_float(stage, "B058F03")): _float(value, "B058F04") for stage, value in rows}
+    for stage, what in ((1, "the gain of stage 1"), (0, "the overall sensitivity")):
+        if stage not in gains:
+            raise InputError(f"{what} (is the file truncated?)", field="B058F04")
+        if gains[stage] <= 0:
+            raise InputError("a positive gain", field="B058F04", value=gains[stage])
+    return gains
+
+
+def _from_name(name: str) -> dict[str, str | float | None]:
+    parts = name.split(".")
+    if len(parts) not in (8, 10):
+        raise InputError("a name RESP.network.station.location.channel.model[.coil.shunt].corner.gain", field="name",
+                         value=name)
+    model, rest = parts[5], parts[6:]
+    coil: str | None = None
+    shunt: str | None = None
+    if len(rest) == 2:
+        corner, gain = rest
+    elif model.startswith("GS11"):
+        corner, coil, shunt, gain = rest
+    else:
+        coil, shunt, corner, gain = rest
+
+    def value(word: str | None) -> float | None:
+        if word is None or word == "NONE":
+            return None
+        return _float(re.sub(r"[A-Z]+$", "", word).replace("_", "."), "name")
+    return {"model": model, "coil_ohm": value(coil), "shunt_ohm": value(shunt), "named_corner_Hz": value(corner),
+            "named_gain_Vs_per_m": value(gain)}
