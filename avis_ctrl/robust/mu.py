@@ -1,0 +1,84 @@
+"""Structured singular value of matrices: bounds with their proofs.
+
+    w = Delta z,  z = M w:    mu(M) = 1 / min{ ||Delta|| : det(I - M Delta) = 0 },  0 where no Delta does it.
+
+The upper bound comes with the scalings that prove it, the lower one with a perturbation that makes
+I - M Delta singular; both are recomputed from what is returned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.robust.mu_lmi import Array
+from avis_ctrl.robust.mu_upper import UpperBound, upper_bound
+from avis_ctrl.uncertainty.blocks import Block, BlockStructure
+
+
+@dataclass(frozen=True, eq=False)
+class MuUpper:
+    """Upper bound of mu with its scalings; a leading frequency axis where M had one.
+
+    upper : scalar or (n_omega,).
+    D, D_w : (.., n_z, n_z) and (.., n_w, n_w), Hermitian positive definite, commuting with Delta.
+    G : (.., n_w, n_z), Hermitian on each real block, zero elsewhere.
+
+    M^H D^2 M + j (G M - M^H G^H) <= upper^2 D_w^2; without real blocks upper = sigma_max(D M inv(D_w)).
+    """
+
+    upper: float | Array
+    D: Array
+    D_w: Array
+    G: Array
+
+
+def checked(M: Array, blocks: BlockStructure | Sequence[Block]) -> tuple[Array, BlockStructure]:
+    """M as complex (n_omega, n_z, n_w) and the structure that fits it; an InputError where it does not."""
+    structure = BlockStructure.of(blocks)
+    M = np.asarray(M, complex)
+    if M.ndim not in (2, 3):
+        raise InputError("expected (n_z, n_w) or (n_omega, n_z, n_w)", field="shape of M", value=M.shape)
+    if M.shape[-2:] != (structure.n_z, structure.n_w):
+        raise InputError(f"the blocks need {structure.n_z} rows (their cols) and {structure.n_w} columns (their rows)",
+                         field="shape of M", value=M.shape[-2:])
+    if not np.all(np.isfinite(M)):
+        raise InputError("expected finite entries", field="M")
+    return M.reshape(-1, *M.shape[-2:]), structure
+
+
+def mu_upper(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: float = 1e-5) -> MuUpper:
+    """Upper bound of mu alone, batched over frequency (the analysis step of D-K iteration).
+
+    Parameters
+    ----------
+    M : (n_z, n_w) or (n_omega, n_z, n_w) complex; n_z = sum of the blocks' cols, n_w = sum of their rows.
+    tolerance : relative accuracy in upper^2 at which the optimisation stops. The value returned is an upper
+        bound in any case: it is recomputed from the scalings by an eigenvalue computation.
+
+    Raises
+    ------
+    InputError : shapes that do not fit the blocks, entries that are not finite.
+    """
+    stack, structure = checked(M, blocks)
+    with threadpool_limits(1):
+        bound = upper_bound(stack[:, None], structure, tolerance)
+        return _with_roots(bound, np.ndim(M) == 2)
+
+
+def _with_roots(bound: UpperBound, single: bool) -> MuUpper:
+    X_z, X_w, G = bound.scalings
+    D, D_w = _root(X_z), _root(X_w)
+    if single:
+        return MuUpper(float(bound.beta[0]), D[0], D_w[0], G[0])
+    return MuUpper(bound.beta, D, D_w, G)
+
+
+def _root(X: Array) -> Array:
+    """Hermitian square root of positive definite matrices (n_omega, n, n)."""
+    values, vectors = np.linalg.eigh(X)
+    return (vectors * np.sqrt(values)[:, None, :]) @ np.conj(np.swapaxes(vectors, 1, 2))

@@ -1,0 +1,286 @@
+"""Convex upper bound of the structured singular value, for many frequencies at once.
+
+For w = Delta z, z = M w with ||Delta|| <= 1/beta no loop exists if scalings that commute with Delta satisfy
+
+    F(X, G, lambda) = lambda X_w - M^H X_z M - j (G M - M^H G^H) > 0,   X > 0,   lambda = beta^2
+
+(Fan, Tits and Doyle, IEEE TAC 36, 1991). X_z and X_w carry the same numbers on both sides of a block, G
+lives on real blocks. The least lambda is a generalized eigenvalue problem, solved here by following the
+analytic centres of {F > 0, X > 0} as lambda falls (Boyd and El Ghaoui, Linear Algebra and its
+Applications 188/189, 1993), with a tangent step in lambda between the Newton steps. All derivatives come
+from one Gram matrix:  F = V K(theta) V^H,  V = [I  M^H],  d2(-log det F) = tr(T K_k T K_l),  T = V^H inv(F) V.
+
+Several matrices may share one set of scalings (axis 1 of M): their bound then holds for all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from avis_ctrl.uncertainty.blocks import BlockStructure
+
+Array = np.ndarray
+
+
+class Scalings(NamedTuple):
+    """X_z (B, n_z, n_z), X_w (B, n_w, n_w), G (B, n_w, n_z): one set for each problem of a batch."""
+
+    X_z: Array
+    X_w: Array
+    G: Array
+
+
+class LinearForm:
+    """A Hermitian matrix linear in real parameters, K(theta) = sum_k theta_k K_k, by its non-zero entries."""
+
+    def __init__(self, size: int, parameters: int, entries: list[tuple[int, int, complex, int]]):
+        order = sorted(entries, key=lambda entry: entry[3])
+        self.size, self.parameters = size, parameters
+        self.row = np.array([e[0] for e in order], int)
+        self.col = np.array([e[1] for e in order], int)
+        self.value = np.array([e[2] for e in order], complex)
+        self.incidence = np.zeros((parameters, len(order)))
+        self.incidence[[e[3] for e in order], np.arange(len(order))] = 1.0
+        self._dense = np.zeros((parameters, size * size), complex)
+        self._dense[[e[3] for e in order], self.row * size + self.col] = self.value
+        # tr(T K_k T K_l) = sum of K_k[a, b] T[b, c] K_l[c, d] T[d, a]
+        self._to_next = self.row[None, :] + size * self.col[:, None]
+        self._to_first = self.row[:, None] + size * self.col[None, :]
+
+    def matrix(self, theta: Array) -> Array:
+        """K(theta), shape (B, size, size)."""
+        return (theta @ self._dense).reshape(-1, self.size, self.size)
+
+    def gradient(self, T: Array, weight: Array | float = 1.0) -> Array:
+        """tr(T K_k) for each parameter, shape (B, p); T is (B, size, size), weight (B, entries)."""
+        flat = T.reshape(T.shape[0], -1)
+        return (flat[:, self.col * self.size + self.row] * (self.value * weight)).real @ self.incidence.T
+
+    def hessian(self, T: Array, weight: Array | None = None) -> Array:
+        """tr(T K_k T K_l), shape (B, p, p), summed over axis 1 of T (B, n_shared, size, size)."""
+        flat = T.reshape(*T.shape[:2], -1)
+        product = np.sum(flat[:, :, self._to_next] * flat[:, :, self._to_first], axis=1)
+        value = np.broadcast_to(self.value, (T.shape[0], self.value.size)) if weight is None else self.value * weight
+        product = (value[:, :, None] * product * value[:, None, :]).real
+        return self.incidence @ product @ self.incidence.T
+
+
+@dataclass(frozen=True)
+class ScalingSpace:
+    """Real coordinates theta of the scalings that commute with a block structure.
+
+    `level` marks the entries of w whose X_w is multiplied by lambda: all of them for mu, the performance
+    channel alone for the worst-case gain (skewed mu).
+    """
+
+    structure: BlockStructure
+    level: Array
+    form: LinearForm
+    core: LinearForm
+    is_level: Array
+    trace: Array
+
+    @staticmethod
+    def of(structure: BlockStructure, level: Array | None = None) -> ScalingSpace:
+        n_w, n_z = structure.n_w, structure.n_z
+        level = np.ones(n_w, bool) if level is None else np.asarray(level, bool)
+        form: list[tuple[int, int, complex, int]] = []
+        core: list[tuple[int, int, complex, int]] = []
+        p = c = 0
+        for block, w, z in structure.slices():
+            if block.kind == "full":
+                form += [(k, k, 1.0, p) for k in range(w.start, w.stop)]
+                form += [(n_w + k, n_w + k, -1.0, p) for k in range(z.start, z.stop)]
+                core.append((c, c, 1.0, p))
+                p, c = p + 1, c + 1
+                continue
+            for entries in _hermitian_basis(block.rows):
+                for a, b, value in entries:
+                    form += [(w.start + a, w.start + b, value, p), (n_w + z.start + a, n_w + z.start + b, -value, p)]
+                    core.append((c + a, c + b, value, p))
+                p += 1
+            c += block.rows
+            if block.kind == "real":
+                for entries in _hermitian_basis(block.rows):
+                    for a, b, value in entries:
+                        form += [(w.start + a, n_w + z.start + b, -1j * value, p),
+                                 (n_w + z.start + b, w.start + a, 1j * np.conj(value), p)]
+                    p += 1
+        kform, kcore = LinearForm(n_w + n_z, p, form), LinearForm(c, p, core)
+        on_level = (kform.row < n_w) & (kform.col < n_w) & np.r_[level, np.zeros(n_z, bool)][kform.row]
+        return ScalingSpace(structure, level, kform, kcore, on_level, kcore.gradient(np.eye(c)[None])[0])
+
+    def scalings(self, theta: Array) -> Scalings:
+        n_w = self.structure.n_w
+        K = self.form.matrix(theta)
+        return Scalings(-K[:, n_w:, n_w:], K[:, :n_w, :n_w], 1j * K[:, :n_w, n_w:])
+
+    def theta(self, scalings: Scalings) -> Array:
+        """Coordinates of scalings that have the structure (inverse of `scalings`)."""
+        K = np.zeros((scalings.X_w.shape[0], self.form.size, self.form.size), complex)
+        n_w = self.structure.n_w
+        K[:, :n_w, :n_w], K[:, n_w:, n_w:], K[:, :n_w, n_w:] = scalings.X_w, -scalings.X_z, -1j * scalings.G
+        K[:, n_w:, :n_w] = np.conj(np.swapaxes(K[:, :n_w, n_w:], 1, 2))
+        gram = (self.form.incidence * np.abs(self.form.value) ** 2).sum(axis=1)
+        return self.form.gradient(K) / gram
+
+    def identity(self, batch: int) -> Array:
+        """theta of X = I, G = 0."""
+        n_w, n_z = self.structure.n_w, self.structure.n_z
+        one = self.theta(Scalings(np.eye(n_z)[None], np.eye(n_w)[None], np.zeros((1, n_w, n_z))))
+        return np.repeat(one, batch, axis=0)
+
+
+def _hermitian_basis(n: int) -> list[list[tuple[int, int, complex]]]:
+    basis: list[list[tuple[int, int, complex]]] = [[(i, i, 1.0)] for i in range(n)]
+    for i in range(n):
+        for k in range(i):
+            basis += [[(i, k, 1.0), (k, i, 1.0)], [(i, k, 1j), (k, i, -1j)]]
+    return basis
+
+
+def dagger(A: Array) -> Array:
+    return np.conj(np.swapaxes(A, -1, -2))
+
+
+def residual(M: Array, scalings: Scalings, lam: Array, level: Array) -> Array:
+    """F (B, n_shared, n_w, n_w) for M (B, n_shared, n_z, n_w), lam (B,): positive definite where the bound holds."""
+    Mh = dagger(M)
+    GM = scalings.G[:, None] @ M
+    weight = np.where(level, lam[:, None], 1.0)
+    F = (scalings.X_w * weight[:, None, :])[:, None] - Mh @ (scalings.X_z[:, None] @ M) - 1j * (GM - dagger(GM))
+    return (F + dagger(F)) / 2
+
+
+def least_level(M: Array, scalings: Scalings, level: Array) -> Array:
+    """Least lambda (B,) for which given scalings make F >= 0, by an eigenvalue computation; inf where none does."""
+    F = residual(M, scalings, np.zeros(M.shape[0]), level)
+    p, r = np.flatnonzero(level), np.flatnonzero(~level)
+    Fpp = F[..., p[:, None], p]
+    if r.size:
+        Frr, Frp = F[..., r[:, None], r], F[..., r[:, None], p]
+        feasible = np.all(np.linalg.eigvalsh(Frr)[..., 0] > 0, axis=1)
+        Frr = np.where(feasible[:, None, None, None], Frr, np.eye(r.size))
+        Fpp = Fpp - dagger(Frp) @ np.linalg.solve(Frr, Frp)
+    inverse = np.linalg.inv(np.linalg.cholesky(scalings.X_w[:, p[:, None], p]))[:, None]
+    pencil = inverse @ Fpp @ dagger(inverse)
+    lam = -np.min(np.linalg.eigvalsh((pencil + dagger(pencil)) / 2)[..., 0], axis=1)
+    return np.where(feasible, lam, np.inf) if r.size else lam
+
+
+@dataclass
+class _Point:
+    """Derivatives of the barrier at (theta, lambda) for a batch."""
+
+    gradient: Array
+    hessian: Array
+    slope: Array  # d gradient / d lambda
+
+    def part(self, which: Array) -> _Point:
+        return _Point(self.gradient[which], self.hessian[which], self.slope[which])
+
+
+def _barrier(space: ScalingSpace, M: Array, theta: Array, lam: Array) -> _Point:
+    batch, shared, _, n_w = M.shape
+    scalings = space.scalings(theta)
+    S = np.linalg.inv(residual(M, scalings, lam, space.level))
+    V = np.concatenate([np.broadcast_to(np.eye(n_w), (batch, shared, n_w, n_w)), dagger(M)], axis=-1)
+    SV = S @ V
+    T = dagger(V) @ SV
+    weight = np.where(space.is_level, lam[:, None], 1.0)
+    Xi = np.linalg.inv(space.core.matrix(theta))
+    gradient = space.trace - space.form.gradient(T.sum(axis=1), weight) - space.core.gradient(Xi)
+    hessian = space.form.hessian(T, weight) + space.core.hessian(Xi[:, None])
+    Xp = scalings.X_w * space.level
+    T_slope = (dagger(SV) @ Xp[:, None] @ SV).sum(axis=1)
+    slope = space.form.gradient(T_slope, weight) - space.form.gradient(T.sum(axis=1), space.is_level.astype(float))
+    return _Point(gradient, hessian, slope)
+
+
+def _inside(space: ScalingSpace, M: Array, theta: Array, lam: Array) -> Array:
+    """Whether F > 0 and X > 0, for each problem."""
+    F = np.linalg.eigvalsh(residual(M, space.scalings(theta), lam, space.level))
+    X = np.linalg.eigvalsh(space.core.matrix(theta))
+    return np.all(F[..., 0] > 1e-14 * np.abs(F[..., -1]), axis=1) & (X[:, 0] > 0)
+
+
+def _step_to_boundary(space: ScalingSpace, M: Array, theta: Array, lam: Array, direction: Array) -> Array:
+    """How far lambda may fall along d theta / d lambda until F or X turns singular (linearised)."""
+    scalings, moved = space.scalings(theta), space.scalings(direction)
+    F = residual(M, scalings, lam, space.level)
+    dF = residual(M, moved, lam, space.level) + (scalings.X_w * space.level)[:, None]
+    X, dX = space.core.matrix(theta), space.core.matrix(direction)
+
+    def fastest(P: Array, dP: Array) -> Array:
+        L = np.linalg.inv(np.linalg.cholesky(P))
+        Q = L @ dP @ dagger(L)
+        return np.linalg.eigvalsh((Q + dagger(Q)) / 2)[..., -1]
+    rate = np.maximum(np.max(fastest(F, dF), axis=1), fastest(X, dX))
+    return 1.0 / np.maximum(rate, 1e-300)
+
+
+def _newton(hessian: Array, gradient: Array) -> Array:
+    """-inv(hessian) gradient with unit-diagonal scaling; a ridge of round-off size where it is singular."""
+    d = 1.0 / np.sqrt(np.maximum(np.diagonal(hessian, axis1=1, axis2=2), 1e-300))
+    scaled = hessian * d[:, :, None] * d[:, None, :] + 1e-13 * np.eye(d.shape[1])
+    return -d * np.linalg.solve(scaled, (d * gradient)[..., None])[..., 0]
+
+
+def _centre(space: ScalingSpace, M: Array, theta: Array, lam: Array, accuracy: float = 0.3,
+            steps: int = 40) -> tuple[Array, _Point]:
+    """Damped Newton steps towards the analytic centre at fixed lambda."""
+    for _ in range(steps):
+        point = _barrier(space, M, theta, lam)
+        step = _newton(point.hessian, point.gradient)
+        decrement = np.sqrt(np.maximum(-np.sum(step * point.gradient, axis=1), 0.0))
+        if np.all(decrement < accuracy):
+            break
+        length = np.where(decrement < 0.4, 1.0, 1.0 / (1.0 + decrement))
+        theta = theta + length[:, None] * step
+    return theta, point
+
+
+def follow(space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array | float = 0.0, tolerance: float = 1e-5,
+           iterations: int = 60) -> tuple[Array, Array]:
+    """Follow the analytic centres from a feasible (theta, lam) down to the least lambda, or to `goal`.
+
+    M (B, n_shared, n_z, n_w). Returns theta (B, p) and lambda (B,), feasible with each other. Problems whose
+    lambda reaches a positive `goal` stop there, at its centre.
+    """
+    theta, lam = theta.copy(), lam.copy()
+    floor = np.broadcast_to(goal, lam.shape)
+    active = np.arange(M.shape[0])
+    for _ in range(iterations):
+        Ma, la, end = M[active], lam[active], floor[active]
+        th, point = _centre(space, Ma, theta[active], la)
+        sound = np.all(np.isfinite(th), axis=1) & np.all(np.isfinite(point.slope), axis=1)
+        if not np.all(sound):
+            # Round-off ended the path here; the last verified point stands.
+            active, Ma, la, end, th, point = (active[sound], Ma[sound], la[sound], end[sound], th[sound],
+                                              point.part(sound))
+            if not active.size:
+                break
+        theta[active] = th
+        direction = _newton(point.hessian, point.slope)
+        reach = _step_to_boundary(space, Ma, th, la, direction)
+        fall = np.minimum(0.9 * reach, la - end)
+        for _ in range(30):
+            ok = _inside(space, Ma, th - fall[:, None] * direction, la - fall)
+            if np.all(ok):
+                break
+            fall = np.where(ok, fall, 0.6 * fall)
+        fall = np.where(ok, fall, 0.0)
+        theta[active], lam[active] = th - fall[:, None] * direction, la - fall
+        done = (reach <= tolerance * np.maximum(la, end)) | (lam[active] <= end) | (fall == 0.0)
+        active = active[~done]
+        if not active.size:
+            break
+    held = np.flatnonzero((floor > 0) & (lam <= floor))
+    if held.size:
+        centred, _ = _centre(space, M[held], theta[held], lam[held])
+        good = np.all(np.isfinite(centred), axis=1)
+        theta[held[good]] = centred[good]
+    return theta, lam

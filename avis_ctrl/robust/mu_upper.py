@@ -1,0 +1,144 @@
+"""Upper bounds of mu and of the skewed mu from the scalings of `mu_lmi`: start, normalisation, final check.
+
+The number reported is always recomputed from the final scalings by an eigenvalue computation, so that it is
+an upper bound however far the optimisation got.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from avis_ctrl.robust.mu_lmi import Array, Scalings, ScalingSpace, dagger, follow, least_level, residual
+from avis_ctrl.uncertainty.blocks import BlockStructure
+
+BATCH_BYTES = 64e6
+
+
+class UpperBound(NamedTuple):
+    """beta (B,) and the scalings that prove it."""
+
+    beta: Array
+    scalings: Scalings
+
+
+def block_balance(M: Array, structure: BlockStructure, sweeps: int = 20) -> Array:
+    """Osborne's scaling: d (B, n_blocks) > 0 that evens out the block norms of M (B, n_shared, n_z, n_w)."""
+    power = np.sum(np.abs(M) ** 2, axis=1)
+    places = list(structure.slices())
+    rows = np.stack([power[:, z].sum(axis=1) for _, _, z in places], axis=1)
+    norm2 = np.stack([rows[:, :, w].sum(axis=2) for _, w, _ in places], axis=2)
+    n = len(places)
+    norm2[:, np.arange(n), np.arange(n)] = 0.0
+    d2 = np.ones((M.shape[0], n))
+    # A floor keeps the scaling finite where a block is not coupled both ways.
+    norm2 = norm2 + 1e-16 * np.max(norm2, axis=(1, 2), initial=0.0)[:, None, None] + 1e-300
+    for _ in range(sweeps):
+        for k in range(n):
+            row = d2[:, k] * np.sum(norm2[:, k] / d2, axis=1)
+            col = np.sum(norm2[:, :, k] * d2, axis=1) / d2[:, k]
+            d2[:, k] *= np.sqrt(col / row)
+    return np.sqrt(d2 / np.exp(np.mean(np.log(d2), axis=1, keepdims=True)))
+
+
+def _expand(structure: BlockStructure, d: Array) -> tuple[Array, Array]:
+    """Per-entry scalings (d_z (B, n_z), d_w (B, n_w)) from one number a block."""
+    return (np.repeat(d, [b.cols for b in structure.blocks], axis=1),
+            np.repeat(d, [b.rows for b in structure.blocks], axis=1))
+
+
+def _rescaled(scalings: Scalings, d_z: Array, d_w: Array, size: Array) -> Scalings:
+    """Scalings of the original M from those of diag(d_z) M / diag(d_w) / size."""
+    return Scalings(d_z[:, :, None] * scalings.X_z * d_z[:, None, :],
+                    d_w[:, :, None] * scalings.X_w * d_w[:, None, :],
+                    size[:, None, None] * d_w[:, :, None] * scalings.G * d_z[:, None, :])
+
+
+def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5,
+                goal: Array | float = 0.0) -> UpperBound:
+    """Least beta with scalings that prove mu <= beta, for M (B, n_shared, n_z, n_w).
+
+    Matrices along axis 1 share scalings. With `goal` > 0 the search stops where beta <= goal, at the analytic
+    centre of the scalings that prove it: the ones with most room around them.
+    """
+    n_chunk = max(1, int(BATCH_BYTES / (32 * ScalingSpace.of(structure).form.row.size ** 2 * M.shape[1])))
+    goals = np.broadcast_to(goal, M.shape[:1])
+    parts = [_upper_chunk(M[k:k + n_chunk], structure, tolerance, goals[k:k + n_chunk])
+             for k in range(0, M.shape[0], n_chunk)]
+    return UpperBound(np.concatenate([p.beta for p in parts]),
+                      Scalings(*(np.concatenate(s) for s in zip(*(p.scalings for p in parts), strict=True))))
+
+
+def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Array) -> UpperBound:
+    space = ScalingSpace.of(structure)
+    d_z, d_w = _expand(structure, block_balance(M, structure))
+    balanced = M * d_z[:, None, :, None] / d_w[:, None, None, :]
+    size = np.max(np.linalg.norm(balanced, ord=2, axis=(2, 3)), axis=1)
+    live = size > 0
+    size = np.where(live, size, 1.0)
+    unit = balanced / size[:, None, None, None]
+    theta = space.identity(M.shape[0])
+    floor = np.where(goal > 0, (goal / size) ** 2, -1e-8)
+    if np.any(live):
+        found, _ = follow(space, unit[live], theta[live], np.full(live.sum(), 2.0), floor[live], tolerance)
+        theta[live] = found
+    scalings = space.scalings(theta)
+    lam = np.where(live, least_level(unit, scalings, space.level), 0.0)
+    beta = size * np.sqrt(np.maximum(lam, 0.0))
+    return UpperBound(beta, _rescaled(scalings, d_z, d_w, size))
+
+
+def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5) -> UpperBound:
+    """Least beta for which the last block of `structure` (performance) may have gain beta, the others norm 1.
+
+    M (B, n_shared, n_z, n_w). beta = inf where the scalings cannot prove robust stability (the upper bound of
+    mu over the first blocks is not below 1).
+    """
+    robust = BlockStructure(structure.blocks[:-1])
+    r_w, r_z = robust.n_w, robust.n_z
+    if not r_w:
+        return upper_bound(M, structure, tolerance)
+    batch = M.shape[0]
+    beta = np.full(batch, np.inf)
+    found = Scalings(*(np.zeros((batch, *shape), complex) for shape in
+                       ((structure.n_z,) * 2, (structure.n_w,) * 2, (structure.n_w, structure.n_z))))
+    inner = upper_bound(M[:, :, :r_z, :r_w], robust, tolerance)
+    safe = np.flatnonzero(inner.beta < 1.0 - 1e-9)
+    if safe.size:
+        # Between the least level and 1 the analytic centre leaves room for the performance block.
+        goal = np.maximum(np.sqrt(inner.beta[safe]), 0.3)
+        start = upper_bound(M[safe][:, :, :r_z, :r_w], robust, tolerance, goal).scalings
+        beta[safe], part = _skewed_from(M[safe], structure, start, tolerance)
+        for whole, piece in zip(found, part, strict=True):
+            whole[safe] = piece
+    return UpperBound(beta, found)
+
+
+def _skewed_from(M: Array, structure: BlockStructure, start: Scalings, tolerance: float) -> tuple[Array, Scalings]:
+    """Skewed bound from scalings of the robust blocks that hold with room at level 1."""
+    batch, r_w, r_z = M.shape[0], start.X_w.shape[1], start.X_z.shape[1]
+    space = ScalingSpace.of(structure, np.arange(structure.n_w) >= r_w)
+    X_w = np.repeat(np.eye(structure.n_w, dtype=complex)[None], batch, axis=0)
+    X_z = np.repeat(np.eye(structure.n_z, dtype=complex)[None], batch, axis=0)
+    G = np.zeros((batch, structure.n_w, structure.n_z), complex)
+    X_w[:, :r_w, :r_w], X_z[:, :r_z, :r_z], G[:, :r_w, :r_z] = start
+    room = residual(M[:, :, :r_z, :r_w], start, np.ones(batch), np.ones(r_w, bool))
+    L = np.linalg.inv(np.linalg.cholesky(room))
+    taken = np.max(np.linalg.norm(M[:, :, r_z:, :r_w] @ dagger(L), ord=2, axis=(2, 3)), axis=1)
+    X_p = np.minimum(0.3 / np.maximum(taken, 1e-150) ** 2, np.linalg.norm(start.X_w, ord=2, axis=(1, 2)))
+    X_w[:, r_w:, r_w:] *= X_p[:, None, None]
+    X_z[:, r_z:, r_z:] *= X_p[:, None, None]
+    # Coordinates in which these scalings are near the identity and the first level is 2.
+    d = np.stack([np.sqrt(np.trace(X_w[:, w, w], axis1=1, axis2=2).real / (w.stop - w.start))
+                  for _, w, _ in structure.slices()], axis=1)
+    d_z, d_w = _expand(structure, d)
+    unit = M * d_z[:, None, :, None] / d_w[:, None, None, :]
+    theta = space.theta(_rescaled(Scalings(X_z, X_w, G), 1 / d_z, 1 / d_w, np.ones(batch)))
+    first = np.maximum(least_level(unit, space.scalings(theta), space.level), 1e-300)
+    size = np.sqrt(first)
+    scaled = unit / np.where(space.level, size[:, None], 1.0)[:, None, None, :]
+    theta, _ = follow(space, scaled, theta, np.full(batch, 2.0), -1e-8, tolerance)
+    scalings = space.scalings(theta)
+    beta = size * np.sqrt(np.maximum(least_level(scaled, scalings, space.level), 0.0))
+    return beta, _rescaled(scalings, d_z, d_w, np.ones(batch))
