@@ -1,0 +1,158 @@
+"""The air-mount AVIS (Rademakers, TU/e 2005): a payload on four isolators with eight linear motors."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
+from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
+from avis_ctrl.rigs.rig import Parameter, Place, Rig
+from avis_ctrl.rigs.rigid_body import EquationsOfMotion
+
+AXES = ("x", "y", "z")
+INERTIA = ("J1", "J2", "J3", "J12", "J13", "J23")
+_ISOLATOR_PARAMETER = re.compile(r"isolator(\d+)\.(k|c|p)_([xyz])")
+_UNITS = {"k": "N/m", "c": "N s/m", "p": "m"}
+_WORDS = {"k": "stiffness", "c": "damping", "p": "position of the attachment"}
+
+
+@dataclass(frozen=True)
+class Isolator:
+    """Air mount: spring and damper along each earth axis (eqs. 2.15-2.16).
+
+    position, chassis_point [m] : attachment on the payload and on the chassis (p_i and c_i; the
+        source takes them equal, Table 3.1).
+    stiffness [N/m], damping [N s/m] : along x, y, z.
+    """
+
+    position: tuple[float, ...]
+    stiffness: tuple[float, ...]
+    damping: tuple[float, ...]
+    chassis_offset: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class LinearMotor:
+    """Actuator in isolator `isolator` (1-based) along `axis`, force constant in N/V (eqs. 2.17-2.18)."""
+
+    name: str
+    isolator: int
+    axis: str
+    constant_N_per_V: float
+
+
+@dataclass(frozen=True)
+class AvisTable(Rig):
+    """The AVIS.
+
+    inertia : (J1, J2, J3, J12, J13, J23) [kg m^2] about the centre of mass; the last three are the
+        entries of the inertia tensor itself, J12 = -integral of x y dm.
+    centre_of_mass : [m] from the geometric centre.
+    """
+
+    name: str
+    mass: float
+    inertia: tuple[float, ...]
+    centre_of_mass: tuple[float, ...]
+    isolators: tuple[Isolator, ...]
+    motors: tuple[LinearMotor, ...]
+    limit_V: float
+    geophones: Geophones
+    acquisition: Acquisition
+    ambient: Ambient | None = None
+    accelerometers: Accelerometers | None = None
+
+    def __post_init__(self) -> None:
+        self.mounted_body()  # refuses a mass or an inertia that is not positive
+
+    @property
+    def edge_m(self) -> float:
+        """Half width of the isolators' rectangle, p_y of Table 3.1."""
+        return max(abs(isolator.position[1]) for isolator in self.isolators)
+
+    @property
+    def drive_limit_V(self) -> float:
+        return self.limit_V
+
+    @property
+    def sample_rate_Hz(self) -> float:
+        return self.acquisition.sample_rate_Hz
+
+    @property
+    def loop_delay_s(self) -> float:
+        return self.acquisition.loop_delay_s
+
+    def inertia_matrix(self) -> np.ndarray:
+        """(3, 3) about the centre of mass."""
+        J1, J2, J3, J12, J13, J23 = self.inertia
+        return np.array([[J1, J12, J13], [J12, J2, J23], [J13, J23, J3]])
+
+    def parameters(self) -> dict[str, Parameter]:
+        """mass, J1.., com_x.., isolator1.k_x.., isolator1.c_x.., isolator1.p_x.., actuator.Ay1.. (1-based)."""
+        found = {"mass": Parameter(self.mass, "kg", "mass of the payload")}
+        for name, value in zip(INERTIA, self.inertia, strict=True):
+            found[name] = Parameter(value, "kg m^2", "inertia about the centre of mass")
+        for axis, value in zip(AXES, self.centre_of_mass, strict=True):
+            found[f"com_{axis}"] = Parameter(value, "m", "centre of mass from the geometric centre")
+        for number, isolator in enumerate(self.isolators, 1):
+            for kind, triple in (("k", isolator.stiffness), ("c", isolator.damping), ("p", isolator.position)):
+                for axis, value in zip(AXES, triple, strict=True):
+                    found[f"isolator{number}.{kind}_{axis}"] = Parameter(
+                        value, _UNITS[kind], f"{_WORDS[kind]} of isolator {number} along {axis}")
+        for motor in self.motors:
+            found[f"actuator.{motor.name}"] = Parameter(motor.constant_N_per_V, "N/V", "force constant")
+        return found
+
+    def _with_values(self, values: dict[str, float]) -> AvisTable:
+        get = values.get
+        tables = {"k": [list(i.stiffness) for i in self.isolators], "c": [list(i.damping) for i in self.isolators],
+                  "p": [list(i.position) for i in self.isolators]}
+        for name, value in values.items():
+            if match := _ISOLATOR_PARAMETER.fullmatch(name):
+                number, kind, axis = match.groups()
+                tables[kind][int(number) - 1][AXES.index(axis)] = value
+        isolators = tuple(replace(old, stiffness=tuple(k), damping=tuple(c), position=tuple(p))
+                          for old, k, c, p in zip(self.isolators, tables["k"], tables["c"], tables["p"], strict=True))
+        motors = tuple(replace(m, constant_N_per_V=get(f"actuator.{m.name}", m.constant_N_per_V))
+                       for m in self.motors)
+        inertia = tuple(get(name, old) for name, old in zip(INERTIA, self.inertia, strict=True))
+        com = tuple(get(f"com_{axis}", old) for axis, old in zip(AXES, self.centre_of_mass, strict=True))
+        return replace(self, mass=get("mass", self.mass), inertia=inertia, centre_of_mass=com,
+                       isolators=isolators, motors=motors)
+
+    def mounted_body(self) -> MountedBody:
+        mounts = tuple(
+            Mount(f"isolator{number}", np.array(one.position), np.add(one.position, one.chassis_offset),
+                  np.diag(one.stiffness), np.diag(one.damping))
+            for number, one in enumerate(self.isolators, 1))
+        actuators = tuple(PointActuator(motor.name, self._at(motor.isolator), _unit(motor.axis),
+                                        motor.constant_N_per_V) for motor in self.motors)
+        return MountedBody(self.mass, self.inertia_matrix(), np.array(self.centre_of_mass), mounts, actuators)
+
+    def equations_of_motion(self) -> EquationsOfMotion:
+        """Eq. 2.36 with the chassis motion kept; about the geometric centre."""
+        return self.mounted_body().equations_of_motion()
+
+    def points(self) -> dict[str, Place]:
+        found = {f"isolator{k}": Place(np.array(one.position), "isolator") for k, one in enumerate(self.isolators, 1)}
+        found |= {motor.name: Place(self._at(motor.isolator), "actuator") for motor in self.motors}
+        found |= {name: Place(place, "sensor") for name, (place, _) in self.sensor_axes().items()}
+        return found | {"centre of mass": Place(np.array(self.centre_of_mass), "centre of mass")}
+
+    def sensor_axes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """The geophones, in the isolators (fig. 2.2)."""
+        channels = zip(self.geophones.names, self.geophones.isolator, self.geophones.axis, strict=True)
+        return {name: (self._at(isolator), _unit(axis)) for name, isolator, axis in channels}
+
+    def _at(self, isolator: int) -> np.ndarray:
+        if not 1 <= isolator <= len(self.isolators):
+            raise InputError(f"expected an isolator from 1 to {len(self.isolators)}", field="isolator", value=isolator)
+        return np.array(self.isolators[isolator - 1].position)
+
+
+def _unit(axis: str) -> np.ndarray:
+    return np.eye(3)[AXES.index(axis)]

@@ -1,0 +1,69 @@
+"""From pydantic's report on a file to one line for a person."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from avis_ctrl.errors import InputError
+
+_UNITS = {"kg", "g", "t", "lb", "m", "mm", "cm", "um", "in", "N", "kN", "mN", "Nm", "Ns", "Nms", "kNs", "per", "rad",
+          "deg", "V", "mV", "kV", "Hz", "kHz", "rtHz", "s", "ms", "us", "s2", "Vs", "Vs2", "kgm2", "gmm2", "kgmm2",
+          "gcm2"}
+
+
+def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputError:
+    """The complaint that says most, as an `InputError` with field, value and what was expected.
+
+    `model` is what the content was validated against; its keys are what an unknown one is compared with.
+    """
+    # An unknown key explains the missing one beside it, so it comes first.
+    problem = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+    *parents, last = problem["loc"] or ("file",)
+    field = _dotted(problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        return InputError(_unknown_key(str(last), _known_keys(model, parents)), field=field, value=problem["input"])
+    if problem["type"] == "missing":
+        return InputError("this key is missing", field=field)
+    return InputError(problem["msg"].replace("Input should be", "expected", 1), field=field, value=problem["input"])
+
+
+def _dotted(place: Sequence[int | str]) -> str:
+    """("isolator", 1, "position_m") as isolator[2].position_m, counted from 1 as the sources do."""
+    return "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
+
+
+def _unknown_key(key: str, known: Sequence[str]) -> str:
+    if same := [name for name in known if _stem(name) == _stem(key)]:
+        return f"the unit in this key is wrong; expected {same[0]}"
+    if near := difflib.get_close_matches(key, known, n=1):
+        return f"unknown key; did you mean {near[0]}?"
+    return f"unknown key; expected one of {', '.join(known)}"
+
+
+def _stem(key: str) -> str:
+    """The key without its unit: "mass_kg" and "mass_g" are both "mass"."""
+    parts = key.split("_")
+    while len(parts) > 1 and parts[-1] in _UNITS:
+        parts.pop()
+    return "_".join(parts)
+
+
+def _known_keys(model: type[BaseModel], parents: Sequence[int | str]) -> list[str]:
+    for part in parents:
+        if isinstance(part, str):
+            inner = _model_within(model.model_fields[part].annotation)
+            if inner is None:
+                return []
+            model = inner
+    return list(model.model_fields)
+
+
+def _model_within(annotation: Any) -> type[BaseModel] | None:
+    """The section's model in an annotation such as list[Section] or Section | None."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((found for part in get_args(annotation) if (found := _model_within(part))), None)

@@ -1,0 +1,317 @@
+"""The spring-suspended Halcyonics table (Beadle, Hurlebaus, Stoebener, Gaul), eqs. 1-32 corrected.
+
+The matrices are those of eqs. 16-19 with the misprints of the source corrected (each has a test):
+second derivatives in eq. 4, K(4,4) = (k_a + k_s) L_2^2 + 2 k_a L_6^2, E(3,1..4) = e_i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti import StateSpace
+from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
+from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
+from avis_ctrl.rigs.rig import Parameter, Place, Rig
+from avis_ctrl.rigs.rigid_body import EquationsOfMotion, cross_matrix, point_map
+
+_ROOT_HALF = np.sqrt(0.5)
+# Signs of (x, y) of the corners that actuator A_i and spring i stand at, and of the force of A5..A8.
+CORNERS = np.array([[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
+_PUSH = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+# A5..A8 stand at (+-1/2, +-1/2) (L4 + L5): E fixes the lines of action only, not the places along them.
+_STAND = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Load:
+    """Equipment on the plate: centre of mass (L7, L8, L9) [m] from the plate's, inertia about its own [kg m^2].
+
+    Ixy, Ixz, Iyz are products of inertia with the sign of eq. 11 (the tensor has -Ixy). Table 2 prints
+    I_xx + I^e_xx; the terms m_e L^2 of eq. 16 come on top. Only this reading is admissible with
+    the table's "actual values": it leaves I^e = (0.115, 0.115, 0.230) with Ixy = 0.115, principal moments
+    (0, 0.230, 0.230), a slender rod under 45 degrees, on the edge of what a body can have. If the printed totals
+    contained m_e L^2, with 10 kg the load's own moments about x and y would be -0.005 kg m^2.
+    """
+
+    mass: float
+    L7: float
+    L8: float
+    L9: float
+    Ixx: float
+    Iyy: float
+    Izz: float
+    Ixy: float = 0.0
+    Ixz: float = 0.0
+    Iyz: float = 0.0
+
+    def position(self) -> np.ndarray:
+        return np.array([self.L7, self.L8, self.L9])
+
+    def inertia(self) -> np.ndarray:
+        """(3, 3) tensor about the load's own centre of mass, eq. 11."""
+        return np.array([[self.Ixx, -self.Ixy, -self.Ixz], [-self.Ixy, self.Iyy, -self.Iyz],
+                         [-self.Ixz, -self.Iyz, self.Izz]])
+
+
+@dataclass(frozen=True)
+class ReactionMass:
+    """Freely vibrating actuator of section 2.2: mass [kg], damping [N s/m], force constant [N/V]."""
+
+    mass: float
+    damping: float
+    constant_N_per_V: float
+
+
+_SCALARS = {  # field: unit, description
+    "mass": ("kg", "mass m of the upper plate"), "Ixx": ("kg m^2", "inertia of the plate"),
+    "Iyy": ("kg m^2", "inertia of the plate"), "Izz": ("kg m^2", "inertia of the plate"),
+    "L1": ("m", "distance of the springs along x"), "L2": ("m", "distance of the springs along y"),
+    "L3": ("m", "places the vertical actuators: arm L3 - L1/2 along x"),
+    "L4_plus_L5": ("m", "places the horizontal actuators: yaw arm (L4 + L5)/sqrt(2)"),
+    "L6": ("m", "height of the centre of mass above the horizontal actuators"),
+    "k_a": ("N/m", "stiffness of an actuator"), "k_t": ("N/m", "transverse stiffness of the suspension"),
+    "k_r": ("N m/rad", "yaw stiffness of the suspension"), "d1": ("N s/m", "damping along x and along y"),
+    "d3": ("N s/m", "damping along z"), "d4": ("N m s/rad", "damping of phi_x"),
+    "d5": ("N m s/rad", "damping of phi_y"), "d6": ("N m s/rad", "damping of phi_z"),
+    "M2_arm": ("m", "measured point M2 from the centre of mass, along x (assumed)"),
+    "M3_arm": ("m", "measured point M3 from the centre of mass, along y (assumed)"),
+}
+_LOAD_UNITS = {"mass": "kg", "L7": "m", "L8": "m", "L9": "m"}
+
+
+@dataclass(frozen=True)
+class Halcyonics(Rig):
+    """The table; SI units, symbols of the source.
+
+    k_s : the four vertical spring stiffnesses, spring i at the corner of actuator A_i. The source has
+        one value for all; separate ones let each mount be uncertain by itself.
+    e : force constants e_1..e_8 [N/V]; load : None when the plate is bare.
+    Coordinates are those of the bare plate's centre of mass (eq. 16), loaded or not.
+    """
+
+    name: str
+    mass: float
+    Ixx: float
+    Iyy: float
+    Izz: float
+    L1: float
+    L2: float
+    L3: float
+    L4_plus_L5: float
+    L6: float
+    k_s: tuple[float, ...]
+    k_a: float
+    k_t: float
+    k_r: float
+    d1: float
+    d3: float
+    d4: float
+    d5: float
+    d6: float
+    e: tuple[float, ...]
+    actuator_names: tuple[str, ...]
+    reaction: ReactionMass
+    accelerometers: Accelerometers
+    load: Load | None = None
+    M2_arm: float = 0.2
+    M3_arm: float = 0.15
+    geophones: Geophones | None = None
+    acquisition: Acquisition | None = None
+    ambient: Ambient | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.k_s) != 4 or len(self.e) != 8 or len(self.actuator_names) != 8:
+            raise InputError(f"expected 4 springs and 8 actuators, got {len(self.k_s)}, {len(self.e)}", field="k_s, e")
+        plate = np.array([self.mass, self.Ixx, self.Iyy, self.Izz])
+        if not np.all(np.isfinite(plate)) or np.any(plate <= 0) or np.min(np.linalg.eigvalsh(self.mass_matrix())) <= 0:
+            raise InputError("expected positive mass and inertia [kg, kg m^2]", field="mass, Ixx, Iyy, Izz",
+                             value=plate.tolist())
+
+    @property
+    def edge_m(self) -> float:
+        """Arm L2/2 along y of the springs and the vertical actuators."""
+        return self.L2 / 2
+
+    @property
+    def drive_limit_V(self) -> float:
+        return self.accelerometers.drive_limit_V
+
+    @property
+    def sample_rate_Hz(self) -> float:
+        return self.accelerometers.sample_rate_Hz
+
+    @property
+    def loop_delay_s(self) -> float:
+        return self.accelerometers.loop_delay_s
+
+    def unloaded(self) -> Halcyonics:
+        return replace(self, load=None)
+
+    def mass_matrix(self) -> np.ndarray:
+        """M of eq. 16."""
+        M = np.diag([self.mass] * 3 + [self.Ixx, self.Iyy, self.Izz])
+        if self.load is None:
+            return M
+        m_e, L7, L8, L9 = self.load.mass, self.load.L7, self.load.L8, self.load.L9
+        coupling = m_e * np.array([[0, L9, -L8], [-L9, 0, L7], [L8, -L7, 0]])
+        M[:3, :3] += m_e * np.eye(3)
+        M[:3, 3:] += coupling
+        M[3:, :3] += coupling.T
+        M[3:, 3:] += self.load.inertia() + m_e * np.array(
+            [[L8**2 + L9**2, -L7 * L8, -L7 * L9], [-L7 * L8, L7**2 + L9**2, -L8 * L9],
+             [-L7 * L9, -L8 * L9, L7**2 + L8**2]])
+        return M
+
+    def damping_matrix(self) -> np.ndarray:
+        """D of eq. 17."""
+        return np.diag([self.d1, self.d1, self.d3, self.d4, self.d5, self.d6])
+
+    def stiffness_matrix(self) -> np.ndarray:
+        """K of eq. 18, corrected; the sums over k_s become 4 k_s, 0, k_s L2^2, k_s L1^2 for equal springs."""
+        k_a, k_s, L6 = self.k_a, np.array(self.k_s), self.L6
+        x, y = CORNERS[:, 0] * self.L1 / 2, CORNERS[:, 1] * self.L2 / 2
+        K = np.diag([2 * k_a + self.k_t, 2 * k_a + self.k_t, 4 * k_a + k_s.sum(),
+                     k_a * self.L2**2 + k_s @ y**2 + 2 * k_a * L6**2,
+                     k_a * ((self.L1 - 2 * self.L3)**2 + 2 * L6**2) + k_s @ x**2,
+                     2 * k_a * self.L4_plus_L5**2 + self.k_r])
+        K[0, 4] = K[4, 0] = -2 * k_a * L6
+        K[1, 3] = K[3, 1] = 2 * k_a * L6
+        K[2, 3] = K[3, 2] = k_s @ y
+        K[2, 4] = K[4, 2] = -k_s @ x
+        K[3, 4] = K[4, 3] = -k_s @ (x * y)
+        return K
+
+    def actuator_matrix(self) -> np.ndarray:
+        """E of eq. 19, corrected, (6, 8) in N/V and N m/V."""
+        a, b, r = self.L3 - self.L1 / 2, self.L2 / 2, _ROOT_HALF
+        h, g = self.L6 * r, self.L4_plus_L5 * r
+        return np.array([[0, 0, 0, 0, -r, r, r, -r],
+                         [0, 0, 0, 0, r, r, -r, -r],
+                         [1, 1, 1, 1, 0, 0, 0, 0],
+                         [-b, -b, b, b, h, h, -h, -h],
+                         [-a, a, a, -a, h, -h, -h, h],
+                         [0, 0, 0, 0, -g, g, -g, g]]) * np.array(self.e)
+
+    def equations_of_motion(self) -> EquationsOfMotion:
+        """Eq. 15: the floor acts through the same K and D as the plate."""
+        D, K = self.damping_matrix(), self.stiffness_matrix()
+        return EquationsOfMotion(self.mass_matrix(), D, K, D, K, self.actuator_matrix(), self.actuator_names)
+
+    def actuator_axes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Position (3,) [m] and unit direction (3,) of each actuator's force, A1..A8."""
+        a, b, s = self.L3 - self.L1 / 2, self.L2 / 2, self.L4_plus_L5 / 2
+        places = [np.array([cx * a, cy * b, 0.0]) for cx, cy in CORNERS]
+        places += [np.array([cx * s, cy * s, -self.L6]) for cx, cy in _STAND]
+        directions = [np.array([0.0, 0.0, 1.0])] * 4 + [np.array([px, py, 0.0]) * _ROOT_HALF for px, py in _PUSH]
+        return dict(zip(self.actuator_names, zip(places, directions, strict=True), strict=True))
+
+    def mounted_body(self) -> MountedBody:
+        """The rig by positions: springs at (+-L1/2, +-L2/2), actuators as springs along their axes."""
+        z = np.diag([0.0, 0.0, 1.0])
+        corners = [np.array([cx * self.L1 / 2, cy * self.L2 / 2, 0.0]) for cx, cy in CORNERS]
+        mounts = [Mount(f"spring{k}", place, place, stiffness * z, np.zeros((3, 3)))
+                  for k, (place, stiffness) in enumerate(zip(corners, self.k_s, strict=True), 1)]
+        axes = self.actuator_axes()
+        mounts += [Mount(name, place, place, self.k_a * np.outer(n, n), np.zeros((3, 3)))
+                   for name, (place, n) in axes.items()]
+        actuators = tuple(PointActuator(name, place, n, e)
+                          for (name, (place, n)), e in zip(axes.items(), self.e, strict=True))
+        mass, inertia, centre = self._rigid_body()
+        suspension = np.diag([self.k_t, self.k_t, 0.0, 0.0, 0.0, self.k_r])
+        return MountedBody(mass, inertia, centre, tuple(mounts), actuators, suspension, self.damping_matrix())
+
+    def _rigid_body(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """Mass, inertia about the common centre of mass, and that centre, of plate and load."""
+        plate = np.diag([self.Ixx, self.Iyy, self.Izz])
+        if self.load is None:
+            return self.mass, plate, np.zeros(3)
+        total = self.mass + self.load.mass
+        centre = self.load.mass / total * self.load.position()
+        to_plate, to_load = cross_matrix(-centre), cross_matrix(self.load.position() - centre)
+        inertia = (plate - self.mass * to_plate @ to_plate
+                   + self.load.inertia() - self.load.mass * to_load @ to_load)
+        return total, inertia, centre
+
+    def free_actuator(self) -> StateSpace:
+        """An actuator with its reaction mass free, eq. 1: "voltage" [V] to "displacement" [m] and "velocity"."""
+        m_a, d_a, e = self.reaction.mass, self.reaction.damping, self.reaction.constant_N_per_V
+        A = np.array([[0.0, 1.0], [-self.k_a / m_a, -d_a / m_a]])
+        motion = ("displacement", "velocity")
+        return StateSpace(A, np.array([[0.0], [e / m_a]]), np.eye(2), np.zeros((2, 1)), 0.0, ("voltage",), motion, motion)
+
+    def transfer(self, point: str | ArrayLike, direction: str | ArrayLike,
+                 drive: Mapping[str, float] | Sequence[float], omega: ArrayLike,
+                 reference: str | None = None) -> np.ndarray:
+        """X_ps / F_r of eq. 32, (n_omega,) complex [m/N].
+
+        Parameters
+        ----------
+        point : name of `points()` (such as "M3"), or position (3,) [m] from the plate's centre of mass.
+        direction : "x", "y", "z", or a vector (3,) of any length.
+        drive : voltage pattern A, by actuator name or as 8 numbers.
+        omega : rad/s.
+        reference : actuator r whose force is divided by; the first one driven by default.
+        """
+        pattern = self._pattern(drive)
+        if reference is None:
+            reference = self.actuator_names[int(np.flatnonzero(pattern)[0])]
+        e_r = self.e[self.actuator_names.index(reference)]
+        place = self.points()[point].position if isinstance(point, str) else np.asarray(point, float)
+        s = np.eye(3)["xyz".index(direction)] if isinstance(direction, str) else np.asarray(direction, float)
+        eom = self.equations_of_motion()
+        w = np.atleast_1d(np.asarray(omega, float))[:, None, None]
+        W = np.linalg.solve(-w**2 * eom.M + 1j * w * eom.C + eom.K, (eom.T @ pattern)[:, None])[:, :, 0]
+        return W @ point_map(place).T @ s / (np.linalg.norm(s) * e_r)
+
+    def _pattern(self, drive: Mapping[str, float] | Sequence[float]) -> np.ndarray:
+        if isinstance(drive, Mapping):
+            if unknown := [name for name in drive if name not in self.actuator_names]:
+                raise InputError(f"expected actuators out of {self.actuator_names}", field="drive", value=unknown)
+            drive = [float(drive.get(name, 0.0)) for name in self.actuator_names]
+        pattern = np.asarray(drive, float)
+        if pattern.shape != (8,) or not np.any(pattern) or not np.all(np.isfinite(pattern)):
+            raise InputError("expected 8 finite voltages, not all zero", field="drive", value=pattern.tolist())
+        return pattern
+
+    def points(self) -> dict[str, Place]:
+        found = {m.name: Place(m.position, "isolator") for m in self.mounted_body().mounts[:4]}
+        found |= {name: Place(place, "actuator") for name, (place, _) in self.actuator_axes().items()}
+        found |= {"M1": Place(np.zeros(3), "measured point"),
+                  "M2": Place(np.array([self.M2_arm, 0.0, 0.0]), "measured point"),
+                  "M3": Place(np.array([0.0, self.M3_arm, 0.0]), "measured point"),
+                  "centre of mass": Place(self._rigid_body()[2], "centre of mass")}
+        return found | ({"load": Place(self.load.position(), "load")} if self.load else {})
+
+    def sensor_axes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """The built-in accelerometers (section 3.1), one at an actuator and along its axis, named as it."""
+        axes = self.actuator_axes()
+        return {name: axes[name] for name in self.accelerometers.at}
+
+    def parameters(self) -> dict[str, Parameter]:
+        """Symbols of the source; k_s1..k_s4 by corner (k_s: their mean), e1..e8, load.mass, load.L7, load.Ixx .."""
+        found = {name: Parameter(getattr(self, name), unit, text) for name, (unit, text) in _SCALARS.items()}
+        found["k_s"] = Parameter(float(np.mean(self.k_s)), "N/m", "vertical stiffness of each suspension spring")
+        for k, value in enumerate(self.k_s, 1):
+            found[f"k_s{k}"] = Parameter(value, "N/m", f"vertical stiffness of the spring at the corner of A{k}")
+        for k, value in enumerate(self.e, 1):
+            found[f"e{k}"] = Parameter(value, "N/V", f"force constant of actuator A{k}")
+        if self.load is not None:
+            for one in fields(self.load):
+                unit = _LOAD_UNITS.get(one.name, "kg m^2")
+                found[f"load.{one.name}"] = Parameter(getattr(self.load, one.name), unit, f"{one.name} of the load")
+        return found
+
+    def _with_values(self, values: dict[str, float]) -> Halcyonics:
+        """`k_s` sets all four springs; k_s1..k_s4, when also given, go over it."""
+        springs = tuple(values.get(f"k_s{k}", values.get("k_s", old)) for k, old in enumerate(self.k_s, 1))
+        constants = tuple(values.get(f"e{k}", old) for k, old in enumerate(self.e, 1))
+        load = self.load and replace(self.load, **{name.removeprefix("load."): value for name, value in values.items()
+                                                   if name.startswith("load.")})
+        plain: dict[str, Any] = {name: value for name, value in values.items() if name in _SCALARS}
+        return replace(self, k_s=springs, e=constants, load=load, **plain)

@@ -1,0 +1,113 @@
+"""What every rig offers, whatever its geometry: named parameters and equations of motion."""
+
+from __future__ import annotations
+
+import difflib
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
+from avis_ctrl.rigs.mounted_body import MountedBody
+from avis_ctrl.rigs.rigid_body import EquationsOfMotion, point_map
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A physical parameter of a rig."""
+
+    value: float
+    unit: str
+    description: str
+
+
+class Place(NamedTuple):
+    """A point of a drawing: position (3,) [m] from the geometric centre and what is there."""
+
+    position: np.ndarray
+    kind: str
+
+
+class Rig(ABC):
+    """A table on its isolators.
+
+    Coordinates q of the payload's geometric centre; `edge_m` is the lever arm that turns phi_x into
+    displacement of the edge along z.
+    """
+
+    name: str
+    geophones: Geophones | None
+    accelerometers: Accelerometers | None
+    acquisition: Acquisition | None
+    ambient: Ambient | None
+
+    @property
+    @abstractmethod
+    def edge_m(self) -> float:
+        """Distance [m] from the phi_x axis to the edge whose displacement judges phi_x."""
+
+    @property
+    @abstractmethod
+    def drive_limit_V(self) -> float:
+        """Largest voltage of an actuator."""
+
+    @property
+    @abstractmethod
+    def sample_rate_Hz(self) -> float:
+        """Clock of the controller."""
+
+    @property
+    @abstractmethod
+    def loop_delay_s(self) -> float:
+        """Delay from the sample to the actuator voltage."""
+
+    @abstractmethod
+    def parameters(self) -> dict[str, Parameter]:
+        """Every physical parameter by its flat name."""
+
+    @abstractmethod
+    def _with_values(self, values: dict[str, float]) -> Self:
+        """A new rig; the names are known and the values finite."""
+
+    @abstractmethod
+    def mounted_body(self) -> MountedBody:
+        """The rig by positions."""
+
+    @abstractmethod
+    def equations_of_motion(self) -> EquationsOfMotion:
+        """Linear model about rest, floor motion kept."""
+
+    @abstractmethod
+    def points(self) -> dict[str, Place]:
+        """Named points for a drawing."""
+
+    @abstractmethod
+    def sensor_axes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Position (3,) [m] and unit direction (3,) of each sensor."""
+
+    def sensor_rows(self) -> tuple[tuple[str, ...], np.ndarray]:
+        """Sensor names and the (n, 6) matrix from q to the displacement along each sensor's axis."""
+        axes = self.sensor_axes()
+        return tuple(axes), np.array([direction @ point_map(place) for place, direction in axes.values()])
+
+    def with_parameters(self, changes: Mapping[str, float]) -> Self:
+        """The rig with some parameters changed.
+
+        Raises
+        ------
+        InputError : an unknown name, a value that is not finite, a mass or an inertia that
+            leaves no positive definite mass matrix.
+        """
+        known = self.parameters()
+        for name, value in changes.items():
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                hint = f"; did you mean {near[0]!r}?" if near else f"; there are {sorted(known)}"
+                raise InputError(f"the rig {self.name} has no such parameter{hint}", field=name, value=value)
+            if not np.isfinite(value):
+                raise InputError("expected a finite number", field=name, value=value)
+        return self._with_values({name: float(value) for name, value in changes.items()})
