@@ -124,7 +124,7 @@ def cascade(zeros: Sequence[complex] | np.ndarray, poles: Sequence[complex] | np
         numerator, denominator = (np.atleast_1d(np.poly(part)).real for part in (num, den))
         size = _section_size(numerator, denominator)
         leading *= size
-        section = tf(numerator / size, denominator)
+        section = tf(list(numerator / size), list(denominator))
         chain = section if chain is None else section @ chain
     assert chain is not None
     spread = np.sign(leading) * np.sqrt(abs(leading)), np.sqrt(abs(leading))

@@ -41,7 +41,7 @@ def pade_delay(delay_s: float, order: int = 2, input_name: str = "u", output_nam
         return gain(1.0, [input_name], [output_name])
     denominator = pade_coefficients(order)
     numerator = denominator * (-1.0) ** np.arange(order, -1, -1)
-    unit = tf(numerator, denominator)
+    unit = tf(list(numerator), list(denominator))
     gramian = la.solve_continuous_lyapunov(unit.A, -unit.B @ unit.B.T)
     unit = unit.similar(la.cholesky(gramian, lower=True))
     root = np.sqrt(1.0 / delay_s)
@@ -60,7 +60,7 @@ def zero_order_hold(sample_time_s: float, order: int = 2, input_name: str = "u",
     denominator = pade_coefficients(order)
     # N(x) - N(-x) keeps twice the odd powers; divided by x they move down by one.
     odd = np.where(np.arange(order, -1, -1) % 2 == 1, 2.0 * denominator, 0.0)
-    unit = tf(odd[:-1], denominator)
+    unit = tf(list(odd[:-1]), list(denominator))
     root = np.sqrt(1.0 / sample_time_s)
     return StateSpace(unit.A / sample_time_s, unit.B * root, unit.C * root, unit.D, 0.0, (input_name,), (output_name,))
 

@@ -49,8 +49,8 @@ class CatalogueEntry:
 def check_against_name(entry: CatalogueEntry, tolerance: float = 0.02) -> list[str]:
     """What in the file contradicts its name or itself, in words with both numbers; empty when all agrees.
 
-    Compared, each to the relative tolerance: corner from the poles, gain, the product of the stage gains with the overall
-    sensitivity, and the normalisation factor with the poles' response at its frequency.
+    Compared, each to the relative tolerance: corner from the poles, gain, the product of the stage gains with the
+    overall sensitivity, and the normalisation factor with the poles' response at its frequency.
     """
     s = 2j * np.pi * entry.normalisation_Hz
     w = 2 * np.pi * entry.corner_Hz
@@ -128,10 +128,12 @@ def _parse(text: str, name: str) -> CatalogueEntry:
     w = float(np.sqrt(abs(np.prod(poles))))
     gains = _stage_gains(text)
     analogue = float(np.prod([value for stage_number, value in gains.items() if stage_number > 0]))
-    return CatalogueEntry(file=name, corner_Hz=w / (2 * np.pi), damping=float(-np.sum(poles.real) / (2 * w)),
-                          gain_Vs_per_m=analogue, overall_sensitivity=gains[0],
-                          normalisation=_number(stage, "B053F07"), normalisation_Hz=_number(stage, "B053F08"),
-                          **_from_name(name))
+    named = _from_name(name)
+    return CatalogueEntry(file=name, model=name.split(".")[5], corner_Hz=w / (2 * np.pi),
+                          damping=float(-np.sum(poles.real) / (2 * w)), gain_Vs_per_m=analogue,
+                          overall_sensitivity=gains[0], normalisation=_number(stage, "B053F07"),
+                          normalisation_Hz=_number(stage, "B053F08"), coil_ohm=named["coil"], shunt_ohm=named["shunt"],
+                          named_corner_Hz=_given(named, "corner"), named_gain_Vs_per_m=_given(named, "gain"))
 
 
 def _poles_and_zeros_stage(text: str) -> str:
@@ -182,24 +184,28 @@ def _stage_gains(text: str) -> dict[int, float]:
     return gains
 
 
-def _from_name(name: str) -> dict[str, str | float | None]:
+def _from_name(name: str) -> dict[str, float | None]:
+    """Coil, shunt, corner and gain as the file's name states them; None for what it leaves out."""
     parts = name.split(".")
     if len(parts) not in (8, 10):
         raise InputError("a name RESP.network.station.location.channel.model[.coil.shunt].corner.gain", field="name",
                          value=name)
-    model, rest = parts[5], parts[6:]
-    coil: str | None = None
-    shunt: str | None = None
-    if len(rest) == 2:
-        corner, gain = rest
-    elif model.startswith("GS11"):
-        corner, coil, shunt, gain = rest
+    if len(parts) == 8:
+        order = ["corner", "gain"]
+    elif parts[5].startswith("GS11"):
+        order = ["corner", "coil", "shunt", "gain"]
     else:
-        coil, shunt, corner, gain = rest
+        order = ["coil", "shunt", "corner", "gain"]
+    named: dict[str, float | None] = {"coil": None, "shunt": None}
+    for what, word in zip(order, parts[6:], strict=True):
+        # A letter after the corner tells elements of one model apart (HG-6 4.5A, 4.5B).
+        number = re.sub(r"[A-Z]$", "", word).replace("_", ".")
+        named[what] = None if word == "NONE" else _float(number, f"name ({what})")
+    return named
 
-    def value(word: str | None) -> float | None:
-        if word is None or word == "NONE":
-            return None
-        return _float(re.sub(r"[A-Z]+$", "", word).replace("_", "."), "name")
-    return {"model": model, "coil_ohm": value(coil), "shunt_ohm": value(shunt), "named_corner_Hz": value(corner),
-            "named_gain_Vs_per_m": value(gain)}
+
+def _given(named: dict[str, float | None], what: str) -> float:
+    value = named[what]
+    if value is None or value <= 0:
+        raise InputError("a positive number in the file's name", field=f"name ({what})", value=value)
+    return value

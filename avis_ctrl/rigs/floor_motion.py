@@ -1,0 +1,183 @@
+"""Floor motion as amplitude spectral densities: measured files, conversions, r.m.s. in third octaves.
+
+An amplitude spectral density (ASD) is one-sided, per square root of Hz: the variance in a band is the integral of
+its square over frequency in Hz. Between points an ASD is taken as a power law (a straight line in
+double-logarithmic axes) and integrated exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+
+Quantity = Literal["displacement", "velocity", "acceleration"]
+DERIVATIVES: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
+
+
+@dataclass(frozen=True)
+class MeasuredSpectrum:
+    """A measured displacement ASD.
+
+    Parameters
+    ----------
+    name : what was measured, usually the file's name.
+    frequency_Hz : (n,) increasing, positive.
+    displacement_asd : (n,) [m/sqrt(Hz)], positive.
+
+    Raises
+    ------
+    InputError : values that are not finite and positive, or frequencies that do not increase.
+    """
+
+    name: str
+    frequency_Hz: np.ndarray
+    displacement_asd: np.ndarray
+
+    def __post_init__(self) -> None:
+        check_spectrum(self.frequency_Hz, self.displacement_asd, "displacement_asd")
+
+    def asd(self, quantity: Quantity = "displacement") -> np.ndarray:
+        """The ASD of that quantity, (n,)."""
+        return convert_asd(self.frequency_Hz, self.displacement_asd, "displacement", quantity)
+
+    def rms(self, low_Hz: float, high_Hz: float, quantity: Quantity = "velocity") -> float:
+        """R.m.s. in a band [m, m/s or m/s^2]."""
+        return band_rms(self.frequency_Hz, self.asd(quantity), low_Hz, high_Hz)
+
+    def between(self, low_Hz: float, high_Hz: float) -> MeasuredSpectrum:
+        """The points of a band."""
+        kept = (self.frequency_Hz >= low_Hz) & (self.frequency_Hz <= high_Hz)
+        return MeasuredSpectrum(self.name, self.frequency_Hz[kept], self.displacement_asd[kept])
+
+
+def check_spectrum(frequency_Hz: np.ndarray, asd: np.ndarray, field: str = "asd") -> None:
+    """Raise InputError unless these are two vectors of one length, increasing and positive, and positive."""
+    if np.ndim(frequency_Hz) != 1 or np.shape(frequency_Hz) != np.shape(asd) or np.size(asd) < 2:
+        raise InputError(f"two vectors of one length, at least 2 points; got {np.shape(frequency_Hz)} and "
+                         f"{np.shape(asd)}", field=field)
+    if not (np.all(np.isfinite(frequency_Hz)) and np.all(np.asarray(frequency_Hz) > 0)
+            and np.all(np.diff(frequency_Hz) > 0)):
+        raise InputError("finite, positive, increasing frequencies", field="frequency_Hz")
+    if not (np.all(np.isfinite(asd)) and np.all(np.asarray(asd) > 0)):
+        raise InputError("finite, positive densities", field=field)
+
+
+def read_floor_motion(path: str | Path) -> MeasuredSpectrum:
+    """A displacement ASD from a text file (two columns: Hz, m/sqrt(Hz)) or an .npz with arrays `f` and `asd`.
+
+    Raises
+    ------
+    InputError : a file that cannot be read, lacks a column or array, or holds values that check_spectrum refuses.
+    """
+    path = Path(path)
+    try:
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as arrays:
+                frequency, asd = arrays["f"].astype(float), arrays["asd"].astype(float)
+        else:
+            columns = np.loadtxt(path, ndmin=2)
+            if columns.shape[1] != 2:
+                raise InputError(f"two columns, the file has {columns.shape[1]}", field="columns")
+            frequency, asd = columns.T
+        return MeasuredSpectrum(path.stem, frequency, asd)
+    except InputError as error:
+        raise error.in_file(path) from None
+    except (OSError, ValueError, KeyError, IndexError, EOFError) as error:
+        raise InputError(f"a displacement spectrum: {error}", file=path) from error
+
+
+def shared_points(a: MeasuredSpectrum, b: MeasuredSpectrum) -> list[tuple[float, float]]:
+    """Bands [Hz] over which two files hold the very same numbers, which two measurements never do."""
+    other = dict(zip(b.frequency_Hz.tolist(), b.displacement_asd.tolist(), strict=True))
+    same = np.array([other.get(f) == d for f, d in
+                     zip(a.frequency_Hz.tolist(), a.displacement_asd.tolist(), strict=True)])
+    return [(float(a.frequency_Hz[i]), float(a.frequency_Hz[j])) for i, j in _runs(same, 3)]
+
+
+def drawn_lines(spectrum: MeasuredSpectrum, points: int = 6) -> list[tuple[float, float, float]]:
+    """Stretches (low Hz, high Hz, slope) where the ASD is an exact power law: drawn, not measured."""
+    slope = np.diff(np.log(spectrum.displacement_asd)) / np.diff(np.log(spectrum.frequency_Hz))
+    straight = np.abs(np.diff(slope)) < 1e-6
+    return [(float(spectrum.frequency_Hz[i]), float(spectrum.frequency_Hz[j + 2]), float(slope[i]))
+            for i, j in _runs(straight, points - 2)]
+
+
+def _runs(flags: np.ndarray, shortest: int) -> list[tuple[int, int]]:
+    """First and last index of each run of True at least that long."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(i), int(j) - 1) for i, j in edges.reshape(-1, 2) if j - i >= shortest]
+
+
+def convert_asd(frequency_Hz: np.ndarray, asd: np.ndarray, given: Quantity, wanted: Quantity) -> np.ndarray:
+    """ASD of another derivative of the same motion: each derivative multiplies by 2 pi f.
+
+    Raises InputError for a quantity other than displacement, velocity and acceleration.
+    """
+    for what in (given, wanted):
+        if what not in DERIVATIVES:
+            raise InputError(f"one of {list(DERIVATIVES)}", field="quantity", value=what)
+    steps = DERIVATIVES[wanted] - DERIVATIVES[given]
+    return np.asarray(asd, float) * (2 * np.pi * np.asarray(frequency_Hz, float)) ** steps
+
+
+def band_rms(frequency_Hz: np.ndarray, asd: np.ndarray, low_Hz: float, high_Hz: float) -> float:
+    """R.m.s. between two frequencies inside the data, exact for the piecewise power law through the points.
+
+    Raises InputError where the band is empty or leaves the data.
+    """
+    check_spectrum(frequency_Hz, asd)
+    f, a = np.asarray(frequency_Hz, float), np.asarray(asd, float)
+    slack = 1e-9
+    if not (f[0] * (1 - slack) <= low_Hz < high_Hz <= f[-1] * (1 + slack)):
+        raise InputError(f"a band inside {f[0]:.4g} to {f[-1]:.4g} Hz", field="band_Hz", value=(low_Hz, high_Hz))
+    low_Hz, high_Hz = max(low_Hz, f[0]), min(high_Hz, f[-1])
+    inside = (f > low_Hz) & (f < high_Hz)
+    points = np.concatenate([[low_Hz], f[inside], [high_Hz]])
+    power = np.exp(2 * np.interp(np.log(points), np.log(f), np.log(a)))
+    ratio = np.log(points[1:] / points[:-1])
+    # integral of c f^m over one piece; the exponent m + 1 may vanish, where it is a logarithm
+    exponent = np.log(power[1:] / power[:-1]) / ratio + 1.0
+    growth = exponent * ratio
+    pieces = power[:-1] * points[:-1] * ratio * np.where(np.abs(growth) < 1e-9, 1.0 + growth / 2,
+                                                         np.expm1(growth) / np.where(growth == 0, 1.0, growth))
+    return float(np.sqrt(np.sum(pieces)))
+
+
+def third_octave_midbands(low_Hz: float, high_Hz: float) -> np.ndarray:
+    """Exact midbands 1000 * 10^(k/10) Hz (IEC 61260-1:2014, base ten) from low_Hz to high_Hz, nominal names included.
+
+    The limits are taken as nominal: 8 Hz means the band at 7.943 Hz.
+    """
+    if not (np.isfinite(low_Hz) and np.isfinite(high_Hz) and 0 < low_Hz <= high_Hz):
+        raise InputError("0 < low_Hz <= high_Hz", field="band_Hz", value=(low_Hz, high_Hz))
+    first, last = (int(np.round(10 * np.log10(f / 1000.0))) for f in (low_Hz, high_Hz))
+    return 1000.0 * 10.0 ** (np.arange(first, last + 1) / 10.0)
+
+
+def third_octave_edges(midband_Hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper edge of each third-octave band: midband times 10^(-+1/20)."""
+    midband_Hz = np.asarray(midband_Hz, float)
+    return midband_Hz * 10 ** -0.05, midband_Hz * 10 ** 0.05
+
+
+def third_octave_rms(frequency_Hz: np.ndarray, asd: np.ndarray,
+                     midband_Hz: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Midbands [Hz] and the r.m.s. in each, for every third octave that lies wholly inside the data.
+
+    Raises InputError where a band asked for leaves the data, or none fits.
+    """
+    check_spectrum(frequency_Hz, asd)
+    if midband_Hz is None:
+        every = third_octave_midbands(float(frequency_Hz[0]), float(frequency_Hz[-1]))
+        lower, upper = third_octave_edges(every)
+        midband_Hz = every[(lower >= frequency_Hz[0] * (1 - 1e-9)) & (upper <= frequency_Hz[-1] * (1 + 1e-9))]
+        if not midband_Hz.size:
+            raise InputError("data that span at least one third-octave band", field="frequency_Hz",
+                             value=(float(frequency_Hz[0]), float(frequency_Hz[-1])))
+    edges = zip(*third_octave_edges(midband_Hz), strict=True)
+    return np.asarray(midband_Hz, float), np.array([band_rms(frequency_Hz, asd, lo, hi) for lo, hi in edges])

@@ -1,0 +1,216 @@
+"""Floor motion as a model: a rational shaping filter fitted to a measured spectrum, and time series made from it.
+
+The filter takes white noise of unit intensity (E[w(t) w(t')] = delta(t - t')) to displacement [m]. Its H2 norm is the
+r.m.s., and the one-sided ASD per square root of Hz is sqrt(2) |H(j 2 pi f)|.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass, replace
+from importlib import resources
+from typing import NamedTuple
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.magnitude_fit import DB, magnitude_fit
+from avis_ctrl.lti.rational import Rational, cascade
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.converter import require_positive
+from avis_ctrl.rigs.floor_motion import DERIVATIVES, Quantity, band_rms, check_spectrum
+
+ONE_SIDED = np.sqrt(2.0)
+
+
+@dataclass(frozen=True)
+class SpectrumModel:
+    """A rational model of floor displacement.
+
+    Parameters
+    ----------
+    name, source : what it models, and whose measurement it was fitted to.
+    shape : unit-intensity white noise -> displacement [m]; relative degree 2 at least, so that velocity is proper.
+    low_Hz, high_Hz : the band over which it was fitted; nothing is claimed outside.
+    error_rms_dB, error_max_dB : of the fit, against the smoothed measurement.
+
+    Raises
+    ------
+    InputError : an empty band, or a shape of relative degree below 2.
+    """
+
+    name: str
+    source: str
+    shape: Rational
+    low_Hz: float
+    high_Hz: float
+    error_rms_dB: float = 0.0
+    error_max_dB: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.low_Hz) and np.isfinite(self.high_Hz) and 0 < self.low_Hz < self.high_Hz):
+            raise InputError("0 < low_Hz < high_Hz", field="band_Hz", value=(self.low_Hz, self.high_Hz))
+        if self.shape.relative_degree < 2:
+            raise InputError("relative degree at least 2 (velocity must be strictly proper)", field="shape",
+                             value=self.shape.relative_degree)
+
+    def asd(self, frequency_Hz: np.ndarray, quantity: Quantity = "displacement") -> np.ndarray:
+        """One-sided ASD at the frequencies [Hz], (n,)."""
+        if quantity not in DERIVATIVES:
+            raise InputError(f"one of {list(DERIVATIVES)}", field="quantity", value=quantity)
+        omega = 2 * np.pi * np.asarray(frequency_Hz, float)
+        return ONE_SIDED * self.shape.magnitude(omega) * omega ** DERIVATIVES[quantity]
+
+    def rms(self, low_Hz: float, high_Hz: float, quantity: Quantity = "velocity") -> float:
+        """R.m.s. in a band."""
+        frequency = np.geomspace(low_Hz, high_Hz, 4000)
+        return band_rms(frequency, self.asd(frequency, quantity), low_Hz, high_Hz)
+
+    def scaled_to_rms(self, rms: float, low_Hz: float, high_Hz: float,
+                      quantity: Quantity = "velocity") -> SpectrumModel:
+        """The same shape with the r.m.s. wanted in a band."""
+        require_positive(rms, "rms")
+        factor = rms / self.rms(low_Hz, high_Hz, quantity)
+        return replace(self, name=f"{self.name}, scaled by {factor:.4g}", shape=self.shape.scaled(factor))
+
+    def system(self, input_name: str = "white_noise", output_name: str = "floor_displacement",
+               quantity: Quantity = "displacement") -> StateSpace:
+        """Shaping filter: unit-intensity white noise -> displacement, velocity or acceleration."""
+        if quantity not in DERIVATIVES:
+            raise InputError(f"one of {list(DERIVATIVES)}", field="quantity", value=quantity)
+        zeros = np.concatenate([self.shape.zeros(), np.zeros(DERIVATIVES[quantity])])
+        return cascade(zeros, self.shape.poles(), self.shape.gain, input_name, output_name)
+
+
+def smoothed(frequency_Hz: np.ndarray, asd: np.ndarray, octaves: float = 1 / 3) -> np.ndarray:
+    """ASD averaged in power over a sliding band of that width: a narrow line keeps its energy, not its height.
+
+    Bands are cut short at the ends of the data.
+    """
+    check_spectrum(frequency_Hz, asd)
+    require_positive(octaves, "octaves")
+    half = 2 ** (octaves / 2)
+    lower = np.maximum(frequency_Hz / half, frequency_Hz[0])
+    upper = np.minimum(frequency_Hz * half, frequency_Hz[-1])
+    return np.array([band_rms(frequency_Hz, asd, lo, hi) / np.sqrt(hi - lo)
+                     for lo, hi in zip(lower, upper, strict=True)])
+
+
+def fit_spectrum(frequency_Hz: np.ndarray, asd: np.ndarray, order: int, *, name: str = "", source: str = "",
+                 octaves: float = 1 / 3, points: int = 160) -> SpectrumModel:
+    """Stable, minimum-phase shaping filter fitted to a displacement ASD [m/sqrt(Hz)] by its logarithm.
+
+    The ASD is first averaged in power over `octaves` and taken at `points` frequencies evenly spaced in
+    logarithm, so that every octave counts alike however finely it was sampled.
+
+    Raises
+    ------
+    InputError : a spectrum that check_spectrum refuses, or an order below 2.
+    """
+    if not (isinstance(order, int) and order >= 2):
+        raise InputError("a whole number, 2 or more", field="order", value=order)
+    frequency_Hz, asd = np.asarray(frequency_Hz, float), np.asarray(asd, float)
+    level = smoothed(frequency_Hz, asd, octaves)
+    grid = np.geomspace(frequency_Hz[0], frequency_Hz[-1], points)
+    target = np.exp(np.interp(np.log(grid), np.log(frequency_Hz), np.log(level)))
+    fit = magnitude_fit(2 * np.pi * grid, target / ONE_SIDED, order, relative_degree=2, min_damping=0.05)
+    return SpectrumModel(name, source, fit.function, float(frequency_Hz[0]), float(frequency_Hz[-1]),
+                         fit.error_rms_dB, fit.error_max_dB)
+
+
+def fit_error_dB(model: SpectrumModel, frequency_Hz: np.ndarray, asd: np.ndarray,
+                 octaves: float = 1 / 3) -> np.ndarray:
+    """Model over smoothed measurement [dB] at the measured frequencies inside the model's band."""
+    inside = (frequency_Hz >= model.low_Hz * (1 - 1e-9)) & (frequency_Hz <= model.high_Hz * (1 + 1e-9))
+    f, a = np.asarray(frequency_Hz, float)[inside], np.asarray(asd, float)[inside]
+    return DB * np.log(model.asd(f) / smoothed(f, a, octaves))
+
+
+def shipped_spectra() -> dict[str, SpectrumModel]:
+    """The models carried in the package, by name: fitted parameters and the source of the measurement."""
+    text = resources.files("avis_ctrl.rigs").joinpath("data/floor_spectra.toml").read_text(encoding="utf-8")
+    return {name: spectrum_from_table(name, table) for name, table in tomllib.loads(text).items()}
+
+
+def shipped_spectrum(name: str) -> SpectrumModel:
+    """One model carried in the package; InputError names those there are."""
+    spectra = shipped_spectra()
+    if name not in spectra:
+        raise InputError(f"one of {sorted(spectra)}", field="spectrum", value=name)
+    return spectra[name]
+
+
+def spectrum_from_table(name: str, table: dict) -> SpectrumModel:
+    """A model from its TOML table: corner frequencies in Hz, dampings, low-frequency ASD."""
+    def pairs(key: str) -> tuple[tuple[float, float], ...]:
+        return tuple((2 * np.pi * float(f), float(z)) for f, z in table.get(key, []))
+
+    def singles(key: str) -> tuple[float, ...]:
+        return tuple(2 * np.pi * float(f) for f in table.get(key, []))
+    try:
+        unit = Rational(1.0, pairs("zeros_Hz_damping"), pairs("poles_Hz_damping"), singles("real_zeros_Hz"),
+                        singles("real_poles_Hz"))
+        shape = unit.scaled(float(table["static_asd_m_rtHz"]) / (ONE_SIDED * abs(complex(unit(np.array(0.0))))))
+        low, high = table["band_Hz"]
+        return SpectrumModel(name, table["source"], shape, float(low), float(high),
+                             float(table["error_rms_dB"]), float(table["error_max_dB"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise error if isinstance(error, InputError) else InputError(
+            f"a spectrum table: {error!r}", field=name) from error
+
+
+def spectrum_to_table(model: SpectrumModel, digits: int = 6) -> str:
+    """TOML lines from which spectrum_from_table rebuilds the model, to that many significant digits."""
+    def number(x: float) -> str:
+        return f"{x:.{digits}g}"
+
+    def pairs(sections: tuple[tuple[float, float], ...]) -> str:
+        return "[" + ", ".join(f"[{number(w / (2 * np.pi))}, {number(z)}]" for w, z in sorted(sections)) + "]"
+
+    def singles(corners: tuple[float, ...]) -> str:
+        return "[" + ", ".join(number(w / (2 * np.pi)) for w in sorted(corners)) + "]"
+    shape = model.shape
+    return "\n".join([
+        f'source = "{model.source}"',
+        f"band_Hz = [{number(model.low_Hz)}, {number(model.high_Hz)}]",
+        f"static_asd_m_rtHz = {number(float(model.asd(np.array([0.0]))[0]))}",
+        f"zeros_Hz_damping = {pairs(shape.zero_pairs)}", f"poles_Hz_damping = {pairs(shape.pole_pairs)}",
+        f"real_zeros_Hz = {singles(shape.real_zeros)}", f"real_poles_Hz = {singles(shape.real_poles)}",
+        f"error_rms_dB = {model.error_rms_dB:.3f}", f"error_max_dB = {model.error_max_dB:.3f}"])
+
+
+class FloorRecord(NamedTuple):
+    """A realised floor motion: time [s], displacement [m], velocity [m/s], each (n,)."""
+
+    time: np.ndarray
+    displacement: np.ndarray
+    velocity: np.ndarray
+
+
+def realise(spectrum: SpectrumModel, duration_s: float, dt: float, rng: np.random.Generator) -> FloorRecord:
+    """A Gaussian time series with the spectrum of the model, exact at every line of its Fourier transform.
+
+    Each line k/duration draws an independent complex Gaussian amplitude of variance S(f) df; the inverse FFT
+    gives displacement, and j 2 pi f times the same amplitudes velocity. Lines below the model's low_Hz and
+    the Nyquist line are zero, so that nothing drifts. The record repeats after `duration_s`.
+
+    Raises
+    ------
+    InputError : a duration or step that is not positive, or a record too short to hold a line of the band.
+    """
+    require_positive(duration_s, "duration_s")
+    require_positive(dt, "dt")
+    n = round(duration_s / dt)
+    if n < 4 or 1.0 / (n * dt) > spectrum.high_Hz or spectrum.low_Hz >= 0.5 / dt:
+        raise InputError(f"a record with lines inside {spectrum.low_Hz:g} to {spectrum.high_Hz:g} Hz",
+                         field="duration_s", value=(duration_s, dt))
+    frequency = np.fft.rfftfreq(n, dt)
+    active = frequency >= spectrum.low_Hz * (1 - 1e-9)
+    if n % 2 == 0:
+        active[-1] = False
+    # x[m] = sum over k of Re(c_k exp(j 2 pi k m / n)) with E|c_k|^2 = 2 S df; irfft wants n/2 times c_k.
+    line_rms = np.zeros(frequency.size)
+    line_rms[active] = spectrum.asd(frequency[active]) * np.sqrt(1.0 / (n * dt))
+    draw = rng.standard_normal((2, frequency.size))
+    lines = 0.5 * n * line_rms * (draw[0] + 1j * draw[1])
+    return FloorRecord(dt * np.arange(n), np.fft.irfft(lines, n), np.fft.irfft(2j * np.pi * frequency * lines, n))
