@@ -32,7 +32,7 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
     if not system.is_stable():
         return PeakGain(np.inf, np.nan)
     if system.dt:
-        continuous = _bilinear(system)
+        continuous = bilinear_to_continuous(system)
         peak = hinf_norm(continuous, tolerance)
         # arctan(inf) is pi/2: the direct term of the bilinear image is the Nyquist frequency.
         return PeakGain(peak.gain, 2.0 / system.dt * float(np.arctan(peak.omega * system.dt / 2.0)))
@@ -92,7 +92,7 @@ def _level_crossings(system: StateSpace, level: float) -> np.ndarray:
     return np.unique(np.abs(eigenvalues[on_axis].imag))
 
 
-def _bilinear(system: StateSpace) -> StateSpace:
+def bilinear_to_continuous(system: StateSpace) -> StateSpace:
     """Continuous system with the same H-infinity norm (bilinear transform, s = 2/dt (z-1)/(z+1))."""
     if not system.nstates:
         return StateSpace(system.A, system.B, system.C, system.D, 0.0)

@@ -1,0 +1,166 @@
+"""The generalized plant of an H-infinity problem: partition, assumptions in plain words, normal form.
+
+    x' = A  x + B1  w + B2  u
+    z  = C1 x + D11 w + D12 u          u = K y  (positive feedback)
+    y  = C2 x + D21 w + D22 u
+
+Solvability asks for (A, B2) stabilisable and (A, C2) detectable. The Riccati solution further asks
+for D12 of full column rank, D21 of full row rank, and no zero of the channels u -> z and w -> y on
+the imaginary axis (Zhou, Doyle and Glover, Robust and Optimal Control, 1996, section 16.2.1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti import StateSpace, balance
+
+RANK_TOLERANCE = 1e-8
+PBH_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A partitioned plant in continuous time, its states balanced; names of u and y for messages."""
+
+    A: np.ndarray
+    B1: np.ndarray
+    B2: np.ndarray
+    C1: np.ndarray
+    C2: np.ndarray
+    D11: np.ndarray
+    D12: np.ndarray
+    D21: np.ndarray
+    D22: np.ndarray
+    u: tuple[str, ...] = ()
+    y: tuple[str, ...] = ()
+
+    @staticmethod
+    def of(P: StateSpace, nmeas: int, ncon: int) -> Plant:
+        """Split P (w, u -> z, y) by its last nmeas outputs and last ncon inputs, its states balanced."""
+        P = balance(P)
+        w, z = P.ninputs - ncon, P.noutputs - nmeas
+        return Plant(P.A, P.B[:, :w], P.B[:, w:], P.C[:z], P.C[z:], P.D[:z, :w], P.D[:z, w:], P.D[z:, :w],
+                     P.D[z:, w:], P.inputs[w:], P.outputs[z:])
+
+    @property
+    def n(self) -> int:
+        return self.A.shape[0]
+
+    def sample_points(self) -> np.ndarray:
+        """Points of the right half plane, off the imaginary axis, at the magnitudes of the poles."""
+        sizes = np.abs(la.eigvals(self.A)) if self.n else np.zeros(0)
+        sizes = np.unique(np.concatenate([sizes[sizes > 0], [1.0]]))
+        return sizes * np.exp(0.25j * np.pi)
+
+    def channel(self, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> np.ndarray:
+        """|transfer matrix| of one channel, largest over the sample points and infinity, entry by entry."""
+        size = np.abs(D)
+        for s in self.sample_points() if self.n else ():
+            size = np.maximum(size, np.abs(C @ np.linalg.solve(s * np.eye(self.n) - self.A, B.astype(complex)) + D))
+        return size
+
+
+def as_plant(P: Any, nmeas: int, ncon: int) -> StateSpace:
+    """Our StateSpace from ours or a python-control one, with the partition checked (InputError)."""
+    if not isinstance(P, StateSpace):
+        if not hasattr(P, "A") and not hasattr(P, "num"):
+            raise InputError("expected an avis_ctrl or python-control StateSpace", field="P", value=type(P).__name__)
+        P = StateSpace.from_control(P)
+    for field, count, total, what in (("nmeas", nmeas, P.noutputs, "outputs (z, y)"),
+                                      ("ncon", ncon, P.ninputs, "inputs (w, u)")):
+        if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+            raise InputError("expected a whole number of at least 1", field=field, value=count)
+        if count >= total:
+            raise InputError(f"expected less than {total}: the plant has {total} {what} and one must be left "
+                             "for the performance channel", field=field, value=count)
+    return P
+
+
+def check_stabilisable(plant: Plant) -> None:
+    """ComputationError naming the unstable mode that no input moves or no measurement sees (PBH test)."""
+    for A, B, names, verb, who in (
+            (plant.A, plant.B2, plant.u, "not moved by any of the inputs", "an actuator or input"),
+            (plant.A.T, plant.C2.T, plant.y, "not seen by any of the measurements", "a sensor")):
+        for pole in np.unique(la.eigvals(A)) if plant.n else ():
+            size = la.norm(np.hstack([A, B]), 2)
+            if pole.imag < 0 or pole.real < -1e-12 * size:
+                continue
+            margin = la.svdvals(np.hstack([A - pole * np.eye(plant.n), B]))[-1] / size
+            if margin < PBH_TOLERANCE:
+                raise ComputationError(
+                    f"mode at {abs(pole.imag) / (2 * np.pi):.4g} Hz is {verb} {list(names)}: no controller exists",
+                    measured=f"pole {pole.real:.4g} {pole.imag:+.4g}j rad/s, rank margin {margin:.1e} "
+                             f"of the PBH matrix (at least {PBH_TOLERANCE:.0e} is needed)",
+                    cause="an integrator or unstable weight outside the loop, or a missing channel",
+                    next_step=f"make the mode stable, or give {who} that reaches it")
+
+
+@dataclass(frozen=True)
+class NormalForm:
+    """Plant with D12 = [0; I], D21 = [0 I], D22 = 0, and the maps back: K = S K_n T, then D22 is restored."""
+
+    plant: Plant
+    S: np.ndarray
+    T: np.ndarray
+    D22: np.ndarray
+
+
+def normal_form(plant: Plant) -> NormalForm:
+    """Scale u and y, rotate z and w, shift D22 away; D12 and D21 must have full rank (see `rank_margins`)."""
+    m2, p2 = plant.D12.shape[1], plant.D21.shape[0]
+    U, s, Vt = la.svd(plant.D12)
+    Q, S = np.hstack([U[:, m2:], U[:, :m2]]), Vt.T / s
+    V, t, Wt = la.svd(plant.D21)
+    W, T = np.hstack([Wt[p2:].T, Wt[:p2].T]), (V / t).T
+    normal = replace(plant, B1=plant.B1 @ W, B2=plant.B2 @ S, C1=Q.T @ plant.C1, C2=T @ plant.C2,
+                     D11=Q.T @ plant.D11 @ W, D12=Q.T @ plant.D12 @ S, D21=T @ plant.D21 @ W,
+                     D22=np.zeros_like(plant.D22))
+    return NormalForm(normal, S, T, plant.D22)
+
+
+def channel_scales(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """Size of each input's effect on z, and of w's effect on each measurement: the yardsticks of the rank tests."""
+    of_u = np.max(plant.channel(plant.B2, plant.C1, plant.D12), axis=0)
+    of_y = np.max(plant.channel(plant.B1, plant.C2, plant.D21), axis=1)
+    return np.where(of_u > 0, of_u, 1.0), np.where(of_y > 0, of_y, 1.0)
+
+
+def rank_margins(plant: Plant) -> tuple[float, float]:
+    """Smallest singular values of D12 (columns) and D21 (rows) in units of the channel sizes; 0 where too narrow."""
+    of_u, of_y = channel_scales(plant)
+
+    def margin(D: np.ndarray) -> float:
+        return float(la.svdvals(D)[-1]) if D.shape[0] >= D.shape[1] else 0.0
+    return margin(plant.D12 / of_u), margin((plant.D21 / of_y[:, None]).T)
+
+
+def regularised(plant: Plant, epsilon: float, of_D12: bool, of_D21: bool, of_states: bool) -> Plant:
+    """The plant with small extra outputs (epsilon u, and epsilon x) or inputs (noise on y, and on x)."""
+    of_u, of_y = channel_scales(plant)
+    C1, D11, D12, B1, D21 = plant.C1, plant.D11, plant.D12, plant.B1, plant.D21
+    n, w = plant.n, plant.D11.shape[1]
+    state_C = epsilon * np.eye(n) * _typical(C1) if of_states else np.zeros((0, n))
+    state_B = epsilon * np.eye(n) * _typical(B1) if of_states else np.zeros((n, 0))
+    if of_D12 or of_states:
+        extra = epsilon * np.diag(of_u) if of_D12 else np.zeros((0, of_u.size))
+        rows = state_C.shape[0]
+        C1 = np.vstack([C1, state_C, np.zeros((extra.shape[0], n))])
+        D11 = np.vstack([D11, np.zeros((rows + extra.shape[0], w))])
+        D12 = np.vstack([D12, np.zeros((rows, of_u.size)), extra])
+    if of_D21 or of_states:
+        noise = epsilon * np.diag(of_y) if of_D21 else np.zeros((of_y.size, 0))
+        cols = state_B.shape[1]
+        B1 = np.hstack([B1, state_B, np.zeros((n, noise.shape[1]))])
+        D11 = np.hstack([D11, np.zeros((D11.shape[0], cols + noise.shape[1]))])
+        D21 = np.hstack([D21, np.zeros((of_y.size, cols)), noise])
+    return replace(plant, B1=B1, C1=C1, D11=D11, D12=D12, D21=D21)
+
+
+def _typical(matrix: np.ndarray) -> float:
+    return float(la.norm(matrix, 2)) if np.any(matrix) else 1.0

@@ -1,0 +1,234 @@
+"""Two-Riccati test and central controller for any D11, and the search for the smallest gamma.
+
+Formulas of Glover and Doyle, Systems & Control Letters 11 (1988) 167-172, for a plant in normal form
+(D12 = [0; I], D21 = [0 I], D22 = 0). A controller with ||F_l(P, K)|| < gamma exists if and only if
+
+    gamma > max(sigma [D1111 D1112], sigma [D1111; D1121]),   X >= 0,   Y >= 0,   rho(X Y) < gamma^2 .
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.lti import StateSpace
+from avis_ctrl.robust.hinf_plant import NormalForm, Plant
+from avis_ctrl.robust.riccati import solve_riccati
+
+
+@dataclass(frozen=True)
+class GammaTest:
+    """Outcome of the test at one gamma: feasible with X, Y, or the condition that fails.
+
+    coupling : rho(X Y) / gamma^2, nan where X or Y does not exist or is indefinite.
+    """
+
+    gamma: float
+    feasible: bool
+    reason: str
+    coupling: float = np.nan
+    X: np.ndarray | None = None
+    Y: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class GammaBracket:
+    """lower: largest gamma at which the test failed (and why); upper: the smallest at which it passed."""
+
+    lower: float
+    upper: GammaTest
+    limited_by: str
+    tests: int
+
+
+def direct_term_bound(plant: Plant) -> float:
+    """What no controller can go below at infinite frequency (Parrott's theorem on D11)."""
+    m2, p2 = plant.D12.shape[1], plant.D21.shape[0]
+    p, m = plant.D11.shape
+    top, left = plant.D11[:p - m2, :], plant.D11[:, :m - p2]
+    return float(max(la.norm(top, 2) if top.size else 0.0, la.norm(left, 2) if left.size else 0.0))
+
+
+def gamma_test(plant: Plant, gamma: float) -> GammaTest:
+    """The existence test at one gamma, for a plant in normal form."""
+    if gamma <= direct_term_bound(plant):
+        return GammaTest(gamma, False, "gamma is not above what D11 leaves at infinite frequency")
+    try:
+        x = solve_riccati(*_control_riccati(plant, gamma))
+        if x.X is None or not x.semidefinite:
+            return GammaTest(gamma, False, f"control Riccati equation: {x.reason or 'X is not positive semidefinite'}")
+        y = solve_riccati(*_filter_riccati(plant, gamma))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        return GammaTest(gamma, False, f"the Riccati equation is singular ({error})")
+    if y.X is None or not y.semidefinite:
+        return GammaTest(gamma, False, f"filter Riccati equation: {y.reason or 'Y is not positive semidefinite'}")
+    coupling = float(np.max(la.eigvals(x.X @ y.X).real, initial=0.0)) / gamma ** 2
+    reason = "" if coupling < 1 else "control and filter together: rho(X Y) is not below gamma^2"
+    return GammaTest(gamma, coupling < 1, reason, coupling, x.X, y.X)
+
+
+def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit: float = 1e10) -> GammaBracket:
+    """Bracket the optimum to a relative tolerance: decades first, then regula falsi on rho(X Y), else bisection.
+
+    ComputationError where even gamma = limit times the start fails.
+    """
+    floor = direct_term_bound(plant)
+    start = max(hint or _natural_gamma(plant), floor * (1 + 2 * tolerance), 1e-12)
+    search = _Search(plant, floor, start)
+    step, factor = start, 1.05 if hint else 4.0
+    while search.upper is None:
+        search.try_gamma(step)
+        step, factor = step * factor, factor ** 2
+        if step > limit * start:
+            raise ComputationError("no controller reaches any gamma", measured=f"gamma up to {step:.3g} tried",
+                                   cause=search.reason, next_step="check weights and scaling of the plant")
+    factor = 1.05 if hint else 4.0
+    while search.lower <= max(floor, 0.0) and search.upper.gamma > 1e-9 * start:
+        step = search.upper.gamma / factor
+        if step <= floor * (1 + tolerance):
+            step = floor * (1 + tolerance / 2)
+            if step == 0.0 or search.upper.gamma <= step * (1 + tolerance / 4):
+                break
+        search.try_gamma(step)
+        factor = min(factor ** 2, 1e3)
+    search.refine(tolerance, 1e-9 * start)
+    return GammaBracket(search.lower, search.upper, search.reason or "the direct term D11", search.tests)
+
+
+class _Search:
+    """State of the search for gamma: the bracket and the couplings seen so far."""
+
+    def __init__(self, plant: Plant, floor: float, start: float):
+        self.plant, self.lower, self.start = plant, floor, start
+        self.upper: GammaTest | None = None
+        self.below: GammaTest | None = None
+        self.second: GammaTest | None = None
+        self.reason = ""
+        self.tests = 0
+
+    def try_gamma(self, gamma: float) -> bool:
+        outcome = gamma_test(self.plant, gamma)
+        self.tests += 1
+        if outcome.feasible:
+            self.second, self.upper = self.upper, outcome
+        elif gamma >= self.lower:
+            self.lower, self.below, self.reason = gamma, outcome, outcome.reason
+        return outcome.feasible
+
+    def refine(self, tolerance: float, absolute: float) -> None:
+        """Shrink the bracket to the tolerance, or to an absolute size where the optimum is zero."""
+        for count in range(200):
+            assert self.upper is not None
+            low, high = self.lower, self.upper.gamma
+            if high - low <= max(tolerance * low, absolute):
+                return
+            middle = np.sqrt(low * high) if low > 0 and high > 2 * low else (low + high) / 2
+            guess = self._predicted()
+            # Every third test halves the bracket, so that a bad prediction costs at most a factor of 1.5.
+            if count % 3 == 2 or not low < guess < high:
+                self.try_gamma(middle)
+                continue
+            below, above = guess * (1 - 0.4 * tolerance), guess * (1 + 0.4 * tolerance)
+            if below > low and self.try_gamma(below):
+                continue
+            if self.upper.gamma > above > self.lower:
+                self.try_gamma(above)
+
+    def _predicted(self) -> float:
+        """Root of 1 / coupling = 1 by the secant through the two nearest couplings; nan without them."""
+        other = self.below if self.below is not None and np.isfinite(self.below.coupling) else self.second
+        if self.upper is None or other is None or not min(self.upper.coupling, other.coupling) > 0:
+            return np.nan
+        f_high, f_other = 1 / self.upper.coupling - 1, 1 / other.coupling - 1
+        if f_high == f_other:
+            return np.nan
+        return self.upper.gamma - f_high * (self.upper.gamma - other.gamma) / (f_high - f_other)
+
+
+def central_controller(form: NormalForm, test: GammaTest) -> StateSpace:
+    """The central (maximum entropy) controller of the original plant at a feasible gamma, state dimension n."""
+    assert test.X is not None and test.Y is not None
+    P, gamma, X, Y = form.plant, test.gamma, test.X, test.Y
+    m2, p2 = P.D12.shape[1], P.D21.shape[0]
+    p1, m1 = P.D11.shape[0] - m2, P.D11.shape[1] - p2
+    B, C = np.hstack([P.B1, P.B2]), np.vstack([P.C1, P.C2])
+    D1, R = _row_terms(P, gamma)
+    Dc, Rt = _column_terms(P, gamma)
+    F = -np.linalg.solve(R, D1.T @ P.C1 + B.T @ X)
+    L = -np.linalg.solve(Rt, Dc @ P.B1.T + C @ Y).T
+    F12, F2 = F[m1:m1 + p2], F[m1 + p2:]
+    L12, L2 = L[:, p1:p1 + m2], L[:, p1 + m2:]
+    D1111, D1112 = P.D11[:p1, :m1], P.D11[:p1, m1:]
+    D1121, D1122 = P.D11[p1:, :m1], P.D11[p1:, m1:]
+    D = -D1121 @ D1111.T @ np.linalg.solve(gamma ** 2 * np.eye(p1) - D1111 @ D1111.T, D1112) - D1122
+    inner = P.C2 + F12
+    # Z = inv(I - Y X / gamma^2); the controller's states are chosen so that Z meets only its input matrix.
+    B_hat = np.linalg.solve(np.eye(P.n) - Y @ X / gamma ** 2, (P.B2 + L12) @ D - L2)
+    C_hat = F2 - D @ inner
+    A_hat = P.A + B @ F - B_hat @ inner
+    return _restored(form, A_hat, B_hat, C_hat, D)
+
+
+def _restored(form: NormalForm, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> StateSpace:
+    """Undo the scalings of u and y, then the shift of D22: u = K (y - D22 u)."""
+    B, C, D = B @ form.T, form.S @ C, form.S @ D @ form.T
+    loop = np.eye(D.shape[0]) + D @ form.D22
+    if np.linalg.cond(loop) > 1e12:
+        raise ComputationError("the controller's loop around D22 is not well posed",
+                               measured=f"condition of I + D_K D22 is {np.linalg.cond(loop):.1e}",
+                               cause="a direct term from u to y that cancels the controller's own",
+                               next_step="put a low-pass filter in the plant's actuators or sensors")
+    M = np.linalg.inv(loop)
+    C, D = M @ C, M @ D
+    return StateSpace(A - B @ form.D22 @ C, B @ (np.eye(B.shape[1]) - form.D22 @ D), C, D, 0.0,
+                      form.plant.y, form.plant.u)
+
+
+def _row_terms(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray]:
+    """D1. = [D11 D12] and R = D1.' D1. - diag(gamma^2 I, 0)."""
+    D1 = np.hstack([P.D11, P.D12])
+    R = D1.T @ D1
+    w = P.D11.shape[1]
+    R[:w, :w] -= gamma ** 2 * np.eye(w)
+    return D1, R
+
+
+def _column_terms(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray]:
+    """D.1 = [D11; D21] and R~ = D.1 D.1' - diag(gamma^2 I, 0)."""
+    Dc, Rt = _row_terms(_dual(P), gamma)
+    return Dc.T, Rt
+
+
+def _dual(P: Plant) -> Plant:
+    return Plant(P.A.T, P.C1.T, P.C2.T, P.B1.T, P.B2.T, P.D11.T, P.D21.T, P.D12.T, P.D22.T, P.y, P.u)
+
+
+def _control_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(A, R, Q) of the equation of X."""
+    D1, R = _row_terms(P, gamma)
+    B = np.hstack([P.B1, P.B2])
+    solved = np.linalg.solve(R, np.hstack([D1.T @ P.C1, B.T]))
+    K, G = solved[:, :P.n], solved[:, P.n:]
+    quadratic, constant = -B @ G, _difference(P.C1.T @ P.C1, P.C1.T @ D1, K)
+    return _difference(P.A, B, K), (quadratic + quadratic.T) / 2, (constant + constant.T) / 2
+
+
+def _difference(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """a - b c with entries that are pure round-off set to zero: a balancing would take them for couplings."""
+    result = a - b @ c
+    noise = 8 * np.finfo(float).eps * (np.abs(a) + np.abs(b) @ np.abs(c))
+    return np.where(np.abs(result) <= noise, 0.0, result)
+
+
+def _filter_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(A', R, Q) of the equation of Y: the control equation of the transposed plant."""
+    return _control_riccati(_dual(P), gamma)
+
+
+def _natural_gamma(plant: Plant) -> float:
+    """A first gamma of the right order: the open channel w -> z, off the imaginary axis."""
+    size = plant.channel(plant.B1, plant.C1, plant.D11)
+    return float(la.norm(size)) if np.any(size) else 1.0

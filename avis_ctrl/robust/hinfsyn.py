@@ -1,0 +1,246 @@
+"""H-infinity synthesis: K with u = K y that makes ||F_l(P, K)|| small, and stabilises.
+
+The optimum is bracketed by the two-Riccati test; the controller is taken `backoff` above it, where its
+poles are still slow enough to implement. Every figure reported is measured on the closed loop of the
+plant as it was given, before any scaling or regularisation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any, Literal
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti import StateSpace, balance, discretise, hinf_norm, lft_lower
+from avis_ctrl.lti.norms import bilinear_to_continuous
+from avis_ctrl.robust.hinf_plant import (
+    RANK_TOLERANCE,
+    NormalForm,
+    Plant,
+    as_plant,
+    check_stabilisable,
+    normal_form,
+    rank_margins,
+    regularised,
+)
+from avis_ctrl.robust.hinf_riccati import GammaBracket, central_controller, find_gamma, gamma_test
+
+
+class Status(Enum):
+    """How a synthesis ended; the value is the diagnosis."""
+
+    OPTIMAL = "the optimum is bracketed and the closed loop was measured below its target"
+    REGULARISED = ("the problem is singular: small extra channels were added, and the closed loop of the plant "
+                   "without them was measured")
+    BACKED_OFF = ("the closed loop missed its target at the back-off asked for, and the target was raised: this usually "
+                  "means a badly scaled plant or a nearly singular D12 or D21")
+    SUBOPTIMAL = "a controller at the gamma asked for; the optimum was not sought"
+
+
+@dataclass(frozen=True)
+class Synthesis:
+    """Result of an H-infinity synthesis.
+
+    K : controller, inputs named as the plant's y, outputs as its u; positive feedback u = K y.
+    gamma : H-infinity norm of `closed_loop`, measured (relative accuracy 1e-6).
+    gamma_optimal_bounds : (largest gamma found infeasible, smallest found feasible). Where channels were added,
+        the optimum with them; the lower one is then 0, since nothing is proved about the plant without them.
+    fastest_pole : largest magnitude [rad/s] of a controller pole (of its continuous image when P is sampled).
+    limited_by : the condition that fails just below the optimum.
+    notes : what was done that the caller did not ask for, and what it cost.
+    """
+
+    K: StateSpace
+    gamma: float
+    gamma_optimal_bounds: tuple[float, float]
+    status: Status
+    closed_loop: StateSpace
+    fastest_pole: float
+    limited_by: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def abscissa(self) -> float:
+        """Largest real part of the closed loop's poles (largest magnitude minus 1 when sampled)."""
+        poles = self.closed_loop.poles()
+        return float(np.max(np.abs(poles) - 1 if self.closed_loop.dt else poles.real, initial=-np.inf))
+
+
+def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: float = 1e-3,
+            method: Literal["riccati", "lmi"] = "riccati", sample_rate_Hz: float | None = None,
+            gamma_hint: float | None = None) -> Synthesis:
+    """H-infinity optimal controller, `backoff` above the optimum.
+
+    Parameters
+    ----------
+    P : StateSpace (ours or python-control's) from (w, u) to (z, y), u and y last.
+    nmeas, ncon : number of measurements y and of controls u.
+    backoff : relative distance from the optimum at which the controller is taken.
+    tolerance : relative width to which the optimum is bracketed.
+    method : "riccati" (Glover and Doyle 1988), or "lmi" (Gahinet and Apkarian 1994) as a slow second opinion
+        on the optimum; the controller then comes from the Riccati formulas at the gamma which the LMI found.
+    sample_rate_Hz : the rate at which the controller is to run; its fastest pole is compared with half of it.
+    gamma_hint : a gamma expected to be near the optimum; shortens the search.
+
+    Raises
+    ------
+    InputError : wrong shapes, counts or options.
+    ComputationError : a mode that cannot be stabilised (named), or no gamma that can be reached.
+    """
+    P = as_plant(P, nmeas, ncon)
+    _check_options(backoff, tolerance, method, gamma_hint)
+    problem = _Problem.of(P, nmeas, ncon)
+    if method == "lmi":
+        from avis_ctrl.robust.hinf_lmi import lmi_gamma
+
+        gamma_hint = lmi_gamma(P, nmeas, ncon).upper
+    form, bracket, notes = problem.solve(tolerance, gamma_hint)
+    status = Status.REGULARISED if notes else Status.OPTIMAL
+    bounds = (0.0 if notes else bracket.lower, bracket.upper.gamma)
+    result, raised = problem.realise(form, bracket.upper.gamma, backoff)
+    if raised:
+        status, notes = Status.BACKED_OFF, (*notes, raised)
+    rate = _rate_note(result, sample_rate_Hz)
+    return replace(result, gamma_optimal_bounds=bounds, status=status, limited_by=bracket.limited_by,
+                   notes=(*notes, *rate))
+
+
+def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
+    """The central controller at a given gamma, without a search: for iterations that know what they want.
+
+    ComputationError where that gamma cannot be reached, with the condition that fails.
+    """
+    P = as_plant(P, nmeas, ncon)
+    if not (np.isfinite(gamma) and gamma > 0):
+        raise InputError("expected a positive number", field="gamma", value=gamma)
+    problem = _Problem.of(P, nmeas, ncon)
+    form, notes = problem.form(*problem.singular, 1e-5)
+    test = gamma_test(form.plant, gamma)
+    if not test.feasible:
+        raise ComputationError(f"no controller reaches gamma = {gamma:.6g}", cause=test.reason,
+                               measured=f"rho(XY)/gamma^2 = {test.coupling:.4g}", next_step="ask for a larger gamma")
+    result = problem.measured(central_controller(form, test))
+    return replace(result, gamma_optimal_bounds=(0.0, gamma), status=Status.SUBOPTIMAL, notes=notes)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The plant as given, its continuous balanced partition, and which of the assumptions fail."""
+
+    P: StateSpace
+    plant: Plant
+    singular: tuple[bool, bool]
+
+    @staticmethod
+    def of(P: StateSpace, nmeas: int, ncon: int) -> _Problem:
+        plant = Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon)
+        check_stabilisable(plant)
+        of_u, of_y = rank_margins(plant)
+        return _Problem(P, plant, (of_u < RANK_TOLERANCE, of_y < RANK_TOLERANCE))
+
+    def form(self, of_D12: bool, of_D21: bool, epsilon: float, of_states: bool = False) -> tuple[NormalForm,
+                                                                                                 tuple[str, ...]]:
+        """Normal form, regularised where asked, with a note that says so."""
+        if not (of_D12 or of_D21 or of_states):
+            return normal_form(self.plant), ()
+        said = []
+        if of_D12:
+            said.append(f"D12 has not full column rank: not every control {list(self.plant.u)} is penalised at infinite "
+                        "frequency")
+        if of_D21:
+            said.append(f"D21 has not full row rank: not every measurement {list(self.plant.y)} is corrupted at infinite "
+                        "frequency")
+        if of_states:
+            said.append("a zero of u -> z or w -> y lies on the imaginary axis")
+        extra = f"; extra channels of relative size {epsilon:.0e} were added for the synthesis alone"
+        plant = regularised(self.plant, epsilon, of_D12, of_D21, of_states)
+        return normal_form(plant), ("; ".join(said) + extra,)
+
+    def solve(self, tolerance: float, hint: float | None) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
+        """The bracket of the optimum; extra channels are shrunk until they cost less than a per cent."""
+        of_states = False
+        if not any(self.singular):
+            form, _ = self.form(False, False, 0.0)
+            try:
+                return form, find_gamma(form.plant, tolerance, hint), ()
+            except ComputationError:
+                of_states = True
+        best: tuple[NormalForm, GammaBracket, tuple[str, ...]] | None = None
+        failure: ComputationError | None = None
+        for epsilon in (1e-3, 1e-4, 1e-5, 1e-6):
+            form, notes = self.form(*self.singular, epsilon, of_states)
+            try:
+                bracket = find_gamma(form.plant, tolerance, hint)
+            except ComputationError as error:
+                if best is None and not of_states:
+                    of_states, failure = True, error
+                    continue
+                failure = error
+                continue
+            cost = np.inf if best is None else best[1].upper.gamma / bracket.upper.gamma - 1
+            said = "" if best is None else f"; gamma fell by {100 * cost:.2g} % over the last decade of that size"
+            best = form, bracket, (notes[0] + said,)
+            hint = bracket.upper.gamma
+            if cost < 0.01:
+                break
+        if best is None:
+            raise failure or ComputationError("no controller was found")
+        return best
+
+    def realise(self, form: NormalForm, gamma: float, backoff: float) -> tuple[Synthesis, str]:
+        """The first controller above the optimum whose measured closed loop keeps its promise."""
+        best: Synthesis | None = None
+        for k in range(12):
+            margin = backoff * 2.0 ** k if backoff > 0 else 1e-6 * 4.0 ** k
+            target = (1 + (margin if k or backoff > 0 else 0.0)) * gamma
+            test = gamma_test(form.plant, target)
+            if not test.feasible:
+                continue
+            try:
+                result = self.measured(central_controller(form, test))
+            except (ComputationError, np.linalg.LinAlgError):
+                continue
+            if best is None or result.gamma < best.gamma:
+                best = result
+            if result.gamma <= target * (1 + 1e-5):
+                said = f"the back-off was raised from {100 * backoff:.3g} % to {100 * margin:.3g} %" if k else ""
+                return result, said
+        if best is None or not np.isfinite(best.gamma):
+            raise ComputationError("no controller's closed loop was measured to be stable",
+                                   measured=f"gamma from {gamma:.4g} upwards tried",
+                                   cause="the plant is too badly scaled or conditioned for double precision",
+                                   next_step="rescale signals, or raise the smallest weights")
+        return best, f"no back-off was confirmed; the best measured is {best.gamma:.6g} against an optimum {gamma:.6g}"
+
+    def measured(self, K: StateSpace) -> Synthesis:
+        """K in the plant's time domain and names, with the closed loop it makes measured on the plant as given."""
+        fastest = float(np.max(np.abs(K.poles()), initial=0.0))
+        K = balance(K)
+        if self.P.dt:
+            K = discretise(K, self.P.dt, "tustin")
+        closed = lft_lower(self.P, K)
+        return Synthesis(K, hinf_norm(closed).gain, (0.0, np.inf), Status.OPTIMAL, closed, fastest, "")
+
+
+def _check_options(backoff: float, tolerance: float, method: str, gamma_hint: float | None) -> None:
+    if not (np.isfinite(backoff) and backoff >= 0):
+        raise InputError("expected a number of at least 0, such as 0.01", field="backoff", value=backoff)
+    if not 1e-8 <= tolerance < 1:
+        raise InputError("expected a relative width from 1e-8 to 1", field="tolerance", value=tolerance)
+    if method not in ("riccati", "lmi"):
+        raise InputError("expected 'riccati' or 'lmi'", field="method", value=method)
+    if gamma_hint is not None and not (np.isfinite(gamma_hint) and gamma_hint > 0):
+        raise InputError("expected a positive number or None", field="gamma_hint", value=gamma_hint)
+
+
+def _rate_note(result: Synthesis, sample_rate_Hz: float | None) -> tuple[str, ...]:
+    if sample_rate_Hz is None:
+        return ()
+    if not (np.isfinite(sample_rate_Hz) and sample_rate_Hz > 0):
+        raise InputError("expected a positive rate in hertz", field="sample_rate_Hz", value=sample_rate_Hz)
+    ratio = result.fastest_pole / (np.pi * sample_rate_Hz)
+    verdict = "slow enough" if ratio < 0.5 else "too fast: raise backoff or the sample rate, or reduce the controller"
+    return (f"fastest controller pole {result.fastest_pole:.4g} rad/s is {ratio:.2g} of half the sample rate: {verdict}",)
