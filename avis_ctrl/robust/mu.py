@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.robust.mu_lmi import Array
+from avis_ctrl.robust.mu_lower import lower_bound
 from avis_ctrl.robust.mu_upper import UpperBound, upper_bound
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
@@ -35,6 +36,19 @@ class MuUpper:
     D: Array
     D_w: Array
     G: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MuBounds(MuUpper):
+    """Both bounds of mu; a leading frequency axis where M had one.
+
+    lower : scalar or (n_omega,); 0 where no singular perturbation was found (mu itself may be 0).
+    delta : (.., n_w, n_z) with the block structure, ||delta|| = 1/lower and I - M delta singular. Where lower
+        is 0 there is none: None for a single M, entries NaN in a stack.
+    """
+
+    lower: float | Array
+    delta: Array | None
 
 
 def checked(M: Array, blocks: BlockStructure | Sequence[Block]) -> tuple[Array, BlockStructure]:
@@ -68,6 +82,34 @@ def mu_upper(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: floa
     with threadpool_limits(1):
         bound = upper_bound(stack[:, None], structure, tolerance)
         return _with_roots(bound, np.ndim(M) == 2)
+
+
+def mu(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: float = 1e-5) -> MuBounds:
+    """Bounds of the structured singular value with the scalings and the perturbation that prove them.
+
+    Parameters
+    ----------
+    M : (n_z, n_w) or (n_omega, n_z, n_w) complex; n_z = sum of the blocks' cols, n_w = sum of their rows.
+    tolerance : relative accuracy in upper^2 at which the scalings' optimisation stops.
+
+    The lower bound is local: the search may miss the least perturbation, what it returns is verified (smallest
+    singular value of I - M delta below 1e-9 (1 + ||M delta||)). Up to three full complex blocks the two meet.
+
+    Raises
+    ------
+    InputError : shapes that do not fit the blocks, entries that are not finite.
+    """
+    stack, structure = checked(M, blocks)
+    single = np.ndim(M) == 2
+    with threadpool_limits(1):
+        bound = upper_bound(stack[:, None], structure, tolerance)
+        found = lower_bound(stack, structure, bound.beta, bound.scalings)
+        upper = _with_roots(bound, single)
+    delta = np.where((found.beta > 0)[:, None, None], found.delta, np.nan)
+    if single:
+        lower = float(found.beta[0])
+        return MuBounds(upper.upper, upper.D, upper.D_w, upper.G, lower, delta[0] if lower else None)
+    return MuBounds(upper.upper, upper.D, upper.D_w, upper.G, found.beta, delta)
 
 
 def _with_roots(bound: UpperBound, single: bool) -> MuUpper:

@@ -1,0 +1,281 @@
+"""Lower bound of mu: perturbations that make I - M Delta singular, found by repeated linearisation.
+
+An eigenvalue of M Delta is followed to 1. To first order it is linear in Delta,
+
+    lambda(Delta) = y^H M Delta x / (y^H x) = sum_real g_i delta_i + sum_complex g_i delta_i
+                    + sum_full a_k^H Delta_k x_k / (y^H x),           a = M^H y,
+
+and the Delta of least norm k that makes this 1 is known in closed form: with the multiplier 1 + j t,
+
+    1/k = min over t of  sum_real |Re g_i + t Im g_i| + C sqrt(1 + t^2),
+    C   = sum_complex |g_i| + sum_full |a_k| |x_k| / |y^H x|,
+
+convex in t with kinks where a real delta leaves its bound. For complex blocks alone this is the power
+iteration of Packard, Fan and Doyle (Proc. 27th CDC, 1988); for real blocks alone it is Newton's method on
+det(I - M Delta) = 0 with the least ||Delta||. Starts come from the null vectors of the upper bound's LMI.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from avis_ctrl.robust.mu_lmi import Array, Scalings, dagger, residual
+from avis_ctrl.uncertainty.blocks import BlockStructure
+
+SINGULAR = 1e-9
+
+
+class _Step(NamedTuple):
+    """Least-norm solution of the linearised equation."""
+
+    k: Array  # (B,) norm of Delta
+    phase: Array  # (B,) unit complex number that complex blocks are turned to
+    real: Array  # (B, m) values of the real scalars
+
+
+def _least_norm(g: Array, C: Array, t_fixed: Array | None = None) -> _Step:
+    """min ||Delta|| so that the linearised eigenvalue is 1; g (B, m) of the real scalars, C (B,) of the others.
+
+    `t_fixed` (B,) prescribes the multiplier (a free frequency does); the imaginary part is then left to it.
+    """
+    a, b = g.real, g.imag
+    batch, m = g.shape
+
+    def height(t: Array) -> Array:
+        return np.sum(np.abs(a[:, None] + t[..., None] * b[:, None]), axis=2) + C[:, None] * np.sqrt(1 + t ** 2)
+    if t_fixed is not None:
+        t, kink = t_fixed[:, None], np.full((batch, 1), -1)
+    else:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            kinks = np.where(np.abs(b) > 1e-12 * np.abs(a), -a / b, 0.0)
+        order = np.argsort(kinks, axis=1)
+        sorted_kinks = np.take_along_axis(kinks, order, axis=1)
+        edges = np.concatenate([np.full((batch, 1), -np.inf), sorted_kinks, np.full((batch, 1), np.inf)], axis=1)
+        low, high = edges[:, :-1], edges[:, 1:]
+        below, above = np.isinf(low), np.isinf(high)
+        low_end, high_end = np.where(below, 0.0, low), np.where(above, 0.0, high)
+        middle = np.where(below, high_end - 1 - np.abs(high_end),
+                          np.where(above, low_end + 1 + np.abs(low_end), (low_end + high_end) / 2))
+        slope = np.sum(np.sign(a[:, None] + middle[..., None] * b[:, None]) * b[:, None], axis=2)
+        inner = np.maximum(C[:, None] ** 2 - slope ** 2, 0.0)
+        flat = np.where(inner > 0, -slope / np.sqrt(np.maximum(inner, 1e-300)), 0.0)
+        # Kinks first: where an interval's own minimum is clipped to its end, the kink is what is meant.
+        t = np.concatenate([sorted_kinks, np.clip(flat, low, high), np.zeros((batch, 1))], axis=1)
+        kink = np.concatenate([order, np.full((batch, m + 2), -1)], axis=1)
+    best = np.argmin(height(t), axis=1)[:, None]
+    t, kink = np.take_along_axis(t, best, axis=1), np.take_along_axis(kink, best, axis=1)[:, 0]
+    k = 1.0 / np.maximum(height(t)[:, 0], 1e-12)
+    phase = ((1 + 1j * t) / np.sqrt(1 + t ** 2))[:, 0]
+    real = k[:, None] * np.where(a + t * b >= 0, 1.0, -1.0)
+    inside = np.flatnonzero(kink >= 0)
+    if inside.size:
+        j = kink[inside]
+        turned = np.conj(phase[inside])[:, None] * g[inside]
+        real[inside, j] = 0.0
+        rest = -np.sum(turned * real[inside], axis=1).imag - phase[inside].imag
+        slope_j = turned[np.arange(inside.size), j].imag
+        ratio = rest / np.where(slope_j == 0, 1.0, slope_j)
+        real[inside, j] = np.where(slope_j == 0, 0.0, np.clip(ratio, -k[inside], k[inside]))
+    return _Step(k, phase, real)
+
+
+def _eigenpair(A: Array, near: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Right and left eigenvectors x, y (B, n) of A for the eigenvalue nearest to `near`, by inverse iteration."""
+    batch, n = A.shape[:2]
+    shift = near * (1 + 1e-9 * (1 + 0.7j)) + 1e-14 * np.linalg.norm(A, axis=(1, 2))
+    P = np.linalg.inv(A - shift[:, None, None] * np.eye(n) + 1e-300)
+    P /= np.maximum(np.linalg.norm(P, axis=(1, 2)), 1e-300)[:, None, None]
+    P = P @ P
+    P /= np.maximum(np.linalg.norm(P, axis=(1, 2)), 1e-300)[:, None, None]
+    start = rng.standard_normal((2, batch, n)) + 1j * rng.standard_normal((2, batch, n))
+    x, y = (P @ start[0][..., None])[..., 0], (dagger(P) @ start[1][..., None])[..., 0]
+    return (x / np.maximum(np.linalg.norm(x, axis=1), 1e-300)[:, None],
+            y / np.maximum(np.linalg.norm(y, axis=1), 1e-300)[:, None])
+
+
+class Linearised(NamedTuple):
+    """The next Delta, the norm predicted for it, and the move of a free frequency (0 where it is fixed)."""
+
+    delta: Array
+    k: Array
+    shift: Array
+
+
+def next_delta(M: Array, delta: Array, structure: BlockStructure, rng: np.random.Generator, near: Array,
+               slope: Array | None = None) -> Linearised:
+    """One step: M (B, n_z, n_w), delta (B, n_w, n_z). `slope` dM/d omega frees the frequency as well."""
+    x, y = _eigenpair(M @ delta, near, rng)
+    e = np.sum(np.conj(y) * x, axis=1)
+    e = np.where(np.abs(e) < 1e-12, 1e-12, e)
+    a = (dagger(M) @ y[..., None])[..., 0]
+    places = list(structure.slices())
+    g = [np.zeros_like(e) if block.kind == "full" else np.sum(np.conj(a[:, w]) * x[:, z], axis=1) / e
+         for block, w, z in places]
+    size = [np.linalg.norm(a[:, w], axis=1) * np.linalg.norm(x[:, z], axis=1) for _, w, z in places]
+    C = np.zeros(M.shape[0])
+    for (block, _, _), gk, sk in zip(places, g, size, strict=True):
+        C += sk / np.abs(e) if block.kind == "full" else np.abs(gk) if block.kind == "complex" else 0.0
+    real = [gk for (block, _, _), gk in zip(places, g, strict=True) if block.kind == "real"]
+    g_real = np.stack(real, axis=1) if real else np.zeros((M.shape[0], 0), complex)
+    q = None
+    if slope is not None:
+        q = np.einsum("bi,bij,bjk,bk->b", np.conj(y), slope, delta, x) / e
+        # The multiplier must be orthogonal to what the frequency can do by itself.
+        across = 1j * q * np.where(q.imag > 0, -1.0, 1.0)
+        t_fixed = across.imag / np.maximum(across.real, 1e-9 * np.abs(q) + 1e-300)
+        step = _least_norm(g_real, C, t_fixed)
+    else:
+        step = _least_norm(g_real, C)
+    new = np.zeros_like(delta)
+    place = 0
+    for (block, w, z), gk, sk in zip(places, g, size, strict=True):
+        if block.kind == "full":
+            turn = step.k * step.phase * e / np.abs(e) / np.where(sk > 0, sk, 1.0)
+            new[:, w, z] = turn[:, None, None] * a[:, w, None] * np.conj(x[:, None, z])
+            continue
+        if block.kind == "real":
+            value, place = step.real[:, place], place + 1
+        else:
+            value = step.k * step.phase * np.conj(gk) / np.where(np.abs(gk) > 0, np.abs(gk), 1.0)
+        new[:, w, z] = value[:, None, None] * np.eye(block.rows)
+    shift = np.zeros(M.shape[0])
+    if q is not None:
+        made = np.einsum("bi,bij,bj->b", np.conj(a), new, x) / e
+        shift = np.real(np.conj(q) * (1 - made)) / np.maximum(np.abs(q) ** 2, 1e-300)
+    return Linearised(new, step.k, shift)
+
+
+def block_norm(delta: Array, structure: BlockStructure) -> Array:
+    """Largest block norm (B,) of Delta (B, n_w, n_z)."""
+    return np.max(np.stack([np.linalg.norm(delta[:, w, z], ord=2, axis=(1, 2)) if block.kind == "full"
+                            else np.abs(delta[:, w.start, z.start]) for block, w, z in structure.slices()]), axis=0)
+
+
+def singularity(M: Array, delta: Array) -> Array:
+    """Smallest singular value of I - M Delta against 1 + ||M Delta|| (B,): 0 where the loop is singular."""
+    A = M @ delta
+    return (np.linalg.svd(np.eye(A.shape[-1]) - A, compute_uv=False)[..., -1]
+            / (1 + np.linalg.norm(A, ord=2, axis=(-2, -1))))
+
+
+def _complex_part(structure: BlockStructure) -> Array:
+    mask = np.zeros((structure.n_w, structure.n_z))
+    for block, w, z in structure.slices():
+        mask[w, z] = block.kind != "real"
+    return mask
+
+
+def made_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
+    """Delta with its complex blocks turned and scaled together so that I - M Delta is exactly singular.
+
+    Where there are none, the real ones are scaled (exact at frequencies where M Delta has a real eigenvalue).
+    Entries become inf where it is impossible.
+    """
+    mask = _complex_part(structure)
+    n_z = structure.n_z
+    real, rest = delta * (1 - mask), delta * mask
+    free = not np.any(mask)
+    if free:
+        real, rest = np.zeros_like(delta), delta
+    open_loop = np.eye(n_z) - M @ real
+    with np.errstate(all="ignore"):
+        regular = np.linalg.cond(open_loop) < 1e13
+        inner = np.linalg.solve(np.where(regular[:, None, None], open_loop, np.eye(n_z)), M) @ rest
+        values = np.linalg.eigvals(inner)
+        values = np.where(np.abs(values) > 1e-13, 1 / np.where(values == 0, 1, values), np.inf)
+        distance = np.where(np.isfinite(values), np.abs(values - 1), np.inf)
+        factor = np.take_along_axis(values, np.argmin(distance, axis=1)[:, None], axis=1)[:, 0]
+        factor = factor.real.astype(complex) if free else factor
+        factor = np.where(regular, factor, 1.0)
+        return real + factor[:, None, None] * rest
+
+
+def starts(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure, count: int,
+           rng: np.random.Generator) -> Array:
+    """First perturbations (count, B, n_w, n_z) of norm 1/beta from the null vectors w of the upper bound's LMI."""
+    batch = M.shape[0]
+    F = residual(M[:, None], scalings, beta ** 2, np.ones(structure.n_w, bool))[:, 0]
+    values, vectors = np.linalg.eigh(scalings.X_w)
+    root = vectors / np.sqrt(np.maximum(values, 1e-300))[:, None, :]
+    _, null = np.linalg.eigh(dagger(root) @ F @ root)
+    null = root @ null
+    made = []
+    for k in range(count):
+        few = min(3, structure.n_w)
+        mix = rng.standard_normal((batch, few)) + 1j * rng.standard_normal((batch, few))
+        w = null[:, :, k] if k < few else np.einsum("bik,bk->bi", null[:, :, :few], mix)
+        made.append(_aligned(w, (M @ w[..., None])[..., 0], structure) / beta[:, None, None])
+    return np.stack(made)
+
+
+def _aligned(w: Array, z: Array, structure: BlockStructure) -> Array:
+    """Delta of norm 1 that comes nearest to w = Delta z, block by block."""
+    delta = np.zeros((w.shape[0], structure.n_w, structure.n_z), complex)
+    for block, iw, iz in structure.slices():
+        wk, zk = w[:, iw], z[:, iz]
+        if block.kind == "full":
+            size = np.linalg.norm(wk, axis=1) * np.linalg.norm(zk, axis=1)
+            delta[:, iw, iz] = wk[:, :, None] * np.conj(zk[:, None, :]) / np.where(size > 0, size, 1)[:, None, None]
+            continue
+        product = np.sum(np.conj(zk) * wk, axis=1)
+        if block.kind == "real":
+            value = np.clip(product.real / np.maximum(np.sum(np.abs(zk) ** 2, axis=1), 1e-300), -1, 1).astype(complex)
+        else:
+            value = np.where(np.abs(product) > 0, product / np.maximum(np.abs(product), 1e-300), 1.0)
+        delta[:, iw, iz] = value[:, None, None] * np.eye(block.rows)
+    return delta
+
+
+class LowerBound(NamedTuple):
+    """beta (B,) with delta (B, n_w, n_z): ||delta|| = 1/beta and I - M delta singular; beta = 0, delta = 0 if none."""
+
+    beta: Array
+    delta: Array
+
+
+def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Scalings, *, enough: float = 0.99,
+                seed: int = 0) -> LowerBound:
+    """Best verified perturbation for each M (B, n_z, n_w), from starts at the null vectors of the upper bound.
+
+    Where three starts do not reach `enough` times the upper bound, more are made, with shorter steps too.
+    """
+    rng = np.random.default_rng(seed)
+    batch = M.shape[0]
+    best = LowerBound(np.zeros(batch), np.zeros((batch, structure.n_w, structure.n_z), complex))
+    for count, iterations, damping in ((3, 20, 0.0), (6, 30, 0.0), (6, 40, 0.5)):
+        live = np.flatnonzero((upper > 0) & (best.beta < enough * upper))
+        if live.size:
+            _search(best, M, structure, upper, scalings, live, count, iterations, damping, rng)
+    return best
+
+
+def _search(best: LowerBound, M: Array, structure: BlockStructure, upper: Array, scalings: Scalings, live: Array,
+            count: int, iterations: int, damping: float, rng: np.random.Generator) -> None:
+    size = upper[live]
+    unit = M[live] / size[:, None, None]
+    part = Scalings(scalings.X_z[live], scalings.X_w[live], scalings.G[live] / size[:, None, None])
+    near = np.ones(live.size, complex)
+    for delta in starts(unit, part, np.ones(live.size), structure, count, rng):
+        for sweep in range(iterations):
+            new = next_delta(unit, delta, structure, rng, near).delta
+            delta = damping * delta + (1 - damping) * new
+            if sweep % 5 == 4:
+                _keep(best, live, size, unit, new, structure)
+
+
+def _keep(best: LowerBound, live: Array, size: Array, unit: Array, delta: Array,
+          structure: BlockStructure) -> None:
+    """Enter into `best` what is verified and better."""
+    exact = made_singular(unit, delta, structure)
+    for candidate in (exact, delta) if not np.any(_complex_part(structure)) else (exact,):
+        finite = np.all(np.isfinite(candidate), axis=(1, 2))
+        candidate = np.where(finite[:, None, None], candidate, 0.0)
+        norm = block_norm(candidate, structure)
+        good = finite & (norm > 0)
+        good[good] &= singularity(unit[good], candidate[good]) < SINGULAR
+        value = np.where(good, size / np.where(good, norm, 1.0), 0.0)
+        better = value > best.beta[live]
+        best.beta[live[better]] = value[better]
+        best.delta[live[better]] = candidate[better] / size[better, None, None]
