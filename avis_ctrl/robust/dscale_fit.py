@@ -69,7 +69,7 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
     if order == 0 or error <= tolerance:
         return MagnitudeFit(best, error, error if order == 0 else 0.0, 0)
     unit = float(np.exp(np.mean(np.log(omega))))
-    problem = _Feasibility((omega / unit) ** 2, 2 * target, weight, order, _initial_roots(omega / unit, target, order))
+    problem = _Feasibility((omega / unit) ** 2, 2 * target, weight, order, initial_roots(omega / unit, target, order))
     lower, solves = 0.0, 0
     while error - lower > tolerance and solves < 40:
         level = (lower + error) / 2
@@ -119,7 +119,7 @@ def _constant_fit(target: np.ndarray, weight: np.ndarray) -> tuple[ScalarScaling
     return ScalarScaling(np.array([c])), float(np.max(weight * np.abs(target - c)))
 
 
-def _initial_roots(omega: np.ndarray, target: np.ndarray, order: int) -> np.ndarray:
+def initial_roots(omega: np.ndarray, target: np.ndarray, order: int) -> np.ndarray:
     """Roots -y_i of the first basis, spread over the band in proportion to how much the target varies."""
     position = np.log(omega)
     arrange = np.argsort(position)
@@ -136,13 +136,13 @@ class _Feasibility:
                  poles: np.ndarray | None = None, ratio: np.ndarray | None = None):
         self.y, self.log_target, self.weight, self.order = y, log_target, weight, order
         self.poles = zeros if poles is None else poles
-        self.e_p, self.e_q = _basis_scale(zeros), _basis_scale(self.poles)
+        self.e_p, self.e_q = basis_scale(zeros), basis_scale(self.poles)
         log_p, log_q = (np.sum(np.log(y[:, None] + np.abs(r)), axis=1) for r in (zeros, self.poles))
         # In the scaled variables P = p / prod, Q = q / prod the target reads T' = T prod_q / prod_p.
         self.shift = float(np.mean(log_target + log_q - log_p))
         self.log_scaled_target = log_target + log_q - log_p - self.shift
-        self.rows_p, self.gram_p = _value_rows(y, log_p, self.e_p)
-        self.rows_q, self.gram_q = _value_rows(y, log_q, self.e_q)
+        self.rows_p, self.gram_p = half_line_rows(y, log_p, self.e_p)
+        self.rows_q, self.gram_q = half_line_rows(y, log_q, self.e_q)
         self.centre = np.ones(y.size) if ratio is None else ratio
 
     def recentred(self, zeros: np.ndarray, poles: np.ndarray) -> _Feasibility:
@@ -168,22 +168,22 @@ class _Feasibility:
         bound = np.concatenate([margin_q - inverse_t[:, 0] * margin_p, margin_p - inverse_t[:, 0] * margin_q])
         normal = np.concatenate([np.zeros(n_p), np.mean(Q, axis=0), [0.0]])[None, :]
         cones: list[Any] = [clarabel.ZeroConeT(1), clarabel.NonnegativeConeT(bound.size)]
-        cones += [_gram_cone(size) for size in (*self.gram_p, *self.gram_q) if size]
+        cones += [gram_cone(size) for size in (*self.gram_p, *self.gram_q) if size]
         A = sp.csc_matrix(np.vstack([normal, upper, lower, -np.eye(n_p + n_q, n_p + n_q + 1)]))
         b = np.concatenate([[1.0], bound, np.zeros(n_p + n_q)])
-        x = _maximise_last(A, b, cones)
+        x = maximise_last(A, b, cones)
         if x is None or x[-1] <= 0:
             return None
-        p = _coefficients(x[:n_p], self.gram_p, self.e_p) * np.exp(self.shift)
-        return p, _coefficients(x[n_p:-1], self.gram_q, self.e_q)
+        p = half_line_coefficients(x[:n_p], self.gram_p, self.e_p) * np.exp(self.shift)
+        return p, half_line_coefficients(x[n_p:-1], self.gram_q, self.e_q)
 
 
-def _basis_scale(roots: np.ndarray) -> np.ndarray:
+def basis_scale(roots: np.ndarray) -> np.ndarray:
     """Coefficients e_k of prod(y + |y_i|), ascending."""
-    return np.poly(-np.abs(roots)).real[::-1]
+    return np.atleast_1d(np.poly(-np.abs(roots))).real[::-1]
 
 
-def _value_rows(y: np.ndarray, log_scale: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+def half_line_rows(y: np.ndarray, log_scale: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
     """Rows that map the stacked Gram vectors to p(y) / prod(y + |y_i|), and the Gram sizes."""
     degree = e.size - 1
     sizes = (degree // 2 + 1, (degree + 1) // 2)
@@ -192,34 +192,34 @@ def _value_rows(y: np.ndarray, log_scale: np.ndarray, e: np.ndarray) -> tuple[np
         if size:
             power = np.arange(size) + odd / 2
             m = np.exp(0.5 * np.log(e[odd::2][:size]) + np.log(y)[:, None] * power - 0.5 * log_scale[:, None])
-            i, j = _triangle(size)
+            i, j = triangle(size)
             rows.append(m[:, i] * m[:, j] * np.where(i == j, 1.0, np.sqrt(2.0)))
     return np.hstack(rows), sizes
 
 
-def _coefficients(x: np.ndarray, sizes: tuple[int, int], e: np.ndarray) -> np.ndarray:
+def half_line_coefficients(x: np.ndarray, sizes: tuple[int, int], e: np.ndarray) -> np.ndarray:
     """Coefficients of s0(y) + y s1(y) + margin, ascending, from the stacked Gram vectors."""
     coefficients = POSITIVITY_MARGIN * e
     start = 0
     for odd, size in enumerate(sizes):
         scale = np.sqrt(e[odd::2][:size])
-        for i, j in zip(*_triangle(size), strict=True):
+        for i, j in zip(*triangle(size), strict=True):
             coefficients[i + j + odd] += x[start] * scale[i] * scale[j] * (1.0 if i == j else np.sqrt(2.0))
             start += 1
     return coefficients
 
 
-def _triangle(size: int) -> tuple[np.ndarray, np.ndarray]:
+def triangle(size: int) -> tuple[np.ndarray, np.ndarray]:
     """Upper triangle, column by column: the solver's order of a symmetric matrix."""
     j, i = np.tril_indices(size)
     return i, j
 
 
-def _gram_cone(size: int) -> Any:
+def gram_cone(size: int) -> Any:
     return clarabel.NonnegativeConeT(1) if size == 1 else clarabel.PSDTriangleConeT(size)
 
 
-def _maximise_last(A: sp.csc_matrix, b: np.ndarray, cones: list[Any]) -> np.ndarray | None:
+def maximise_last(A: sp.csc_matrix, b: np.ndarray, cones: list[Any]) -> np.ndarray | None:
     """Solution of max x[-1] subject to b - A x in the cones; None where the solver stops without one."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
@@ -234,13 +234,14 @@ def _maximise_last(A: sp.csc_matrix, b: np.ndarray, cones: list[Any]) -> np.ndar
 
 def _spectral_factor(p: np.ndarray, q: np.ndarray, unit: float) -> ScalarScaling:
     """d(s) with |d(j omega)|^2 = p / q at y = (omega / unit)^2, all roots in the left half plane."""
-    roots = []
-    for polynomial in (p, q):
-        y = np.roots(polynomial[::-1])
-        if np.any((np.abs(y.imag) <= 1e-12 * np.abs(y)) & (y.real >= 0)):
-            raise ComputationError("a positive polynomial came out of factorisation with a root on the axis",
-                                   measured=f"y = {y[y.real >= 0][0]:.3g}",
-                                   cause="frequencies spanning too many decades",
-                                   next_step="a lower order or a narrower band")
-        roots.append(-np.sqrt(-y) * unit)
-    return ScalarScaling.from_roots(float(np.sqrt(p[-1] / q[-1])), *roots)
+    return ScalarScaling.from_roots(float(np.sqrt(p[-1] / q[-1])), stable_roots(p) * unit, stable_roots(q) * unit)
+
+
+def stable_roots(polynomial: np.ndarray) -> np.ndarray:
+    """The left half plane roots s of p(-s^2), for p ascending in y = -s^2 and positive on y >= 0."""
+    y = np.roots(polynomial[::-1])
+    if np.any((np.abs(y.imag) <= 1e-12 * np.abs(y)) & (y.real >= 0)):
+        raise ComputationError("a positive polynomial came out of factorisation with a root on the axis",
+                               measured=f"y = {y[y.real >= 0][0]:.3g}", cause="frequencies spanning too many decades",
+                               next_step="a lower order or a narrower band")
+    return -np.sqrt(-y.astype(complex))

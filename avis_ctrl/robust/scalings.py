@@ -48,7 +48,7 @@ class ScalarScaling:
                    poles: Sequence[complex] | np.ndarray) -> ScalarScaling:
         """From the gain at infinite frequency and as many zeros as poles, conjugates included."""
         if len(zeros) != len(poles) or g <= 0:
-            raise InputError(f"expected a positive gain and as many zeros as poles, got {g}, {len(zeros)}, {len(poles)}")
+            raise InputError(f"expected g > 0 and as many zeros as poles, not {g}, {len(zeros)} and {len(poles)}")
         return ScalarScaling(np.concatenate([[np.log(g)], _pair(np.asarray(zeros, complex)),
                                              _pair(np.asarray(poles, complex))]))
 
@@ -250,9 +250,14 @@ class Scalings:
     @staticmethod
     def from_dicts(structure: BlockStructure, items: Sequence[dict[str, Any]]) -> Scalings:
         """Inverse of `as_dicts`."""
-        return Scalings(structure, tuple(
-            ScalarScaling(np.array(item["theta"])) if "theta" in item else
-            MatrixScaling(StateSpace(*(np.array(item[key], float) for key in "ABCD"))) for item in items))
+        def part(item: dict[str, Any]) -> Part:
+            if "theta" in item:
+                return ScalarScaling(np.array(item["theta"]))
+            D = np.array(item["D"], float)
+            n = len(item["A"])
+            return MatrixScaling(StateSpace(np.reshape(item["A"], (n, n)), np.reshape(item["B"], (n, D.shape[1])),
+                                            np.reshape(item["C"], (D.shape[0], n)), D))
+        return Scalings(structure, tuple(part(item) for item in items))
 
     def _pairs(self) -> list[tuple[Part, Block]]:
         return list(zip(self.parts, self.structure.blocks, strict=True))
@@ -266,5 +271,5 @@ class Scalings:
 
 def _side_by_side(systems: Sequence[StateSpace]) -> StateSpace:
     """Block-diagonal stack with numbered signals; the names of the parts may repeat."""
-    A, B, C, D = (la.block_diag(*(getattr(s, key) for s in systems)) for key in "ABCD")
-    return StateSpace(A, B, C, D)
+    return StateSpace(la.block_diag(*(s.A for s in systems)), la.block_diag(*(s.B for s in systems)),
+                      la.block_diag(*(s.C for s in systems)), la.block_diag(*(s.D for s in systems)))
