@@ -85,6 +85,22 @@ class GeneralizedPlant:
             return self.P.select(list(outputs), list(inputs))
         return lft_lower(self.P, K)
 
+    def restricted(self, w: Sequence[str], z: Sequence[str]) -> GeneralizedPlant:
+        """The same connection with fewer performance signals; parts that no output depends on are left out."""
+        if unknown := [name for name in (*w, *z) if name not in (*self.w, *self.z)]:
+            raise InputError(f"the performance signals are {[*self.w, *self.z]}", field="w, z", value=unknown)
+        w_delta = self.P.inputs[:self.blocks.n_w]
+        z_delta = self.P.outputs[:self.blocks.n_z]
+        parts = _contributing(self.parts, [*z_delta, *z, *self.y])
+        inputs, outputs = [*w_delta, *w, *self.u], [*z_delta, *z, *self.y]
+        # An input that is left out is at rest.
+        absent = [name for name in self.w if name not in w]
+        systems = {p.name: p.system.select(None, [n for n in p.system.inputs if n not in absent]) for p in parts}
+        kept = {name for part in parts for name in (*part.system.inputs, *part.system.outputs)}
+        signals = tuple(s for s in self.signals if s.name in kept and s.name not in absent)
+        return GeneralizedPlant(connect(systems, inputs, outputs), self.blocks, tuple(w), tuple(z), self.u, self.y,
+                                signals, parts, self.units)
+
     def as_dict(self) -> dict[str, Any]:
         """The contract's avis-plant JSON form."""
         P = self.P
@@ -101,6 +117,19 @@ class Part:
     name: str
     kind: str  # "rig", "actuator", "sensor", "weight", "uncertainty", "allocation", ...
     system: StateSpace
+
+
+def _contributing(parts: Sequence[Part], outputs: Sequence[str]) -> tuple[Part, ...]:
+    """The parts that the outputs depend on, directly or through others, in their order."""
+    maker = {name: part for part in parts for name in part.system.outputs}
+    needed: set[str] = set()
+    frontier = [name for name in outputs if name in maker]
+    while frontier:
+        part = maker[frontier.pop()]
+        if part.name not in needed:
+            needed.add(part.name)
+            frontier += [name for name in part.system.inputs if name in maker]
+    return tuple(part for part in parts if part.name in needed)
 
 
 class Diagram:

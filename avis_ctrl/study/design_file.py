@@ -1,0 +1,211 @@
+"""Design files: TOML that names a rig, the coordinates kept, weights, uncertainty, controllers and checks.
+
+Every key carries its unit in its name. Whatever is wrong is one line that names file, field, value and what
+was expected; a misspelt key is answered with the nearest one.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.file_errors import first_complaint
+from avis_ctrl.rigs.floor_spectrum import shipped_spectra
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Percent = Annotated[float, Field(gt=0, lt=100)]
+Band = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+Axis = Literal["x", "y", "z", "phi_x", "phi_y", "phi_z"]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class LoopSection(_Section):
+    """What lies between the controller and the rig, beyond what the rig file says."""
+
+    amplifier_corner_Hz: Positive = 300.0
+    integrator_corner_Hz: Positive = 0.1
+    pade_order: Annotated[int, Field(ge=1, le=6)] = 2
+
+
+class ChainUncertainty(_Section):
+    """Relative uncertainty of a chain: low at low frequency, 100 % at the crossover, high above."""
+
+    low_percent: Percent
+    crossover_Hz: Positive
+    high_percent: Annotated[float, Field(gt=100)]
+
+
+class UncertaintySection(_Section):
+    parameters_percent: dict[str, Percent] = {}
+    parameters_absolute: dict[str, Positive] = {}
+    actuator_chains: ChainUncertainty | None = None
+    sensor_chains: ChainUncertainty | None = None
+
+    def of(self, rig: Rig) -> list[UncertainParameter]:
+        """The uncertain parameters, wildcards ("isolator*.k_z") expanded over the rig's names."""
+        known = list(rig.parameters())
+        found: dict[str, UncertainParameter] = {}
+        for section, absolute in ((self.parameters_percent, False), (self.parameters_absolute, True)):
+            for pattern, spread in section.items():
+                names = [name for name in known if fnmatchcase(name, pattern)]
+                field = f"uncertainty.parameters_{'absolute' if absolute else 'percent'}"
+                if not names:
+                    raise InputError(f"the rig has no parameter that matches; it has {', '.join(known)}",
+                                     field=field, value=pattern)
+                for name in names:
+                    if name in found:
+                        raise InputError(f"{name} is listed twice", field=field, value=pattern)
+                    found[name] = UncertainParameter(name, spread if absolute else spread / 100, absolute)
+        return list(found.values())
+
+
+class TransmissibilitySection(_Section):
+    """The bound that synthesis is asked for: peak_dB everywhere, band_dB inside band_Hz."""
+
+    peak_dB: float
+    band_dB: float
+    band_Hz: Band
+    transition_octaves: Positive = 0.5
+    tolerance_dB: Positive = 0.5
+
+    @model_validator(mode="after")
+    def _ordered(self) -> TransmissibilitySection:
+        if self.band_Hz[0] >= self.band_Hz[1]:
+            raise ValueError(f"band_Hz must rise, got {self.band_Hz}")
+        if self.band_dB >= self.peak_dB:
+            raise ValueError(f"band_dB must lie below peak_dB, got {self.band_dB} and {self.peak_dB}")
+        return self
+
+
+class EffortSection(_Section):
+    """The floor velocity that may use the whole drive up to the bandwidth; above it the drive is rolled off."""
+
+    floor_velocity_m_per_s: Positive
+    bandwidth_Hz: Positive
+    reduction: Annotated[float, Field(gt=1)] = 30.0
+
+
+class ComplianceSection(_Section):
+    """Largest displacement per force on the payload."""
+
+    limit_m_per_N: Positive
+
+
+class FloorSection(_Section):
+    """Floor motion of the site: a measured shape, scaled to a velocity r.m.s. in a band."""
+
+    spectrum: str = "kamioka_quiet"
+    velocity_rms_m_per_s: Positive | None = None
+    band_Hz: Band = [0.5, 60.0]
+
+    @model_validator(mode="after")
+    def _known(self) -> FloorSection:
+        if self.spectrum not in shipped_spectra():
+            raise ValueError(f"no spectrum {self.spectrum!r}; there are {', '.join(shipped_spectra())}")
+        return self
+
+
+class SynthesisSection(_Section):
+    max_iterations: Annotated[int, Field(ge=1, le=50)] = 8
+    time_limit_s: Positive = 20.0
+    backoff_percent: Annotated[float, Field(ge=0, le=50)] = 1.0
+    reduction_cost_percent: NotNegative = 1.0
+    target_mu: Positive | None = None
+
+
+class SkyhookSection(_Section):
+    tilt_corner_Hz: Band = [0.02, 1.0]
+    roll_off_Hz: Band = [30.0, 400.0]
+
+
+class SimulationSection(_Section):
+    duration_s: Annotated[float, Field(ge=10, le=3600)] = 60.0
+    random_plants: Annotated[int, Field(ge=0, le=500)] = 20
+    seed: int = 1
+
+
+Quantity = Literal["mu_upper", "mu_gap_percent", "worst_case_peak_transmissibility_dB",
+                   "worst_case_band_transmissibility_dB", "passive_peak_transmissibility_dB",
+                   "advantage_over_skyhook_dB", "fastest_controller_pole_Hz"]
+UNITS: dict[str, str] = {"mu_upper": "", "mu_gap_percent": "%", "fastest_controller_pole_Hz": "Hz"}
+
+
+class RequirementSection(_Section):
+    """A line of the verdict table: a quantity of the mu controller and its limit."""
+
+    quantity: Quantity
+    at_most: float | None = None
+    at_least: float | None = None
+
+    @model_validator(mode="after")
+    def _one_limit(self) -> RequirementSection:
+        if (self.at_most is None) == (self.at_least is None):
+            raise ValueError("give exactly one of at_most and at_least")
+        return self
+
+    @property
+    def unit(self) -> str:
+        return UNITS.get(self.quantity, "dB")
+
+
+class Design(_Section):
+    """A whole design file."""
+
+    title: str
+    rig: str
+    keep: Annotated[list[Axis], Field(min_length=1)]
+    loop: LoopSection = LoopSection()
+    uncertainty: UncertaintySection = UncertaintySection()
+    transmissibility: TransmissibilitySection
+    control_effort: EffortSection
+    compliance: ComplianceSection | None = None
+    floor: FloorSection = FloorSection()
+    synthesis: SynthesisSection = SynthesisSection()
+    skyhook: SkyhookSection = SkyhookSection()
+    simulation: SimulationSection = SimulationSection()
+    requirement: list[RequirementSection] = []
+
+    @model_validator(mode="after")
+    def _different_axes(self) -> Design:
+        if len(set(self.keep)) != len(self.keep):
+            raise ValueError(f"keep lists an axis twice: {self.keep}")
+        return self
+
+
+def read_design(path: str | Path) -> Design:
+    """Read and check a design file.
+
+    Raises
+    ------
+    InputError : one line naming file, field, value and what was expected.
+    """
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError("no such file; expected a design file such as designs/avis_z_phix.toml", file=path) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read as text: {error}", file=path) from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"not a TOML file: {error}", file=path) from None
+    return design_from_table(table, path)
+
+
+def design_from_table(table: dict, file: object = None) -> Design:
+    """Check a design given as a table."""
+    try:
+        return Design.model_validate(table)
+    except ValidationError as error:
+        complaint = first_complaint(error, Design)
+        raise (complaint.in_file(file) if file is not None else complaint) from None

@@ -1,0 +1,251 @@
+"""From a design and a rig to the generalized plant, and to the physical channels it is judged by.
+
+    floor velocity, forces ->  rig (uncertain parameters)  -> payload velocity -> sensor chains -> seen velocity (y)
+    force commands (u) -> delay -> amplifier -> allocation -> volts -> neglected dynamics of each chain -> rig
+
+The same diagram carries the weighted channels that synthesis works on and the physical ones (transmissibility,
+compliance, volts, noise) that analysis reports, so that both speak of one plant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.statespace import StateSpace, gain
+from avis_ctrl.rigs.actuator import pade_delay
+from avis_ctrl.rigs.converter import Converter, white_density
+from avis_ctrl.rigs.floor_spectrum import SpectrumModel, shipped_spectrum
+from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.study.design_file import ChainUncertainty, Design
+from avis_ctrl.uncertainty.blocks import ComplexFull
+from avis_ctrl.uncertainty.generalized_plant import Diagram, GeneralizedPlant
+from avis_ctrl.uncertainty.performance_weights import Band, ComplianceBound, ControlEffort, TransmissibilityBound
+from avis_ctrl.uncertainty.uncertain_rig import UncertainRig, uncertain_rig
+from avis_ctrl.uncertainty.weight_base import Weight
+from avis_ctrl.uncertainty.weights import NeglectedDynamics
+
+
+@dataclass(frozen=True, eq=False)
+class DesignPlant:
+    """Everything that synthesis and analysis need of the plant.
+
+    Attributes
+    ----------
+    full : generalized plant with weighted and physical channels.
+    synthesis : the same, weighted channels only.
+    rig : the uncertain rig inside.
+    axes : kept coordinates, rotations named as edge displacements ("phi_x_edge").
+    actuators : channels that the kept axes use.
+    allocation : (n_actuators, n_axes) volts per newton on each axis (edge force for rotations).
+    decoding : (n_axes, n_sensors) axis velocity (edge velocity) from the sensors' velocities.
+    sensor_chain : velocity -> seen velocity of one axis, unit passband gain.
+    sensor_noise : unit white noise density -> noise of one sensor as velocity [m/s/sqrt(Hz)].
+    floor_density : mean velocity density of the floor [m/s/sqrt(Hz)]: the unit of the noise inputs.
+    floor : spectrum of the floor's motion, each kept axis alike.
+    weights : the weighting filters by name, with their meaning, for the report.
+    """
+
+    full: GeneralizedPlant
+    synthesis: GeneralizedPlant
+    rig: UncertainRig
+    axes: tuple[str, ...]
+    actuators: tuple[str, ...]
+    sensors: tuple[str, ...]
+    allocation: np.ndarray
+    decoding: np.ndarray
+    sensor_chain: StateSpace
+    sensor_noise: StateSpace
+    floor_density: float
+    floor: SpectrumModel
+    weights: dict[str, Weight]
+
+    @property
+    def floor_velocities(self) -> list[str]:
+        return [f"floor_{axis}_dot" for axis in self.axes]
+
+    @property
+    def velocities(self) -> list[str]:
+        return [f"{axis}_dot" for axis in self.axes]
+
+    @property
+    def volts(self) -> list[str]:
+        return [f"{name}_command" for name in self.actuators]
+
+
+def build_plant(design: Design, rig: Rig) -> DesignPlant:
+    """The generalized plant of a design.
+
+    Raises
+    ------
+    InputError : parameters or axes that the rig does not have, axes that its actuators cannot push or its
+        sensors cannot tell apart.
+    """
+    uncertain = uncertain_rig(rig, design.uncertainty.of(rig), design.keep)
+    axes = uncertain.coordinates
+    lever = np.array([rig.edge_m if name != axis else 1.0 for name, axis in zip(axes, design.keep, strict=True)])
+    allocation = actuator_axes(rig, design.keep)
+    # An edge force F at lever e is a moment F e.
+    matrix = allocation.allocation * lever
+    used = [k for k in range(len(allocation.actuators)) if np.any(np.abs(matrix[k]) > 1e-9 * np.abs(matrix).max())]
+    actuators = tuple(allocation.actuators[k] for k in used)
+    decoder = sensor_axes(rig, design.keep)
+    decoding = decoder.decoding * lever[:, None]
+
+    diagram = Diagram()
+    chain, noise = sensor_chain(design, rig)
+    weights: dict[str, Weight] = {}
+    _rig_part(diagram, uncertain, actuators)
+    _actuator_side(diagram, design, rig, axes, actuators, matrix[used], weights)
+    floor = floor_spectrum(design, rig)
+    low, high = design.floor.band_Hz
+    reference = floor.rms(low, high) / np.sqrt(high - low)
+    _sensor_side(diagram, axes, chain, noise, decoding, reference)
+    _performance(diagram, design, rig, axes, matrix[used], weights)
+    w = [*(f"floor_{a}_dot" for a in axes), *(f"noise_{a}" for a in axes), *(f"force_{a}" for a in axes)]
+    weighted = [*(f"e_{a}" for a in axes), *(f"effort_{a}" for a in axes)]
+    compliance = [f"compliance_{a}" for a in axes] if design.compliance else []
+    physical = [*(f"{a}_dot" for a in axes), *(f"{a}_rel" for a in axes), *(f"{n}_command" for n in actuators)]
+    u, y = [f"command_{a}" for a in axes], [f"seen_{a}_dot" for a in axes]
+    full = diagram.plant(w, [*weighted, *compliance, *physical], u, y)
+    asked = w if design.compliance else w[:2 * len(axes)]
+    return DesignPlant(full, full.restricted(asked, [*weighted, *compliance]), uncertain, axes, actuators,
+                       decoder.sensors, matrix[used], decoding, chain, noise, reference, floor, weights)
+
+
+def floor_spectrum(design: Design, rig: Rig) -> SpectrumModel:
+    """The design's floor motion: the measured shape at the site's r.m.s. velocity."""
+    rms = design.floor.velocity_rms_m_per_s
+    if rms is None:
+        if rig.ambient is None:
+            raise InputError("the rig file has no [ambient] section: give the floor's r.m.s. velocity here",
+                             field="floor.velocity_rms_m_per_s")
+        rms = rig.ambient.floor_velocity_rms_m_per_s
+    return shipped_spectrum(design.floor.spectrum).scaled_to_rms(rms, design.floor.band_Hz[0], design.floor.band_Hz[1])
+
+
+def _rig_part(diagram: Diagram, uncertain: UncertainRig, actuators: tuple[str, ...]) -> None:
+    system, axes = uncertain.system, uncertain.coordinates
+    deltas = [name for name in system.inputs if name.startswith("w:")]
+    diagram.add("rig", system.select(
+        [*(name for name in system.outputs if name.startswith("z:")), *(f"{a}_dot" for a in axes),
+         *(f"{a}_rel" for a in axes)],
+        [*deltas, *actuators, *(f"floor_{a}_dot" for a in axes), *(f"force_{a}" for a in axes)]), "rig")
+    place = 0
+    for block in uncertain.blocks.blocks:
+        names = deltas[place:place + block.rows]
+        place += block.rows
+        diagram.uncertain(block, names, [f"z:{name[2:]}" for name in names])
+    for axis in axes:
+        diagram.means(f"floor_{axis}_dot", "velocity of the floor", "m/s")
+        diagram.means(f"{axis}_dot", "velocity of the payload", "m/s")
+        diagram.means(f"{axis}_rel", "displacement of the payload against the floor", "m")
+        diagram.means(f"force_{axis}", "force on the payload", "N")
+    for name in actuators:
+        diagram.means(name, "voltage that acts at the motor", "V")
+
+
+def _actuator_side(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, ...], actuators: tuple[str, ...],
+                   allocation: np.ndarray, weights: dict[str, Weight]) -> None:
+    """Delay with the hold of the converter, amplifier, allocation, neglected dynamics."""
+    corner = 2 * np.pi * design.loop.amplifier_corner_Hz
+    # A zero-order hold delays by half a sample on average.
+    delay_s = rig.loop_delay_s + 0.5 / rig.sample_rate_Hz
+    for axis in axes:
+        lag = cascade([], [-corner], corner) @ pade_delay(delay_s, design.loop.pade_order)
+        diagram.add(f"delay and amplifier {axis}", lag.renamed([f"command_{axis}"], [f"drive_{axis}"]), "actuator")
+        diagram.means(f"command_{axis}", "force asked by the controller", "N")
+        diagram.means(f"drive_{axis}", "force asked, after delay and amplifier", "N")
+    # What the amplifiers hold: the volts that are limited, after delay and lag (both of unit gain).
+    diagram.add("allocation", gain(allocation, [f"drive_{a}" for a in axes], [f"{n}_command" for n in actuators]),
+                "allocation")
+    for name in actuators:
+        diagram.means(f"{name}_command", "voltage of the channel", "V")
+    _chains(diagram, design.uncertainty.actuator_chains, actuators, "{}_command", "{}", "actuator chain {}", weights)
+
+
+def _chains(diagram: Diagram, uncertainty: ChainUncertainty | None, names: tuple[str, ...], before: str, after: str,
+            title: str, weights: dict[str, Weight]) -> None:
+    """(1 + W delta) in each channel: neglected dynamics as an input multiplicative uncertainty."""
+    for name in names:
+        read, made, label = before.format(name), after.format(name), title.format(name)
+        if uncertainty is None:
+            diagram.add(label, gain([[1.0]], [read], [made]), "actuator")
+            continue
+        weight = NeglectedDynamics(uncertainty.low_percent / 100, uncertainty.crossover_Hz,
+                                   uncertainty.high_percent / 100)
+        weights.setdefault(title.format("*"), weight)
+        diagram.add(f"W {label}", weight.system(read, f"z:{label}"), "weight")
+        diagram.add(label, gain([[1.0, 1.0]], [read, f"w:{label}"], [made]), "actuator")
+        diagram.uncertain(ComplexFull(1, 1, label), [f"w:{label}"], [f"z:{label}"])
+
+
+def sensor_chain(design: Design, rig: Rig) -> tuple[StateSpace, StateSpace]:
+    """Velocity -> seen velocity, and unit white noise density -> noise of one sensor as velocity [m/s/sqrt(Hz)].
+
+    Geophones see velocity above the compensated corner. Accelerometers are integrated with a leak, so that what
+    the controller sees is a velocity too, with one corner from the charge amplifier and one from the leak.
+    """
+    if rig.geophones is not None:
+        if rig.acquisition is None:
+            raise InputError("geophones need the rig file's [acquisition] section", field="acquisition")
+        g, a = rig.geophones, rig.acquisition
+        corner, damping = 2 * np.pi * g.compensated_Hz, g.compensated_damping
+        poles = np.roots([1.0, 2 * damping * corner, corner ** 2])
+        volts = g.preamplifier_gain * min(g.sensitivity_Vs_per_m)
+        rounding = Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz).noise_density_V_rtHz
+        ambient = rig.ambient.sensor_noise_rms_V if rig.ambient else 0.0
+        density = float(np.hypot(rounding, white_density(ambient, a.sample_rate_Hz)) / volts)
+        return cascade(np.zeros(2), poles, 1.0), gain([[density]])
+    if rig.accelerometers is None:
+        raise InputError("the rig file has no sensors", field="geophones")
+    acc, leak = rig.accelerometers, 2 * np.pi * design.loop.integrator_corner_Hz
+    chain = cascade(np.zeros(2), [-2 * np.pi * acc.low_corner_Hz, -leak], 1.0)
+    return chain, cascade([], [-leak], acc.noise_m_per_s2_rtHz)
+
+
+def _sensor_side(diagram: Diagram, axes: tuple[str, ...], chain: StateSpace, noise: StateSpace,
+                 decoding: np.ndarray, reference: float) -> None:
+    """Sensor chains of the logical axes (alike, so that decoding and chain commute) and their noise.
+
+    One unit of noise is what accompanies 1 m/s of floor velocity: sensor density over floor density.
+    """
+    mix = np.linalg.cholesky(decoding @ decoding.T) / reference
+    for axis in axes:
+        diagram.add(f"sensor chain {axis}", chain.renamed([f"{axis}_dot"], [f"clean_{axis}_dot"]), "sensor")
+        diagram.add(f"noise {axis}", noise.renamed([f"mixed_noise_{axis}"], [f"sensor_noise_{axis}"]), "weight")
+        diagram.add(f"sum {axis}", gain([[1.0, 1.0]], [f"clean_{axis}_dot", f"sensor_noise_{axis}"],
+                                        [f"seen_{axis}_dot"]), "sum")
+        diagram.means(f"clean_{axis}_dot", "velocity as the sensors' band shows it", "m/s")
+        diagram.means(f"seen_{axis}_dot", "measured velocity", "m/s")
+        diagram.means(f"noise_{axis}", "sensor noise that accompanies 1 m/s of floor velocity", "1")
+        diagram.means(f"sensor_noise_{axis}", "sensor noise as velocity", "m/s")
+    diagram.add("noise mixing", gain(mix, [f"noise_{a}" for a in axes], [f"mixed_noise_{a}" for a in axes]),
+                "allocation")
+
+
+def _performance(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, ...], allocation: np.ndarray,
+                 weights: dict[str, Weight]) -> None:
+    """Weighted outputs, per m/s of floor velocity (compliance: per newton)."""
+    asked, effort = design.transmissibility, design.control_effort
+    weights["transmissibility"] = TransmissibilityBound(
+        asked.peak_dB, (Band(asked.band_Hz[0], asked.band_Hz[1], asked.band_dB),), asked.transition_octaves, asked.tolerance_dB)
+    weights["control effort"] = ControlEffort(rig.drive_limit_V, effort.floor_velocity_m_per_s, effort.bandwidth_Hz,
+                                              effort.reduction)
+    for k, axis in enumerate(axes):
+        diagram.add(f"W_T {axis}", weights["transmissibility"].system(f"{axis}_dot", f"e_{axis}"), "weight")
+        # Volts on the channel that this axis loads most.
+        volts = weights["control effort"].system(f"command_{axis}", f"effort_{axis}").scaled(
+            right=float(np.max(np.abs(allocation[:, k]))))
+        diagram.add(f"W_u {axis}", volts, "weight")
+        diagram.means(f"e_{axis}", "payload velocity over its bound", "1")
+        diagram.means(f"effort_{axis}", "drive over its limit", "1")
+    if design.compliance:
+        weights["compliance"] = ComplianceBound(design.compliance.limit_m_per_N)
+        for axis in axes:
+            diagram.add(f"W_c {axis}", weights["compliance"].system(f"{axis}_rel", f"compliance_{axis}"), "weight")
+            diagram.means(f"compliance_{axis}", "displacement over its bound", "1")
