@@ -243,7 +243,8 @@ class Halcyonics(Rig):
         m_a, d_a, e = self.reaction.mass, self.reaction.damping, self.reaction.constant_N_per_V
         A = np.array([[0.0, 1.0], [-self.k_a / m_a, -d_a / m_a]])
         motion = ("displacement", "velocity")
-        return StateSpace(A, np.array([[0.0], [e / m_a]]), np.eye(2), np.zeros((2, 1)), 0.0, ("voltage",), motion, motion)
+        B = np.array([[0.0], [e / m_a]])
+        return StateSpace(A, B, np.eye(2), np.zeros((2, 1)), 0.0, ("voltage",), motion, motion)
 
     def transfer(self, point: str | ArrayLike, direction: str | ArrayLike,
                  drive: Mapping[str, float] | Sequence[float], omega: ArrayLike,
