@@ -120,7 +120,7 @@ def magnitude_fit(omega: np.ndarray, magnitude: np.ndarray, order: int, relative
     return MagnitudeFit(layout.function(x), float(np.sqrt(np.mean(error ** 2))), float(np.max(np.abs(error))))
 
 
-def covering_fit(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order: int,
+def covering_fit(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order: int, target: np.ndarray | None = None,
                  min_damping: float = 0.1, reach: float = 10.0) -> MagnitudeFit:
     """Biproper function with |H| >= lower everywhere and the largest excess of |H| over upper, in dB, minimised.
 
@@ -128,6 +128,7 @@ def covering_fit(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order:
     ----------
     omega : (n,) increasing positive frequencies [rad/s].
     lower, upper : (n,) positive, lower <= upper; they are equal where the magnitude is to be met closely.
+    target : (n,) the magnitude that the search starts from; None for the geometric mean of the two.
     order, min_damping, reach : as in `magnitude_fit`.
 
     Returns
@@ -142,7 +143,8 @@ def covering_fit(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order:
     _, log_upper = _checked(omega, upper)
     if np.any(log_lower > log_upper + 1e-12):
         raise InputError("the lower curve must not exceed the upper one", field="lower")
-    start = magnitude_fit(omega, np.exp((log_lower + log_upper) / 2), order, 0, min_damping, reach).function
+    middle = np.exp((log_lower + log_upper) / 2) if target is None else target
+    start = magnitude_fit(omega, middle, order, 0, min_damping, reach).function
     layout = _Layout(len(start.zero_pairs), len(start.pole_pairs), len(start.real_zeros), len(start.real_poles))
     x = layout.join(np.log(start.gain), *(np.log(np.asarray(part, float)) for part in
                     (start.zero_pairs, start.pole_pairs, start.real_zeros, start.real_poles)))

@@ -86,6 +86,30 @@ class Rational:
         """1/H; raises InputError unless H is biproper."""
         return Rational(1.0 / self.gain, self.pole_pairs, self.zero_pairs, self.real_poles, self.real_zeros)
 
+    @staticmethod
+    def from_roots(zeros: Sequence[complex] | np.ndarray, poles: Sequence[complex] | np.ndarray,
+                   leading: float) -> Rational:
+        """leading * prod(s - z) / prod(s - p).
+
+        Raises InputError for a root on or right of the imaginary axis, a complex root without its conjugate, a
+        leading coefficient that is not positive, or more zeros than poles.
+        """
+        pairs: dict[str, tuple[Section, ...]] = {}
+        singles: dict[str, tuple[float, ...]] = {}
+        for field, roots in (("zeros", zeros), ("poles", poles)):
+            roots = np.atleast_1d(np.asarray(roots, complex))
+            if not np.all(np.isfinite(roots)):
+                raise InputError("finite roots", field=field, value=roots.tolist())
+            if np.any(roots.real >= 0):
+                worst = complex(roots[np.argmax(roots.real)])
+                raise InputError("every root left of the imaginary axis (stable, minimum phase)", field=field,
+                                 value=worst.real if worst.imag == 0 else worst)
+            sections = _real_sections(roots, field)
+            complex_ones = [section for section in sections if section[0].imag]
+            pairs[field] = tuple((float(abs(z[0])), float(-z[0].real / abs(z[0]))) for z in complex_ones)
+            singles[field] = tuple(float(-r.real) for z in sections if not z[0].imag for r in z)
+        return Rational(leading, pairs["zeros"], pairs["poles"], singles["zeros"], singles["poles"])
+
     def zeros(self) -> np.ndarray:
         """Finite zeros [rad/s], complex."""
         return _roots(self.zero_pairs, self.real_zeros)
@@ -144,8 +168,7 @@ def _real_sections(roots: Sequence[complex] | np.ndarray, field: str) -> list[np
     tolerance = 1e-9 * np.abs(roots)
     upper = roots[roots.imag > tolerance]
     lower = list(roots[roots.imag < -tolerance])
-    real = np.sort(np.abs(roots[np.abs(roots.imag) <= tolerance].real))
-    signed = sorted(roots[np.abs(roots.imag) <= tolerance].real, key=abs)
+    real = sorted(roots[np.abs(roots.imag) <= tolerance].real, key=abs)
     sections = []
     for root in upper:
         mate = min(lower, key=lambda r: abs(r - np.conj(root)), default=None)
@@ -155,7 +178,7 @@ def _real_sections(roots: Sequence[complex] | np.ndarray, field: str) -> list[np
         sections.append(np.array([root, np.conj(root)]))
     if lower:
         raise InputError(f"complex root {lower[0]:.4g} has no conjugate", field=field)
-    sections += [np.array(signed[k:k + 2], complex) for k in range(0, real.size, 2)]
+    sections += [np.array(real[k:k + 2], complex) for k in range(0, len(real), 2)]
     return sorted(sections, key=lambda s: float(np.max(np.abs(s))))
 
 

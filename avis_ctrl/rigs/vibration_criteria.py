@@ -2,7 +2,8 @@
 
 C. G. Gordon, Generic criteria for vibration-sensitive equipment, Proc. SPIE 1619 (1991); H. Amick, M. Gendreau,
 T. Busch and C. Gordon, Evolving criteria for research facilities: I - Vibration, Proc. SPIE 5933 (2005). VC-A and
-VC-B hold from 4 Hz, as constant acceleration below 8 Hz; VC-C to VC-G are constant velocity from 1 Hz. All end at 80 Hz.
+VC-B hold from 4 Hz, as constant acceleration below 8 Hz; VC-C to VC-G are constant velocity from 1 Hz. All end at
+80 Hz.
 """
 
 from __future__ import annotations

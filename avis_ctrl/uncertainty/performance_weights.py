@@ -1,0 +1,263 @@
+"""Weights on what is to stay small: transmissibility, compliance, control effort, vibration criteria."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import ClassVar
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.rational import Rational
+from avis_ctrl.rigs import vibration_criteria
+from avis_ctrl.rigs.floor_motion import third_octave_edges
+from avis_ctrl.uncertainty.weight_base import Role, Weight, require, smallest_cover
+
+THIRD_OCTAVE_WIDTH = 10 ** 0.05 - 10 ** -0.05
+
+
+@dataclass(frozen=True)
+class Band:
+    """A limit [dB] from low_Hz to high_Hz, in place of the overall one."""
+
+    low_Hz: float
+    high_Hz: float
+    limit_dB: float
+
+    def __post_init__(self) -> None:
+        require(self.low_Hz, "low_Hz")
+        require(self.high_Hz, "high_Hz", self.low_Hz)
+        require(self.limit_dB, "limit_dB", -200.0, 200.0)
+
+
+@dataclass(frozen=True)
+class TransmissibilityBound(Weight):
+    """Payload motion over floor motion: at most `overall_dB`, and in each band at most that band's limit.
+
+    A rational filter cannot step. It is never laxer than what is asked anywhere on the grid; within
+    `transition_octaves` outside a stricter band it may be stricter than asked, elsewhere by at most
+    `tolerance_dB`. The order is the smallest that does this.
+
+    Parameters
+    ----------
+    overall_dB : limit outside the bands.
+    bands : they must not overlap.
+    relaxed_below_Hz, relaxed_above_Hz : nothing is asked beyond (None: asked from a hundredth of the lowest to a
+        hundred times the highest frequency named, and the filter is flat outside).
+    """
+
+    overall_dB: float = 4.0
+    bands: tuple[Band, ...] = ()
+    transition_octaves: float = 0.5
+    tolerance_dB: float = 0.5
+    relaxed_below_Hz: float | None = None
+    relaxed_above_Hz: float | None = None
+    max_order: int = 8
+
+    role: ClassVar[Role] = "limit"
+    unit: ClassVar[str] = "m/m"
+
+    def __post_init__(self) -> None:
+        require(self.overall_dB, "overall_dB", -200.0, 200.0)
+        require(self.transition_octaves, "transition_octaves")
+        require(self.tolerance_dB, "tolerance_dB")
+        ordered = sorted(self.bands, key=lambda band: band.low_Hz)
+        for first, second in pairwise(ordered):
+            if second.low_Hz < first.high_Hz:
+                raise InputError(f"bands that do not overlap; {first.low_Hz:g} to {first.high_Hz:g} Hz and "
+                                 f"{second.low_Hz:g} to {second.high_Hz:g} Hz do", field="bands")
+        for field in ("relaxed_below_Hz", "relaxed_above_Hz"):
+            if getattr(self, field) is not None:
+                require(getattr(self, field), field)
+
+    def asked(self, omega: np.ndarray) -> np.ndarray:
+        """The limit as specified, with its steps; inf where nothing is asked."""
+        # A band owns its edges in spite of the rounding of 2 pi f.
+        f, slack = np.asarray(omega, float) / (2 * np.pi), 1e-12
+        limit = np.full(f.shape, 10 ** (self.overall_dB / 20))
+        for band in self.bands:
+            inside = (f >= band.low_Hz * (1 - slack)) & (f <= band.high_Hz * (1 + slack))
+            limit = np.where(inside, 10 ** (band.limit_dB / 20), limit)
+        low, high = self.relaxed_below_Hz or 0.0, self.relaxed_above_Hz or np.inf
+        return np.where((f < low) | (f > high), np.inf, limit)
+
+    @cached_property
+    def shape(self) -> Rational:
+        if not self.bands and self.relaxed_below_Hz is None and self.relaxed_above_Hz is None:
+            return Rational(10 ** (-self.overall_dB / 20))
+        omega = 2 * np.pi * self._grid(120, 15)
+        lower = 1.0 / self.asked(omega)
+        window = 2.0 ** self.transition_octaves
+        first = np.searchsorted(omega, omega / window * (1 - 1e-9))
+        last = np.searchsorted(omega, omega * window * (1 + 1e-9))
+        upper = np.array([np.max(lower[i:j]) for i, j in zip(first, last, strict=True)])
+        # Where nothing is asked the filter may fall as it likes, but not rise.
+        usual = 10 ** (-self.overall_dB / 20)
+        upper = np.where(upper > 0, upper, usual)
+        target = np.sqrt(np.where(lower > 0, lower, np.minimum(usual, upper)) * upper)
+        lower = np.where(lower > 0, lower, 1e-4 * usual)
+        shape = smallest_cover(omega, lower, upper, self.tolerance_dB, self.max_order, "the transmissibility bound",
+                               target)
+        dense = 2 * np.pi * self._grid(4000, 400)
+        return shape.scaled(max(1.0, float(np.max(1.0 / (self.asked(dense) * shape.magnitude(dense))))))
+
+    def _grid(self, points: int, fine_points: int) -> np.ndarray:
+        """Frequencies [Hz], evenly spaced in logarithm, dense about every step and on both sides of it."""
+        steps = [edge for band in self.bands for edge in (band.low_Hz, band.high_Hz)]
+        steps += [f for f in (self.relaxed_below_Hz, self.relaxed_above_Hz) if f is not None]
+        window = 2.0 ** self.transition_octaves
+        fine = [np.geomspace(f / window, f * window, fine_points) for f in steps]
+        sides = [f * (1 + side) for f in steps for side in (-1e-6, 0.0, 1e-6)]
+        return np.unique(np.concatenate([np.geomspace(min(steps) / 100, max(steps) * 100, points), *fine, sides]))
+
+    @property
+    def meaning(self) -> str:
+        parts = [f"at most {band.limit_dB:+g} dB from {band.low_Hz:g} to {band.high_Hz:g} Hz" for band in self.bands]
+        return (f"transmissibility at most {self.overall_dB:+g} dB" + "".join(f", {part}" for part in parts)
+                + f"; realised with {self.shape.order} states, stricter than asked by up to {self.tolerance_dB:g} dB, "
+                  f"and by more within {self.transition_octaves:g} octave of a stricter band")
+
+
+@dataclass(frozen=True)
+class ComplianceBound(Weight):
+    """Payload displacement per force on the payload: at most limit_m_per_N.
+
+    Parameters
+    ----------
+    limit_m_per_N : limit in the middle band.
+    static_limit_m_per_N, corner_Hz : below the corner the limit rises to this (a velocity sensor cannot stiffen the rig
+        at rest); both or neither.
+    relaxed_above_Hz : above it the limit rises as frequency (the payload's mass takes over).
+    """
+
+    limit_m_per_N: float
+    static_limit_m_per_N: float | None = None
+    corner_Hz: float | None = None
+    relaxed_above_Hz: float | None = None
+
+    role: ClassVar[Role] = "limit"
+    unit: ClassVar[str] = "m/N"
+
+    def __post_init__(self) -> None:
+        require(self.limit_m_per_N, "limit_m_per_N")
+        if (self.static_limit_m_per_N is None) != (self.corner_Hz is None):
+            raise InputError("static_limit_m_per_N and corner_Hz belong together: give both or neither",
+                             field="corner_Hz", value=self.corner_Hz)
+        if self.static_limit_m_per_N is not None and self.corner_Hz is not None:
+            require(self.static_limit_m_per_N, "static_limit_m_per_N", self.limit_m_per_N)
+            require(self.corner_Hz, "corner_Hz")
+        if self.relaxed_above_Hz is not None:
+            require(self.relaxed_above_Hz, "relaxed_above_Hz")
+
+    @cached_property
+    def shape(self) -> Rational:
+        gain, zeros, poles = 1.0 / self.limit_m_per_N, [], []
+        if self.static_limit_m_per_N is not None and self.corner_Hz is not None:
+            poles.append(2 * np.pi * self.corner_Hz)
+            zeros.append(poles[0] * self.limit_m_per_N / self.static_limit_m_per_N)
+        if self.relaxed_above_Hz is not None:
+            poles.append(2 * np.pi * self.relaxed_above_Hz)
+            gain *= poles[-1]
+        return Rational(gain, real_zeros=tuple(zeros), real_poles=tuple(poles))
+
+    @property
+    def meaning(self) -> str:
+        text = f"compliance at most {self.limit_m_per_N:.3g} m/N"
+        if self.static_limit_m_per_N is not None:
+            text += f", rising below {self.corner_Hz:g} Hz to {self.static_limit_m_per_N:.3g} m/N at rest"
+        return text + (f", rising above {self.relaxed_above_Hz:g} Hz" if self.relaxed_above_Hz else "")
+
+
+@dataclass(frozen=True)
+class ControlEffort(Weight):
+    """Voltage of an actuator: at most its limit when the normalised disturbance has the level expected.
+
+    W = (level / limit) ((s/wb + 1)/(s/(R wb) + 1))^order: up to wb the whole limit may be used, far above it only
+    a share 1/R^order, which rolls the controller off.
+
+    Parameters
+    ----------
+    limit_V : actuator limit.
+    disturbance_level : size of the disturbance, in the unit of the plant's disturbance input, that may use it all.
+    bandwidth_Hz : wb; None for a constant weight.
+    reduction : R > 1, how much less is allowed per order far above wb.
+    order : 1 or 2.
+    """
+
+    limit_V: float
+    disturbance_level: float = 1.0
+    bandwidth_Hz: float | None = None
+    reduction: float = 30.0
+    order: int = 1
+
+    role: ClassVar[Role] = "limit"
+    unit: ClassVar[str] = "V per unit of disturbance"
+
+    def __post_init__(self) -> None:
+        require(self.limit_V, "limit_V")
+        require(self.disturbance_level, "disturbance_level")
+        require(self.reduction, "reduction", 1.0)
+        if self.bandwidth_Hz is not None:
+            require(self.bandwidth_Hz, "bandwidth_Hz")
+        if self.order not in (1, 2):
+            raise InputError("1 or 2", field="order", value=self.order)
+
+    @cached_property
+    def shape(self) -> Rational:
+        gain = self.disturbance_level / self.limit_V
+        if self.bandwidth_Hz is None:
+            return Rational(gain)
+        wb = 2 * np.pi * self.bandwidth_Hz
+        return Rational(gain * self.reduction ** self.order, real_zeros=(wb,) * self.order,
+                        real_poles=(self.reduction * wb,) * self.order)
+
+    @property
+    def meaning(self) -> str:
+        text = f"at most {self.limit_V:g} V when the disturbance has the level {self.disturbance_level:.3g}"
+        if self.bandwidth_Hz is None:
+            return text
+        return text + (f" up to {self.bandwidth_Hz:g} Hz, falling with order {self.order} to a share "
+                       f"{self.reduction ** -self.order:.2g} of it")
+
+
+@dataclass(frozen=True)
+class VibrationCriterion(Weight):
+    """Payload velocity density: a motion below it everywhere meets the criterion in every third octave.
+
+    In a band of width 0.2307 f a density v/sqrt(0.2307 f) makes the r.m.s. velocity v (IEC 61260 base-ten bands).
+    Nothing is asked outside the criterion's bands.
+    """
+
+    name: str = "VC-E"
+    tolerance_dB: float = 0.5
+    max_order: int = 6
+
+    role: ClassVar[Role] = "limit"
+    unit: ClassVar[str] = "m/s/sqrt(Hz)"
+
+    def __post_init__(self) -> None:
+        vibration_criteria.criterion(self.name)
+        require(self.tolerance_dB, "tolerance_dB")
+
+    def asked(self, omega: np.ndarray) -> np.ndarray:
+        """The density that the criterion allows [m/s/sqrt(Hz)]; inf outside its bands."""
+        f = np.asarray(omega, float) / (2 * np.pi)
+        limit = vibration_criteria.criterion(self.name).limit(f)
+        return limit / np.sqrt(THIRD_OCTAVE_WIDTH * f)
+
+    @cached_property
+    def shape(self) -> Rational:
+        bands = vibration_criteria.criterion(self.name).midbands()
+        low, high = third_octave_edges(bands)[0][0], third_octave_edges(bands)[1][-1]
+        frequency = np.geomspace(low * (1 + 1e-9), high * (1 - 1e-9), 120)
+        required = 1.0 / self.asked(2 * np.pi * frequency)
+        return smallest_cover(2 * np.pi * frequency, required, required, self.tolerance_dB, self.max_order,
+                              f"the criterion {self.name}")
+
+    @property
+    def meaning(self) -> str:
+        one = vibration_criteria.criterion(self.name)
+        return (f"payload velocity within {self.name}: {one.velocity_m_per_s * 1e6:g} um/s r.m.s. per third octave, "
+                f"{one.low_Hz:g} to 80 Hz")
