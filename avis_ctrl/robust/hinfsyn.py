@@ -16,6 +16,7 @@ import numpy as np
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, discretise, hinf_norm, lft_lower
 from avis_ctrl.lti.norms import bilinear_to_continuous
+from avis_ctrl.robust.hinf_bounds import pointwise_bound
 from avis_ctrl.robust.hinf_plant import (
     RANK_TOLERANCE,
     NormalForm,
@@ -33,9 +34,9 @@ class Status(Enum):
     """How a synthesis ended; the value is the diagnosis."""
 
     OPTIMAL = "the optimum is bracketed and the closed loop was measured below its target"
-    REGULARISED = ("the problem is singular: small extra channels were added, and the closed loop of the plant "
-                   "without them was measured")
-    BACKED_OFF = ("the closed loop missed its target at the back-off asked for, and the target was raised: this usually "
+    REGULARISED = ("the problem is singular: small extra channels were added; the closed loop measured is that "
+                   "of the plant without them")
+    BACKED_OFF = ("the closed loop missed its target at the back-off asked for, which was raised: this usually "
                   "means a badly scaled plant or a nearly singular D12 or D21")
     SUBOPTIMAL = "a controller at the gamma asked for; the optimum was not sought"
 
@@ -47,7 +48,7 @@ class Synthesis:
     K : controller, inputs named as the plant's y, outputs as its u; positive feedback u = K y.
     gamma : H-infinity norm of `closed_loop`, measured (relative accuracy 1e-6).
     gamma_optimal_bounds : (largest gamma found infeasible, smallest found feasible). Where channels were added,
-        the optimum with them; the lower one is then 0, since nothing is proved about the plant without them.
+        the upper one is of the plant with them, and the lower one is the pointwise bound of `hinf_lower_bound`.
     fastest_pole : largest magnitude [rad/s] of a controller pole (of its continuous image when P is sampled).
     limited_by : the condition that fails just below the optimum.
     notes : what was done that the caller did not ask for, and what it cost.
@@ -93,19 +94,21 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     P = as_plant(P, nmeas, ncon)
     _check_options(backoff, tolerance, method, gamma_hint)
     problem = _Problem.of(P, nmeas, ncon)
+    form, bracket, notes = problem.solve(tolerance, gamma_hint)
+    status = Status.REGULARISED if notes else Status.OPTIMAL
+    # Extra channels only add to the problem: what fails with them may be possible without.
+    bounds = (pointwise_bound(problem.plant).gamma if notes else bracket.lower, bracket.upper.gamma)
     if method == "lmi":
         from avis_ctrl.robust.hinf_lmi import lmi_gamma
 
-        gamma_hint = lmi_gamma(P, nmeas, ncon).upper
-    form, bracket, notes = problem.solve(tolerance, gamma_hint)
-    status = Status.REGULARISED if notes else Status.OPTIMAL
-    bounds = (0.0 if notes else bracket.lower, bracket.upper.gamma)
-    result, raised = problem.realise(form, bracket.upper.gamma, backoff)
+        optimum = lmi_gamma(P, nmeas, ncon)
+        bounds = optimum.lower, optimum.upper
+    result, raised = problem.realise(form, bounds[1] if not notes else bracket.upper.gamma, backoff)
     if raised:
         status, notes = Status.BACKED_OFF, (*notes, raised)
     rate = _rate_note(result, sample_rate_Hz)
-    return replace(result, gamma_optimal_bounds=bounds, status=status, limited_by=bracket.limited_by,
-                   notes=(*notes, *rate))
+    return replace(result, gamma_optimal_bounds=(float(bounds[0]), float(bounds[1])), status=status,
+                   limited_by=bracket.limited_by, notes=(*notes, *rate))
 
 
 def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
@@ -148,11 +151,11 @@ class _Problem:
             return normal_form(self.plant), ()
         said = []
         if of_D12:
-            said.append(f"D12 has not full column rank: not every control {list(self.plant.u)} is penalised at infinite "
-                        "frequency")
+            said.append(f"D12 has not full column rank: not every control {list(self.plant.u)} is penalised "
+                        "at infinite frequency")
         if of_D21:
-            said.append(f"D21 has not full row rank: not every measurement {list(self.plant.y)} is corrupted at infinite "
-                        "frequency")
+            said.append(f"D21 has not full row rank: not every measurement {list(self.plant.y)} is noisy "
+                        "at infinite frequency")
         if of_states:
             said.append("a zero of u -> z or w -> y lies on the imaginary axis")
         extra = f"; extra channels of relative size {epsilon:.0e} were added for the synthesis alone"
@@ -243,4 +246,5 @@ def _rate_note(result: Synthesis, sample_rate_Hz: float | None) -> tuple[str, ..
         raise InputError("expected a positive rate in hertz", field="sample_rate_Hz", value=sample_rate_Hz)
     ratio = result.fastest_pole / (np.pi * sample_rate_Hz)
     verdict = "slow enough" if ratio < 0.5 else "too fast: raise backoff or the sample rate, or reduce the controller"
-    return (f"fastest controller pole {result.fastest_pole:.4g} rad/s is {ratio:.2g} of half the sample rate: {verdict}",)
+    return (f"fastest controller pole {result.fastest_pole:.4g} rad/s is {ratio:.2g} of half the sample rate: "
+            f"{verdict}",)

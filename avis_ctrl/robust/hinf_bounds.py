@@ -1,0 +1,114 @@
+"""What no controller can do: a lower bound on ||F_l(P, K)|| over every stabilising K.
+
+At any point s of the closed right half plane where P has no pole, F_l(P, K)(s) = P11 + P12 Q P21 with
+some finite matrix Q(s), and by Parrott's theorem no Q brings its norm below
+
+    max( sigma(U' P11), sigma(P11 V) ),      U' P12 = 0,   P21 V = 0.
+
+By the maximum principle each such value bounds the H-infinity norm. On the imaginary axis this is what
+the directions of actuators and sensors leave; at a zero of u -> z or w -> y in the right half plane it is
+the interpolation bound, such as |W(z)| for a weighted sensitivity (Zames and Francis 1983; Skogestad and
+Postlethwaite, Multivariable Feedback Control, 2nd ed. 2005, section 5.6.1). The Riccati test, where
+the plant needs no regularisation, gives the sharp bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.lti.norms import bilinear_to_continuous
+from avis_ctrl.robust.hinf_plant import RANK_TOLERANCE, Plant, as_plant, normal_form, rank_margins
+from avis_ctrl.robust.hinf_riccati import find_gamma
+
+RANK_AT_POINT = 1e-9
+
+
+@dataclass(frozen=True)
+class LowerBound:
+    """No stabilising controller brings the norm below `gamma`.
+
+    point : s [rad/s] where the bound is reached (of the bilinear image when P is sampled); nan for the Riccati test.
+    source : the argument, in words.
+    """
+
+    gamma: float
+    point: complex
+    source: str
+
+
+def hinf_lower_bound(P: Any, nmeas: int, ncon: int, omega: np.ndarray | None = None) -> LowerBound:
+    """The best of the pointwise bounds and, where it applies, of the Riccati test (infeasible gamma, within 0.1 %).
+
+    omega : frequencies [rad/s] to look at; by default 400 over the range of the plant's poles.
+    Errors as in `hinfsyn`.
+    """
+    P = as_plant(P, nmeas, ncon)
+    plant = Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon)
+    best = pointwise_bound(plant, omega)
+    if min(rank_margins(plant)) >= RANK_TOLERANCE:
+        lower = find_gamma(normal_form(plant).plant, 1e-3).lower
+        if lower > best.gamma:
+            return LowerBound(lower, complex(np.nan), "the two-Riccati test fails there")
+    return best
+
+
+def pointwise_bound(plant: Plant, omega: np.ndarray | None = None) -> LowerBound:
+    """Largest Parrott bound over the imaginary axis (sampled) and the zeros in the right half plane."""
+    if omega is None:
+        poles = np.abs(plant.sample_points())
+        omega = np.geomspace(1e-2 * np.min(poles), 1e2 * np.max(poles), 400)
+    sizes = (float(la.norm(plant.channel(plant.B2, plant.C1, plant.D12))),
+             float(la.norm(plant.channel(plant.B1, plant.C2, plant.D21))))
+    best = LowerBound(parrott(plant.D11, plant.D12, plant.D21, sizes), complex(np.inf),
+                      "directions free at infinite frequency")
+    for s, source in [*((1j * w, "directions free at one frequency") for w in omega),
+                      *((z, "a right-half-plane zero of u -> z or w -> y") for z in right_zeros(plant))]:
+        value = _at(plant, s, sizes)
+        if value > best.gamma:
+            best = LowerBound(value, complex(s), source)
+    return best
+
+
+def parrott(P11: np.ndarray, P12: np.ndarray, P21: np.ndarray, sizes: tuple[float, float] = (0.0, 0.0)) -> float:
+    """min over Q of sigma(P11 + P12 Q P21), exactly (Parrott 1978).
+
+    sizes : yardsticks of P12 and P21, against which a singular value of 1e-9 counts as lost rank.
+    """
+    left, right = _kernel(P12.conj().T, sizes[0]).conj().T @ P11, P11 @ _kernel(P21, sizes[1])
+    return float(max(la.norm(left, 2) if left.size else 0.0, la.norm(right, 2) if right.size else 0.0))
+
+
+def right_zeros(plant: Plant) -> np.ndarray:
+    """Invariant zeros in the open right half plane of the square channels among u -> z and w -> y."""
+    found = []
+    for B, C, D in ((plant.B2, plant.C1, plant.D12), (plant.B1, plant.C2, plant.D21)):
+        if D.shape[0] != D.shape[1] or not plant.n:
+            continue
+        n, m = plant.n, D.shape[0]
+        E = la.block_diag(np.eye(n), np.zeros((m, m)))
+        alpha, beta = la.eigvals(np.block([[plant.A, B], [C, D]]), E, homogeneous_eigvals=True)
+        finite = np.abs(beta) > 1e-10 * np.abs(alpha)
+        zeros = alpha[finite] / beta[finite]
+        found.append(zeros[(zeros.real > 1e-9 * np.abs(zeros)) & (zeros.imag >= 0)])
+    return np.concatenate(found) if found else np.zeros(0, complex)
+
+
+def _at(plant: Plant, s: complex, sizes: tuple[float, float]) -> float:
+    """The bound at one point; 0 where P has a pole."""
+    resolvent = s * np.eye(plant.n) - plant.A
+    if plant.n and 1 / np.linalg.cond(resolvent) < 1e-13:
+        return 0.0
+    x1, x2 = np.linalg.solve(resolvent, plant.B1), np.linalg.solve(resolvent, plant.B2)
+    return parrott(plant.C1 @ x1 + plant.D11, plant.C1 @ x2 + plant.D12, plant.C2 @ x1 + plant.D21,
+                   sizes)
+
+
+def _kernel(matrix: np.ndarray, size: float) -> np.ndarray:
+    """Orthonormal basis of the null space of a matrix, singular values judged against `size` and their largest."""
+    _, s, Vh = la.svd(matrix)
+    rank = int(np.sum(s > RANK_AT_POINT * max(size, float(s[0])))) if s.size and s[0] > 0 else 0
+    return Vh[rank:].conj().T
