@@ -84,13 +84,22 @@ def signal_sources(parts: dict[str, StateSpace], inputs: Sequence[str]) -> dict[
 def _close(total: StateSpace, F: np.ndarray, E: np.ndarray) -> tuple[np.ndarray, ...]:
     """State space of all part outputs, from the external inputs, with u = F y + E e."""
     loop = np.eye(total.noutputs) - total.D @ F
-    if total.noutputs and np.linalg.cond(loop) > 1e12:
+    if total.noutputs and (condition := np.linalg.cond(_equilibrated(loop))) > 1e12:
         raise ComputationError("the connection is not well posed", cause="an algebraic loop of unit gain",
-                               measured=f"condition of I - D F is {np.linalg.cond(loop):.1e}",
+                               measured=f"condition of I - D F, scaled, is {condition:.1e}",
                                next_step="put a delay or a low-pass filter in the loop")
     C = np.linalg.solve(loop, total.C)
     D = np.linalg.solve(loop, total.D @ E)
     return total.A + total.B @ F @ C, total.B @ (E + F @ D), C, D
+
+
+def _equilibrated(matrix: np.ndarray) -> np.ndarray:
+    """Rows and columns scaled to largest entries near one, so that units of signals do not look like singularity."""
+    for _ in range(10):
+        for axis in (0, 1):
+            size = np.sqrt(np.max(np.abs(matrix), axis=axis, keepdims=True))
+            matrix = matrix / np.where(size > 0, size, 1.0)
+    return matrix
 
 
 def lft_lower(P: StateSpace, K: StateSpace) -> StateSpace:
