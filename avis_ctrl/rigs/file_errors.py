@@ -21,26 +21,34 @@ def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputErro
     `model` is what the content was validated against; its keys are what an unknown one is compared with.
     """
     # An unknown key explains the missing one beside it, so it comes first.
-    problem = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+    problems = error.errors()
+    problem = min(problems, key=lambda one: one["type"] != "extra_forbidden")
     *parents, last = problem["loc"] or ("file",)
     field = _dotted(problem["loc"])
     if problem["type"] == "extra_forbidden":
-        return InputError(_unknown_key(str(last), _known_keys(model, parents)), field=field, value=problem["input"])
+        value = None if isinstance(problem["input"], (dict, list)) else problem["input"]
+        absent = [str(one["loc"][-1]) for one in problems if one["type"] == "missing" and [*one["loc"][:-1]] == parents]
+        return InputError(_unknown_key(str(last), absent, _known_keys(model, parents)), field=field, value=value)
     if problem["type"] == "missing":
         return InputError("this key is missing", field=field)
-    return InputError(problem["msg"].replace("Input should be", "expected", 1), field=field, value=problem["input"])
+    return InputError(problem["msg"].replace("Input should", "expected to", 1).replace("to be ", "", 1), field=field,
+                      value=problem["input"])
 
 
 def _dotted(place: Sequence[int | str]) -> str:
     """("isolator", 1, "position_m") as isolator[2].position_m, counted from 1 as the sources do."""
-    return "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
+    words = (f"[{part + 1}]" if isinstance(part, int) else f".{part if part.isprintable() else repr(part)}"
+             for part in place)
+    return "".join(words).lstrip(".")
 
 
-def _unknown_key(key: str, known: Sequence[str]) -> str:
+def _unknown_key(key: str, absent: Sequence[str], known: Sequence[str]) -> str:
+    """What to write instead of `key`: rather one of the keys that are `absent` than any that is `known`."""
     if same := [name for name in known if _stem(name) == _stem(key)]:
         return f"the unit in this key is wrong; expected {same[0]}"
-    if near := difflib.get_close_matches(key, known, n=1):
-        return f"unknown key; did you mean {near[0]}?"
+    for names in (absent, known):
+        if near := difflib.get_close_matches(key, names, n=1):
+            return f"unknown key; did you mean {near[0]}?"
     return f"unknown key; expected one of {', '.join(known)}"
 
 

@@ -283,6 +283,7 @@ class Halcyonics(Rig):
     def points(self) -> dict[str, Place]:
         found = {m.name: Place(m.position, "isolator") for m in self.mounted_body().mounts[:4]}
         found |= {name: Place(place, "actuator") for name, (place, _) in self.actuator_axes().items()}
+        found |= {name: Place(place, "sensor") for name, (place, _) in self.sensor_axes().items()}
         found |= {"M1": Place(np.zeros(3), "measured point"),
                   "M2": Place(np.array([self.M2_arm, 0.0, 0.0]), "measured point"),
                   "M3": Place(np.array([0.0, self.M3_arm, 0.0]), "measured point"),
@@ -290,9 +291,9 @@ class Halcyonics(Rig):
         return found | ({"load": Place(self.load.position(), "load")} if self.load else {})
 
     def sensor_axes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """The built-in accelerometers (section 3.1), one at an actuator and along its axis, named as it."""
+        """The built-in accelerometers (section 3.1), "acc_A1" at actuator A1 and along its axis, and so on."""
         axes = self.actuator_axes()
-        return {name: axes[name] for name in self.accelerometers.at}
+        return {f"acc_{name}": axes[name] for name in self.accelerometers.at}
 
     def parameters(self) -> dict[str, Parameter]:
         """Symbols of the source; k_s1..k_s4 by corner (k_s: their mean), e1..e8, load.mass, load.L7, load.Ixx .."""

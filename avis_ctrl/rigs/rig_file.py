@@ -18,13 +18,17 @@ from avis_ctrl.rigs.avis import AvisTable, Isolator, LinearMotor
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
 from avis_ctrl.rigs.file_errors import first_complaint
 from avis_ctrl.rigs.halcyonics import Halcyonics, Load, ReactionMass
+from avis_ctrl.rigs.rigid_body import COORDINATES
 
 SHIPPED = {"avis": ("avis.toml", False), "halcyonics": ("halcyonics.toml", False),
            "halcyonics_loaded": ("halcyonics.toml", True)}
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+# In SI units nothing on a table comes near the limit; it keeps the products of such numbers finite.
+LIMIT = 1e12
+Number = Annotated[float, Field(ge=-LIMIT, le=LIMIT)]
+Positive = Annotated[float, Field(gt=0, le=LIMIT)]
+NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
+Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 PositiveVector = Annotated[list[Positive], Field(min_length=3, max_length=3)]
 DampingVector = Annotated[list[NotNegative], Field(min_length=3, max_length=3)]
 Axis = Literal["x", "y", "z"]
@@ -99,7 +103,7 @@ class PlateSection(_Section):
     L2_m: Positive
     L3_m: Positive
     L4_plus_L5_m: Positive
-    L6_m: float
+    L6_m: Number
 
 
 class SuspensionSection(_Section):
@@ -134,13 +138,13 @@ class AccelerometerSection(_Section):
 
 class LoadSection(_Section):
     mass_kg: Positive
-    L7_m: float
-    L8_m: float
-    L9_m: float
+    L7_m: Number
+    L8_m: Number
+    L9_m: Number
     Ixx_total_kgm2: Positive
     Iyy_total_kgm2: Positive
     Izz_total_kgm2: Positive
-    Ixy_load_kgm2: float = 0.0
+    Ixy_load_kgm2: Number = 0.0
 
 
 class HalcyonicsFile(_Section):
@@ -171,7 +175,7 @@ def load_rig(path_or_name: str | Path, loaded: bool = False) -> AvisTable | Halc
         path = Path(path_or_name)
     content = _read_toml(path)
     try:
-        return _rig_from(content, loaded)
+        return rig_from(content, loaded)
     except InputError as error:
         raise error.in_file(path) from None
 
@@ -182,19 +186,35 @@ def _read_toml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"expected a rig file or one of {sorted(SHIPPED)}; {error.strerror or error}",
                          file=path) from None
-    except (UnicodeDecodeError, ValueError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"expected a TOML file in UTF-8; {' '.join(str(error).split())}", file=path) from None
 
 
-def _rig_from(content: dict[str, Any], loaded: bool) -> AvisTable | Halcyonics:
+def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcyonics:
+    """The rig of a file's content; raises as `load_rig` does, without the file's name."""
+    rig: AvisTable | Halcyonics
     if "isolator" in content:
         if loaded:
             raise InputError("a rig with isolators has no [load] section to put on it", field="load")
-        return _avis(_checked(AvisFile, content))
-    if "suspension" in content:
-        return _halcyonics(_checked(HalcyonicsFile, content), loaded)
-    raise InputError("expected the sections of a rig: [[isolator]] (air mounts) or [suspension] (springs)",
-                     field="top level", value=sorted(content))
+        rig = _avis(_checked(AvisFile, content))
+    elif "suspension" in content:
+        rig = _halcyonics(_checked(HalcyonicsFile, content), loaded)
+    else:
+        raise InputError("expected the sections of a rig: [[isolator]] (air mounts) or [suspension] (springs)",
+                         field="top level", value=sorted(content))
+    _check_support(rig)
+    return rig
+
+
+def _check_support(rig: AvisTable | Halcyonics) -> None:
+    """Every motion of the payload stretches a spring: the stiffness, its diagonal scaled to one, is definite."""
+    K = rig.equations_of_motion().K
+    size = np.sqrt(np.maximum(np.diag(K), np.finfo(float).tiny))
+    softest, motion = (part[..., 0] for part in np.linalg.eigh(K / np.outer(size, size)))
+    if softest < 1e-9:
+        most = COORDINATES[int(np.argmax(np.abs(motion)))]
+        raise InputError(f"expected springs that hold every motion; nothing resists one that is mostly {most}",
+                         field="isolator" if isinstance(rig, AvisTable) else "suspension")
 
 
 def _checked(model: type[File], content: dict[str, Any]) -> File:

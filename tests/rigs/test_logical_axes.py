@@ -1,0 +1,73 @@
+"""Actuator and sensor matrices against forces and motions at the places, and least norm against an optimiser."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs import COORDINATES, load_rig
+from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
+
+RIGS = ["avis", "halcyonics", "halcyonics_loaded"]
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_allocated_voltages_make_the_force_asked_and_no_other(name, rng):
+    rig = load_rig(name)
+    body, axes = rig.mounted_body(), actuator_axes(rig)
+    wanted = rng.normal(size=6)
+    volts = axes.allocation @ wanted
+    forces = [a.constant_N_per_V * v * a.direction for a, v in zip(body.actuators, volts, strict=True)]
+    moments = [np.cross(a.position, f) for a, f in zip(body.actuators, forces, strict=True)]
+    assert np.allclose(np.concatenate([np.sum(forces, axis=0), np.sum(moments, axis=0)]), wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_the_kept_axes_push_nothing_else(name):
+    rig = load_rig(name)
+    axes = actuator_axes(rig, ("z", "phi_x"))
+    pushed = rig.equations_of_motion().T @ axes.allocation
+    assert np.allclose(pushed, np.eye(6)[:, [2, 3]], atol=1e-12)
+    assert axes.quiet == ("x", "y", "phi_y", "phi_z")
+
+
+def test_allocation_is_the_one_of_least_norm(rng):
+    rig, wanted = load_rig("avis"), rng.normal(size=6)
+    volts = cp.Variable(8)
+    cp.Problem(cp.Minimize(cp.sum_squares(volts)), [rig.equations_of_motion().T @ volts == wanted]).solve("CLARABEL")
+    assert np.allclose(actuator_axes(rig).allocation @ wanted, volts.value, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_sensors_decode_any_rigid_motion(name, rng):
+    rig = load_rig(name)
+    q = rng.normal(size=6)
+    seen = [n @ (q[:3] + np.cross(q[3:], p)) for p, n in rig.sensor_axes().values()]
+    assert np.allclose(sensor_axes(rig).decoding @ seen, q, atol=1e-12)
+    assert np.allclose(sensor_axes(rig, ("z", "phi_x")).decoding @ seen, q[[2, 3]], atol=1e-12)
+
+
+def test_condition_numbers_do_not_depend_on_units():
+    """By hand for z and phi_x of four equal vertical motors at y = +-0.375: orthogonal rows, condition 1."""
+    rig = load_rig("avis")
+    four = ["Az1", "Az2", "Az3", "Az4"]
+    assert actuator_axes(rig, ("z", "phi_x"), four, quiet=["phi_y"]).condition == pytest.approx(1.0)
+    assert 1.0 < actuator_axes(rig).condition < 2.0 and 1.0 < sensor_axes(rig).condition < 3.0
+
+
+def test_axes_out_of_reach_are_named():
+    rig = load_rig("avis")
+    with pytest.raises(InputError, match="x cannot be pushed independently by the actuators"):
+        actuator_axes(rig, ("x", "z"), ["Az1", "Az2", "Az3", "Az4"], quiet=[])
+    with pytest.raises(InputError, match="cannot be pushed independently"):
+        actuator_axes(rig, ("z", "phi_x", "phi_y"), ["Az1", "Az2"], quiet=[])
+    with pytest.raises(InputError, match="cannot be told apart by the sensors"):
+        sensor_axes(rig, COORDINATES, ["Sz1", "Sz2", "Sz3", "Sx2", "Sy1"])
+    with pytest.raises(InputError, match="out of"):
+        sensor_axes(rig, ("z",), ["Sz9"])
+
+
+def test_two_motors_on_a_line_cannot_tell_z_from_the_roll():
+    """Az1 and Az2 both stand at y = -0.375: z and phi_x only in the fixed ratio of the arm."""
+    with pytest.raises(InputError, match="z and phi_x cannot be pushed independently"):
+        actuator_axes(load_rig("avis"), ("z", "phi_x"), ["Az1", "Az2"], quiet=[])
