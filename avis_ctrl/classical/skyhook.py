@@ -1,0 +1,65 @@
+"""The baseline: decentralised velocity feedback, one loop an axis ("skyhook" of both sources).
+
+    F_a = -g_a  s/(s + w_tilt)  1/(s/w_roll + 1)  v_a
+
+The first filter keeps gravity (tilt) and the sensor's drift out of the loop, the second keeps the loop's gain
+from meeting what lies above its band. Gains come from the classical rule or from the tuning in
+`avis_ctrl.classical.tuning`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.statespace import StateSpace, append
+
+
+@dataclass(frozen=True)
+class Skyhook:
+    """Velocity feedback of some axes.
+
+    Parameters
+    ----------
+    axes : names; rotations as edge displacements.
+    gains : N s/m, one an axis (edge force per edge velocity for rotations).
+    tilt_corner_Hz, roll_off_Hz : corners of the high-pass and of the low-pass filter.
+    """
+
+    axes: tuple[str, ...]
+    gains: tuple[float, ...]
+    tilt_corner_Hz: float
+    roll_off_Hz: float
+
+    def __post_init__(self) -> None:
+        if len(self.axes) != len(self.gains):
+            raise InputError(f"{len(self.axes)} axes but {len(self.gains)} gains", field="gains", value=self.gains)
+        for field in ("tilt_corner_Hz", "roll_off_Hz"):
+            value = getattr(self, field)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError("expected a positive frequency", field=field, value=value)
+        if self.tilt_corner_Hz >= self.roll_off_Hz:
+            raise InputError(f"expected a corner below the roll-off at {self.roll_off_Hz:g} Hz",
+                             field="tilt_corner_Hz", value=self.tilt_corner_Hz)
+
+    @property
+    def filter(self) -> StateSpace:
+        """Both filters, unit passband gain."""
+        tilt, roll = 2 * np.pi * self.tilt_corner_Hz, 2 * np.pi * self.roll_off_Hz
+        return cascade(np.zeros(1), [-tilt, -roll], roll)
+
+    def controller(self) -> StateSpace:
+        """K with u = K y: inputs "seen_AXIS_dot" [m/s], outputs "command_AXIS" [N]."""
+        loops = [self.filter.scaled(left=-gain).renamed([f"seen_{axis}_dot"], [f"command_{axis}"])
+                 for axis, gain in zip(self.axes, self.gains, strict=True)]
+        return append(*loops)
+
+
+def critical_damping(mass: Sequence[float], stiffness: Sequence[float], damping: Sequence[float]) -> np.ndarray:
+    """The classical rule: g = 2 sqrt(k m) - c makes each axis, taken alone, critically damped."""
+    m, k, c = (np.asarray(values, float) for values in (mass, stiffness, damping))
+    return np.maximum(2.0 * np.sqrt(k * m) - c, 0.0)
