@@ -52,7 +52,7 @@ def lmi_gamma(P: Any, nmeas: int, ncon: int) -> LmiOptimum:
     P = as_plant(P, nmeas, ncon)
     plant = Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon)
     check_stabilisable(plant)
-    size = float(la.norm(plant.channel(plant.B1, plant.C1, plant.D11))) or 1.0
+    first = size = float(la.norm(plant.channel(plant.B1, plant.C1, plant.D11))) or 1.0
     best: LmiOptimum | None = None
     # The solver's tolerances are absolute: the norm is measured in units of the last answer until that is 1.
     for _ in range(6):
@@ -63,7 +63,7 @@ def lmi_gamma(P: Any, nmeas: int, ncon: int) -> LmiOptimum:
         settled = best is not None and abs(found.upper - best.upper) < 1e-5 * best.upper
         if best is None or found.upper < best.upper:
             best = found
-        if settled or upper < 1e-9:
+        if settled or found.upper < 1e-7 * first:
             break
         size = found.upper
     assert best is not None
@@ -151,7 +151,7 @@ def _dual_value(plant: Plant, multipliers: list[np.ndarray]) -> float:
 
 def _sides(plant: Plant) -> list[tuple[np.ndarray, ...]]:
     """(A, B1, C1, D11, N) of the inequality of R, and of that of S: the same form on the transposed plant."""
-    sides = []
+    sides: list[tuple[np.ndarray, ...]] = []
     for A, B1, C1, D11, B2, D12 in ((plant.A, plant.B1, plant.C1, plant.D11, plant.B2, plant.D12),
                                     (plant.A.T, plant.C1.T, plant.B1.T, plant.D11.T, plant.C2.T, plant.D21.T)):
         kernel = la.null_space(np.hstack([B2.T, D12.T]))

@@ -18,6 +18,9 @@ from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.hinf_plant import NormalForm, Plant
 from avis_ctrl.robust.riccati import solve_riccati
 
+# Relative to the open channel w -> z, a gamma below this is round-off.
+ZERO_GAMMA = 1e-9
+
 
 @dataclass(frozen=True)
 class GammaTest:
@@ -75,8 +78,9 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
 
     ComputationError where even gamma = limit times the start fails.
     """
-    floor = direct_term_bound(plant)
-    start = max(hint or _natural_gamma(plant), floor * (1 + 2 * tolerance), 1e-12)
+    floor, natural = direct_term_bound(plant), _natural_gamma(plant)
+    nothing = ZERO_GAMMA * natural
+    start = max(hint or natural, floor * (1 + 2 * tolerance), nothing)
     search = _Search(plant, floor, start)
     step, factor = start, 1.05 if hint else 4.0
     while search.upper is None:
@@ -86,7 +90,7 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
             raise ComputationError("no controller reaches any gamma", measured=f"gamma up to {step:.3g} tried",
                                    cause=search.reason, next_step="check weights and scaling of the plant")
     factor = 1.05 if hint else 4.0
-    while search.lower <= max(floor, 0.0) and search.upper.gamma > 1e-9 * start:
+    while search.lower <= max(floor, 0.0) and search.upper.gamma > nothing:
         step = search.upper.gamma / factor
         if step <= floor * (1 + tolerance):
             step = floor * (1 + tolerance / 2)
@@ -94,7 +98,9 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
                 break
         search.try_gamma(step)
         factor = min(factor ** 2, 1e3)
-    search.refine(tolerance, 1e-9 * start)
+    if search.upper.gamma <= 100 * nothing:
+        return GammaBracket(0.0, search.upper, "nothing: the optimum is zero to working precision", search.tests)
+    search.refine(tolerance, nothing)
     return GammaBracket(search.lower, search.upper, search.reason or "the direct term D11", search.tests)
 
 

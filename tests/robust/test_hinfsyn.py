@@ -1,0 +1,305 @@
+"""H-infinity synthesis against textbooks, closed forms and linear matrix inequalities."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti import (
+    StateSpace,
+    append,
+    connect,
+    discretise,
+    gain,
+    hinf_norm,
+    lft_lower,
+    summing_junction,
+    tf,
+)
+from avis_ctrl.lti.realisation import hankel_singular_values
+from avis_ctrl.robust.hinf_bounds import hinf_lower_bound
+from avis_ctrl.robust.hinf_lmi import lmi_gamma
+from avis_ctrl.robust.hinfsyn import Status, hinf_suboptimal, hinfsyn
+
+DISTURBANCE_PROCESS = ([200], np.polymul([10, 1], np.polymul([0.05, 1], [0.05, 1])))
+
+
+def random_plant(rng, n, n_w, n_z, ncon, nmeas, direct=1.0):
+    D = np.block([[direct * rng.standard_normal((n_z, n_w)), rng.standard_normal((n_z, ncon))],
+                  [rng.standard_normal((nmeas, n_w)), direct * rng.standard_normal((nmeas, ncon))]])
+    return StateSpace(rng.standard_normal((n, n)), rng.standard_normal((n, n_w + ncon)),
+                      rng.standard_normal((n_z + nmeas, n)), D)
+
+
+def check(P, nmeas, ncon, result, backoff=0.01):
+    """What every result must satisfy, measured by another route than the synthesis's own."""
+    closed = lft_lower(P, result.K)
+    assert np.max(la.eigvals(closed.A).real, initial=-1.0) < 0
+    omega = np.geomspace(1e-4, 1e5, 2000)
+    on_grid = np.max(la.svd(closed.frequency_response(omega), compute_uv=False))
+    assert on_grid <= result.gamma * (1 + 1e-6)
+    assert result.gamma <= (1 + backoff) * result.gamma_optimal_bounds[1] * (1 + 1e-4)
+    assert result.K.inputs == P.outputs[-nmeas:] and result.K.outputs == P.inputs[-ncon:]
+
+
+def mixed_sensitivity(weight, plant=DISTURBANCE_PROCESS):
+    return connect([tf(*plant, ["u"], ["g"]), summing_junction("e", ["r", "-g"]), tf(*weight, ["e"], ["wp_e"]),
+                    gain([[1.0]], ["u"], ["wu_u"]), gain([[1.0]], ["e"], ["y"])], ["r", "u"], ["wp_e", "wu_u", "y"])
+
+
+class TestTextbooks:
+    def test_mixed_sensitivity_of_the_disturbance_process(self):
+        """Skogestad and Postlethwaite, 2nd ed. 2005, example 2.17 (2.11 in the 1st): weight 1 gives 1.37."""
+        M, w_B, A = 1.5, 10.0, 1e-4
+        result = hinfsyn(mixed_sensitivity(([1 / M, w_B], [1, w_B * A])), 1, 1)
+        assert result.gamma_optimal_bounds[1] == pytest.approx(1.37, abs=0.005)
+        assert result.status is Status.OPTIMAL
+
+    def test_second_weight_of_the_disturbance_process(self):
+        """Same example, weight of second order for more gain at low frequency: 2.19."""
+        M, w_B, A = 1.5, 10.0, 1e-4
+        num, den = [1 / np.sqrt(M), w_B], [1, w_B * np.sqrt(A)]
+        result = hinfsyn(mixed_sensitivity((np.polymul(num, num), np.polymul(den, den))), 1, 1)
+        assert result.gamma_optimal_bounds[1] == pytest.approx(2.19, abs=0.005)
+
+    def test_loop_shaping_of_the_disturbance_process(self):
+        """Example 9.3: normalised coprime factors, gamma_min = 2.34; also sqrt(1 + rho(X Z)), eq. 9.66."""
+        G = tf(*DISTURBANCE_PROCESS) @ tf([1, 2], [1, 0])
+        X = la.solve_continuous_are(G.A, G.B, G.C.T @ G.C, np.eye(1))
+        Z = la.solve_continuous_are(G.A.T, G.C.T, G.B @ G.B.T, np.eye(1))
+        exact = np.sqrt(1 + np.max(la.eigvals(X @ Z).real))
+        P = StateSpace(G.A, np.hstack([Z @ G.C.T, G.B]), np.vstack([0 * G.C, G.C, G.C]),
+                       [[0, 1], [1, 0], [1, 0]], 0.0, ["w", "u"], ["z_u", "z_y", "y"])
+        result = hinfsyn(P, 1, 1, tolerance=1e-5)
+        assert result.gamma_optimal_bounds[1] == pytest.approx(2.34, abs=0.005)
+        assert result.gamma_optimal_bounds[0] <= exact * (1 + 1e-7)
+        assert result.gamma_optimal_bounds[1] == pytest.approx(exact, rel=2e-5)
+        check(P, 1, 1, result)
+
+    @pytest.mark.parametrize("a", [-1.0, 0.0, 0.5, 3.0])
+    def test_scalar_plant_in_closed_form(self, a):
+        """Doyle, Glover, Khargonekar and Francis (IEEE TAC 34, 1989), theorem 3, for the scalar plant
+        x' = a x + w1 + u, z = (x, u), y = x + w2: X = Y = 1/(sqrt(a^2 + 1 - 1/gamma^2) - a), so that
+        rho(X Y) = gamma^2 at gamma = a + sqrt(a^2 + 2)."""
+        P = StateSpace([[a]], [[1, 0, 1]], [[1], [0], [1]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]])
+        result = hinfsyn(P, 1, 1, tolerance=1e-5)
+        assert result.gamma_optimal_bounds[0] <= a + np.sqrt(a * a + 2) <= result.gamma_optimal_bounds[1] * (1 + 1e-9)
+        check(P, 1, 1, result)
+
+    @pytest.mark.parametrize("z", [0.5, 2.0])
+    def test_weighted_sensitivity_with_a_right_half_plane_zero(self, z):
+        """min ||W S|| = |W(z)|: Zames and Francis (IEEE TAC 28, 1983); Skogestad and Postlethwaite eq. 5.30."""
+        P = connect([tf([-1, z], [1, 4, 3], ["u"], ["g"]), summing_junction("e", ["r", "-g"]),
+                     tf([1, 1], [1, 0.01], ["e"], ["z"]), gain([[1.0]], ["e"], ["y"])], ["r", "u"], ["z", "y"])
+        exact = (z + 1) / (z + 0.01)
+        result = hinfsyn(P, 1, 1)
+        assert result.status is Status.REGULARISED and "D12" in result.notes[0]
+        assert exact <= result.gamma <= 1.03 * exact
+        assert hinf_lower_bound(P, 1, 1).gamma == pytest.approx(exact, rel=1e-6)
+        assert lmi_gamma(P, 1, 1).upper == pytest.approx(exact, rel=2e-3)
+
+    def test_sensitivity_peak_of_an_unstable_plant_with_a_zero(self):
+        """min ||S|| = |z + p| / |z - p|: Skogestad and Postlethwaite, section 5.3, combined pole and zero."""
+        z, p = 8.0, 1.0
+        P = connect([tf([1, -z], np.polymul([1, -p], [0.1, 1]), ["u"], ["g"]), summing_junction("y", ["r", "-g"]),
+                     gain([[1.0]], ["y"], ["e"])], ["r", "u"], ["e", "y"])
+        result = hinfsyn(P, 1, 1)
+        assert (z + p) / (z - p) <= result.gamma <= 1.03 * (z + p) / (z - p)
+
+    @pytest.mark.parametrize("poles", [[1.5], [1.0, 4.0]])
+    def test_control_effort_to_stabilise(self, poles):
+        """min ||K S|| = 1 / (smallest Hankel singular value of the mirrored unstable part):
+        Glover (IJC 43, 1986, robust stabilisation), Skogestad and Postlethwaite eq. 5.31. One pole p: 2 p."""
+        G = tf([1], np.poly(poles), ["u"], ["g"])
+        P = connect([G, summing_junction("y", ["g", "d"]), gain([[1.0]], ["u"], ["z"])], ["d", "u"], ["z", "y"])
+        mirrored = tf([1], np.poly(-np.array(poles)))
+        Wc = la.solve_continuous_lyapunov(mirrored.A, -mirrored.B @ mirrored.B.T)
+        # The antistable part s -> -s; for a second-order plant the sign of the numerator does not matter.
+        Wo = la.solve_continuous_lyapunov(mirrored.A.T, -mirrored.C.T @ mirrored.C)
+        smallest = np.sqrt(np.min(la.eigvals(Wc @ Wo).real))
+        result = hinfsyn(P, 1, 1, tolerance=1e-5)
+        assert result.gamma_optimal_bounds[1] == pytest.approx(1 / smallest, rel=2e-5)
+        if len(poles) == 1:
+            assert 1 / smallest == pytest.approx(2 * poles[0])
+        check(P, 1, 1, result)
+
+    def test_model_matching_by_nevanlinna_and_pick(self):
+        """min over stable Q of ||T1 - T2 Q||, T2 inner with zeros z_i: the root of the largest eigenvalue of
+        inv(A) B, A_ij = 1/(z_i + z_j), B_ij = T1(z_i) T1(z_j)/(z_i + z_j).
+        Doyle, Francis and Tannenbaum, Feedback Control Theory (1992), chapters 9 and 10."""
+        zeros = np.array([1.0, 3.0])
+        T1 = tf([1, 10], [1, 2], ["w"], ["t1"])
+        T2 = tf(np.poly(zeros), np.poly(-zeros), ["u"], ["t2"])
+        P = connect([T1, T2, summing_junction("z", ["t1", "-t2"]), gain([[1.0]], ["w"], ["y"])], ["w", "u"], ["z", "y"])
+        values = (zeros + 10) / (zeros + 2)
+        A = 1 / np.add.outer(zeros, zeros)
+        exact = np.sqrt(np.max(la.eigvals(np.linalg.solve(A, A * np.outer(values, values))).real))
+        result = hinfsyn(P, 1, 1, tolerance=1e-5)
+        assert result.gamma_optimal_bounds[1] == pytest.approx(exact, rel=2e-5)
+        check(P, 1, 1, result)
+
+    def test_nehari_distance_is_a_hankel_norm(self):
+        """Distance of an antistable R from the stable functions = Hankel norm of its mirror image (Nehari 1957;
+        Francis, A Course in H-infinity Control Theory, 1987). Posed as T1 = R T2 with T2 inner, its zeros R's poles."""
+        p = np.array([1.0, 2.0])
+        R_num = [3.0, 5.0]
+        P = connect([tf(R_num, np.poly(-p), ["w"], ["t1"]), tf(np.poly(p), np.poly(-p), ["u"], ["t2"]),
+                     summing_junction("z", ["t1", "-t2"]), gain([[1.0]], ["w"], ["y"])], ["w", "u"], ["z", "y"])
+        mirror = tf([-R_num[0], R_num[1]], np.poly(-p))
+        result = hinfsyn(P, 1, 1, tolerance=1e-5)
+        assert result.gamma_optimal_bounds[1] == pytest.approx(hankel_singular_values(mirror)[0], rel=2e-5)
+
+    def test_optimum_of_zero(self):
+        """python-control's and Octave's example for SB10AD: both channels have stable inverses, K = -1/(s + 3)
+        makes the closed loop vanish."""
+        P = StateSpace([[-1]], [[1, 1]], [[1], [1]], [[0, 1], [1, 0]])
+        result = hinfsyn(P, 1, 1)
+        assert result.gamma < 1e-7 and result.gamma_optimal_bounds[0] == 0 and "zero" in result.limited_by
+        s = 0.7j
+        assert result.K(s)[0, 0] == pytest.approx(-1 / (s + 3), rel=1e-6)
+
+    def test_static_problem_is_parrott(self, rng):
+        """No states: min over K of ||D11 + D12 K D21|| (Parrott 1978), here with zero blocks known by hand."""
+        P = gain([[3.0, 0.0, 0.0], [0.0, 5.0, 1.0], [0.0, 1.0, 0.0]])
+        result = hinfsyn(P, 1, 1)
+        assert result.gamma_optimal_bounds[1] == pytest.approx(3.0, rel=2e-3)
+
+
+class TestAgainstMatrixInequalities:
+    @pytest.mark.parametrize("size", [(0, 3, 3, 1, 2), (1, 2, 2, 1, 1), (2, 2, 1, 1, 1), (3, 3, 2, 1, 2),
+                                      (4, 4, 5, 2, 2), (3, 2, 4, 2, 2), (6, 3, 3, 2, 1)])
+    def test_same_optimum_for_any_direct_terms(self, rng, size):
+        n, n_w, n_z, ncon, nmeas = size
+        P = random_plant(rng, n, n_w, n_z, ncon, nmeas)
+        result = hinfsyn(P, nmeas, ncon)
+        optimum = lmi_gamma(P, nmeas, ncon)
+        assert result.gamma_optimal_bounds[0] <= optimum.upper * (1 + 1e-5)
+        assert result.gamma_optimal_bounds[1] >= optimum.lower * (1 - 1e-5)
+        assert optimum.lower == pytest.approx(optimum.upper, rel=1e-3)
+        check(P, nmeas, ncon, result)
+
+    def test_method_lmi_returns_its_own_bounds(self, rng):
+        P = random_plant(rng, 3, 2, 2, 1, 1)
+        by_lmi, by_riccati = hinfsyn(P, 1, 1, method="lmi"), hinfsyn(P, 1, 1)
+        assert by_lmi.gamma_optimal_bounds[1] == pytest.approx(by_riccati.gamma_optimal_bounds[1], rel=1.5e-3)
+        check(P, 1, 1, by_lmi)
+
+    def test_no_controller_beats_the_lower_bound(self, rng):
+        P = random_plant(rng, 4, 3, 3, 1, 1)
+        bound = hinf_lower_bound(P, 1, 1)
+        assert bound.gamma <= lmi_gamma(P, 1, 1).upper * (1 + 1e-6)
+
+
+class TestSingularProblems:
+    def test_both_rank_deficient(self, rng):
+        P = random_plant(rng, 3, 2, 2, 1, 1, direct=0.0)
+        P = StateSpace(P.A, P.B, P.C, np.zeros((3, 3)))
+        result = hinfsyn(P, 1, 1)
+        assert result.status is Status.REGULARISED
+        assert "D12" in result.notes[0] and "D21" in result.notes[0]
+        assert lmi_gamma(P, 1, 1).lower * (1 - 1e-4) <= result.gamma
+        assert hinf_norm(lft_lower(P, result.K)).gain == pytest.approx(result.gamma)
+
+    def test_zero_on_the_imaginary_axis(self):
+        """An undamped mode that the cost does not see but the input moves."""
+        A = la.block_diag([[0.0, 1.0], [-4.0, 0.0]], [[-1.0]])
+        P = StateSpace(A, [[0, 0, 0], [1, 0, 1], [1, 0, 1]], [[0, 0, 1], [0, 0, 0], [1, 0, 1]],
+                       [[0, 0, 0], [0, 0, 1], [0, 1, 0]])
+        result = hinfsyn(P, 1, 1)
+        assert result.status is Status.REGULARISED and "imaginary axis" in result.notes[0]
+        assert result.abscissa < 0
+
+    def test_fewer_outputs_than_controls(self, rng):
+        P = random_plant(rng, 3, 3, 1, 2, 1)
+        result = hinfsyn(P, 1, 2)
+        assert result.status is Status.REGULARISED
+        assert lmi_gamma(P, 1, 2).lower * (1 - 1e-4) <= result.gamma
+
+
+class TestRefusals:
+    def test_mode_that_no_input_moves_is_named(self):
+        stuck = tf([1.0], [1, 0, (2 * np.pi * 2.07) ** 2], ["floor"], ["z1"])
+        P = connect([stuck, tf([1.0], [1, 1], ["force"], ["x"]), summing_junction("y", ["x", "z1"]),
+                     gain([[1.0]], ["force"], ["z2"])], ["floor", "force"], ["z1", "z2", "y"])
+        with pytest.raises(ComputationError, match=r"mode at 2\.07 Hz is not moved by any of the inputs \['force'\]"):
+            hinfsyn(P, 1, 1)
+
+    def test_mode_that_no_measurement_sees_is_named(self):
+        unseen = tf([1.0], [1, -0.5], ["force"], ["z1"])
+        P = connect([unseen, tf([1.0], [1, 1], ["force"], ["x"]), summing_junction("y", ["x", "n"])],
+                    ["n", "force"], ["z1", "y"])
+        with pytest.raises(ComputationError, match=r"not seen by any of the measurements \['y'\]"):
+            hinfsyn(P, 1, 1)
+
+    @pytest.mark.parametrize(("nmeas", "ncon", "field"), [(0, 1, "nmeas"), (1, 0, "ncon"), (3, 1, "nmeas"),
+                                                         (1, 7, "ncon"), (1.5, 1, "nmeas"), (True, 1, "nmeas")])
+    def test_wrong_partition(self, rng, nmeas, ncon, field):
+        with pytest.raises(InputError, match=field):
+            hinfsyn(random_plant(rng, 2, 2, 2, 1, 1), nmeas, ncon)
+
+    @pytest.mark.parametrize("options", [{"backoff": -1}, {"tolerance": 0}, {"method": "magic"},
+                                         {"gamma_hint": np.nan}, {"sample_rate_Hz": -5.0}])
+    def test_wrong_options(self, rng, options):
+        with pytest.raises(InputError, match=next(iter(options))):
+            hinfsyn(random_plant(rng, 2, 2, 2, 1, 1), 1, 1, **options)
+
+    def test_not_a_plant(self):
+        with pytest.raises(InputError, match="P = 'ndarray'"):
+            hinfsyn(np.eye(3), 1, 1)
+
+    def test_gamma_out_of_reach_says_which_condition_fails(self):
+        P = StateSpace([[1.0]], [[1, 0, 1]], [[1], [0], [1]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]])
+        with pytest.raises(ComputationError, match="rho"):
+            hinf_suboptimal(P, 1, 1, 2.0)
+
+
+class TestUse:
+    def test_suboptimal_keeps_its_gamma(self, rng):
+        P = random_plant(rng, 5, 3, 3, 2, 2)
+        optimum = hinfsyn(P, 2, 2).gamma_optimal_bounds[1]
+        result = hinf_suboptimal(P, 2, 2, 1.2 * optimum)
+        assert result.gamma < 1.2 * optimum and result.abscissa < 0
+
+    def test_python_control_plant(self, rng):
+        P = random_plant(rng, 3, 2, 2, 1, 1)
+        assert hinfsyn(P.to_control(), 1, 1).gamma == pytest.approx(hinfsyn(P, 1, 1).gamma, rel=1e-9)
+
+    def test_hint_changes_nothing_but_the_time(self, rng):
+        P = random_plant(rng, 4, 3, 3, 1, 1)
+        plain = hinfsyn(P, 1, 1)
+        for hint in (1e-3, 0.5, 0.999, 1.02, 50.0):
+            hinted = hinfsyn(P, 1, 1, gamma_hint=hint * plain.gamma_optimal_bounds[1])
+            assert hinted.gamma_optimal_bounds[1] == pytest.approx(plain.gamma_optimal_bounds[1], rel=1.5e-3)
+
+    def test_units_of_states_and_signals_do_not_matter(self, rng):
+        P = random_plant(rng, 5, 2, 2, 1, 1)
+        scaled = P.similar(np.diag(10.0 ** rng.uniform(-5, 5, 5))).scaled([1, 1, 1e6], [1, 1, 1e-4])
+        assert hinfsyn(scaled, 1, 1).gamma_optimal_bounds[1] == pytest.approx(
+            hinfsyn(P, 1, 1).gamma_optimal_bounds[1], rel=2e-3)
+
+    def test_sampled_plant_gets_a_sampled_controller(self):
+        P = mixed_sensitivity(([1 / 1.5, 10.0], [1, 1e-3]))
+        sampled = discretise(P, 1e-3, "tustin")
+        result = hinfsyn(sampled, 1, 1)
+        closed = lft_lower(sampled, result.K)
+        assert result.K.dt == sampled.dt and np.max(np.abs(closed.poles())) < 1
+        # The bilinear map keeps the H-infinity norm, so the optimum is the continuous one.
+        assert result.gamma_optimal_bounds[1] == pytest.approx(hinfsyn(P, 1, 1).gamma_optimal_bounds[1], rel=2e-3)
+        on_circle = closed.frequency_response(np.geomspace(1e-3, np.pi / 1e-3, 2000))
+        assert np.max(la.svd(on_circle, compute_uv=False)) <= result.gamma * (1 + 1e-6)
+
+    def test_fastest_pole_against_the_sample_rate(self):
+        P = mixed_sensitivity(([1 / 1.5, 10.0], [1, 1e-3]))
+        result = hinfsyn(P, 1, 1, sample_rate_Hz=10.0)
+        assert result.fastest_pole == pytest.approx(np.max(np.abs(result.K.poles())))
+        assert "too fast" in result.notes[-1]
+
+    def test_two_plants_side_by_side_have_the_larger_optimum(self, rng):
+        a, b = (random_plant(rng, 2, 2, 2, 1, 1) for _ in range(2))
+        both = append(a.renamed(["w1", "w2", "u1"], ["z1", "z2", "y1"]), b.renamed(["w3", "w4", "u2"],
+                                                                                 ["z3", "z4", "y2"]))
+        both = both.select(["z1", "z2", "z3", "z4", "y1", "y2"], ["w1", "w2", "w3", "w4", "u1", "u2"])
+        larger = max(hinfsyn(one, 1, 1).gamma_optimal_bounds[1] for one in (a, b))
+        assert hinfsyn(both, 2, 2).gamma_optimal_bounds[1] == pytest.approx(larger, rel=2e-3)
