@@ -15,6 +15,9 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti.statespace import StateSpace
 
+# Angle from the imaginary axis within which an eigenvalue of the Hamiltonian is looked at as a crossing.
+NEAR_AXIS = 3e-2
+
 
 class PeakGain(NamedTuple):
     """H-infinity norm and the frequency [rad/s] where it is reached (inf for the direct term)."""
@@ -74,7 +77,7 @@ def _balanced(system: StateSpace) -> StateSpace:
 
 
 def _level_crossings(system: StateSpace, level: float) -> np.ndarray:
-    """Frequencies [rad/s] where a singular value of the response equals the level (greater than sigma_max(D))."""
+    """Frequencies [rad/s] where a singular value of the response equals, or nearly, the level (above sigma_max(D))."""
     A, B, C, D = system.A, system.B, system.C, system.D
     R = level ** 2 * np.eye(system.ninputs) - D.T @ D
     if not system.nstates or np.min(la.eigvalsh(R)) <= 0:
@@ -88,7 +91,9 @@ def _level_crossings(system: StateSpace, level: float) -> np.ndarray:
     H = np.block([[F, t * BR], [-Q / t, -F.T]])
     eigenvalues = la.eigvals(H)
     scale = np.maximum(np.abs(eigenvalues), 1e-8 * np.max(np.abs(eigenvalues)))
-    on_axis = np.abs(eigenvalues.real) < 1e-8 * scale + 1e-14 * np.max(np.abs(eigenvalues))
+    # Round-off moves the crossings of a flat response far off the axis (a nearly multiple eigenvalue). The caller
+    # evaluates the response at every frequency returned, so one too many costs little and one too few the norm.
+    on_axis = np.abs(eigenvalues.real) < NEAR_AXIS * scale
     return np.unique(np.abs(eigenvalues[on_axis].imag))
 
 
