@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -87,7 +88,7 @@ def read_floor_motion(path: str | Path) -> MeasuredSpectrum:
         return MeasuredSpectrum(path.stem, frequency, asd)
     except InputError as error:
         raise error.in_file(path) from None
-    except (OSError, ValueError, KeyError, IndexError, EOFError) as error:
+    except (OSError, ValueError, KeyError, IndexError, EOFError, BadZipFile) as error:
         raise InputError(f"a displacement spectrum: {error}", file=path) from error
 
 

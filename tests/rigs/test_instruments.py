@@ -1,0 +1,203 @@
+"""Sensor and actuator chains against their limits, and against noise measured on samples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import factorial
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti import hinf_norm
+from avis_ctrl.lti.realisation import hankel_singular_values
+from avis_ctrl.rigs.actuator import ActuatorChain, pade_delay, zero_order_hold
+from avis_ctrl.rigs.converter import Converter, quantise
+from avis_ctrl.rigs.geophone import Accelerometer, CompensationFilter, Geophone, SensorChain
+
+AVIS_CONVERTER = Converter(14, 10.0, 1000.0)
+
+
+def response(system, frequency_Hz):
+    return system.frequency_response(2 * np.pi * np.atleast_1d(frequency_Hz))[:, 0, 0]
+
+
+def avis_chain(corner_Hz=4.5, damping=0.56, **more):
+    return SensorChain(Geophone(corner_Hz, damping, 31.25, **more), CompensationFilter(4.5, 0.56, 0.5, 0.7), 100.0,
+                       AVIS_CONVERTER, 1e-3)
+
+
+def test_a_geophone_senses_velocity_above_its_corner_and_jerk_below():
+    geophone = Geophone(4.5, 0.56, 31.25)
+    high, low = 4.5e4, 4.5e-4
+    assert response(geophone.system(), high)[0] == pytest.approx(31.25, rel=2e-4)
+    jerk_over_velocity = (2j * np.pi * low) ** 2
+    assert response(geophone.system(), low)[0] / jerk_over_velocity == pytest.approx(
+        31.25 / (2 * np.pi * 4.5) ** 2, rel=2e-4)
+    slope = np.diff(np.log10(np.abs(response(geophone.system(), [low, 10 * low]))))
+    assert slope[0] == pytest.approx(2.0, abs=1e-6)
+
+
+def test_at_its_corner_a_geophone_turns_by_90_degrees_and_is_damped():
+    at_corner = response(Geophone(4.5, 0.56, 31.25).system(), 4.5)[0]
+    assert at_corner == pytest.approx(31.25 * 1j / (2 * 0.56), rel=1e-12)
+
+
+def test_exact_compensation_leaves_two_states_with_the_corner_wanted():
+    chain = avis_chain()
+    assert chain.system().nstates == 2
+    product = (response(chain.compensation.system(), [0.1, 0.5, 4.5, 100])
+               * response(chain.geophone.system(), [0.1, 0.5, 4.5, 100]) * 100.0)
+    np.testing.assert_allclose(response(chain.system(), [0.1, 0.5, 4.5, 100]), product, rtol=1e-12)
+
+
+def test_a_mismatched_geophone_keeps_its_full_order_and_its_error():
+    chain = avis_chain(corner_Hz=4.6)
+    assert chain.system().nstates == 4
+    assert hankel_singular_values(chain.system())[-1] > 0
+    # Far below both corners the gain is off by the square of the ratio of the corners.
+    ratio = response(chain.system(), 1e-3)[0] / response(avis_chain().system(), 1e-3)[0]
+    assert ratio == pytest.approx((4.5 / 4.6) ** 2, rel=1e-5)
+
+
+def test_rounding_noise_of_a_random_signal_is_lsb_squared_over_12(rng):
+    signal = rng.normal(0.0, 1.0, 200_000)
+    error = AVIS_CONVERTER.convert(signal) - signal
+    variance = AVIS_CONVERTER.lsb_V ** 2 / 12
+    # Variance of the estimate for a uniform error: (1/80 - 1/144) lsb^4 / n; five standard deviations.
+    spread = AVIS_CONVERTER.lsb_V ** 2 * np.sqrt((1 / 80 - 1 / 144) / signal.size)
+    assert abs(np.mean(error ** 2) - variance) < 5 * spread
+    assert AVIS_CONVERTER.noise_rms_V ** 2 == pytest.approx(variance)
+
+
+def test_rounding_noise_is_white_with_the_density_stated(rng):
+    signal = rng.normal(0.0, 1.0, 2 ** 17)
+    error = AVIS_CONVERTER.convert(signal) - signal
+    lines = np.abs(np.fft.rfft(error)[1:-1]) ** 2 * 2 / (error.size * 1000.0)
+    bands = lines[:lines.size // 16 * 16].reshape(16, -1).mean(axis=1)
+    # Each band averages about 4096 exponential lines: 1/64 relative standard deviation, five of them.
+    np.testing.assert_allclose(bands, AVIS_CONVERTER.noise_density_V_rtHz ** 2, rtol=5 / 64)
+
+
+def test_converter_clips_at_its_end_codes_and_has_one_code_less_above():
+    volts = AVIS_CONVERTER.convert(np.array([-50.0, 50.0, 0.0, 3.2]))
+    assert volts[0] == -10.0
+    assert volts[1] == 10.0 - 20.0 / 2 ** 14
+    assert volts[2] == 0.0
+    assert AVIS_CONVERTER.clipped(np.array([-10.5, 10.5, 9.0])).tolist() == [True, True, False]
+
+
+def test_compiled_sample_quantiser_equals_the_array_one(rng):
+    compiled = numba.njit(quantise)
+    voltage = np.concatenate([rng.uniform(-12, 12, 2000), [np.inf, -np.inf]])
+    one_by_one = [compiled(v, AVIS_CONVERTER.lsb_V, *AVIS_CONVERTER.limits_V) for v in voltage]
+    np.testing.assert_array_equal(one_by_one, AVIS_CONVERTER.convert(voltage))
+
+
+def test_chain_noise_adds_in_power_and_integrates_to_its_variance():
+    chain = avis_chain()
+    density = chain.noise_density(2 * np.pi * np.linspace(0, 500, 11))
+    np.testing.assert_allclose(density ** 2 * 500.0, 1e-6 + (20 / 2 ** 14) ** 2 / 12, rtol=1e-12)
+    assert chain.noise_variance_V2 == pytest.approx(1e-6 + (20 / 2 ** 14) ** 2 / 12)
+
+
+def test_johnson_noise_of_a_kilohm_is_four_nanovolt():
+    # Textbook value: 4.07 nV/sqrt(Hz) for 1 kohm at 300 K (Horowitz and Hill, The Art of Electronics, 3rd ed., 8.1.1).
+    assert Geophone(4.5, 0.5, 30.0, coil_ohm=1000.0).johnson_density_V_rtHz(300.0) == pytest.approx(4.07e-9, rel=2e-3)
+    shunted = Geophone(4.5, 0.5, 30.0, coil_ohm=2000.0, shunt_ohm=2000.0)
+    assert shunted.johnson_density_V_rtHz(300.0) == pytest.approx(4.07e-9, rel=2e-3)
+
+
+def test_thermal_noise_is_amplified_below_the_corner_that_was_moved():
+    silent = Converter(32, 1e-6, 1000.0)
+    chain = replace(avis_chain(coil_ohm=380.0), converter=silent, noise_rms_V=0.0)
+    density = chain.noise_density(2 * np.pi * np.array([1e-3, 400.0]))
+    assert density[0] / density[1] == pytest.approx(81.0, rel=1e-2)
+
+
+def test_equivalent_velocity_noise_and_clipping_velocity():
+    chain = avis_chain()
+    f = np.array([0.1, 1.0, 100.0])
+    # Compensated corner of 0.5 Hz, damping 0.7, written out.
+    sensed = 3125.0 * f ** 2 / np.hypot(0.25 - f ** 2, 2 * 0.7 * 0.5 * f)
+    density = np.sqrt((1e-6 + (20 / 2 ** 14) ** 2 / 12) / 500.0)
+    np.testing.assert_allclose(chain.velocity_noise_density(2 * np.pi * f), density / sensed, rtol=1e-12)
+    assert chain.clipping_velocity_m_per_s == pytest.approx(3.2e-3)
+
+
+def test_accelerometer_is_flat_above_its_corner_and_a_differentiator_below():
+    sensor = Accelerometer(2.0, 0.3, 1e-5)
+    assert abs(response(sensor.system(), 300.0)[0]) == pytest.approx(2.0, rel=1e-5)
+    assert abs(response(sensor.system(), 3e-4)[0]) == pytest.approx(2.0 * 1e-3, rel=1e-5)
+    np.testing.assert_allclose(sensor.acceleration_noise_density(2 * np.pi * np.array([0.3, 300.0])),
+                               [np.sqrt(2) * 1e-5, 1e-5], rtol=1e-5)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 6])
+def test_pade_delay_is_all_pass_with_the_phase_of_the_delay(order):
+    delay = 1e-3
+    system = pade_delay(delay, order)
+    frequency = np.geomspace(0.1, 1e4, 50)
+    np.testing.assert_allclose(np.abs(response(system, frequency)), 1.0, rtol=1e-10)
+    # Leading phase error of the diagonal approximant, (n!)^2 x^(2n+1) / ((2n)! (2n+1)!) (Baker and Graves-Morris,
+    # Pade Approximants, section 1.2: error of the [n/n] approximant of the exponential).
+    x = 0.25 * order
+    error = np.angle(response(system, x / delay / (2 * np.pi))[0] * np.exp(1j * x))
+    leading = factorial(order) ** 2 * x ** (2 * order + 1) / (factorial(2 * order) * factorial(2 * order + 1))
+    assert error == pytest.approx(leading, rel=0.05)
+
+
+def test_second_order_pade_of_one_millisecond_is_exact_to_a_hundredth_of_a_degree_at_80_hz():
+    phase = np.angle(response(pade_delay(1e-3, 2), 80.0)[0], deg=True)
+    assert phase == pytest.approx(-28.8, abs=0.01)
+
+
+@given(delay=st.floats(1e-6, 10.0), order=st.integers(1, 8))
+@settings(max_examples=30, deadline=None)
+def test_pade_delay_is_balanced_at_any_delay(delay, order):
+    system = pade_delay(delay, order)
+    assert hankel_singular_values(system) == pytest.approx(np.ones(order), rel=1e-6)
+    assert hinf_norm(system).gain == pytest.approx(1.0, rel=1e-6)
+
+
+def test_no_delay_is_a_wire():
+    assert pade_delay(0.0).nstates == 0
+
+
+def test_zero_order_hold_model_follows_the_sinc():
+    T, f = 1e-3, np.array([1.0, 30.0, 100.0])
+    x = 2j * np.pi * f * T
+    np.testing.assert_allclose(response(zero_order_hold(T, 3), f), (1 - np.exp(-x)) / x, rtol=2e-6)
+    assert zero_order_hold(T, 2).dcgain()[0, 0] == pytest.approx(1.0, rel=1e-13)
+
+
+def test_actuator_chain_force_lag_delay_and_back_emf():
+    chain = ActuatorChain(2.0, amplifier_corner_Hz=200.0, back_emf_Ns_per_m=3.0, delay_s=1e-3, pade_order=4)
+    system = chain.system("u", "F", "v")
+    assert system.inputs == ("u", "v") and system.outputs == ("F",)
+    f = 50.0
+    drive, emf = system.frequency_response(np.array([2 * np.pi * f]))[0, 0]
+    assert drive == pytest.approx(2.0 * np.exp(-2j * np.pi * f * 1e-3) / (1 + 1j * f / 200.0), rel=1e-8)
+    assert emf == -3.0
+    assert chain.limit_N == 20.0
+
+
+def test_back_emf_without_a_velocity_signal_is_refused():
+    with pytest.raises(InputError, match="velocity"):
+        ActuatorChain(2.0, back_emf_Ns_per_m=1.0).system()
+
+
+@pytest.mark.parametrize(("make", "field"), [
+    (lambda: Geophone(-4.5, 0.5, 30.0), "corner_Hz"), (lambda: Geophone(4.5, np.nan, 30.0), "damping"),
+    (lambda: Geophone(4.5, 0.5, 0.0), "sensitivity"), (lambda: Geophone(4.5, 0.5, 30.0, coil_ohm=-1.0), "coil_ohm"),
+    (lambda: Converter(0, 10.0, 1000.0), "bits"), (lambda: Converter(14.5, 10.0, 1000.0), "bits"),
+    (lambda: Converter(14, np.inf, 1000.0), "range_V"), (lambda: CompensationFilter(4.5, 0.5, 0.0, 0.7), "to_Hz"),
+    (lambda: ActuatorChain("2"), "constant"), (lambda: ActuatorChain(2.0, delay_s=-1.0), "delay_s"),
+    (lambda: pade_delay(1e-3, 0), "order"), (lambda: pade_delay(1e-3, 40), "order"),
+    (lambda: zero_order_hold(0.0), "sample_time"), (lambda: Accelerometer(1.0, 0.3, -1e-5), "noise")])
+def test_wrong_numbers_are_refused_by_name(make, field):
+    with pytest.raises(InputError, match=field):
+        make()
