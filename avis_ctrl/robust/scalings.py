@@ -69,6 +69,28 @@ class ScalarScaling:
         n = self.order
         return ScalarScaling(np.concatenate([[-self.theta[0]], self.theta[1 + n:], self.theta[1:1 + n]]))
 
+    def within(self, band: tuple[float, float]) -> ScalarScaling:
+        """Roots beyond the band [rad/s] moved to its edge, the magnitude kept as it was far inside."""
+        n, theta = self.order, self.theta.copy()
+        for start in (1, 1 + n):
+            sign = 1.0 if start == 1 else -1.0
+            for k in range(start, start + n):
+                is_damping = k < start + 2 * (n // 2) and (k - start) % 2 == 1
+                if is_damping:
+                    theta[k] = np.clip(theta[k], np.log(0.05), np.log(50.0))
+                    continue
+                moved = np.clip(theta[k], np.log(band[0]), np.log(band[1]))
+                # A factor (s + a) is about a below its corner: a faster root lowered takes gain with it.
+                if moved < theta[k]:
+                    theta[0] += sign * (theta[k] - moved) * (1 if k == start + n - 1 and n % 2 else 2)
+                theta[k] = moved
+        return ScalarScaling(theta)
+
+    def with_neutral_pair(self, omega: float, split: float = 0.0) -> ScalarScaling:
+        """One more zero at omega e^split and pole at omega e^-split: the same d(s) where split = 0."""
+        return ScalarScaling.from_roots(np.exp(self.theta[0]), np.append(self.zeros, -omega * np.exp(split)),
+                                        np.append(self.poles, -omega * np.exp(-split)))
+
     def log_magnitude(self, omega: np.ndarray) -> np.ndarray:
         """log |d(j omega)| (n_omega,), omega in rad/s, finite."""
         n = self.order
@@ -148,7 +170,7 @@ def _log_modulus(theta: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.n
 def _biquad(wz: float, zz: float, wp: float, zp: float) -> StateSpace:
     """(s^2 + 2 zz wz s + wz^2) / (s^2 + 2 zp wp s + wp^2) with states of like size."""
     c = np.array([[(wz ** 2 - wp ** 2) / wp, 2 * zz * wz - 2 * zp * wp]])
-    root = np.sqrt(np.linalg.norm(c)) or 1.0
+    root = np.sqrt(wp)
     return StateSpace(np.array([[0.0, wp], [-wp, -2 * zp * wp]]), np.array([[0.0], [root]]), c / root, np.ones((1, 1)))
 
 

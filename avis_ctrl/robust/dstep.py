@@ -1,0 +1,241 @@
+"""The D-step: scalings of least order that keep the scaled loop within a per cent of its peak mu.
+
+Only magnitudes matter for scalar scalings, and log sigma_max(D N D^-1) is convex in log |d| with the gradient
+|u_i|^2 - |v_i|^2 of its singular vectors (Sezginer and Overton, IEEE TAC 35, 1990). So after the semidefinite
+fit of single blocks, all parameters are moved together by linear programs in a trust region, on what counts:
+the peak over frequency of the loop scaled by the realised D(s).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize as so
+
+from avis_ctrl.robust.dscale_fit import fit_magnitude
+from avis_ctrl.robust.dscale_matrix import fit_hermitian
+from avis_ctrl.robust.gamma_descent import free_parameters, parameter_box, parameters, with_parameters
+from avis_ctrl.robust.mu_upper import upper_bound
+from avis_ctrl.robust.scalings import MatrixScaling, ScalarScaling, Scalings
+from avis_ctrl.uncertainty.blocks import BlockStructure
+
+FIT_TOLERANCE = 3e-3
+MATRIX_FIT_TOLERANCE = 1e-2
+MAX_ORDER = 6
+FLOOR = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class PointwiseScalings:
+    """Best scalings at each frequency on its own: what D(s) is fitted to.
+
+    mu : (n_omega,) upper bounds; log_d : (n_omega, n_blocks), zero for performance; X : block index ->
+    (n_omega, n, n) Hermitian positive definite D^H D of a repeated scalar, relative to performance.
+    """
+
+    omega: np.ndarray
+    M: np.ndarray
+    structure: BlockStructure
+    mu: np.ndarray
+    log_d: np.ndarray
+    X: dict[int, np.ndarray]
+
+    @property
+    def peak(self) -> float:
+        return float(np.max(self.mu))
+
+    @staticmethod
+    def of(omega: np.ndarray, M: np.ndarray, structure: BlockStructure, tolerance: float = 2e-3) -> PointwiseScalings:
+        """From the response M (n_omega, n_z, n_w) of the loop; the last block is performance, none is real."""
+        mu, scalings = upper_bound(M[:, None], structure, tolerance)
+        last = next(reversed(list(structure.slices())))[2].start
+        log_d, X = np.zeros((omega.size, len(structure.blocks))), {}
+        for k, (block, _, z) in enumerate(structure.slices()):
+            part = scalings.X_z[:, z, z] / scalings.X_z[:, last, last].real[:, None, None]
+            log_d[:, k] = 0.5 * np.log(np.trace(part, axis1=1, axis2=2).real / block.cols)
+            if block.repeated:
+                X[k] = part
+        return PointwiseScalings(omega, M, structure, mu, log_d, X)
+
+
+@dataclass(frozen=True)
+class DStep:
+    """Realised scalings, the peak of the loop they scale, and its ratio to the peak of mu (1 + cost)."""
+
+    scalings: Scalings
+    peak: float
+    cost: float
+
+
+def choose_scalings(points: PointwiseScalings, allowed_cost: float = 0.01, max_states: int = 60,
+                    start: Scalings | None = None) -> DStep:
+    """Greedy search for the smallest orders whose realised scalings cost less than `allowed_cost` of peak mu.
+
+    All orders start at zero; the block whose misfit accounts for most of the excess gets one more, as long as
+    the scaled plant gains at most `max_states` states. `start` (scalings of the last iteration) is tried too.
+    """
+    best = _evaluated(points, _refined(points, _constants(points)))
+    if start is not None:
+        again = _evaluated(points, _refined(points, start))
+        if again.cost <= allowed_cost < best.cost and again.scalings.added_states <= max_states:
+            best = again
+    exhausted: set[int] = set()
+    while best.cost > allowed_cost:
+        share = _blame(points, best.scalings)
+        share[list(exhausted)] = 0.0
+        if not np.any(share > 0):
+            break
+        k = int(np.argmax(share))
+        candidate = _raised(points, best, k, max_states)
+        if candidate is None or candidate.cost > max(0.9 * best.cost, allowed_cost):
+            # One more order did not pay; two may (a resonance needs a pair of roots).
+            candidate = _raised(points, best, k, max_states, 2)
+        if candidate is None or candidate.cost > max(0.95 * best.cost, allowed_cost):
+            exhausted.add(k)
+            continue
+        best, exhausted = candidate, set()
+    return best
+
+
+def band_of(omega: np.ndarray) -> tuple[float, float]:
+    """Where roots of scalings may lie [rad/s]: beyond the frequencies looked at they would only cost accuracy."""
+    return float(np.min(omega)), float(np.max(omega))
+
+
+def peak_of(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
+    """sigma_max(D N D^-1) (n_omega,) with the realised scalings."""
+    left, right = scalings.response(points.omega)
+    return np.linalg.norm(left @ points.M @ right, ord=2, axis=(1, 2))
+
+
+def _evaluated(points: PointwiseScalings, scalings: Scalings) -> DStep:
+    sigma = peak_of(points, scalings)
+    reference = np.maximum(points.mu, FLOOR * points.peak)
+    return DStep(scalings, float(np.max(sigma)), float(np.max(sigma / reference)) - 1)
+
+
+def _constants(points: PointwiseScalings) -> Scalings:
+    """Constant scalings from the frequencies near the peak."""
+    weight = _closeness(points)
+    parts = list(Scalings.identity(points.structure).parts)
+    for k in range(len(parts) - 1):
+        if k in points.X:
+            parts[k] = fit_hermitian(points.omega, points.X[k], 0, weight, MATRIX_FIT_TOLERANCE).scaling
+        else:
+            parts[k] = fit_magnitude(points.omega, np.exp(points.log_d[:, k]), 0, weight).scaling
+    return Scalings(points.structure, tuple(parts))
+
+
+def _raised(points: PointwiseScalings, step: DStep, k: int, max_states: int, by: int = 1) -> DStep | None:
+    """The step with block k refitted at a higher order and everything refined; None where it may not grow."""
+    part = step.scalings.parts[k]
+    weight = _sensitivity(points, step.scalings, k)
+    new: ScalarScaling | MatrixScaling
+    if isinstance(part, MatrixScaling):
+        degree = part.order // part.system.ninputs + by
+        if degree > MAX_ORDER // 2:
+            return None
+        new = fit_hermitian(points.omega, points.X[k], degree, weight, MATRIX_FIT_TOLERANCE).scaling
+    else:
+        if part.order + by > MAX_ORDER:
+            return None
+        fit = fit_magnitude(points.omega, np.exp(points.log_d[:, k]), part.order + by, weight, FIT_TOLERANCE)
+        new = fit.scaling.within(band_of(points.omega))
+    scalings = step.scalings.replace(k, new)
+    if scalings.added_states > max_states:
+        return None
+    return _evaluated(points, _refined(points, scalings))
+
+
+def _closeness(points: PointwiseScalings) -> np.ndarray:
+    """Weight of a misfit by the distance of mu from its peak: one at the peak, little where there is room."""
+    room = np.log(points.peak / np.maximum(points.mu, 1e-3 * points.peak))
+    return 0.03 / (0.03 + room)
+
+
+def _sensitivity(points: PointwiseScalings, scalings: Scalings, k: int) -> np.ndarray:
+    """What a misfit of block k costs: closeness to the peak times the block's share in the singular vectors."""
+    left, right = scalings.response(points.omega)
+    U, _, Vh = np.linalg.svd(left @ points.M @ right)
+    _, w, z = list(points.structure.slices())[k]
+    share = np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
+    weight = _closeness(points) * np.maximum(share / np.max(share), 1e-2)
+    return np.maximum(weight / np.max(weight), 1e-3)
+
+
+def _blame(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
+    """How much of the excess over the peak each block's misfit explains (n_blocks,), to first order."""
+    left, right = scalings.response(points.omega)
+    U, s, Vh = np.linalg.svd(left @ points.M @ right)
+    excess = np.maximum(np.log(s[:, 0] / np.maximum(points.mu, FLOOR * points.peak)), 0.0)
+    share = np.zeros(len(scalings.parts))
+    for k, (_, w, z) in enumerate(points.structure.slices()):
+        part = scalings.parts[k]
+        slope = np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) - np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
+        if isinstance(part, ScalarScaling):
+            misfit = part.log_magnitude(points.omega) - points.log_d[:, k]
+            share[k] = float(np.max(excess * np.maximum(slope * misfit, 0.0)))
+        else:
+            fitted = left[:, z, z]
+            ratio = np.linalg.solve(np.conj(np.swapaxes(fitted, 1, 2)) @ fitted, points.X[k])
+            distance = np.max(np.abs(np.log(np.abs(np.linalg.eigvals(ratio)))), axis=1)
+            weight = np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
+            share[k] = float(np.max(excess * weight * distance)) / 2
+    share[-1] = 0.0
+    return share
+
+
+def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 12) -> Scalings:
+    """Sequential linear programs in a trust region on max over frequency of log sigma_max(D N D^-1)."""
+    if not free_parameters(scalings):
+        return scalings
+    box = np.array(parameter_box(scalings, band_of(points.omega)))
+    theta, radius = np.clip(parameters(scalings), box[:, 0], box[:, 1]), 0.5
+    scalings = with_parameters(scalings, theta)
+    values, slopes = _linearised(points, scalings)
+    level = float(np.max(values))
+    for _ in range(steps):
+        move, predicted = _trust_step(values, slopes, np.maximum(box[:, 0] - theta, -radius),
+                                      np.minimum(box[:, 1] - theta, radius))
+        if level - predicted < 1e-4 or radius < 1e-3:
+            break
+        trial = with_parameters(scalings, theta + move)
+        new_values, new_slopes = _linearised(points, trial)
+        gained = (level - float(np.max(new_values))) / (level - predicted)
+        if gained > 0.1:
+            theta, scalings, values, slopes = theta + move, trial, new_values, new_slopes
+            level = float(np.max(values))
+        radius = min(2 * radius, 1.0) if gained > 0.7 else radius if gained > 0.3 else 0.35 * radius
+    return scalings
+
+
+def _linearised(points: PointwiseScalings, scalings: Scalings, kept: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Logarithms of the largest singular values near the peak (n,), and their slopes in theta (n, n_theta)."""
+    left, right = scalings.response(points.omega)
+    U, s, Vh = np.linalg.svd(left @ points.M @ right)
+    kept = min(kept, s.shape[1])
+    log_s = np.log(np.maximum(s[:, :kept], 1e-300))
+    log_ref = np.log(np.maximum(points.mu, FLOOR * points.peak))
+    top = np.argwhere(log_s - log_ref[:, None] > np.max(log_s[:, 0] - log_ref) - 0.7)
+    at, which = top[:, 0], top[:, 1]
+    u, v = np.swapaxes(U, 1, 2)[at, which], Vh[at, which]
+    columns = []
+    places = list(points.structure.slices())
+    for k in free_parameters(scalings):
+        _, w, z = places[k]
+        part = scalings.parts[k]
+        assert isinstance(part, ScalarScaling)
+        slope = np.sum(np.abs(u[:, z]) ** 2, axis=1) - np.sum(np.abs(v[:, w]) ** 2, axis=1)
+        columns.append(slope[:, None] * part.jacobian(points.omega)[at])
+    return (log_s - log_ref[:, None])[at, which], np.hstack(columns)
+
+
+def _trust_step(values: np.ndarray, slopes: np.ndarray, low: np.ndarray,
+                high: np.ndarray) -> tuple[np.ndarray, float]:
+    """Move (n_theta,) between low and high that minimises the largest linearised value, and that value."""
+    n = slopes.shape[1]
+    cost = np.r_[np.zeros(n), 1.0]
+    program = so.linprog(cost, A_ub=np.hstack([slopes, -np.ones((values.size, 1))]), b_ub=-values,
+                         bounds=[*zip(low, high, strict=True), (None, None)], method="highs-ds")
+    return (program.x[:n], float(program.x[n])) if program.status == 0 else (np.zeros(n), float(np.max(values)))

@@ -1,0 +1,53 @@
+"""Frequencies at which a loop is looked at: spread over the band where it changes, dense at its resonances."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.lti import StateSpace
+
+POINTS_PER_DECADE = 8
+MAX_POINTS = 140
+
+
+def frequency_grid(system: StateSpace, change: float = 1e-3) -> np.ndarray:
+    """Grid [rad/s] from the poles, without the ends over which the response stays within `change` of its limit."""
+    poles = system.poles()
+    sizes = np.abs(poles[np.abs(poles) > 1e-9])
+    low, high = (np.min(sizes) / 10, np.max(sizes) * 10) if sizes.size else (1e-2, 1e2)
+    wide = np.geomspace(low, high, max(20, int(4 * np.log10(high / low))))
+    response = system.frequency_response(np.concatenate([[0.0], wide, [np.inf]]))
+    level = np.max(np.linalg.norm(response, axis=(1, 2)))
+    from_start, from_end = (np.linalg.norm(response[1:-1] - response[k], axis=(1, 2)) > change * level for k in (0, -1))
+    if not (np.any(from_start) and np.any(from_end)):
+        return wide
+    first = max(int(np.argmax(from_start)) - 1, 0)
+    last = min(wide.size - int(np.argmax(from_end[::-1])), wide.size - 1)
+    low, high = wide[min(first, last - 1)], wide[max(last, first + 1)]
+    even = np.geomspace(low, high, max(30, int(POINTS_PER_DECADE * np.log10(high / low))))
+    return merged(even, _resonances(poles, low, high))
+
+
+def _resonances(poles: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Peaks of lightly damped modes, with points at half a bandwidth to either side."""
+    light = poles[(poles.imag > 0) & (np.abs(poles.real) < 0.4 * np.abs(poles))]
+    centre = np.sqrt(np.maximum(np.abs(light) ** 2 - 2 * light.real ** 2, 0.0))
+    points = np.concatenate([centre, centre + light.real, centre - light.real])
+    return points[(points > low) & (points < high)]
+
+
+def merged(omega: np.ndarray, extra: np.ndarray) -> np.ndarray:
+    """Sorted union without points closer than a thousandth, at most MAX_POINTS of them."""
+    every = np.sort(np.concatenate([omega, extra]))
+    kept = every[np.concatenate([[True], np.diff(np.log(every)) > 1e-3])]
+    return kept if kept.size <= MAX_POINTS else kept[np.unique(np.linspace(0, kept.size - 1, MAX_POINTS).astype(int))]
+
+
+def refined_grid(omega: np.ndarray, mu: np.ndarray, peaks: int = 4) -> np.ndarray:
+    """The grid with points halfway around its highest local maxima, while there is room."""
+    inner = np.flatnonzero((mu[1:-1] >= mu[:-2]) & (mu[1:-1] >= mu[2:])) + 1
+    highest = inner[np.argsort(mu[inner])[::-1][:peaks]]
+    if omega.size + 2 * highest.size > MAX_POINTS:
+        return omega
+    halfway = [np.sqrt(omega[highest] * omega[highest + side]) for side in (-1, 1)]
+    return merged(omega, np.concatenate(halfway))

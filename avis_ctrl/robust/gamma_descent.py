@@ -1,0 +1,286 @@
+"""Descent on the H-infinity optimum itself over the parameters of the scalings.
+
+D-K iteration minimises over D and K in turn and stalls: after a K-step the scaled loop is flat, so that no
+change of D alone helps. Here gamma(theta) = min over K of ||D P_K D^-1|| is one function of the scalings'
+parameters, and its gradient is cheap. Where the optimum is set by rho(X Y) = gamma^2, the implicit function
+theorem gives dgamma/dtheta = -(drho/dtheta) / (drho/dgamma - 2 gamma), and the derivatives of X and Y are
+solutions of Lyapunov equations, of which two adjoint ones serve all parameters:
+
+    A'X + XA + XRX + Q = 0,   A_c = A + R X:     dX solves   A_c' dX + dX A_c + M = 0,
+    M = dA'X + X dA + X dR X + dQ,     a' dX a = tr(L M),   A_c L + L A_c' + a a' = 0 .
+
+The data (A, R, Q) of the Riccati equations do not change under the rotations of z and w and the scalings of
+u and y that bring a plant to normal form, so that differences of them are taken without meeting those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.lti import StateSpace, balance
+from avis_ctrl.robust.hinf_plant import RANK_TOLERANCE, NormalForm, Plant, normal_form, rank_margins, regularised
+from avis_ctrl.robust.hinf_riccati import GammaBracket, find_gamma, gamma_test
+from avis_ctrl.robust.hinf_riccati import _control_riccati as control_riccati
+from avis_ctrl.robust.hinf_riccati import _filter_riccati as filter_riccati
+from avis_ctrl.robust.scalings import ScalarScaling, Scalings
+
+COUPLED = "rho(X Y)"
+STEP = 1e-6
+GAMMA_TOLERANCE = 1e-5
+MAX_ORDER = 6
+REGULARISATION = 1e-4
+
+
+@dataclass(frozen=True)
+class ScaledProblem:
+    """The plant whose scalings are sought, its states balanced once so that gamma is smooth in theta."""
+
+    P: StateSpace
+    nmeas: int
+    ncon: int
+    singular: tuple[bool, bool]
+
+    @staticmethod
+    def of(P: StateSpace, nmeas: int, ncon: int) -> ScaledProblem:
+        of_u, of_y = rank_margins(Plant.of(P, nmeas, ncon))
+        return ScaledProblem(balance(P), nmeas, ncon, (of_u < RANK_TOLERANCE, of_y < RANK_TOLERANCE))
+
+    def normal(self, scalings: Scalings) -> NormalForm:
+        """Normal form of the scaled plant, with extra channels where D12 or D21 lacks rank."""
+        S = scalings.scale(self.P)
+        w, z = S.ninputs - self.ncon, S.noutputs - self.nmeas
+        plant = Plant(S.A, S.B[:, :w], S.B[:, w:], S.C[:z], S.C[z:], S.D[:z, :w], S.D[:z, w:], S.D[z:, :w], S.D[z:, w:],
+                      S.inputs[w:], S.outputs[z:])
+        return normal_form(regularised(plant, REGULARISATION, *self.singular, False) if any(self.singular) else plant)
+
+    def reaches(self, scalings: Scalings, gamma: float) -> bool:
+        """Whether some controller makes the scaled norm less than gamma."""
+        return gamma_test(self.normal(scalings).plant, gamma).feasible
+
+
+@dataclass(frozen=True)
+class Descent:
+    """The best scalings found, with gamma before and after, and the points tried."""
+
+    scalings: Scalings
+    gamma_before: float
+    gamma: float
+    evaluations: int
+
+
+def free_parameters(scalings: Scalings) -> tuple[int, ...]:
+    """Blocks whose scalar scaling may move: all but the performance block, whose d is one."""
+    return tuple(k for k, part in enumerate(scalings.parts[:-1]) if isinstance(part, ScalarScaling))
+
+
+def parameters(scalings: Scalings) -> np.ndarray:
+    """theta of all free scalings in a row."""
+    return np.concatenate([scalings.parts[k].theta for k in free_parameters(scalings)])  # type: ignore[union-attr]
+
+
+def with_parameters(scalings: Scalings, theta: np.ndarray) -> Scalings:
+    """The scalings moved to theta."""
+    start = 0
+    for k in free_parameters(scalings):
+        size = 1 + 2 * scalings.parts[k].order
+        scalings = scalings.replace(k, ScalarScaling(theta[start:start + size]))
+        start += size
+    return scalings
+
+
+def gamma_and_gradient(problem: ScaledProblem, scalings: Scalings,
+                       hint: float | None = None) -> tuple[float, np.ndarray]:
+    """gamma(theta) and d log gamma / d theta (n_theta,); ComputationError where rho(X Y) does not set the optimum."""
+    slope, gamma, of_gamma = _coupling(problem, scalings, hint)
+    theta = parameters(scalings)
+    gradient = np.empty(theta.size)
+    for k in range(theta.size):
+        moved = theta.copy()
+        moved[k] += STEP
+        shift = problem.normal(with_parameters(scalings, moved)).plant
+        gradient[k] = -slope.along(shift, gamma) / STEP / of_gamma
+    return gamma, gradient / gamma
+
+
+def _coupling(problem: ScaledProblem, scalings: Scalings, hint: float | None) -> tuple[_CouplingSlope, float, float]:
+    """Derivatives of rho(X Y) at the optimum, gamma there, and the slope of rho(X Y) - gamma^2 in gamma."""
+    plant = problem.normal(scalings).plant
+    bracket = find_gamma(plant, GAMMA_TOLERANCE, hint)
+    if COUPLED not in bracket.limited_by:
+        raise ComputationError("gamma has no gradient here", cause=f"it is limited by {bracket.limited_by}",
+                               measured=f"gamma = {bracket.upper.gamma:.6g}", next_step="fit D and iterate on K")
+    gamma = bracket.upper.gamma
+    slope = _CouplingSlope.of(plant, bracket)
+    return slope, gamma, slope.along(plant, gamma * (1 + STEP)) / (gamma * STEP) - 2 * slope.rho / gamma
+
+
+@dataclass(frozen=True)
+class _CouplingSlope:
+    """First-order change of rho(X Y) with the data of the two Riccati equations."""
+
+    rho: float
+    X: np.ndarray
+    Y: np.ndarray
+    control: tuple[np.ndarray, np.ndarray, np.ndarray]
+    filter: tuple[np.ndarray, np.ndarray, np.ndarray]
+    L_x: np.ndarray
+    L_y: np.ndarray
+
+    @staticmethod
+    def of(plant: Plant, bracket: GammaBracket) -> _CouplingSlope:
+        X, Y, gamma = bracket.upper.X, bracket.upper.Y, bracket.upper.gamma
+        assert X is not None and Y is not None
+        control, filter_ = control_riccati(plant, gamma), filter_riccati(plant, gamma)
+        values, vectors = la.eig(X @ Y)
+        rho = float(np.max(values.real))
+        v = vectors[:, np.argmax(values.real)].real
+        a = Y @ v
+        # drho = (a' dX a + rho v' dY v) / (v' a), since Y v is the left eigenvector of X Y
+        weight = float(v @ a)
+        L_x = la.solve_continuous_lyapunov(control[0] + control[1] @ X, -np.outer(a, a) / weight)
+        L_y = la.solve_continuous_lyapunov(filter_[0] + filter_[1] @ Y, -rho * np.outer(v, v) / weight)
+        return _CouplingSlope(rho, X, Y, control, filter_, L_x, L_y)
+
+    def along(self, plant: Plant, gamma: float) -> float:
+        """Change of rho(X Y) when the plant and gamma move to these, to first order."""
+        total = 0.0
+        for X, L, here, there in ((self.X, self.L_x, self.control, control_riccati(plant, gamma)),
+                                  (self.Y, self.L_y, self.filter, filter_riccati(plant, gamma))):
+            dA, dR, dQ = (new - old for new, old in zip(there, here, strict=True))
+            total += 2 * np.sum((L @ X) * dA.T) + np.sum((X @ L @ X) * dR) + np.sum(L * dQ)
+        return float(total)
+
+
+def descend(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float], *,
+            evaluations: int = 40, tolerance: float = 1e-3,
+            stop: Callable[[float], bool] = lambda gamma: False) -> Descent:
+    """Quasi-Newton descent (BFGS in a box) on log gamma over the parameters of the scalar scalings.
+
+    P (w, u -> z, y); roots stay within `band` [rad/s]. Ends where five steps together gain less than `tolerance`.
+    `stop(gamma)` is asked after every evaluation.
+    """
+    problem = ScaledProblem.of(P, nmeas, ncon)
+    low, high = np.array(parameter_box(scalings, band)).T
+    here = with_parameters(scalings, np.clip(parameters(scalings), low, high))
+    gamma, slope = gamma_and_gradient(problem, here)
+    first, count, trail = gamma, 1, [gamma]
+    H = np.eye(low.size)
+    while count < evaluations and not stop(gamma):
+        theta = parameters(here)
+        step = _direction(H, slope, theta, low, high)
+        found = None
+        while found is None and np.max(np.abs(step)) > 1e-4 and count < evaluations:
+            trial = with_parameters(here, np.clip(theta + step, low, high))
+            count += 1
+            found = _tried(problem, trial, gamma, 1e-4 * float(slope @ step))
+            step = step / 3
+        if found is None:
+            if np.allclose(H, np.eye(low.size)):
+                break
+            H = np.eye(low.size)
+            continue
+        new_gamma, new_slope = found
+        H = _updated(H, parameters(trial) - theta, new_slope - slope)
+        here, gamma, slope = trial, new_gamma, new_slope
+        trail.append(gamma)
+        if len(trail) > 5 and trail[-6] / gamma - 1 < tolerance:
+            break
+    return Descent(here, first, gamma, count)
+
+
+def _direction(H: np.ndarray, slope: np.ndarray, theta: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Quasi-Newton step of at most one (a factor e in a root), without parameters that push against the box."""
+    free = ~(((theta <= low) & (slope > 0)) | ((theta >= high) & (slope < 0)))
+    step = np.zeros(theta.size)
+    step[free] = -H[np.ix_(free, free)] @ slope[free]
+    if step @ slope >= 0:
+        step[free] = -slope[free]
+    return step / max(1.0, float(np.max(np.abs(step), initial=0.0)))
+
+
+def _tried(problem: ScaledProblem, trial: Scalings, gamma: float, demanded: float) -> tuple[float, np.ndarray] | None:
+    """gamma and slope at a trial point that falls enough (log gamma by `demanded` < 0); None elsewhere."""
+    try:
+        # A point that does not improve is known by one test, without its optimum.
+        if not problem.reaches(trial, gamma * np.exp(demanded)):
+            return None
+        return gamma_and_gradient(problem, trial, gamma)
+    except ComputationError:
+        return None
+
+
+def _updated(H: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """BFGS update of the inverse Hessian; the first one sets its size."""
+    curvature = float(s @ y)
+    if curvature <= 1e-10 * float(np.linalg.norm(s) * np.linalg.norm(y)):
+        return H
+    if np.allclose(H, np.eye(s.size)):
+        H = H * curvature / float(y @ y)
+    V = np.eye(s.size) - np.outer(s, y) / curvature
+    return V @ H @ V.T + np.outer(s, s) / curvature
+
+
+def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float],
+          max_states: int, share: float = 0.5) -> Scalings | None:
+    """The scalings with one more root pair in the blocks where, and at the frequency where, gamma asks for it.
+
+    A zero and a pole that cancel change nothing, but gamma has a slope in their distance. Pairs are tried at two
+    places a decade in all blocks at once; those blocks grow whose slope is at least `share` of the largest.
+    None where no slope is left, or no room for more states.
+    """
+    problem = ScaledProblem.of(P, nmeas, ncon)
+    places = np.geomspace(*band, max(3, int(2 * np.log10(band[1] / band[0]))))[1:-1]
+    free = [k for k in free_parameters(scalings) if scalings.parts[k].order < MAX_ORDER]
+    slopes = np.array([_neutral_slopes(problem, scalings, free, place) for place in places])
+    if not slopes.size or np.max(np.abs(slopes)) < 1e-3:
+        return None
+    best = np.argmax(np.abs(slopes), axis=0)
+    strength = np.abs(slopes[best, range(len(free))])
+    for threshold in (share, 0.999):
+        larger = scalings
+        for at, k, size in zip(best, free, strength, strict=True):
+            part = scalings.parts[k]
+            if size >= threshold * np.max(strength) and isinstance(part, ScalarScaling):
+                split = -0.02 * np.sign(slopes[at, free.index(k)])
+                larger = larger.replace(k, part.with_neutral_pair(places[at], split))
+        if larger.added_states <= max_states:
+            return larger
+    return None
+
+
+def _neutral_slopes(problem: ScaledProblem, scalings: Scalings, free: list[int], place: float) -> np.ndarray:
+    """d log gamma / d split of a neutral pair at a frequency, for each block."""
+    base = scalings
+    for k in free:
+        part = base.parts[k]
+        assert isinstance(part, ScalarScaling)
+        base = base.replace(k, part.with_neutral_pair(place))
+    try:
+        slope, gamma, of_gamma = _coupling(problem, base, None)
+    except ComputationError:
+        return np.zeros(len(free))
+    result = np.zeros(len(free))
+    for at, k in enumerate(free):
+        part = scalings.parts[k]
+        assert isinstance(part, ScalarScaling)
+        moved = base.replace(k, part.with_neutral_pair(place, STEP))
+        result[at] = -slope.along(problem.normal(moved).plant, gamma) / STEP / of_gamma / gamma
+    return result
+
+
+def parameter_box(scalings: Scalings, band: tuple[float, float]) -> list[tuple[float, float]]:
+    """Bounds: gains within 1e-6..1e6 of where they are, roots in the band, damping from 0.05 to 50."""
+    box: list[tuple[float, float]] = []
+    slow, fast = np.log(band[0]), np.log(band[1])
+    for k in free_parameters(scalings):
+        part = scalings.parts[k]
+        assert isinstance(part, ScalarScaling)
+        box.append((part.theta[0] - np.log(1e6), part.theta[0] + np.log(1e6)))
+        for _ in range(2):
+            box += [(slow, fast), (np.log(0.05), np.log(50.0))] * (part.order // 2) + [(slow, fast)] * (part.order % 2)
+    return box

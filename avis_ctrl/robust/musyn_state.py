@@ -1,0 +1,86 @@
+"""Where a mu synthesis stands, in a form that a JSON file holds: history, best and last loop, grid, phase."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti import StateSpace
+from avis_ctrl.robust.scalings import Scalings
+from avis_ctrl.uncertainty.blocks import BlockStructure
+
+FORMAT = "avis-musyn"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One row of the history.
+
+    gamma : measured H-infinity norm of the loop scaled by D(s); an upper bound of complex mu at every frequency.
+    mu_upper : largest upper bound of complex mu over the frequency grid.
+    order : states of K; d_order : sum of the orders of the scalings that K was made with.
+    d_fit_error : what those realised scalings cost against the best ones at each frequency, relative.
+    kind : "K-step" after a D-step, "descent" after a descent on gamma.
+    """
+
+    iteration: int
+    gamma: float
+    mu_upper: float
+    order: int
+    d_fit_error: float
+    d_order: int
+    seconds: float
+    kind: str
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A controller, the scalings it was made with, and the measured norm of the loop they scale."""
+
+    K: StateSpace
+    scalings: Scalings
+    gamma: float
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"K": {key: getattr(self.K, key).tolist() for key in "ABCD"}, "scalings": self.scalings.as_dicts(),
+                "gamma": self.gamma}
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Phase ("D-K", "descent", "growth" or "done"), grid [rad/s], last and best loop, history."""
+
+    phase: str = "D-K"
+    omega: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    last: Loop | None = None
+    best: Loop | None = None
+    history: tuple[Iteration, ...] = ()
+
+    def as_dict(self, P: StateSpace, nmeas: int, ncon: int) -> dict[str, Any]:
+        """JSON form, with the sizes of the problem it belongs to."""
+        assert self.last is not None and self.best is not None
+        return {"format": FORMAT, "version": VERSION, "problem": [P.nstates, P.ninputs, P.noutputs, nmeas, ncon],
+                "phase": self.phase, "omega": self.omega.tolist(), "last": self.last.as_dict(),
+                "best": self.best.as_dict(), "history": [asdict(row) for row in self.history]}
+
+    @staticmethod
+    def from_dict(saved: dict[str, Any], structure: BlockStructure, P: StateSpace, nmeas: int, ncon: int) -> State:
+        """Inverse of `as_dict`; InputError for a state of another format or problem."""
+        if not isinstance(saved, dict) or saved.get("format") != FORMAT or saved.get("version") != VERSION:
+            raise InputError(f"expected a saved state of format {FORMAT!r}, version {VERSION}", field="state")
+        problem = [P.nstates, P.ninputs, P.noutputs, nmeas, ncon]
+        if saved.get("problem") != problem:
+            raise InputError(f"the saved state belongs to another plant: sizes {saved.get('problem')}, not {problem}",
+                             field="state")
+        n_y, n_u = P.outputs[P.noutputs - nmeas:], P.inputs[P.ninputs - ncon:]
+
+        def loop(item: dict[str, Any]) -> Loop:
+            A, B, C, D = (np.array(item["K"][key], float) for key in "ABCD")
+            return Loop(StateSpace(A, B, C, D, 0.0, n_y, n_u), Scalings.from_dicts(structure, item["scalings"]),
+                        float(item["gamma"]))
+        return State(str(saved["phase"]), np.array(saved["omega"], float), loop(saved["last"]), loop(saved["best"]),
+                     tuple(Iteration(**row) for row in saved["history"]))
