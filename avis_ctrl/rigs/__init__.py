@@ -2,8 +2,11 @@
 
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.halcyonics import Halcyonics
+from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.rig import Parameter, Rig
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rigid_body import COORDINATES, EquationsOfMotion
+from avis_ctrl.rigs.subsystem import reduce_rig, reduction_error
 
-__all__ = ["COORDINATES", "AvisTable", "EquationsOfMotion", "Halcyonics", "Parameter", "Rig", "load_rig"]
+__all__ = ["COORDINATES", "AvisTable", "EquationsOfMotion", "Halcyonics", "Parameter", "Rig", "actuator_axes",
+           "load_rig", "reduce_rig", "reduction_error", "sensor_axes"]

@@ -24,9 +24,10 @@ _WORDS = {"k": "stiffness", "c": "damping", "p": "position of the attachment"}
 class Isolator:
     """Air mount: spring and damper along each earth axis (eqs. 2.15-2.16).
 
-    position, chassis_point [m] : attachment on the payload and on the chassis (p_i and c_i; the
-        source takes them equal, Table 3.1).
+    position [m] : attachment p_i on the payload, from its geometric centre.
     stiffness [N/m], damping [N s/m] : along x, y, z.
+    chassis_offset [m] : c_i - p_i, attachment on the chassis from that on the payload; the source
+        takes them equal (Table 3.1).
     """
 
     position: tuple[float, ...]

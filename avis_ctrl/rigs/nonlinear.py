@@ -199,7 +199,8 @@ def payload_acceleration(q, q_dot, u, q_ch, q_ch_dot, arrays):
     q_ch, q_ch_dot : (6,) motion of the chassis, same coordinates.
     arrays : `RigArrays`.
 
-    All arrays float64 (complex128 throughout is compiled as well, for a complex-step Jacobian).
+    All arrays contiguous, writable float64 (complex128 in all but `arrays` is compiled when first asked for, for
+    complex-step Jacobians).
     Singular at phi_y = +-90 degrees, as every set of 3-2-1 angles is.
     """
     R = _rotation(q[3:])
@@ -232,7 +233,8 @@ class NonlinearRig:
         given = (state, u, q_ch, q_ch_dot)
         kind = complex if any(np.iscomplexobj(part) for part in given if part is not None) else float
         sizes = (12, len(self.body.actuators), 6, 6)
-        state, u, q_ch, q_ch_dot = (np.zeros(n, kind) if part is None else np.ascontiguousarray(part, dtype=kind)
+        # Copies: a read-only array is another type to numba, and would be compiled for anew.
+        state, u, q_ch, q_ch_dot = (np.zeros(n, kind) if part is None else np.array(part, dtype=kind)
                                     for part, n in zip(given, sizes, strict=True))
         q, q_dot = state[:6], state[6:]
         return np.concatenate([q_dot, payload_acceleration(q, q_dot, u, q_ch, q_ch_dot, self.arrays)])

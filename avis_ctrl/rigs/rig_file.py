@@ -52,6 +52,7 @@ class IsolatorSection(_Section):
     position_m: Vector
     stiffness_N_per_m: PositiveVector
     damping_Ns_per_m: DampingVector
+    chassis_point_m: Vector | None = None
 
 
 class MotorSection(_Section):
@@ -235,13 +236,18 @@ def _avis(file: AvisFile) -> AvisTable:
     J = np.diag(payload.inertia_kgm2)
     J[0, 1], J[0, 2], J[1, 2] = payload.inertia_offdiagonal_kgm2
     _check_inertia(J + np.triu(J, 1).T, "payload.inertia_kgm2", payload.inertia_kgm2)
-    isolators = tuple(Isolator(_triple(one.position_m), _triple(one.stiffness_N_per_m), _triple(one.damping_Ns_per_m))
-                      for one in file.isolator)
+    isolators = tuple(_isolator(one) for one in file.isolator)
     inertia = (*_triple(payload.inertia_kgm2), *_triple(payload.inertia_offdiagonal_kgm2))
     rows = zip(motors.names, motors.isolator, motors.axis, motors.constant_N_per_V, strict=True)
     return AvisTable(file.name, payload.mass_kg, inertia, _triple(payload.centre_of_mass_m), isolators,
                      tuple(LinearMotor(*row) for row in rows), motors.limit_V, Geophones(**_tuples(geophones)),
                      Acquisition(**_tuples(file.acquisition)), _ambient(file.ambient))
+
+
+def _isolator(section: IsolatorSection) -> Isolator:
+    offset = np.subtract(section.chassis_point_m or section.position_m, section.position_m)
+    return Isolator(_triple(section.position_m), _triple(section.stiffness_N_per_m), _triple(section.damping_Ns_per_m),
+                    _triple(offset.tolist()))
 
 
 def _halcyonics(file: HalcyonicsFile, loaded: bool) -> Halcyonics:

@@ -48,6 +48,16 @@ def test_a_file_of_ones_own(tmp_path):
     assert rig.mass == 450.0 and rig.inertia_matrix()[1, 2] == -2.0
 
 
+def test_the_chassis_end_of_an_isolator(tmp_path):
+    """A longer mount: the same force per stretch, but a tilting chassis moves its foot by another arm."""
+    path = written(tmp_path, "avis", ("[20.0e3, 21.0e3, 45.0e3]",
+                                      "[20.0e3, 21.0e3, 45.0e3]\nchassis_point_m = [-0.475, -0.375, -0.275]"))
+    eom, usual = load_rig(path).equations_of_motion(), load_rig("avis").equations_of_motion()
+    assert np.array_equal(eom.K, usual.K)
+    # Tilted about y by one radian the foot moves by -0.1 m more along x; that stretch pulls with k_x = 20e3 N/m.
+    assert np.isclose((eom.K_floor - usual.K_floor)[0, 4], -0.1 * 20e3)
+
+
 WRONG = [
     ("avis", ("mass_kg", "mas_kg"), "payload.mas_kg", "did you mean mass_kg"),
     ("avis", ("mass_kg = 500.0", "mass_g = 500000.0"), "payload.mass_g", "unit in this key is wrong; expected mass_kg"),
