@@ -24,7 +24,9 @@ def test_a_cascade_has_the_response_of_its_factors(pole_pairs, zero_pairs, singl
     system = function.system("a", "b")
     omega = np.geomspace(1e-3, 1e4, 40)
     assert system.nstates == function.order
-    np.testing.assert_allclose(system.frequency_response(omega)[:, 0, 0], function(1j * omega), rtol=1e-6)
+    # Far below the peak a state-space sum loses digits of the sum, whatever its realisation.
+    np.testing.assert_allclose(system.frequency_response(omega)[:, 0, 0], function(1j * omega), rtol=1e-6,
+                               atol=1e-12 * np.max(function.magnitude(omega)))
 
 
 def test_roots_give_the_function_back():
