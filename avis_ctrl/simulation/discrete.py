@@ -1,0 +1,154 @@
+"""The loop made discrete: the digital controller, and the exact step of everything that is linear.
+
+Between two instants the linear part (table linearised about rest, drives, sensor chains) is advanced exactly, with
+voltages held and floor velocity linear. What the nonlinear table adds, its excess acceleration N, is extrapolated
+linearly from the last two instants: the exponential Adams-Bashforth method of second order, ETD2 of Cox and Matthews,
+J. Comput. Phys. 176 (2002), eq. 6. At micrometre amplitudes N is parts per million of the whole, so that a
+second-order error in it vanishes, at one evaluation a step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.connect import connect
+from avis_ctrl.lti.realisation import discretise
+from avis_ctrl.lti.statespace import StateSpace, append, gain
+from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
+from avis_ctrl.rigs.nonlinear import RigArrays, rig_arrays
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
+
+N_Q = len(COORDINATES)
+
+
+class StepArrays(NamedTuple):
+    """The loop as C-contiguous arrays, for compiled code. x = (q, q', q_floor, states of drives and sensors).
+
+    advance : (n, n + n_u + 24), x after a substep from (x, volts, floor velocity now, and at its end, N, N - N before)
+    observe : (n_u + 6, n + n_u + 6), volts at the motors and linear acceleration from (x, volts, floor velocity)
+    sense : (n_s, n + 12), sensor volts from (x, floor velocity, N)
+    control : (n_c + n_u, n_c + n_s), controller state and demanded volts from (controller state, sensor volts)
+    """
+
+    advance: np.ndarray
+    observe: np.ndarray
+    sense: np.ndarray
+    control: np.ndarray
+    table: RigArrays
+
+
+def sampled(system: StateSpace, period_s: float) -> StateSpace:
+    """The system at that sample time: by Tustin's rule, or as it is when already sampled so."""
+    if system.dt and abs(system.dt - period_s) > 1e-9 * period_s:
+        raise InputError(f"a continuous system, or one sampled at {period_s:g} s", field="dt", value=system.dt)
+    return replace(system, dt=period_s) if system.dt else discretise(system, period_s, "tustin")
+
+
+def digital_controller(loop: SampledLoop) -> StateSpace:
+    """Sensor volts to demanded drive volts, sampled: what the processor computes, limits aside."""
+    rig, bank, T = loop.rig, loop.sensors, loop.period_s
+    names = (*loop.axes, *loop.loops)
+    arms = lever_arms(rig)[[COORDINATES.index(name) for name in names]]
+    decoding = arms[:, None] * sensor_axes(rig, names).decoding / bank.gain_V
+    # A force F at the edge is a moment of arm times F.
+    allocation = actuator_axes(rig, names).allocation * arms
+    forces = append(*(sampled(part, T) for part in (loop.K, *loop.loops.values())))
+    seen = gain(decoding, dt=T)
+    if bank.conditioning is not None:
+        # The same filter in every channel commutes with the decoding: one copy an axis is enough.
+        seen = append(*[sampled(bank.conditioning, T)] * len(names)) @ seen
+    return gain(allocation, dt=T) @ forces @ seen
+
+
+def linear_part(loop: SampledLoop) -> StateSpace:
+    """Table linearised, drives and sensors: from volts, floor velocity [m/s, rad/s] and excess acceleration.
+
+    Inputs "NAME_dac", "floor_C_dot", "excess_C"; outputs motor volts "NAME", "C_ddot" without the excess,
+    "C_dot" and sensor volts "NAME_volt". The first states are q, q', q_floor.
+    """
+    eom = loop.plant.mounted_body().equations_of_motion()
+    sensor_names, H = loop.plant.sensor_rows()
+    parts = {"table": _table(eom, H, sensor_names, loop.sensors.quantity)}
+    for name, drive in zip(eom.actuators, loop.drives(), strict=True):
+        parts[f"drive {name}"] = drive.renamed([f"{name}_dac"], [name])
+    for name, chain in zip(sensor_names, loop.sensors.chains, strict=True):
+        parts[f"sensor {name}"] = chain.renamed([f"{name}_motion"], [f"{name}_volt"])
+    inputs = [f"{name}_dac" for name in eom.actuators]
+    inputs += [f"floor_{c}_dot" for c in COORDINATES] + [f"excess_{c}" for c in COORDINATES]
+    outputs = [*eom.actuators, *(f"{c}_ddot" for c in COORDINATES), *(f"{c}_dot" for c in COORDINATES),
+               *(f"{name}_volt" for name in sensor_names)]
+    return connect(parts, inputs, outputs)
+
+
+def _table(eom, H: np.ndarray, sensors: tuple[str, ...], quantity: str) -> StateSpace:
+    """M q'' = -C q' - K q + K_f q_f + C_f q_f' + T u + M excess, with states (q, q', q_f)."""
+    n_u, zero, one = len(eom.actuators), np.zeros((N_Q, N_Q)), np.eye(N_Q)
+    acceleration_x = la.solve(eom.M, np.hstack([-eom.K, -eom.C, eom.K_floor]))
+    acceleration_e = np.hstack([la.solve(eom.M, np.hstack([eom.T, eom.C_floor])), zero])
+    excess = np.hstack([np.zeros((N_Q, n_u + N_Q)), one])
+    velocity_x = np.hstack([zero, one, zero])
+    floor_e = np.hstack([np.zeros((N_Q, n_u)), one, zero])
+    A = np.vstack([velocity_x, acceleration_x, np.zeros((N_Q, 3 * N_Q))])
+    B = np.vstack([np.zeros_like(excess), acceleration_e + excess, floor_e])
+    felt_x, felt_e = ((velocity_x, np.zeros_like(excess)) if quantity == "velocity"
+                      else (acceleration_x, acceleration_e + excess))
+    C = np.vstack([acceleration_x, velocity_x, H @ felt_x])
+    D = np.vstack([acceleration_e, np.zeros_like(excess), H @ felt_e])
+    inputs = (*eom.actuators, *(f"floor_{c}_dot" for c in COORDINATES), *(f"excess_{c}" for c in COORDINATES))
+    outputs = (*(f"{c}_ddot" for c in COORDINATES), *(f"{c}_dot" for c in COORDINATES),
+               *(f"{name}_motion" for name in sensors))
+    return StateSpace(A, B, C, D, 0.0, inputs, outputs)
+
+
+def held_and_ramped(A: np.ndarray, B: np.ndarray, step_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Exact step of x' = A x + B e: e^(A h), and what e = 1 and e = t/h add over the step (Van Loan 1978)."""
+    n, m = B.shape
+    block = np.zeros((n + 2 * m, n + 2 * m))
+    block[:n, :n], block[:n, n:n + m] = A * step_s, B * step_s
+    block[n:n + m, n + m:] = np.eye(m)
+    power = la.expm(block)
+    return power[:n, :n], power[:n, n:n + m], power[:n, n + m:]
+
+
+def step_arrays(loop: SampledLoop, extra_substeps: int = 1) -> StepArrays:
+    """Pack a loop; each of its substeps is divided by `extra_substeps` once more."""
+    linear, controller = linear_part(loop), digital_controller(loop)
+    n, n_u, n_s = linear.nstates, loop.n_drives, len(loop.sensors.chains)
+    volts, floor, excess = slice(0, n_u), slice(n_u, n_u + N_Q), slice(n_u + N_Q, n_u + 2 * N_Q)
+    Phi, held, ramped = held_and_ramped(linear.A, linear.B, loop.period_s / (loop.substeps * extra_substeps))
+    advance = np.hstack([Phi, held[:, volts], held[:, floor] - ramped[:, floor], ramped[:, floor],
+                         held[:, excess], ramped[:, excess]])
+    observe = np.hstack([linear.C, linear.D[:, :n_u + N_Q]])[:n_u + N_Q]
+    sense = np.hstack([linear.C, linear.D[:, n_u:]])[-n_s:]
+    control = np.block([[controller.A, controller.B], [controller.C, controller.D]])
+    return StepArrays(*(np.ascontiguousarray(a) for a in (advance, observe, sense, control)),
+                      rig_arrays(loop.plant.mounted_body()))
+
+
+def spectral_radius(loop: SampledLoop) -> float:
+    """Largest modulus of the poles of the linear loop over one control period: stable below 1.
+
+    Exact: the period map of table, drives, sensors, controller and the voltages still on their way.
+    """
+    arrays = step_arrays(loop)
+    n, n_u = arrays.advance.shape[0], loop.n_drives
+    n_c = arrays.control.shape[0] - n_u
+    free = np.r_[:2 * N_Q, 3 * N_Q:n]  # the floor does not feel the loop
+    whole, late = divmod(loop.delay_substeps, loop.substeps)
+    # State over a period: x, controller, voltages computed and not yet applied (newest first).
+    pending = whole + 1
+    size = len(free) + n_c + n_u * pending
+    x, xc = np.eye(size)[:len(free)], np.eye(size)[len(free):len(free) + n_c]
+    queue = [np.eye(size)[len(free) + n_c + n_u * k:][:n_u] for k in range(pending)]
+    Phi, Gamma = arrays.advance[np.ix_(free, free)], arrays.advance[free, n:n + n_u]
+    out = arrays.control @ np.vstack([xc, arrays.sense[:, free] @ x])
+    queue = [out[n_c:], *queue]
+    for j in range(loop.substeps):
+        x = Phi @ x + Gamma @ (queue[whole] if j >= late else queue[whole + 1])
+    return float(np.max(np.abs(la.eigvals(np.vstack([x, out[:n_c], *queue[:pending]])))))

@@ -1,0 +1,114 @@
+"""Closed-loop simulation of the nonlinear table under digital control."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.converter import require_positive
+from avis_ctrl.rigs.floor_spectrum import realise
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.simulation import kernel
+from avis_ctrl.simulation.discrete import linear_part, step_arrays
+from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
+
+# No isolated table moves so far between its stops: beyond, the loop has diverged [m, rad].
+STOPS = np.array([0.02, 0.2])
+
+
+@dataclass(frozen=True, eq=False)
+class SimulationRecord:
+    """What happened, at the samples of the controller.
+
+    Attributes
+    ----------
+    time : (n,) s. A loop that diverged ends early.
+    q, q_dot : (n, 6) payload, m and rad, m/s and rad/s.
+    floor_dot : (n, 6) floor, m/s and rad/s.
+    volts, demanded : (n, n_u) held voltages, and as computed before the limit [V].
+    sensed : (n, n_s) volts at the converter, noise included, before rounding and clipping.
+    diverged : the payload went beyond its stops.
+    clipped_dac, clipped_adc : count of single channel samples beyond the limits.
+    """
+
+    loop: SampledLoop
+    time: np.ndarray
+    q: np.ndarray
+    q_dot: np.ndarray
+    floor_dot: np.ndarray
+    volts: np.ndarray
+    demanded: np.ndarray
+    sensed: np.ndarray
+    diverged: bool
+
+    @cached_property
+    def clipped_dac(self) -> int:
+        return int(np.count_nonzero(np.abs(self.demanded) > self.loop.limit_V))
+
+    @cached_property
+    def clipped_adc(self) -> int:
+        converter = self.loop.sensors.converter
+        return int(np.count_nonzero(converter.clipped(self.sensed))) if converter else 0
+
+    def velocity(self, axis: str) -> np.ndarray:
+        """(n,) payload velocity of a coordinate [m/s], a rotation as velocity of the edge."""
+        k = COORDINATES.index(axis)
+        return self.q_dot[:, k] * lever_arms(self.loop.rig)[k]
+
+
+def floor_velocity(loop: SampledLoop, samples: int, rng: np.random.Generator) -> np.ndarray:
+    """(samples + 1, 6) m/s and rad/s, one period of a periodic realisation; coordinates without a spectrum rest."""
+    velocity = np.zeros((samples + 1, 6))
+    for name, spectrum in loop.floor.items():
+        if name not in COORDINATES:
+            raise InputError(f"a coordinate out of {COORDINATES}", field="floor", value=name)
+        record = realise(spectrum, samples * loop.period_s, loop.period_s, rng)
+        velocity[:-1, COORDINATES.index(name)] = record.velocity
+    velocity[-1] = velocity[0]
+    return velocity
+
+
+def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int = 1, *, settle_s: float = 10.0,
+             nonlinear: bool = True, extra_substeps: int = 1, floor: np.ndarray | None = None,
+             initial: np.ndarray | None = None) -> SimulationRecord:
+    """Run the loop and keep the last `duration_s`.
+
+    Parameters
+    ----------
+    duration_s, settle_s : kept, and run before it from rest.
+    seed : of floor and sensor noise; the same seed gives the same record.
+    nonlinear : False for the table linearised about rest, the step then exact.
+    extra_substeps : divides each step further, to see what the step costs.
+    floor : (n + 1, 6) floor velocities in place of a realisation, n samples in all.
+    initial : (12,) q and q' at the start.
+
+    Raises
+    ------
+    InputError : durations or arrays that do not fit.
+    """
+    require_positive(duration_s, "duration_s")
+    require_positive(settle_s, "settle_s", zero_allowed=True)
+    rng = np.random.default_rng(seed)
+    settle = round(settle_s * loop.sample_rate_Hz)
+    samples = settle + round(duration_s * loop.sample_rate_Hz)
+    floor = floor_velocity(loop, samples, rng) if floor is None else np.ascontiguousarray(floor, float)
+    if floor.shape != (samples + 1, 6):
+        raise InputError(f"expected floor velocities of shape {(samples + 1, 6)}", field="floor", value=floor.shape)
+    n_s, n_u = len(loop.sensors.chains), loop.n_drives
+    noise = rng.standard_normal((samples, n_s)) * loop.sensors.noise_rms_V
+    state = np.zeros(linear_part(loop).nstates)
+    if initial is not None:
+        state[:12] = initial
+    converter = loop.sensors.converter
+    adc = np.array((converter.lsb_V, *converter.limits_V) if converter else (0.0, 0.0, 0.0))
+    records = tuple(np.empty((samples, width)) for width in (6, 6, n_u, n_u, n_s))
+    done = kernel.run(step_arrays(loop, extra_substeps), floor, noise, loop.substeps * extra_substeps,
+                      loop.delay_substeps * extra_substeps, nonlinear, loop.sensors.quantity == "acceleration", adc,
+                      loop.limit_V, STOPS, state, records)
+    kept = slice(min(settle, done - 1), done)
+    q, q_dot, volts, demanded, sensed = (record[kept].copy() for record in records)
+    time = (np.arange(samples)[kept] - settle) * loop.period_s
+    return SimulationRecord(loop, time, q, q_dot, floor[:-1][kept].copy(), volts, demanded, sensed, done < samples)

@@ -1,0 +1,123 @@
+"""What linear theory says the simulated loop does, by frequency response: no state-space step is shared with it.
+
+The digital parts are evaluated at z = exp(j omega T), the hold and the delay exactly, the table and the chains at
+s = j omega. Sampling folds: a signal sampled at rate 1/T contains all omega + 2 pi k / T. The floor velocity is linear
+between samples and the voltages are constant between updates, so both are sampled signals with known images, and
+
+    v*(omega) = sum over k of [ G_w(omega_k) hold_1(omega_k) w* + G_u(omega_k) hold_0(omega_k) exp(-j omega_k tau) u* ]
+
+is exact in the limit of many images; they die out with the second power of k at least.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.simulation.discrete import digital_controller
+from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
+
+IMAGES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class SampledResponse:
+    """The linear loop as a sampled system, at omega (n,) rad/s below half the sample rate.
+
+    Attributes
+    ----------
+    velocity_floor : (n, 6, 6) payload velocity over floor velocity.
+    velocity_noise : (n, 6, n_s) payload velocity over noise at the converters [1/V].
+    volts_floor, volts_noise : (n, n_u, 6), (n, n_u, n_s) demanded voltages over the same.
+    """
+
+    loop: SampledLoop
+    omega: np.ndarray
+    velocity_floor: np.ndarray
+    velocity_noise: np.ndarray
+    volts_floor: np.ndarray
+    volts_noise: np.ndarray
+
+    def velocity_psd(self) -> np.ndarray:
+        """(n, 6) one-sided density of the payload's sampled velocity [(m/s)^2/Hz, (rad/s)^2/Hz]."""
+        return self._psd(self.velocity_floor, self.velocity_noise)
+
+    def volts_psd(self) -> np.ndarray:
+        """(n, n_u) one-sided density of the demanded voltages [V^2/Hz]."""
+        return self._psd(self.volts_floor, self.volts_noise)
+
+    def _psd(self, of_floor: np.ndarray, of_noise: np.ndarray) -> np.ndarray:
+        frequency = self.omega / (2 * np.pi)
+        floor = np.zeros((frequency.size, len(COORDINATES)))
+        for name, spectrum in self.loop.floor.items():
+            # A realisation has no lines below the band of its model.
+            floor[:, COORDINATES.index(name)] = np.where(frequency >= spectrum.low_Hz * (1 - 1e-9),
+                                                         spectrum.asd(frequency, "velocity") ** 2, 0.0)
+        noise = 2 * self.loop.period_s * self.loop.sensors.white_variance_V2
+        return (np.abs(of_floor) ** 2 @ floor[:, :, None])[..., 0] + np.abs(of_noise) ** 2 @ noise
+
+
+@dataclass(frozen=True, eq=False)
+class _Open:
+    """Payload velocity and sensor volts, sampled, over the sampled floor velocity and the voltages computed."""
+
+    velocity_floor: np.ndarray
+    velocity_volts: np.ndarray
+    sensed_floor: np.ndarray
+    sensed_volts: np.ndarray
+
+
+def sampled_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES) -> SampledResponse:
+    """Close the linear loop at the frequencies omega [rad/s].
+
+    images : pairs of images that are folded in.
+    """
+    omega = np.atleast_1d(np.asarray(omega, float))
+    total: list[np.ndarray] | None = None
+    for k in range(-images, images + 1):
+        terms = _image(loop, omega, omega + 2 * np.pi * k / loop.period_s)
+        total = terms if total is None else [a + b for a, b in zip(total, terms, strict=True)]
+    assert total is not None
+    G = _Open(*total)
+    C = digital_controller(loop).frequency_response(omega)
+    # u = C (S_w w + S_u u + n)
+    volts = np.linalg.solve(np.eye(C.shape[1]) - C @ G.sensed_volts, np.concatenate([C @ G.sensed_floor, C], axis=2))
+    volts_floor, volts_noise = volts[:, :, :len(COORDINATES)], volts[:, :, len(COORDINATES):]
+    return SampledResponse(loop, omega, G.velocity_floor + G.velocity_volts @ volts_floor,
+                           G.velocity_volts @ volts_noise, volts_floor, volts_noise)
+
+
+def _image(loop: SampledLoop, omega: np.ndarray, image: np.ndarray) -> list[np.ndarray]:
+    """One term of the folding: continuous responses at `image` = omega + 2 pi k / T, times their holds there."""
+    T, eom = loop.period_s, loop.plant.mounted_body().equations_of_motion()
+    s = 1j * image[:, None, None]
+    sinc = np.sinc(image * T / (2 * np.pi))
+    drive = _diagonal(loop.drives(), image) * (sinc * np.exp(-1j * image * (loop.loop_delay_s + T / 2)))[:, None]
+    # s^2 M q + s C q + K q = (C_f + K_f / s) w + T u, and v = s q
+    dynamic = s * eom.M + eom.C + eom.K / s
+    pushed = np.concatenate([(eom.C_floor + eom.K_floor / s) * (sinc ** 2)[:, None, None],
+                             eom.T * drive[:, None, :]], axis=2)
+    velocity = np.linalg.solve(dynamic, pushed)
+    _, H = loop.plant.sensor_rows()
+    sensed = H @ velocity * _diagonal(loop.sensors.chains, image)[:, :, None]
+    if loop.sensors.quantity == "acceleration":
+        sensed = sensed * s
+    n = len(COORDINATES)
+    return [velocity[:, :, :n], velocity[:, :, n:], sensed[:, :, :n], sensed[:, :, n:]]
+
+
+def _diagonal(systems, omega: np.ndarray) -> np.ndarray:
+    """(n_omega, n) responses of scalar systems; the same object is evaluated once."""
+    known = {id(system): system.frequency_response(omega)[:, 0, 0] for system in systems}
+    return np.stack([known[id(system)] for system in systems], axis=1)
+
+
+def predict_transmissibility_6dof(loop: SampledLoop, omega: np.ndarray) -> np.ndarray:
+    """(n_omega, 6, 6) payload velocity over floor velocity, rotations as displacement of the edge.
+
+    Of the sampled loop with all six degrees of freedom, for a floor that moves at omega [rad/s] alone.
+    """
+    arms = lever_arms(loop.rig)
+    return arms[:, None] * sampled_response(loop, omega).velocity_floor / arms

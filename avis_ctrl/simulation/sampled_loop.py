@@ -1,0 +1,207 @@
+"""A digital controller around a table: everything that a closed-loop simulation or its prediction needs.
+
+    floor --> table --> sensors --> noise, converter --> controller --> limit --> delay, hold --> drives --> table
+
+The controller knows `rig`; the table that moves is `plant`, which may differ from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.statespace import StateSpace, gain
+from avis_ctrl.rigs.converter import Converter, require_positive
+from avis_ctrl.rigs.floor_spectrum import SpectrumModel
+from avis_ctrl.rigs.geophone import Accelerometer, CompensationFilter, Geophone, SensorChain
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rigid_body import COORDINATES
+
+# Finer steps than this per control period would be needed to place the delay: a sign of a mistyped delay.
+MAX_SUBSTEPS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class SensorBank:
+    """The sensors of a rig, from motion along each sensor's axis to volts at the converter.
+
+    Attributes
+    ----------
+    quantity : what a chain takes in, "velocity" [m/s] or "acceleration" [m/s^2].
+    chains : one system a sensor, to volts.
+    gain_V : (n_s,) volts per unit of motion in the passband; the controller divides by it.
+    noise_rms_V : (n_s,) white noise of one sample, before the converter.
+    converter : None for unlimited resolution.
+    conditioning : done by the controller in each channel after division by the gain (an accelerometer's
+        integrator); None for nothing.
+    """
+
+    quantity: str
+    chains: tuple[StateSpace, ...]
+    gain_V: np.ndarray
+    noise_rms_V: np.ndarray
+    converter: Converter | None = None
+    conditioning: StateSpace | None = None
+
+    def __post_init__(self) -> None:
+        if self.quantity not in ("velocity", "acceleration"):
+            raise InputError("velocity or acceleration", field="quantity", value=self.quantity)
+        n = len(self.chains)
+        for name in ("gain_V", "noise_rms_V"):
+            values = np.array(np.broadcast_to(getattr(self, name), (n,)), dtype=float)
+            if not np.all(np.isfinite(values)) or np.any(values < 0):
+                raise InputError(f"{n} finite numbers, not negative", field=name, value=values.tolist())
+            object.__setattr__(self, name, values)
+
+    @property
+    def white_variance_V2(self) -> np.ndarray:
+        """(n_s,) variance of noise and rounding of one sample."""
+        return self.noise_rms_V ** 2 + (self.converter.noise_rms_V ** 2 if self.converter else 0.0)
+
+
+def geophone_bank(rig: Rig) -> SensorBank:
+    """The rig's geophones with compensation filter, preamplifier, ambient noise and converter, as its file says."""
+    if rig.geophones is None or rig.acquisition is None:
+        raise InputError("the rig has no geophones with a converter", field="geophones")
+    g, a = rig.geophones, rig.acquisition
+    converter = Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz)
+    compensation = CompensationFilter(g.suspension_Hz, g.suspension_damping, g.compensated_Hz, g.compensated_damping)
+    noise = rig.ambient.sensor_noise_rms_V if rig.ambient else 0.0
+    chains = [SensorChain(Geophone(g.suspension_Hz, g.suspension_damping, sensitivity), compensation,
+                          g.preamplifier_gain, converter, noise) for sensitivity in g.sensitivity_Vs_per_m]
+    return SensorBank("velocity", tuple(chain.system() for chain in chains),
+                      np.array([chain.passband_gain_Vs_per_m for chain in chains]),
+                      np.full(len(chains), noise), converter)
+
+
+def accelerometer_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
+    """The rig's accelerometers, integrated to velocity by the controller: 1 / (s + 2 pi corner)."""
+    if rig.accelerometers is None:
+        raise InputError("the rig has no accelerometers", field="accelerometers")
+    a, n = rig.accelerometers, len(rig.accelerometers.at)
+    sensor = Accelerometer(a.sensitivity_Vs2_per_m, a.low_corner_Hz, a.noise_m_per_s2_rtHz)
+    # Noise limited to half the sample rate: variance = density^2 fs / 2.
+    rms = float(sensor.noise_density(np.array([1.0]))[0]) * np.sqrt(a.sample_rate_Hz / 2)
+    leak = cascade([], [-2 * np.pi * integrator_corner_Hz], 1.0)
+    return SensorBank("acceleration", (sensor.system(),) * n, np.full(n, a.sensitivity_Vs2_per_m), np.full(n, rms),
+                      None, leak)
+
+
+@dataclass(frozen=True, eq=False)
+class SampledLoop:
+    """A table under digital control on a moving floor.
+
+    Attributes
+    ----------
+    rig : what the controller believes: its geometry makes the logical axes.
+    K : u = K y; from measured velocities of `axes` to forces on them. Rotations count as velocity [m/s] and
+        force [N] at the edge. Continuous, or sampled at the loop's rate.
+    axes : coordinates that K controls, in its order.
+    loops : for other coordinates, a system from velocity to force, signs and units as K's; coordinates not
+        named are not controlled.
+    sensors : the chains, in the order of the rig's sensors.
+    floor : spectrum of the floor's motion by coordinate [m or rad]; others are at rest.
+    plant : the table that moves; `rig` by default.
+    drive_errors : one system a drive, volts to volts (1 + W Delta of neglected dynamics), None where nominal.
+    amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
+    sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage.
+
+    Raises
+    ------
+    InputError : sizes or names that do not fit, a delay that no fine division of the sample time places.
+    """
+
+    rig: Rig
+    K: StateSpace
+    axes: tuple[str, ...]
+    loops: Mapping[str, StateSpace]
+    sensors: SensorBank
+    floor: Mapping[str, SpectrumModel]
+    plant: Rig = None  # type: ignore[assignment]
+    drive_errors: tuple[StateSpace | None, ...] = ()
+    amplifier_corner_Hz: float | None = None
+    sample_rate_Hz: float = 0.0
+    loop_delay_s: float = -1.0
+    limit_V: float = 0.0
+    name: str = "nominal"
+    substeps: int = field(init=False, default=1)
+
+    def __post_init__(self) -> None:
+        def default(name: str, absent: object, value: object) -> None:
+            if getattr(self, name) == absent:
+                object.__setattr__(self, name, value)
+        if self.plant is None:
+            object.__setattr__(self, "plant", self.rig)
+        default("sample_rate_Hz", 0.0, self.rig.sample_rate_Hz)
+        default("loop_delay_s", -1.0, self.rig.loop_delay_s)
+        default("limit_V", 0.0, self.rig.drive_limit_V)
+        default("drive_errors", (), (None,) * self.n_drives)
+        self._check()
+        periods = Fraction(self.loop_delay_s * self.sample_rate_Hz).limit_denominator(MAX_SUBSTEPS)
+        if abs(float(periods) - self.loop_delay_s * self.sample_rate_Hz) > 1e-6:
+            raise InputError(f"a delay of n/m sample periods with m up to {MAX_SUBSTEPS}", field="loop_delay_s",
+                             value=self.loop_delay_s)
+        object.__setattr__(self, "substeps", periods.denominator)
+
+    def _check(self) -> None:
+        for name in ("sample_rate_Hz", "limit_V"):
+            require_positive(getattr(self, name), name)
+        require_positive(self.loop_delay_s, "loop_delay_s", zero_allowed=True)
+        controlled = (*self.axes, *self.loops)
+        if len(set(controlled)) != len(controlled) or not set(controlled) <= set(COORDINATES):
+            raise InputError(f"different coordinates out of {COORDINATES}", field="axes, loops", value=controlled)
+        if self.K.D.shape != (len(self.axes),) * 2:
+            raise InputError(f"a {len(self.axes)} x {len(self.axes)} controller", field="K", value=self.K.D.shape)
+        n_s = len(self.rig.sensor_rows()[0])
+        for name, things, count in (("sensors", self.sensors.chains, n_s),
+                                    ("drive_errors", self.drive_errors, self.n_drives)):
+            if len(things) != count:
+                raise InputError(f"{count} systems", field=name, value=len(things))
+        for name, system in (*self.loops.items(), *((f"drive {k}", s) for k, s in enumerate(self.drive_errors) if s),
+                             *((f"sensor {k}", s) for k, s in enumerate(self.sensors.chains))):
+            if system.D.shape != (1, 1):
+                raise InputError("one input and one output", field=name, value=system.D.shape)
+        if self.sensors.quantity == "acceleration" and any(drive.D[0, 0] for drive in self.drives()):
+            # Acceleration would jump with the voltage, at the very instant of the next sample.
+            raise InputError("a corner for the amplifiers: accelerometers need drives without direct feedthrough",
+                             field="amplifier_corner_Hz", value=self.amplifier_corner_Hz)
+
+    @property
+    def n_drives(self) -> int:
+        return len(self.rig.equations_of_motion().actuators)
+
+    @property
+    def period_s(self) -> float:
+        return 1.0 / self.sample_rate_Hz
+
+    @property
+    def delay_substeps(self) -> int:
+        return round(self.loop_delay_s * self.sample_rate_Hz * self.substeps)
+
+    def drives(self) -> list[StateSpace]:
+        """Volts of the converter to volts at each actuator: amplifier, then its neglected dynamics."""
+        corner = self.amplifier_corner_Hz and 2 * np.pi * self.amplifier_corner_Hz
+        amplifier = cascade([], [-corner], corner) if corner else gain(1.0)
+        return [amplifier if error is None else error @ amplifier for error in self.drive_errors]
+
+    def with_plant(self, name: str, plant: Rig | None = None,
+                   drive_errors: Sequence[StateSpace | None] | None = None,
+                   sensor_errors: Sequence[StateSpace | None] | None = None) -> SampledLoop:
+        """The same controller around another table; errors are volts to volts, None where nominal."""
+        sensors = self.sensors
+        if sensor_errors is not None:
+            chains = tuple(chain if error is None else error @ chain
+                           for chain, error in zip(sensors.chains, sensor_errors, strict=True))
+            sensors = replace(sensors, chains=chains)
+        return replace(self, name=name, plant=plant or self.rig, sensors=sensors,
+                       drive_errors=self.drive_errors if drive_errors is None else tuple(drive_errors))
+
+
+def lever_arms(rig: Rig) -> np.ndarray:
+    """(6,) that turn q into displacements: 1 for translations, the edge [m] for rotations."""
+    return np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in COORDINATES])

@@ -1,0 +1,178 @@
+"""Does a simulated spectrum agree with the predicted one, within what chance allows?
+
+Power in third-octave bands is estimated by Welch's method (Hann window, half overlap) and compared with its exact
+expectation and variance for a Gaussian process of the predicted density: leakage, the correlation of overlapping
+segments and of neighbouring lines, and resonances narrower than a line are all in them. The estimate is then taken as
+chi-square distributed with matching mean and variance (Welch, IEEE Trans. Audio Electroacoust. AU-15 (1967);
+Percival and Walden, Spectral Analysis for Physical Applications, 1993, section 6.10).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import signal, stats
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.floor_motion import third_octave_edges, third_octave_midbands
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.simulation.loop import SimulationRecord
+from avis_ctrl.simulation.prediction import sampled_response
+from avis_ctrl.simulation.sampled_loop import lever_arms
+
+# Points of the predicted density per line of the estimate: a resonance as narrow as a line is still resolved.
+POINTS_PER_LINE = 4
+# Lines beyond which the Hann window's side lobes (18 dB per octave) are left out, and segments beyond which
+# the correlation is.
+REACH_LINES, REACH_SEGMENTS = 8, 6
+
+
+@dataclass(frozen=True, eq=False)
+class SpectrumAgreement:
+    """Band powers of some axes against prediction.
+
+    Attributes
+    ----------
+    axes : names; midband_Hz : (n_bands,).
+    estimated_rms, predicted_rms : (n_axes, n_bands) velocity in each band [m/s], rotations at the edge.
+    dof : (n_axes, n_bands) equivalent degrees of freedom.
+    lower, upper : (n_axes, n_bands) bounds of the ratio of powers that chance allows.
+    false_alarm : probability that any band of a true prediction falls outside.
+    frequency_Hz, estimated_psd, predicted_psd : Welch lines (n_f,), (n_axes, n_f) for plotting.
+    """
+
+    axes: tuple[str, ...]
+    midband_Hz: np.ndarray
+    estimated_rms: np.ndarray
+    predicted_rms: np.ndarray
+    dof: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    false_alarm: float
+    frequency_Hz: np.ndarray
+    estimated_psd: np.ndarray
+    predicted_psd: np.ndarray
+
+    @property
+    def ratio(self) -> np.ndarray:
+        """(n_axes, n_bands) estimated over predicted power."""
+        return (self.estimated_rms / self.predicted_rms) ** 2
+
+    @property
+    def outside(self) -> np.ndarray:
+        """(n_axes, n_bands) bands that chance does not explain."""
+        return (self.ratio < self.lower) | (self.ratio > self.upper)
+
+    @property
+    def agrees(self) -> bool:
+        return not np.any(self.outside)
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"axes": list(self.axes), "midband_Hz": self.midband_Hz.tolist(), "ratio": self.ratio.tolist(),
+                "lower": self.lower.tolist(), "upper": self.upper.tolist(), "dof": self.dof.tolist(),
+                "outside": int(np.count_nonzero(self.outside)), "bands": int(self.ratio.size),
+                "false_alarm": self.false_alarm, "agrees": self.agrees}
+
+
+@dataclass(frozen=True, eq=False)
+class WelchMoments:
+    """Expectation and covariance of Welch's estimate for a given density."""
+
+    segment: int
+    segments: int
+    sample_rate_Hz: float
+
+    @property
+    def window(self) -> np.ndarray:
+        return signal.get_window("hann", self.segment)
+
+    @property
+    def line_Hz(self) -> float:
+        return self.sample_rate_Hz / self.segment
+
+    def fine_grid(self, highest_line: int) -> np.ndarray:
+        """Frequencies [Hz] at which the density is wanted, the first one a step above zero."""
+        return np.arange(1, (highest_line + REACH_LINES) * POINTS_PER_LINE + 1) * self.line_Hz / POINTS_PER_LINE
+
+    def band(self, psd: np.ndarray, first: int, last: int) -> tuple[float, float, np.ndarray]:
+        """Mean and variance of the sum over lines first..last, and the mean of each; psd on the fine grid.
+
+        With X_m(j) the transform of segment m at line j, cov(|X_m(j)|^2, |X_n(k)|^2) = |E X_m(j) conj X_n(k)|^2.
+        """
+        lo, hi = max(first - REACH_LINES, 0), last + REACH_LINES
+        fine = np.arange(max(lo * POINTS_PER_LINE, 1), hi * POINTS_PER_LINE + 1) / POINTS_PER_LINE
+        density = psd[np.round(fine * POINTS_PER_LINE).astype(int) - 1] / POINTS_PER_LINE
+        lines = np.arange(first, last + 1)
+        A = np.sqrt(density)[:, None] * _hann_transform(fine[:, None] - lines)
+        mean = np.sum(A ** 2, axis=0)
+        variance = 0.0
+        for lag in range(min(REACH_SEGMENTS, self.segments)):
+            # Segments half a window apart: frequency f turns by pi f / line_Hz from one to the next.
+            E = A.T @ (np.exp(1j * np.pi * fine * lag)[:, None] * A)
+            share = (self.segments - lag) * (1 if lag == 0 else 2) / self.segments ** 2
+            variance += share * float(np.sum(np.abs(E) ** 2))
+        return float(np.sum(mean)), variance, mean
+
+
+def _hann_transform(x: np.ndarray) -> np.ndarray:
+    """Transform of the Hann window at x lines from its centre, of unit energy; real about the window's middle."""
+    return np.sqrt(2 / 3) * (np.sinc(x) + 0.5 * (np.sinc(x - 1) + np.sinc(x + 1)))
+
+
+def check_spectrum_agreement(record: SimulationRecord, band_Hz: tuple[float, float] = (1.0, 80.0),
+                             axes: tuple[str, ...] | None = None, false_alarm: float = 0.01,
+                             segment_s: float = 8.0) -> SpectrumAgreement:
+    """Compare the record's payload velocity with the linear prediction of its own loop.
+
+    Parameters
+    ----------
+    band_Hz : lowest and highest midband.
+    axes : coordinates; those that K controls by default.
+    false_alarm : probability of any band of any axis outside when the prediction is true (Bonferroni).
+    segment_s : length of Welch's segments; a third octave at the lowest midband has to hold at least one line.
+
+    Raises
+    ------
+    InputError : a record shorter than two segments, a band without lines, unknown axes.
+    """
+    loop = record.loop
+    axes = loop.axes if axes is None else axes
+    fs, segment = loop.sample_rate_Hz, round(segment_s * loop.sample_rate_Hz)
+    segments = 2 * len(record.time) // segment - 1
+    if segments < 2:
+        raise InputError("a record of at least one and a half segments", field="segment_s", value=segment_s)
+    moments = WelchMoments(segment, segments, fs)
+    mid, first, last = _bands(band_Hz, moments.line_Hz)
+    kept = [COORDINATES.index(axis) for axis in axes]
+    arms = lever_arms(loop.rig)[kept]
+    fine = moments.fine_grid(int(last[-1]))
+    predicted = sampled_response(loop, 2 * np.pi * fine).velocity_psd()[:, kept].T * arms[:, None] ** 2
+    estimated = np.array([signal.welch(record.velocity(axis), fs, "hann", segment, segment // 2,
+                                       detrend="constant")[1] for axis in axes])
+    shape = (len(axes), len(mid))
+    mean, dof, power = np.empty(shape), np.empty(shape), np.empty(shape)
+    expected_lines = np.full((len(axes), int(last[-1]) + 1), np.nan)
+    for i in range(len(axes)):
+        for b, (lo, hi) in enumerate(zip(first, last, strict=True)):
+            mean[i, b], variance, expected_lines[i, lo:hi + 1] = moments.band(predicted[i], int(lo), int(hi))
+            dof[i, b] = 2 * mean[i, b] ** 2 / variance
+            power[i, b] = np.sum(estimated[i, lo:hi + 1])
+    tail = false_alarm / mean.size / 2
+    shown = slice(int(first[0]), int(last[-1]) + 1)
+    return SpectrumAgreement(axes, mid, np.sqrt(power * moments.line_Hz), np.sqrt(mean * moments.line_Hz), dof,
+                             stats.chi2.ppf(tail, dof) / dof, stats.chi2.isf(tail, dof) / dof, false_alarm,
+                             np.arange(shown.start, shown.stop) * moments.line_Hz, estimated[:, shown],
+                             expected_lines[:, shown])
+
+
+def _bands(band_Hz: tuple[float, float], line_Hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Midbands and the first and last line of each, every line in one band only."""
+    mid = third_octave_midbands(*band_Hz)
+    lower, upper = third_octave_edges(mid)
+    first, last = np.ceil(lower / line_Hz).astype(int), np.ceil(upper / line_Hz).astype(int) - 1
+    if np.any(last < first):
+        raise InputError(f"segments long enough for a line in every third octave from {band_Hz[0]:g} Hz",
+                         field="segment_s", value=1 / line_Hz)
+    return mid, first, last
