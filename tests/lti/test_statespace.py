@@ -1,0 +1,102 @@
+"""Named linear systems: shapes, algebra, evaluation, exchange with python-control."""
+
+from __future__ import annotations
+
+import pickle
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti import StateSpace, append, gain, tf
+
+coefficients = st.lists(st.floats(0.1, 50), min_size=1, max_size=5)
+
+
+def random_system(rng, n, n_y, n_u, names=("", "")):
+    A = rng.standard_normal((n, n))
+    A -= (max(np.linalg.eigvals(A).real, default=0.0) + rng.uniform(0.05, 1.0)) * np.eye(n)
+    return StateSpace(A, rng.standard_normal((n, n_u)), rng.standard_normal((n_y, n)), rng.standard_normal((n_y, n_u)),
+                      0.0, [f"{names[0]}u{k}" for k in range(n_u)], [f"{names[1]}y{k}" for k in range(n_y)])
+
+
+@given(coefficients, coefficients, st.floats(1e-3, 1e3))
+@settings(max_examples=60, deadline=None)
+def test_tf_evaluates_as_the_ratio_of_its_polynomials(num, den, w):
+    if len(num) > len(den):
+        with pytest.raises(InputError, match="improper"):
+            tf(num, den)
+        return
+    expected = np.polyval(num, 1j * w) / np.polyval(den, 1j * w)
+    assert tf(num, den)(1j * w)[0, 0] == pytest.approx(expected, rel=1e-8)
+    assert tf(num, den).frequency_response([w])[0, 0, 0] == pytest.approx(expected, rel=1e-8)
+
+
+@given(st.integers(0, 2 ** 31), st.integers(0, 5))
+@settings(max_examples=30, deadline=None)
+def test_algebra_is_that_of_the_transfer_matrices(seed, n):
+    rng = np.random.default_rng(seed)
+    G, H = random_system(rng, n, 2, 3), random_system(rng, 3, 3, 2)
+    E = random_system(rng, 2, 2, 3)
+    L, R = rng.standard_normal((4, 2)), rng.standard_normal((3, 1))
+    for s in (0.3j, 7.0 + 1j):
+        np.testing.assert_allclose((G @ H)(s), G(s) @ H(s), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose((G - E)(s), G(s) - E(s), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(G.scaled(L, R)(s), L @ G(s) @ R, rtol=1e-9, atol=1e-9)
+        T = rng.standard_normal((n, n)) + 3 * np.eye(n)
+        np.testing.assert_allclose(G.similar(T)(s), G(s), rtol=1e-7, atol=1e-8)
+
+
+def test_frequency_response_agrees_with_python_control(rng):
+    G = random_system(rng, 6, 2, 3)
+    omega = np.geomspace(1e-2, 1e2, 50)
+    expected = np.moveaxis(control.frequency_response(G.to_control(), omega).frdata, 2, 0)
+    np.testing.assert_allclose(G.frequency_response(omega), expected, rtol=1e-9)
+    np.testing.assert_allclose(G.frequency_response([np.inf])[0], G.D)
+
+
+def test_exchange_with_python_control_keeps_names(rng):
+    G = random_system(rng, 3, 2, 1)
+    back = StateSpace.from_control(G.to_control())
+    assert (back.inputs, back.outputs) == (G.inputs, G.outputs)
+    np.testing.assert_array_equal(back.A, G.A)
+
+
+def test_select_by_name_and_position(rng):
+    G = random_system(rng, 3, 3, 3)
+    part = G.select(["y2", "y0"], "u1")
+    np.testing.assert_allclose(part(1j), G(1j)[[2, 0]][:, [1]])
+    assert part.outputs == ("y2", "y0") and part.inputs == ("u1",)
+    with pytest.raises(InputError, match="no output named 'absent'"):
+        G.select("absent")
+
+
+def test_pickle(rng):
+    G = random_system(rng, 3, 2, 1)
+    back = pickle.loads(pickle.dumps(G))
+    np.testing.assert_array_equal(back.A, G.A)
+    assert back.inputs == G.inputs
+
+
+@pytest.mark.parametrize(("matrices", "message"), [
+    (([[np.nan]], [[1]], [[1]], [[0]]), "matrix A"),
+    (([[1]], [[1, 2]], [[1]], [[0]]), "shapes do not fit"),
+    (([[1, 2]], [[1]], [[1]], [[0]]), "shapes do not fit"),
+])
+def test_wrong_matrices(matrices, message):
+    with pytest.raises(InputError, match=message):
+        StateSpace(*matrices)
+
+
+def test_wrong_names_and_clocks():
+    with pytest.raises(InputError, match="must differ"):
+        gain(np.eye(2), ["a", "a"], ["b", "c"])
+    with pytest.raises(InputError, match="dt"):
+        StateSpace([[1]], [[1]], [[1]], [[0]], -1.0)
+    sampled = StateSpace([[0.5]], [[1]], [[1]], [[0]], 0.1, ["a"], ["b"])
+    with pytest.raises(InputError, match="different sample times"):
+        append(sampled, StateSpace([[-0.5]], [[1]], [[1]], [[0]], 0.0, ["c"], ["d"]))
+    assert append(sampled, gain([[2.0]], ["c"], ["d"])).dt == 0.1
