@@ -232,8 +232,9 @@ def _performance(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, ..
                  weights: dict[str, Weight]) -> None:
     """Weighted outputs, per m/s of floor velocity (compliance: per newton)."""
     asked, effort = design.transmissibility, design.control_effort
-    weights["transmissibility"] = TransmissibilityBound(
-        asked.peak_dB, (Band(asked.band_Hz[0], asked.band_Hz[1], asked.band_dB),), asked.transition_octaves, asked.tolerance_dB)
+    band = Band(asked.band_Hz[0], asked.band_Hz[1], asked.band_dB)
+    weights["transmissibility"] = TransmissibilityBound(asked.peak_dB, (band,), asked.transition_octaves,
+                                                        asked.tolerance_dB)
     weights["control effort"] = ControlEffort(rig.drive_limit_V, effort.floor_velocity_m_per_s, effort.bandwidth_Hz,
                                               effort.reduction)
     for k, axis in enumerate(axes):

@@ -16,7 +16,7 @@ w_delta/z_delta (they come with an uncertainty block), w, z, u and y. Nothing is
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -100,6 +100,11 @@ class GeneralizedPlant:
         signals = tuple(s for s in self.signals if s.name in kept and s.name not in absent)
         return GeneralizedPlant(connect(systems, inputs, outputs), self.blocks, tuple(w), tuple(z), self.u, self.y,
                                 signals, parts, self.units)
+
+    def nominal(self) -> GeneralizedPlant:
+        """The plant with Delta = 0: w_delta and z_delta left out."""
+        P = self.P.select(slice(self.blocks.n_z, None), slice(self.blocks.n_w, None))
+        return replace(self, P=P, blocks=BlockStructure(()))
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's avis-plant JSON form."""

@@ -1,0 +1,132 @@
+"""The same measurements on every controller: bounds, transmissibility, site response.
+
+Each figure is computed on the closed loop of the returned controller, never taken from the synthesis that made it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.lti.norms import hinf_norm
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.floor_motion import band_rms, third_octave_midbands, third_octave_rms
+from avis_ctrl.rigs.vibration_criteria import rating
+from avis_ctrl.robust.mu_peak import MuPeak, mu_peak, worst_case_gain
+from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.model import Bound, ControllerKind, ControllerResult, SiteResponse, Transmissibility
+from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.uncertainty.blocks import BlockStructure
+
+PLOT_HZ = np.geomspace(0.1, 200.0, 300)
+# The level that a Gaussian signal of this bandwidth passes once in ten minutes: sqrt(2 ln(f T)), Rice 1944.
+PEAK_SECONDS, PEAK_BANDWIDTH_HZ = 600.0, 10.0
+PEAK_FACTOR = float(np.sqrt(2 * np.log(PEAK_SECONDS * PEAK_BANDWIDTH_HZ)))
+
+
+def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str, title: str, kind: ControllerKind,
+            samples: np.ndarray, notes: tuple[str, ...] = ()) -> ControllerResult:
+    """Measure one controller (None: actuators at rest) on the design's plant.
+
+    Parameters
+    ----------
+    samples : (n_samples, n_w, n_z) real perturbations for the band of sampled transmissibility.
+    """
+    performance = plant.synthesis.closed(K)
+    motion = plant.full.restricted([*plant.floor_velocities], [*plant.velocities]).closed(K)
+    full = plant.full.closed(K)
+    blocks, all_blocks = plant.synthesis.blocks, plant.synthesis.all_blocks
+    n_w, n_z = blocks.n_w, blocks.n_z
+    low, high = design.transmissibility.band_Hz
+    nominal = performance.select(slice(n_z, None), slice(n_w, None))
+    fastest = float(np.max(np.abs(K.poles()), initial=0.0)) / (2 * np.pi) if K is not None else 0.0
+    worst_peak = bound(plant, blocks, worst_case_gain(motion, blocks))
+    worst_band = bound(plant, blocks, worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high)))
+    omega = 2 * np.pi * PLOT_HZ
+    return ControllerResult(
+        name, title, kind, K, full.is_stable(), hinf_norm(nominal).gain,
+        bound(plant, blocks, mu_peak(performance, all_blocks)),
+        bound(plant, blocks, mu_peak(performance.select(slice(n_z), slice(n_w)), blocks)),
+        worst_peak, worst_band, transmissibility(motion, blocks, samples, omega, worst_peak),
+        _compliance(plant, full, omega), site_response(plant, full),
+        hinf_norm(motion.select(slice(n_z, None), slice(n_w, None))).gain, fastest, notes)
+
+
+def bound(plant: DesignPlant, blocks: BlockStructure, found: MuPeak) -> Bound:
+    """A mu or worst-case result with its perturbation in physical words."""
+    words = describe(plant, blocks, found.delta) if found.delta is not None else ()
+    curve = found.curve
+    return Bound(found.upper, found.lower, found.omega, found.guaranteed, found.delta, words, curve.omega, curve.upper,
+                 curve.lower)
+
+
+def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> tuple[str, ...]:
+    """A perturbation in physical units: parameters by value, chains by size and phase."""
+    part = delta[:blocks.n_w, :blocks.n_z]
+    real = {p.name: p for p in plant.rig.parameters}
+    words = []
+    for value, block in zip(blocks.values(part), blocks.blocks, strict=True):
+        if block.name in real:
+            parameter = real[block.name]
+            words.append(parameter.describe(float(np.real(value)), plant.rig.nominal[block.name],
+                                            plant.rig.units[block.name]))
+        else:
+            number = complex(np.asarray(value).ravel()[0]) if np.size(value) == 1 else None
+            size = abs(number) if number is not None else float(np.linalg.norm(np.asarray(value), 2))
+            phase = f" at {np.degrees(np.angle(number)):+.0f} deg" if number is not None else ""
+            words.append(f"{block.name}: {100 * size:.0f} % of its bound{phase}")
+    return tuple(words)
+
+
+def transmissibility(motion: StateSpace, blocks: BlockStructure, samples: np.ndarray, omega: np.ndarray,
+                     worst: Bound) -> Transmissibility:
+    """Nominal, sampled and worst-case transmissibility of a closed loop with inputs (w_delta, floor)."""
+    response = motion.frequency_response(omega)
+    n_w, n_z = blocks.n_w, blocks.n_z
+    nominal = response[:, n_z:, n_w:]
+    sampled = []
+    for delta in samples:
+        loop = np.eye(n_z) - response[:, :n_z, :n_w] @ delta
+        T = nominal + response[:, n_z:, :n_w] @ delta @ np.linalg.solve(loop, response[:, :n_z, n_w:])
+        sampled.append(np.linalg.norm(T, ord=2, axis=(1, 2)))
+    sigma = np.linalg.norm(nominal, ord=2, axis=(1, 2))
+    band = np.array([sigma, *sampled])
+    known = np.isfinite(worst.frequencies) & (worst.frequencies > 0)
+    if np.any(known):
+        curve = np.exp(np.interp(np.log(omega), np.log(worst.frequencies[known]),
+                                 np.log(np.maximum(worst.upper_curve[known], 1e-12)), left=np.nan, right=np.nan))
+    else:
+        curve = np.full(omega.size, np.nan)
+    return Transmissibility(omega, nominal, sigma, band.min(axis=0), band.max(axis=0), curve)
+
+
+def _compliance(plant: DesignPlant, full: StateSpace, omega: np.ndarray) -> np.ndarray:
+    forces, moved = [f"force_{a}" for a in plant.axes], [f"{a}_rel" for a in plant.axes]
+    return np.linalg.norm(full.select(moved, forces).frequency_response(omega), ord=2, axis=(1, 2))
+
+
+def site_response(plant: DesignPlant, full: StateSpace) -> SiteResponse:
+    """Spectra of payload velocity and of volts under the site's floor motion and the sensors' noise."""
+    frequency = np.geomspace(plant.floor.low_Hz, 250.0, 2000)
+    omega = 2 * np.pi * frequency
+    floor = plant.floor.asd(frequency, "velocity")
+    outputs = [*plant.velocities, *plant.volts]
+    from_floor = full.select(outputs, plant.floor_velocities).frequency_response(omega)
+    from_noise = full.select(outputs, [f"noise_{a}" for a in plant.axes]).frequency_response(omega)
+    # Directions of the floor and the sensors are independent of each other.
+    by_floor = np.linalg.norm(from_floor, axis=2) * floor[:, None]
+    by_noise = np.linalg.norm(from_noise, axis=2) * plant.floor_density
+    density = np.hypot(by_floor, by_noise)
+
+    def rms(asd: np.ndarray) -> float:
+        # Without a controller there are no volts and no sensor noise in the motion.
+        return band_rms(frequency, asd, frequency[0], frequency[-1]) if np.any(asd) else 0.0
+    n = len(plant.axes)
+    bands = third_octave_midbands(1.0, 80.0)
+    payload = np.stack([third_octave_rms(frequency, density[:, k], bands)[1] for k in range(n)], axis=1)
+    on_floor = third_octave_rms(frequency, floor, bands)[1]
+    volts = {name: rms(density[:, n + k]) for k, name in enumerate(plant.actuators)}
+    return SiteResponse(
+        {axis: rms(density[:, k]) for k, axis in enumerate(plant.axes)},
+        {axis: rms(by_noise[:, k]) for k, axis in enumerate(plant.axes)},
+        bands, on_floor, payload, rating(bands, payload.max(axis=1)).criterion, rating(bands, on_floor).criterion,
+        volts, {name: PEAK_FACTOR * value for name, value in volts.items()})

@@ -1,0 +1,104 @@
+"""The controllers that a study compares, each made on the same plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.classical.skyhook import Skyhook, critical_damping
+from avis_ctrl.classical.tuning import Scenarios, TuningRange, tune_skyhook
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.robust.hinfsyn import hinfsyn
+from avis_ctrl.robust.mu_peak import worst_case_gain
+from avis_ctrl.robust.musyn import MuSynthesis, musyn
+from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.model import ControllerKind
+from avis_ctrl.study.plant import DesignPlant
+
+TUNING_HZ = np.concatenate([np.geomspace(0.1, 100.0, 50), [150.0, 250.0, 400.0]])
+TUNING_SAMPLES = 12
+TUNING_ROUNDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A controller to be analysed."""
+
+    name: str
+    title: str
+    kind: ControllerKind
+    K: StateSpace | None
+    notes: tuple[str, ...] = ()
+
+
+def passive() -> Candidate:
+    """Actuators at rest."""
+    return Candidate("passive", "passive", "passive", None)
+
+
+def nominal_hinf(design: Design, plant: DesignPlant, rig: Rig) -> Candidate:
+    """H-infinity controller of the weighted performance of the nominal plant: no D-K, no uncertainty."""
+    nominal = plant.synthesis.nominal()
+    made = hinfsyn(nominal.P, nominal.nmeas, nominal.ncon, backoff=design.synthesis.backoff_percent / 100,
+                   sample_rate_Hz=rig.sample_rate_Hz)
+    return Candidate("hinf", "H-infinity, nominal", "hinf", made.K, made.notes)
+
+
+def mu_optimal(design: Design, plant: DesignPlant, rig: Rig,
+               callback: Callable[[Any], Any] | None = None) -> tuple[Candidate, MuSynthesis]:
+    """D-K iteration on the whole uncertainty set."""
+    P = plant.synthesis
+    made = musyn(P.P, P.blocks, P.nmeas, P.ncon, callback=callback, target=design.synthesis.target_mu,
+                 time_limit=design.synthesis.time_limit_s, max_iterations=design.synthesis.max_iterations,
+                 backoff=design.synthesis.backoff_percent / 100, sample_rate_Hz=rig.sample_rate_Hz)
+    return Candidate("mu", "mu synthesis", "mu", made.K, (made.status, *made.notes)), made
+
+
+def classical_skyhook(plant: DesignPlant, rig: Rig, design: Design) -> Candidate:
+    """Critical damping of each axis taken alone, corners in the middle of their ranges."""
+    tilt, roll = (float(np.sqrt(np.prod(limits))) for limits in (design.skyhook.tilt_corner_Hz,
+                                                                 design.skyhook.roll_off_Hz))
+    loops = Skyhook(plant.axes, critical_gains(rig, design), tilt, roll)
+    return Candidate("skyhook_classical", "skyhook, critical damping", "skyhook", loops.controller(), (_words(loops),))
+
+
+def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: float) -> Candidate:
+    """The skyhook with the lowest worst-case transmissibility in the band whose worst-case peak stays below a limit.
+
+    The search runs on samples; the bound over the whole set is then computed, and where it is above the limit its
+    worst case joins the samples.
+    """
+    omega = 2 * np.pi * TUNING_HZ
+    scenarios = Scenarios.sample(plant.full, plant.floor_velocities, plant.velocities, omega, TUNING_SAMPLES,
+                                 design.simulation.seed)
+    search = TuningRange(critical_gains(rig, design), tilt_corner_Hz=tuple(design.skyhook.tilt_corner_Hz),
+                         roll_off_Hz=tuple(design.skyhook.roll_off_Hz))
+    band = (design.transmissibility.band_Hz[0], design.transmissibility.band_Hz[1])
+    motion = plant.full.restricted(plant.floor_velocities, plant.velocities)
+    limit = peak_limit
+    for round_number in range(TUNING_ROUNDS):
+        loops = tune_skyhook(scenarios, plant.axes, search, band, limit, seed=design.simulation.seed + round_number)
+        found = worst_case_gain(motion.closed(loops.controller()), motion.blocks)
+        if found.upper <= peak_limit:
+            break
+        if found.delta is not None:
+            scenarios = scenarios.with_delta(found.delta[:motion.blocks.n_w, :motion.blocks.n_z])
+        limit *= min(1.0, 0.98 * peak_limit / found.upper) if np.isfinite(found.upper) else 0.9
+    return Candidate("skyhook", "skyhook, tuned", "skyhook", loops.controller(), (_words(loops),))
+
+
+def critical_gains(rig: Rig, design: Design) -> tuple[float, ...]:
+    """Classical gains [N s/m] of the kept axes, rotations at the edge."""
+    equations = rig.equations_of_motion()
+    kept = [equations.coordinates.index(name) for name in design.keep]
+    scale = np.array([1.0 / rig.edge_m ** 2 if name.startswith("phi") else 1.0 for name in design.keep])
+    return tuple(critical_damping(*(np.diag(X)[kept] * scale for X in (equations.M, equations.K, equations.C))))
+
+
+def _words(loops: Skyhook) -> str:
+    gains = ", ".join(f"{axis} {gain:.4g} N s/m" for axis, gain in zip(loops.axes, loops.gains, strict=True))
+    return f"gains {gains}; tilt corner {loops.tilt_corner_Hz:.3g} Hz, roll-off {loops.roll_off_Hz:.3g} Hz"

@@ -1,0 +1,149 @@
+"""What a design study finds: one frozen value from which the JSON files and the report are written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.subsystem import ReductionError
+from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.plant import DesignPlant
+
+ControllerKind = Literal["mu", "hinf", "skyhook", "passive"]
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """Bounds of a supremum over frequency and perturbations.
+
+    Attributes
+    ----------
+    upper, lower : of the supremum; upper is inf where the set holds an unstable plant.
+    omega : frequency [rad/s] of the lower bound.
+    guaranteed : whether the upper bound holds between the computed frequencies.
+    delta : perturbation (n_w, n_z) that reaches the lower bound, or None.
+    words : that perturbation in physical units.
+    frequencies, upper_curve, lower_curve : for plotting (n,).
+    """
+
+    upper: float
+    lower: float
+    omega: float
+    guaranteed: bool
+    delta: np.ndarray | None
+    words: tuple[str, ...]
+    frequencies: np.ndarray
+    upper_curve: np.ndarray
+    lower_curve: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Transmissibility:
+    """Floor to payload, rotations as edge displacement, over omega (n,) [rad/s].
+
+    nominal : (n, n_axes, n_axes) complex; sigma : (n,) its largest singular value.
+    low, high : (n,) smallest and largest sigma over the sampled plants.
+    worst : (n,) upper bound of sigma over the whole set (nan where it was not computed).
+    """
+
+    omega: np.ndarray
+    nominal: np.ndarray
+    sigma: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    worst: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class SiteResponse:
+    """What the loop makes of the site's floor motion and of the sensors' noise (nominal plant).
+
+    velocity_rms, noise_rms : payload velocity by axis [m/s], from floor and noise, and from noise alone.
+    third_octave_Hz, floor_third_octaves, payload_third_octaves : bands [Hz] and r.m.s. velocities [m/s];
+        payload (n_bands, n_axes).
+    rating, floor_rating : generic vibration criterion met by the worst axis and by the floor (None: not even VC-A).
+    volts_rms, volts_peak : by channel [V]; the peak is the level a Gaussian signal passes once in ten minutes.
+    """
+
+    velocity_rms: dict[str, float]
+    noise_rms: dict[str, float]
+    third_octave_Hz: np.ndarray
+    floor_third_octaves: np.ndarray
+    payload_third_octaves: np.ndarray
+    rating: str | None
+    floor_rating: str | None
+    volts_rms: dict[str, float]
+    volts_peak: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerResult:
+    """A controller and all that was measured on it.
+
+    gamma : H-infinity norm of the weighted performance channels of the nominal plant.
+    mu : robust performance of the weighted channels; stability : robust stability (mu of the uncertainty alone).
+    worst_peak, worst_band : worst-case transmissibility over all frequencies, and over the design's band.
+    compliance : (n,) largest singular value of force -> displacement [m/N] at `transmissibility.omega`, floor at rest.
+    peak_transmissibility : nominal, largest singular value over all frequencies.
+    fastest_pole_Hz : of the controller, continuous.
+    """
+
+    name: str
+    title: str
+    kind: ControllerKind
+    K: StateSpace | None
+    stable: bool
+    gamma: float
+    mu: Bound
+    stability: Bound
+    worst_peak: Bound
+    worst_band: Bound
+    transmissibility: Transmissibility
+    compliance: np.ndarray
+    site: SiteResponse
+    peak_transmissibility: float
+    fastest_pole_Hz: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def order(self) -> int:
+        """States of the controller."""
+        return self.K.nstates if self.K is not None else 0
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """A line of the verdict table."""
+
+    name: str
+    limit: float
+    value: float
+    unit: str
+    met: bool
+    comparison: Literal["at most", "at least", "is"]
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class DesignResult:
+    """Everything that `avis design` found."""
+
+    design: Design
+    rig: Rig
+    plant: DesignPlant
+    controllers: tuple[ControllerResult, ...]
+    dk_history: tuple[Any, ...]
+    requirements: tuple[Requirement, ...]
+    reduction: ReductionError
+    simulation: Any | None
+    provenance: dict[str, Any]
+    seconds: float
+    notes: tuple[str, ...] = field(default=())
+
+    def controller(self, name: str) -> ControllerResult:
+        """By name."""
+        return next(c for c in self.controllers if c.name == name)

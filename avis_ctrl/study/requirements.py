@@ -1,0 +1,56 @@
+"""The verdict table: each requirement of the design against what was measured on the mu controller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.study.design_file import Design, Quantity
+from avis_ctrl.study.model import ControllerResult, Requirement
+
+
+def decibel(value: float) -> float:
+    """20 log10, with -inf for zero."""
+    return 20.0 * float(np.log10(value)) if value > 0 else -np.inf
+
+
+def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requirement, ...]:
+    """One line a requirement of the design file, in its order."""
+    by_name = {c.name: c for c in controllers}
+    mu, skyhook, passive = (by_name.get(name) for name in ("mu", "skyhook", "passive"))
+    if mu is None or skyhook is None or passive is None:
+        raise InputError("requirements are judged on the controllers mu, skyhook and passive", field="controllers",
+                         value=sorted(by_name))
+    low, high = design.transmissibility.band_Hz
+    band = f"over {low:g} to {high:g} Hz"
+    measured: dict[Quantity, tuple[str, Callable[[], float], str]] = {
+        "mu_upper": ("mu of the weighted performance, upper bound", lambda: mu.mu.upper,
+                     "guaranteed at every frequency" if mu.mu.guaranteed else "at the computed frequencies"),
+        "mu_gap_percent": ("gap between the bounds of mu at its peak",
+                           lambda: 100 * (1 - mu.mu.lower / mu.mu.upper), "the lower bound has its perturbation"),
+        "worst_case_peak_transmissibility_dB": (
+            "worst-case peak transmissibility", lambda: decibel(mu.worst_peak.upper), "; ".join(mu.worst_peak.words)),
+        "worst_case_band_transmissibility_dB": (
+            f"worst-case transmissibility {band}", lambda: decibel(mu.worst_band.upper),
+            "; ".join(mu.worst_band.words)),
+        "passive_peak_transmissibility_dB": (
+            "passive peak transmissibility, nominal", lambda: decibel(passive.peak_transmissibility), ""),
+        "advantage_over_skyhook_dB": (
+            f"worst case {band} below the best skyhook's",
+            lambda: decibel(skyhook.worst_band.lower) - decibel(mu.worst_band.upper),
+            f"skyhook reaches {decibel(skyhook.worst_band.lower):+.1f} dB at a worst-case peak of "
+            f"{decibel(skyhook.worst_peak.lower):+.1f} dB"),
+        "fastest_controller_pole_Hz": ("fastest pole of the mu controller", lambda: mu.fastest_pole_Hz, ""),
+    }
+    rows = []
+    for one in design.requirement:
+        name, value, note = measured[one.quantity]
+        number = value()
+        limit = one.at_most if one.at_most is not None else one.at_least
+        assert limit is not None  # the design file gives exactly one of the two
+        met = number <= limit if one.at_most is not None else number >= limit
+        rows.append(Requirement(name, limit, number, one.unit, bool(met),
+                                "at most" if one.at_most is not None else "at least", note))
+    return tuple(rows)
