@@ -1,0 +1,147 @@
+"""Controllers of lower order, and in sampled time: what each step costs is measured, not assumed.
+
+Balanced truncation bounds the error of K itself; what counts is the closed loop. So a reduced controller is kept
+only if the figure that the caller measures with it (gamma, mu, ...) grows by no more than was allowed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti import StateSpace, balanced_truncation, discretise, hinf_norm, lft_lower
+from avis_ctrl.robust.hinf_plant import as_plant
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """The controller kept and what was measured on the way.
+
+    figures : (order, figure) of every controller tried; inf where the closed loop is unstable.
+    full, figure : the measured figure before and after.
+    """
+
+    K: StateSpace
+    order: int
+    figure: float
+    full: float
+    figures: tuple[tuple[int, float], ...]
+
+    @property
+    def growth(self) -> float:
+        """Relative growth of the figure."""
+        return self.figure / self.full - 1 if self.full > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class SampledController:
+    """A sampled controller beside its continuous original.
+
+    fastest_pole : [rad/s] largest magnitude among the continuous controller's poles.
+    nyquist : [rad/s] half the sample rate; pole_ratio = fastest_pole / nyquist.
+    response_error : largest error of the frequency response up to a quarter of the sample rate, relative to the
+        largest gain there.
+    """
+
+    K: StateSpace
+    fastest_pole: float
+    nyquist: float
+    pole_ratio: float
+    response_error: float
+    note: str
+
+
+def closed_loop_gamma(P: StateSpace, K: StateSpace) -> float:
+    """H-infinity norm of F_l(P, K); inf where it is unstable."""
+    return hinf_norm(lft_lower(P, K)).gain
+
+
+def reduce_controller(P: Any, K: StateSpace, measure: Callable[[StateSpace], float] | None = None,
+                      growth: float = 0.01, orders: range | None = None) -> Reduction:
+    """The controller of lowest order whose measured figure grows by at most `growth` (relative).
+
+    Parameters
+    ----------
+    P : generalized plant, u and y last; a candidate must stabilise it.
+    K : controller; its unstable part is kept whole, its stable part reduced by balanced truncation.
+    measure : figure of merit of a controller, smaller is better; by default the closed loop's H-infinity norm.
+    growth : allowed relative growth of the figure.
+    orders : orders to choose from, by default all from the unstable part's to K's own. They are searched by halving:
+        the order below the one returned was tried and failed; the figure is not looked at on every order.
+
+    Raises
+    ------
+    InputError : growth negative, K that does not fit P, or that does not stabilise it.
+    """
+    P = as_plant(P, K.ninputs, K.noutputs)
+    if not (np.isfinite(growth) and growth >= 0):
+        raise InputError("expected a number of at least 0, such as 0.01", field="growth", value=growth)
+    figure = measure or (lambda candidate: closed_loop_gamma(P, candidate))
+    if not lft_lower(P, K).is_stable():
+        raise InputError("the controller to reduce does not stabilise the plant", field="K", value=repr(K))
+    full = float(figure(K))
+    stable, unstable = split_stable(K)
+    choices = [k for k in sorted(orders or range(K.nstates)) if unstable.nstates <= k < K.nstates]
+    tried: list[tuple[int, float]] = [(K.nstates, full)]
+    best, value, failed, passed = K, full, -1, len(choices)
+    while passed - failed > 1:
+        middle = (failed + passed) // 2
+        candidate = balanced_truncation(stable, choices[middle] - unstable.nstates) + unstable
+        found = float(figure(candidate)) if lft_lower(P, candidate).is_stable() else np.inf
+        tried.append((choices[middle], found))
+        if found <= (1 + growth) * full:
+            best, value, passed = candidate, found, middle
+        else:
+            failed = middle
+    return Reduction(best, best.nstates, value, full, tuple(tried))
+
+
+def split_stable(K: StateSpace) -> tuple[StateSpace, StateSpace]:
+    """K = stable + unstable (poles on the stability boundary count as unstable); the direct term stays in the first."""
+    n = K.nstates
+    if not n:
+        return K, StateSpace(K.A, K.B, K.C, 0 * K.D, K.dt, K.inputs, K.outputs)
+    # A margin relative to the fastest pole: a slow pole that round-off could move over is kept, not truncated.
+    margin = 1e-12 * float(np.max(np.abs(K.poles())))
+    inside = (lambda re, im: np.hypot(re, im) < 1 - 1e-12) if K.dt else (lambda re, im: re < -margin)
+    T, U, k = la.schur(K.A, output="real", sort=inside)
+    # Solve T11 X - X T22 = -T12, so that the coordinates [I X; 0 I] decouple the two parts.
+    X = la.solve_sylvester(T[:k, :k], -T[k:, k:], -T[:k, k:]) if 0 < k < n else np.zeros((k, n - k))
+    B, C = U.T @ K.B, K.C @ U
+    stable = StateSpace(T[:k, :k], B[:k] - X @ B[k:], C[:, :k], K.D, K.dt, K.inputs, K.outputs)
+    unstable = StateSpace(T[k:, k:], B[k:], C[:, :k] @ X + C[:, k:], 0 * K.D, K.dt, K.inputs, K.outputs)
+    return stable, unstable
+
+
+def discretise_controller(K: StateSpace, sample_rate_Hz: float,
+                          method: Literal["tustin", "zoh"] = "tustin") -> SampledController:
+    """K at a sample rate [Hz], with its fastest pole against half that rate and the error of its response.
+
+    Raises
+    ------
+    InputError : a rate that is not positive, or K already sampled.
+    ComputationError : a pole that the sampling makes unstable.
+    """
+    if not (np.isfinite(sample_rate_Hz) and sample_rate_Hz > 0):
+        raise InputError("expected a positive rate in hertz", field="sample_rate_Hz", value=sample_rate_Hz)
+    sampled = discretise(K, 1.0 / sample_rate_Hz, method)
+    if K.is_stable() and not sampled.is_stable():
+        raise ComputationError("sampling made the controller unstable",
+                               measured=f"largest pole magnitude {np.max(np.abs(sampled.poles())):.6g}",
+                               cause="a pole at the edge of stability", next_step="use method='tustin'")
+    nyquist = np.pi * sample_rate_Hz
+    fastest = float(np.max(np.abs(K.poles()), initial=0.0))
+    omega = np.geomspace(1e-4, 0.5, 200) * nyquist
+    continuous, discrete = K.frequency_response(omega), sampled.frequency_response(omega)
+    largest = float(np.max(np.abs(continuous))) or 1.0
+    error = float(np.max(np.abs(continuous - discrete))) / largest
+    ratio = fastest / nyquist
+    verdict = "slow enough" if ratio < 0.5 else "too fast for this rate: the sampled controller is another one"
+    note = (f"fastest pole {fastest:.4g} rad/s is {ratio:.2g} of half the sample rate ({nyquist:.4g} rad/s), "
+            f"{verdict}; response error up to a quarter of the rate {100 * error:.2g} %")
+    return SampledController(sampled, fastest, float(nyquist), ratio, error, note)

@@ -1,0 +1,87 @@
+"""Reduced and sampled controllers, judged by measured closed loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti import StateSpace, connect, gain, hinf_norm, lft_lower, summing_junction, tf
+from avis_ctrl.robust.hinfsyn import hinfsyn
+from avis_ctrl.robust.reduction import discretise_controller, reduce_controller, split_stable
+
+
+@pytest.fixture(scope="module")
+def process():
+    """S/KS problem of Skogestad and Postlethwaite's disturbance process (example 2.17)."""
+    G = tf([200], np.polymul([10, 1], np.polymul([0.05, 1], [0.05, 1])), ["u"], ["g"])
+    return connect([G, summing_junction("e", ["r", "-g"]), tf([1 / 1.5, 10], [1, 1e-3], ["e"], ["wp"]),
+                    gain([[1.0]], ["u"], ["wu"]), gain([[1.0]], ["e"], ["y"])], ["r", "u"], ["wp", "wu", "y"])
+
+
+def padded(K, rng):
+    """K with fast, nearly invisible modes added: what a D-K iteration leaves behind."""
+    extra = StateSpace(-np.diag(10.0 ** rng.uniform(1, 3, 4)), rng.standard_normal((4, 1)),
+                       1e-5 * rng.standard_normal((1, 4)), [[0.0]], 0.0, K.inputs, K.outputs)
+    return K + extra
+
+
+def test_invisible_states_go_and_the_figure_stays(process, rng):
+    K = hinfsyn(process, 1, 1).K
+    result = reduce_controller(process, padded(K, rng))
+    assert result.order <= K.nstates
+    assert result.figure == pytest.approx(hinf_norm(lft_lower(process, result.K)).gain)
+    assert result.figure <= 1.01 * result.full
+    assert dict(result.figures)[result.order - 1] > 1.01 * result.full
+
+
+def test_own_measure_decides(process):
+    K = hinfsyn(process, 1, 1).K
+    full = reduce_controller(process, K, measure=lambda candidate: 10.0 ** -candidate.nstates)
+    assert full.order == K.nstates and full.K is K and full.growth == 0
+    least = reduce_controller(process, K, measure=lambda candidate: 1.0)
+    assert least.order < K.nstates and lft_lower(process, least.K).is_stable()
+
+
+@given(st.integers(0, 2 ** 31), st.integers(0, 7))
+@settings(max_examples=30, deadline=None)
+def test_split_adds_up(seed, n):
+    rng = np.random.default_rng(seed)
+    K = StateSpace(rng.standard_normal((n, n)), rng.standard_normal((n, 2)), rng.standard_normal((1, n)),
+                   rng.standard_normal((1, 2)))
+    stable, unstable = split_stable(K)
+    assert stable.is_stable() and np.all(unstable.poles().real >= 0)
+    np.testing.assert_allclose((stable + unstable)(1.3j), K(1.3j), rtol=1e-6, atol=1e-8)
+
+
+def test_unstable_part_of_the_controller_is_kept():
+    """A plant that only an unstable controller stabilises: a zero between two unstable poles breaks the parity
+    interlacing condition (Youla, Bongiorno and Lu 1974)."""
+    P = connect([tf([1, -2], np.polymul([1, -4], [1, 1]), ["u"], ["g"]), summing_junction("y", ["r", "-g"]),
+                 gain([[1.0]], ["y"], ["z1"]), gain([[1.0]], ["u"], ["z2"])], ["r", "u"], ["z1", "z2", "y"])
+    K = hinfsyn(P, 1, 1).K
+    assert not K.is_stable()
+    reduced = reduce_controller(P, K, growth=0.2)
+    assert np.sum(reduced.K.poles().real > 0) == np.sum(K.poles().real > 0)
+    assert lft_lower(P, reduced.K).is_stable()
+
+
+def test_refusals(process):
+    with pytest.raises(InputError, match="growth"):
+        reduce_controller(process, gain([[0.1]]), growth=-1)
+    with pytest.raises(InputError, match="does not stabilise"):
+        reduce_controller(process, gain([[-100.0]]))
+    with pytest.raises(InputError, match="sample_rate_Hz"):
+        discretise_controller(gain([[1.0]]), 0.0)
+
+
+def test_sampled_controller_reports_its_fastest_pole():
+    K = tf([30.0], [1, 30.0])
+    slow, fast = discretise_controller(K, 1000.0), discretise_controller(K, 5.0)
+    assert slow.fastest_pole == pytest.approx(30.0) and slow.pole_ratio == pytest.approx(30 / (np.pi * 1000))
+    assert slow.response_error < 0.01 and "slow enough" in slow.note
+    assert fast.pole_ratio > 1 and "too fast" in fast.note
+    s = 2j * np.pi * 3
+    assert slow.K(np.exp(s * 1e-3))[0, 0] == pytest.approx(K(s)[0, 0], rel=1e-3)
