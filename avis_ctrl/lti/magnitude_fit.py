@@ -11,6 +11,7 @@ where the error is largest.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -43,6 +44,10 @@ class _Layout:
     @property
     def size(self) -> int:
         return 1 + 2 * (self.zero_pairs + self.pole_pairs) + self.real_zeros + self.real_poles
+
+    @property
+    def order(self) -> int:
+        return 2 * self.pole_pairs + self.real_poles
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         a = 1 + 2 * self.zero_pairs
@@ -107,21 +112,14 @@ def magnitude_fit(omega: np.ndarray, magnitude: np.ndarray, order: int, relative
     if not (order >= relative_degree >= 0):
         raise InputError("the order must be at least the relative degree, and that at least 0", field="order",
                          value=order)
-    layout, x = _start(omega, log_target, order, relative_degree)
-    x = _least_squares(layout, x, omega, log_target, min_damping, reach)
-    while 2 * layout.pole_pairs + layout.real_poles < order:
-        trials = []
-        for grown, guess in _grown(layout, x, omega, log_target):
-            fitted = _least_squares(grown, guess, omega, log_target, min_damping, reach)
-            error = grown.log_magnitude(fitted, omega)[0] - log_target
-            trials.append((float(error @ error), grown, fitted))
-        _, layout, x = min(trials, key=lambda trial: trial[0])
+    path = _growth(omega, log_target, relative_degree, (order - relative_degree) % 2, min_damping, reach)
+    layout, x = next(step for step in path if step[0].order == order)
     error = DB * (layout.log_magnitude(x, omega)[0] - log_target)
     return MagnitudeFit(layout.function(x), float(np.sqrt(np.mean(error ** 2))), float(np.max(np.abs(error))))
 
 
-def covering_fit(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order: int, target: np.ndarray | None = None,
-                 min_damping: float = 0.1, reach: float = 10.0) -> MagnitudeFit:
+def covering_fit(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order: int,
+                 target: np.ndarray | None = None, min_damping: float = 0.1, reach: float = 10.0) -> MagnitudeFit:
     """Biproper function with |H| >= lower everywhere and the largest excess of |H| over upper, in dB, minimised.
 
     Parameters
@@ -139,21 +137,28 @@ def covering_fit(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order:
     ------
     InputError : as `magnitude_fit`, and lower above upper.
     """
+    *_, last = covering_fits(omega, lower, upper, range(order % 2, order + 1, 2), target, min_damping, reach)
+    return last
+
+
+def covering_fits(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, orders: Iterable[int],
+                  target: np.ndarray | None = None, min_damping: float = 0.1,
+                  reach: float = 10.0) -> Iterator[MagnitudeFit]:
+    """`covering_fit` for increasing orders, one by one; each starts where the one two below ended."""
     omega, log_lower = _checked(omega, lower)
     _, log_upper = _checked(omega, upper)
     if np.any(log_lower > log_upper + 1e-12):
         raise InputError("the lower curve must not exceed the upper one", field="lower")
-    middle = np.exp((log_lower + log_upper) / 2) if target is None else target
-    start = magnitude_fit(omega, middle, order, 0, min_damping, reach).function
-    layout = _Layout(len(start.zero_pairs), len(start.pole_pairs), len(start.real_zeros), len(start.real_poles))
-    x = layout.join(np.log(start.gain), *(np.log(np.asarray(part, float)) for part in
-                    (start.zero_pairs, start.pole_pairs, start.real_zeros, start.real_poles)))
-    if order:
-        x = _chebyshev(layout, x, omega, log_lower, log_upper, min_damping, reach)
-    value, _ = layout.log_magnitude(x, omega)
-    x[0] += np.max(log_lower - value)
-    excess = DB * np.maximum(layout.log_magnitude(x, omega)[0] - log_upper, 0.0)
-    return MagnitudeFit(layout.function(x), float(np.sqrt(np.mean(excess ** 2))), float(np.max(excess)))
+    _, log_target = (omega, (log_lower + log_upper) / 2) if target is None else _checked(omega, target)
+    paths = [_growth(omega, log_target, 0, parity, min_damping, reach) for parity in (0, 1)]
+    for order in orders:
+        layout, x = next(step for step in paths[order % 2] if step[0].order == order)
+        if order:
+            x = _chebyshev(layout, x, omega, log_lower, log_upper, min_damping, reach)
+        x = x.copy()
+        x[0] += np.max(log_lower - layout.log_magnitude(x, omega)[0])
+        excess = DB * np.maximum(layout.log_magnitude(x, omega)[0] - log_upper, 0.0)
+        yield MagnitudeFit(layout.function(x), float(np.sqrt(np.mean(excess ** 2))), float(np.max(excess)))
 
 
 def _chebyshev(layout: _Layout, x: np.ndarray, omega: np.ndarray, lower: np.ndarray, upper: np.ndarray,
@@ -192,9 +197,24 @@ def _checked(omega: np.ndarray, magnitude: np.ndarray) -> tuple[np.ndarray, np.n
     return omega, np.log(magnitude)
 
 
-def _start(omega: np.ndarray, log_target: np.ndarray, order: int, relative_degree: int) -> tuple[_Layout, np.ndarray]:
+def _growth(omega: np.ndarray, log_target: np.ndarray, relative_degree: int, odd: int, min_damping: float,
+            reach: float) -> Iterator[tuple[_Layout, np.ndarray]]:
+    """Least-squares fits of order relative_degree + odd, and of two more each time, without end."""
+    layout, x = _start(omega, log_target, odd, relative_degree)
+    x = _least_squares(layout, x, omega, log_target, min_damping, reach, 300)
+    while True:
+        yield layout, x
+        trials = []
+        for grown, guess in _grown(layout, x, omega, log_target):
+            fitted = _least_squares(grown, guess, omega, log_target, min_damping, reach, 40)
+            error = grown.log_magnitude(fitted, omega)[0] - log_target
+            trials.append((float(error @ error), grown, fitted))
+        _, layout, x = min(trials, key=lambda trial: trial[0])
+        x = _least_squares(layout, x, omega, log_target, min_damping, reach, 300)
+
+
+def _start(omega: np.ndarray, log_target: np.ndarray, odd: int, relative_degree: int) -> tuple[_Layout, np.ndarray]:
     """The part that carries the relative degree, and a lead-lag factor where the order is odd beyond it."""
-    odd = (order - relative_degree) % 2
     layout = _Layout(0, relative_degree // 2, odd, odd + relative_degree % 2)
     middle = 0.5 * (np.log(omega[0]) + np.log(omega[-1]))
     x = np.zeros(layout.size)
@@ -224,11 +244,11 @@ def _grown(layout: _Layout, x: np.ndarray, omega: np.ndarray, log_target: np.nda
 
 
 def _least_squares(layout: _Layout, x: np.ndarray, omega: np.ndarray, log_target: np.ndarray, min_damping: float,
-                   reach: float) -> np.ndarray:
+                   reach: float, evaluations: int) -> np.ndarray:
     low, high = layout.bounds(omega, min_damping, reach)
     result = least_squares(lambda y: layout.log_magnitude(y, omega)[0] - log_target,
                            np.clip(x, low + 1e-6, high - 1e-6), jac=lambda y: layout.log_magnitude(y, omega)[1],
-                           bounds=(low, high), x_scale=1.0, max_nfev=300)
+                           bounds=(low, high), x_scale=1.0, max_nfev=evaluations)
     if not np.all(np.isfinite(result.x)):
         raise ComputationError("the magnitude fit diverged", measured=f"cost {result.cost:.3g}",
                                cause="data spanning too many decades for the order",

@@ -7,6 +7,7 @@ double-logarithmic axes) and integrated exactly.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -81,7 +82,10 @@ def read_floor_motion(path: str | Path) -> MeasuredSpectrum:
             with np.load(path, allow_pickle=False) as arrays:
                 frequency, asd = arrays["f"].astype(float), arrays["asd"].astype(float)
         else:
-            columns = np.loadtxt(path, ndmin=2)
+            with warnings.catch_warnings():
+                # An empty file warns; the shape says so below.
+                warnings.simplefilter("ignore", UserWarning)
+                columns = np.loadtxt(path, ndmin=2)
             if columns.shape[1] != 2:
                 raise InputError(f"two columns, the file has {columns.shape[1]}", field="columns")
             frequency, asd = columns.T

@@ -99,7 +99,11 @@ class TransmissibilityBound(Weight):
         # Where nothing is asked the filter may fall as it likes, but not rise.
         usual = 10 ** (-self.overall_dB / 20)
         upper = np.where(upper > 0, upper, usual)
-        target = np.sqrt(np.where(lower > 0, lower, np.minimum(usual, upper)) * upper)
+        level = np.log(np.where(lower > 0, lower, usual))
+        # The search starts from straight flanks, in double-logarithmic axes, across the transitions.
+        slope = np.ptp(level) / np.log(window)
+        distance = np.abs(np.log(omega[:, None] / omega))
+        target = np.exp(np.max(level - slope * distance, axis=1))
         lower = np.where(lower > 0, lower, 1e-4 * usual)
         shape = smallest_cover(omega, lower, upper, self.tolerance_dB, self.max_order, "the transmissibility bound",
                                target)

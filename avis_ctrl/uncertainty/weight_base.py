@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti.magnitude_fit import covering_fit
+from avis_ctrl.lti.magnitude_fit import covering_fits
 from avis_ctrl.lti.rational import Rational
 from avis_ctrl.lti.statespace import StateSpace
 
@@ -57,8 +57,7 @@ def smallest_cover(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, tole
     Raises ComputationError with the excess reached where `max_order` is too low.
     """
     excess = np.inf
-    for order in range(max_order + 1):
-        fit = covering_fit(omega, lower, upper, order, target)
+    for fit in covering_fits(omega, lower, upper, range(max_order + 1), target):
         excess = min(excess, fit.error_max_dB)
         if fit.error_max_dB <= tolerance_dB:
             return fit.function

@@ -190,9 +190,12 @@ class RationalWeight(Weight):
         """From coefficients by descending power of s; an overall sign is dropped (it changes no bound)."""
         coefficients = {}
         for field, given in (("numerator", numerator), ("denominator", denominator)):
-            c = np.trim_zeros(np.atleast_1d(np.asarray(given, float)), "f")
-            if not c.size or not np.all(np.isfinite(c)):
-                raise InputError("finite coefficients, not all zero", field=field, value=list(given))
+            try:
+                c = np.trim_zeros(np.atleast_1d(np.asarray(given, float)), "f")
+            except (TypeError, ValueError):
+                c = np.zeros(0)
+            if not c.size or c.ndim != 1 or not np.all(np.isfinite(c)):
+                raise InputError("finite coefficients, not all zero", field=field, value=given)
             coefficients[field] = c
         num, den = coefficients["numerator"], coefficients["denominator"]
         return RationalWeight(tuple(np.roots(num).astype(complex)), tuple(np.roots(den).astype(complex)),

@@ -225,7 +225,7 @@ def test_parseval_of_one_record(model):
 @pytest.mark.parametrize(("text", "field"), [
     ("1 2 3\n4 5 6\n", "columns"), ("1 nan\n2 3\n", "displacement_asd"), ("1 2\n1 3\n", "frequency_Hz"),
     ("2 2\n1 3\n", "frequency_Hz"), ("0 2\n1 3\n", "frequency_Hz"), ("1 -2\n2 3\n", "displacement_asd"),
-    ("1 x\n2 3\n", "spectrum"), ("1 2\n", "displacement_asd")])
+    ("1 x\n2 3\n", "spectrum"), ("1 2\n", "displacement_asd"), ("", "columns")])
 def test_broken_text_files_are_refused_naming_the_file(tmp_path, text, field):
     path = tmp_path / "floor.txt"
     path.write_text(text)
