@@ -24,9 +24,7 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, balance
 from avis_ctrl.robust.hinf_plant import RANK_TOLERANCE, NormalForm, Plant, normal_form, rank_margins, regularised
-from avis_ctrl.robust.hinf_riccati import GammaBracket, find_gamma, gamma_test
-from avis_ctrl.robust.hinf_riccati import _control_riccati as control_riccati
-from avis_ctrl.robust.hinf_riccati import _filter_riccati as filter_riccati
+from avis_ctrl.robust.hinf_riccati import GammaBracket, control_riccati, filter_riccati, find_gamma, gamma_test
 from avis_ctrl.robust.scalings import ScalarScaling, Scalings
 
 COUPLED = "rho(X Y)"

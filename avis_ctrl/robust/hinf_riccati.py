@@ -60,10 +60,10 @@ def gamma_test(plant: Plant, gamma: float) -> GammaTest:
     if gamma <= direct_term_bound(plant):
         return GammaTest(gamma, False, "gamma is not above what D11 leaves at infinite frequency")
     try:
-        x = solve_riccati(*_control_riccati(plant, gamma))
+        x = solve_riccati(*control_riccati(plant, gamma))
         if x.X is None or not x.semidefinite:
             return GammaTest(gamma, False, f"control Riccati equation: {x.reason or 'X is not positive semidefinite'}")
-        y = solve_riccati(*_filter_riccati(plant, gamma))
+        y = solve_riccati(*filter_riccati(plant, gamma))
     except (np.linalg.LinAlgError, ValueError) as error:
         return GammaTest(gamma, False, f"the Riccati equation is singular ({error})")
     if y.X is None or not y.semidefinite:
@@ -212,7 +212,7 @@ def _dual(P: Plant) -> Plant:
     return Plant(P.A.T, P.C1.T, P.C2.T, P.B1.T, P.B2.T, P.D11.T, P.D21.T, P.D12.T, P.D22.T, P.y, P.u)
 
 
-def _control_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def control_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(A, R, Q) of the equation of X."""
     D1, R = _row_terms(P, gamma)
     B = np.hstack([P.B1, P.B2])
@@ -229,9 +229,9 @@ def _difference(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     return np.where(np.abs(result) <= noise, 0.0, result)
 
 
-def _filter_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def filter_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(A', R, Q) of the equation of Y: the control equation of the transposed plant."""
-    return _control_riccati(_dual(P), gamma)
+    return control_riccati(_dual(P), gamma)
 
 
 def _natural_gamma(plant: Plant) -> float:
