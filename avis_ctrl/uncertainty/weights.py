@@ -1,6 +1,6 @@
-"""Weighting filters with a physical meaning: the levels of what comes in, and a user's own; all others by import.
+"""Weighting filters with a physical meaning: how large what comes in can be, and a user's own filter.
 
-Performance weights (what is to stay small) are in `performance_weights`; everything is reachable from here.
+The weights on what is to stay small are written in `performance_weights`; all are reachable from here.
 """
 
 from __future__ import annotations

@@ -57,7 +57,8 @@ def test_exact_compensation_leaves_two_states_with_the_corner_wanted():
 def test_a_mismatched_geophone_keeps_its_full_order_and_its_error():
     chain = avis_chain(corner_Hz=4.6)
     assert chain.system().nstates == 4
-    assert hankel_singular_values(chain.system())[-1] > 0
+    singular_values = hankel_singular_values(chain.system())
+    assert singular_values[-1] > 1e-3 * singular_values[0]
     # Far below both corners the gain is off by the square of the ratio of the corners.
     ratio = response(chain.system(), 1e-3)[0] / response(avis_chain().system(), 1e-3)[0]
     assert ratio == pytest.approx((4.5 / 4.6) ** 2, rel=1e-5)
