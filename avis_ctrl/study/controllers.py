@@ -75,9 +75,9 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
     omega = 2 * np.pi * TUNING_HZ
     scenarios = Scenarios.sample(plant.full, plant.floor_velocities, plant.velocities, omega, TUNING_SAMPLES,
                                  design.simulation.seed)
-    search = TuningRange(critical_gains(rig, design), tilt_corner_Hz=tuple(design.skyhook.tilt_corner_Hz),
-                         roll_off_Hz=tuple(design.skyhook.roll_off_Hz))
-    band = (design.transmissibility.band_Hz[0], design.transmissibility.band_Hz[1])
+    search = TuningRange(critical_gains(rig, design), tilt_corner_Hz=_pair(design.skyhook.tilt_corner_Hz),
+                         roll_off_Hz=_pair(design.skyhook.roll_off_Hz))
+    band = _pair(design.transmissibility.band_Hz)
     motion = plant.full.restricted(plant.floor_velocities, plant.velocities)
     limit = peak_limit
     for round_number in range(TUNING_ROUNDS):
@@ -97,6 +97,10 @@ def critical_gains(rig: Rig, design: Design) -> tuple[float, ...]:
     kept = [equations.coordinates.index(name) for name in design.keep]
     scale = np.array([1.0 / rig.edge_m ** 2 if name.startswith("phi") else 1.0 for name in design.keep])
     return tuple(critical_damping(*(np.diag(X)[kept] * scale for X in (equations.M, equations.K, equations.C))))
+
+
+def _pair(limits: list[float]) -> tuple[float, float]:
+    return limits[0], limits[1]
 
 
 def _words(loops: Skyhook) -> str:

@@ -25,6 +25,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.uncertainty.blocks import BlockStructure, RealScalar
+from avis_ctrl.uncertainty.lft_reduction import reduce_copies
 from avis_ctrl.uncertainty.polynomial import Exponents, polynomial_coefficients
 
 
@@ -145,9 +146,12 @@ def uncertain_rig(rig: Rig, parameters: Sequence[UncertainParameter], keep: Sequ
     coefficients = polynomial_coefficients(N, len(parameters))
     rows = _sensor_rows(rig, sensor_names, kept, scale)
     names = tuple(edge_name(name) for name in keep)
-    system, copies = _realise(coefficients, names, equations.actuators, rows, [p.name for p in parameters])
-    blocks = BlockStructure(tuple(RealScalar(copies[p.name], p.name) for p in parameters if copies[p.name]))
-    moving = tuple(p for p in parameters if copies[p.name])
+    lft = _pull_out(coefficients, len(parameters))
+    system = _realise(lft, names, equations.actuators, rows, [p.name for p in parameters])
+    # A parameter of coordinates that are locked has no copy left.
+    felt = [(p, copies) for p, copies in zip(parameters, lft.copies, strict=True) if copies]
+    blocks = BlockStructure(tuple(RealScalar(copies, p.name) for p, copies in felt))
+    moving = tuple(p for p, _ in felt)
     return UncertainRig(system, blocks, moving, nominal, {p.name: known[p.name].unit for p in parameters}, names)
 
 
@@ -180,63 +184,77 @@ def _factor(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return L / size, R * size
 
 
-def _realise(coefficients: dict[Exponents, np.ndarray], coordinates: tuple[str, ...], actuators: Sequence[str],
-             rows: dict[str, np.ndarray], parameters: list[str]) -> tuple[StateSpace, dict[str, int]]:
-    """State space of the LFT with x = (r, v), and how often each delta is repeated."""
-    n, m = len(coordinates), len(actuators)
-    base = coefficients[(0,) * len(parameters)]
-    # One link a power of a parameter: it reads either s (first link of a monomial) or the previous link.
-    chains: list[tuple[list[int], np.ndarray, np.ndarray]] = []
+@dataclass(frozen=True, eq=False)
+class _StaticLft:
+    """N(delta) s = N0 s + L Delta inv(I - W Delta) R s with `copies` of each delta."""
+
+    N0: np.ndarray
+    L: np.ndarray
+    R: np.ndarray
+    W: np.ndarray
+    copies: list[int]
+
+
+def _pull_out(coefficients: dict[Exponents, np.ndarray], n_parameters: int) -> _StaticLft:
+    """The polynomial as an LFT: each monomial a chain of links, one link a power of a parameter."""
+    N0 = coefficients[(0,) * n_parameters]
+    # The first link of a chain reads s, every further one the link before it; the last one acts on the equations.
+    chains = []
     for exponents, matrix in coefficients.items():
         powers = [k for k, exponent in enumerate(exponents) for _ in range(exponent)]
         if powers:
             chains.append((powers, *_factor(matrix)))
-    links = sorted((parameter, chain, position) for chain, (powers, *_) in enumerate(chains)
+    # Links of one parameter stand together, so that its delta is one repeated scalar.
+    links = sorted((parameter, chain, position) for chain, (powers, _, _) in enumerate(chains)
                    for position, parameter in enumerate(powers))
-    width = {link: chains[link[1]][1].shape[1] for link in links}
-    start, total = {}, 0
-    for link in links:
-        start[link], total = total, total + width[link]
-    place = {(chain, position): slice(start[link], start[link] + width[link])
-             for link in links for _, chain, position in [link]}
-
-    L = np.zeros((n, total))           # force of w_delta
-    R = np.zeros((total, 3 * n + m))   # z_delta read from s
-    W = np.zeros((total, total))       # z_delta read from w_delta: further links of a monomial
+    widths = [chains[chain][1].shape[1] for _, chain, _ in links]
+    ends = np.cumsum([0, *widths])
+    place = {(chain, position): slice(ends[k], ends[k + 1]) for k, (_, chain, position) in enumerate(links)}
+    L, R = np.zeros((N0.shape[0], ends[-1])), np.zeros((ends[-1], N0.shape[1]))
+    W = np.zeros((ends[-1], ends[-1]))
     for chain, (powers, left, right) in enumerate(chains):
         R[place[chain, 0]] = right
         for position in range(1, len(powers)):
             W[place[chain, position], place[chain, position - 1]] = np.eye(left.shape[1])
         L[:, place[chain, len(powers) - 1]] += left
+    copies = [sum(width for width, link in zip(widths, links, strict=True) if link[0] == k)
+              for k in range(n_parameters)]
+    M, copies = reduce_copies(np.block([[W, R], [L, N0]]), copies)
+    total = sum(copies)
+    return _StaticLft(M[total:, total:], M[total:, :total], M[:total, total:], M[:total, :total], copies)
 
-    # s = S_x (r, v) + S_e e with the inputs e = (w_delta, u, v_f, f); its first rows solve for v'.
-    M, N_rest = base[:, :n], base[:, n:]
+
+def _realise(lft: _StaticLft, coordinates: tuple[str, ...], actuators: Sequence[str], rows: dict[str, np.ndarray],
+             parameters: list[str]) -> StateSpace:
+    """State space of the LFT with x = (r, v) and inputs e = (w_delta, u, v_f, f)."""
+    n, m, total = len(coordinates), len(actuators), sum(lft.copies)
+    M, N_rest = lft.N0[:, :n], lft.N0[:, n:]
     n_e, Mi = total + m + 2 * n, np.linalg.inv(M)
     w, u, v_f, f = np.split(np.arange(n_e), [total, total + m, total + m + n])
+    # s = S_x x + S_e e; its first rows solve for v'.
     S_x, S_e = np.zeros((3 * n + m, 2 * n)), np.zeros((3 * n + m, n_e))
     S_x[n:2 * n, n:], S_x[2 * n:3 * n, :n] = np.eye(n), np.eye(n)
     S_e[n:2 * n, v_f], S_e[3 * n:, u] = -np.eye(n), np.eye(m)
     S_x[:n] = -Mi @ N_rest @ S_x[n:]
     S_e[:n] = -Mi @ N_rest @ S_e[n:]
-    S_e[:n, w] -= Mi @ L
+    S_e[:n, w] -= Mi @ lft.L
     S_e[:n, f] += Mi
-    # The outputs of motion, each a selection from s and from the floor's velocity.
+    # v = (v - v_f) + v_f
     velocity_x, velocity_e = S_x[n:2 * n], S_e[n:2 * n].copy()
     velocity_e[:, v_f] += np.eye(n)
     sense = np.array(list(rows.values())).reshape(len(rows), n)
-    z_e = R @ S_e
-    z_e[:, w] += W
-    A = np.vstack([S_x[n:2 * n], S_x[:n]])
-    B = np.vstack([S_e[n:2 * n], S_e[:n]])
-    C = np.vstack([R @ S_x, S_x[2 * n:3 * n], velocity_x, S_x[:n], sense @ velocity_x, sense @ S_x[:n]])
+    z_e = lft.R @ S_e
+    z_e[:, w] += lft.W
+    A, B = np.vstack([S_x[n:2 * n], S_x[:n]]), np.vstack([S_e[n:2 * n], S_e[:n]])
+    C = np.vstack([lft.R @ S_x, S_x[2 * n:3 * n], velocity_x, S_x[:n], sense @ velocity_x, sense @ S_x[:n]])
     D = np.vstack([z_e, S_e[2 * n:3 * n], velocity_e, S_e[:n], sense @ velocity_e, sense @ S_e[:n]])
 
-    copies = {name: sum(width[link] for link in links if link[0] == k) for k, name in enumerate(parameters)}
-    tags = [f"{name}[{c}]" if copies[name] > 1 else name for name in parameters for c in range(copies[name])]
+    tags = [f"{name}[{c}]" if copies > 1 else name
+            for name, copies in zip(parameters, lft.copies, strict=True) for c in range(copies)]
     inputs = [*(f"w:{tag}" for tag in tags), *actuators, *(f"floor_{name}_dot" for name in coordinates),
               *(f"force_{name}" for name in coordinates)]
     outputs = [*(f"z:{tag}" for tag in tags), *(f"{name}_rel" for name in coordinates),
                *(f"{name}_dot" for name in coordinates), *(f"{name}_ddot" for name in coordinates),
                *(f"{name}_dot" for name in rows), *(f"{name}_ddot" for name in rows)]
     states = [*(f"{name}_rel" for name in coordinates), *(f"{name}_dot" for name in coordinates)]
-    return StateSpace(A, B, C, D, 0.0, tuple(inputs), tuple(outputs), tuple(states)), copies
+    return StateSpace(A, B, C, D, 0.0, tuple(inputs), tuple(outputs), tuple(states))

@@ -1,0 +1,126 @@
+"""The `avis` command: thin, and late with its imports, so that `avis --help` answers at once."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from avis_ctrl.errors import AvisError
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False,
+                  help="Workbench for active vibration isolation tables.")
+
+
+@app.callback()
+def _commands() -> None:
+    """Workbench for active vibration isolation tables."""
+
+
+@app.command()
+def design(
+    file: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="what to design; start from designs/*.toml")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for controllers and report")],
+) -> None:
+    """From a rig to certified controllers, checks and a design report."""
+    from rich.console import Console
+
+    from avis_ctrl.study.design_file import read_design
+    from avis_ctrl.study.output import open_folder
+
+    console = Console(highlight=False)
+    read_design(file)  # before anything is imported or written that takes time
+    folder = open_folder(out)
+    with _progress(console) as progress:
+        from avis_ctrl.report import render_html, render_pdf
+        from avis_ctrl.study.output import write_study
+        from avis_ctrl.study.runner import run_file
+
+        result = run_file(file, progress)
+        progress("report")
+        files = write_study(result, folder, render_html(result), render_pdf(result))
+    _verdict(console, result)
+    console.print(f"{len(files)} files in {folder}; open {folder / 'report.html'} or {folder / 'report.pdf'}")
+
+
+@app.command()
+def doctor() -> None:
+    """Versions, solvers, threads: what works here and what does not."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from avis_ctrl.study.doctor import examine
+
+    console = Console(highlight=False)
+    table = Table("check", "found", "")
+    checks = examine()
+    for check in checks:
+        table.add_row(check.name, check.found, "[green]ok[/]" if check.works else "[red]does not work[/]")
+    console.print(table)
+    if not all(check.works for check in checks):
+        raise typer.Exit(3)
+
+
+class _progress:
+    """Lines of progress with the time; on a terminal the running step has a spinner."""
+
+    def __init__(self, console):
+        self.console, self.began, self.step = console, time.monotonic(), None
+        self.status = console.status("starting") if console.is_terminal else None
+
+    def __enter__(self):
+        if self.status:
+            self.status.start()
+        return self
+
+    def __call__(self, text: str) -> None:
+        self._finish()
+        self.step = text
+        if self.status:
+            self.status.update(text)
+
+    def _finish(self) -> None:
+        if self.step:
+            self.console.print(f"[dim]{time.monotonic() - self.began:6.1f} s[/]  {self.step}", soft_wrap=True)
+        self.step = None
+
+    def __exit__(self, kind, value, trace) -> None:
+        if kind is None:
+            self._finish()
+        if self.status:
+            self.status.stop()
+
+
+def _verdict(console, result) -> None:
+    from rich.table import Table
+
+    table = Table("requirement", "asked", "measured", "", title=result.design.title)
+    for r in result.requirements:
+        unit = f" {r.unit}" if r.unit else ""
+        asked = "yes" if r.comparison == "is" else f"{r.comparison} {r.limit:.4g}{unit}"
+        table.add_row(r.name, asked, f"{r.value:.4g}{unit}", "[green]met[/]" if r.met else "[red]not met[/]")
+    console.print(table)
+
+
+def main() -> None:
+    """Entry point: errors of ours end in one line and their exit code."""
+    try:
+        app(standalone_mode=False)
+    except AvisError as error:
+        print(f"avis: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except typer.Exit as stop:
+        sys.exit(stop.exit_code)
+    except typer.Abort:
+        sys.exit(130)
+    except KeyboardInterrupt:
+        print("avis: stopped; nothing half-written is left", file=sys.stderr)
+        sys.exit(130)
+    except Exception as error:  # usage errors of the command line parser carry their own code
+        if hasattr(error, "exit_code") and hasattr(error, "format_message"):
+            print(f"avis: {error.format_message()}", file=sys.stderr)
+            sys.exit(error.exit_code)
+        raise

@@ -1,0 +1,99 @@
+"""What works on this machine: each check does what it names, on a problem with a known answer."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib import metadata
+
+import numpy as np
+
+LIBRARIES = ("numpy", "scipy", "control", "slycot", "cvxpy", "clarabel", "matplotlib", "plotly", "typst", "numba")
+
+
+@dataclass(frozen=True)
+class Check:
+    """A line of `avis doctor`."""
+
+    name: str
+    found: str
+    works: bool
+
+
+def examine() -> list[Check]:
+    """All checks; a failure is a line, never an exception."""
+    checks = [Check("python", platform.python_version(), True)]
+    checks += [_attempt(name, partial(metadata.version, name)) for name in LIBRARIES]
+    checks += [_attempt("processors and BLAS threads", _threads), _attempt("SLICOT H-infinity norm", _slicot),
+               _attempt("clarabel solves an LMI", _clarabel), _attempt("numba compiles", _numba),
+               _attempt("typst compiles a PDF", _typst), _attempt("own H-infinity synthesis", _synthesis)]
+    return checks
+
+
+def _attempt(name: str, check: Callable[[], str]) -> Check:
+    try:
+        return Check(name, check(), True)
+    except Exception as error:  # whatever fails is the finding
+        return Check(name, f"{type(error).__name__}: {error}".splitlines()[0][:100], False)
+
+
+def _near(value: float, known: float, tolerance: float) -> str:
+    if not abs(value - known) <= tolerance * abs(known):
+        raise ArithmeticError(f"{value:.6g} instead of {known:.6g}")
+    return f"{value:.6g}"
+
+
+def _threads() -> str:
+    from threadpoolctl import threadpool_info
+
+    pools = ", ".join(f"{pool['internal_api']} {pool['num_threads']}" for pool in threadpool_info())
+    return f"{os.cpu_count()} processors; {pools or 'no pools'} (avis limits them to 1)"
+
+
+def _slicot() -> str:
+    """A resonance of damping zeta peaks at 1/(2 zeta sqrt(1 - zeta^2))."""
+    from avis_ctrl.lti.statespace import tf
+    from avis_ctrl.robust.slycot_adapter import linf_norm
+
+    zeta = 0.1
+    return _near(linf_norm(tf([1.0], [1.0, 2 * zeta, 1.0])).gain, 1 / (2 * zeta * np.sqrt(1 - zeta ** 2)), 1e-6)
+
+
+def _clarabel() -> str:
+    """The largest eigenvalue as an LMI."""
+    import cvxpy as cp
+
+    A = np.array([[2.0, 1.0], [1.0, 3.0]])
+    t = cp.Variable()
+    cp.Problem(cp.Minimize(t), [t * np.eye(2) - A >> 0]).solve(solver=cp.CLARABEL)
+    return _near(float(np.asarray(t.value)), float(np.max(np.linalg.eigvalsh(A))), 1e-6)
+
+
+def _numba() -> str:
+    from numba import njit
+
+    return _near(float(njit(lambda x: x * x)(3.0)), 9.0, 0.0)
+
+
+def _typst() -> str:
+    import typst
+
+    pdf = typst.compile(b"$ sum_(k=1)^n k = (n(n+1))/2 $")
+    if not pdf.startswith(b"%PDF"):
+        raise ArithmeticError("no PDF came out")
+    return f"{len(pdf)} bytes"
+
+
+def _synthesis() -> str:
+    """min ||W S|| = |W(z)| for a zero z of the plant in the right half plane (Skogestad and Postlethwaite, eq. 5.20)."""
+    from avis_ctrl.lti import connect, gain, summing_junction, tf
+    from avis_ctrl.robust.hinfsyn import hinfsyn
+
+    weight, z = tf([1.0, 2.0], [2.0, 0.02]), 1.0
+    parts = [tf([-1.0, z], [1.0, 3.0, 2.0], ["u"], ["g"]), summing_junction("e", ["w", "-g"]),
+             weight.renamed(["e"], ["z"]), gain(1e-4, ["u"], ["z_u"])]
+    made = hinfsyn(connect(parts, ["w", "u"], ["z", "z_u", "e"]), 1, 1, backoff=1e-3)
+    return _near(made.gamma, abs(weight(z)[0, 0]), 1e-2)
