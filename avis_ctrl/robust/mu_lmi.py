@@ -257,6 +257,7 @@ def follow(space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array 
         Ma, la, end = M[active], lam[active], floor[active]
         th, point = _centre(space, Ma, theta[active], la)
         sound = np.all(np.isfinite(th), axis=1) & np.all(np.isfinite(point.slope), axis=1)
+        sound[sound] &= _inside(space, Ma[sound], th[sound], la[sound])
         if not np.all(sound):
             # Round-off ended the path here; the last verified point stands.
             active, Ma, la, end, th, point = (active[sound], Ma[sound], la[sound], end[sound], th[sound],

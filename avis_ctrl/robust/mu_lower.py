@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.mu_lmi import Array, Scalings, dagger, residual
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -279,3 +280,47 @@ def _keep(best: LowerBound, live: Array, size: Array, unit: Array, delta: Array,
         better = value > best.beta[live]
         best.beta[live[better]] = value[better]
         best.delta[live[better]] = candidate[better] / size[better, None, None]
+
+
+def singular_frequency(N: StateSpace, structure: BlockStructure, near: Array, level: float, band: tuple[float, float],
+                       *, count: int = 6, iterations: int = 40, seed: int = 2) -> tuple[float, float, Array] | None:
+    """A small Delta and the frequency at which it makes I - N Delta singular, both free: (beta, omega, delta).
+
+    For real perturbations, whose critical frequency is a point that no grid meets. `near` (n,) are starts [rad/s].
+    """
+    rng = np.random.default_rng(seed)
+    omega = np.repeat(near[np.isfinite(near) & (near > 0)], count)
+    if not omega.size or not N.nstates or level <= 0:
+        return None
+    delta = np.stack([structure.random(rng, 1 / level) for _ in omega])
+    best: tuple[float, float, Array] | None = None
+    for sweep in range(iterations):
+        M, slope = _response_and_slope(N, omega)
+        near_one = np.ones(omega.size, complex) if sweep else _leading(M @ delta)
+        step = next_delta(M, delta, structure, rng, near_one, slope)
+        delta = step.delta
+        omega = np.clip(omega + np.clip(step.shift, -0.3 * omega, 0.3 * omega), max(band[0], 1e-300), band[1])
+        if sweep % 5 != 4:
+            continue
+        M, _ = _response_and_slope(N, omega)
+        exact = made_singular(M, delta, structure) if np.any(_complex_part(structure)) else delta
+        usable = np.flatnonzero(np.all(np.isfinite(exact), axis=(1, 2)))
+        usable = usable[block_norm(exact[usable], structure) > 0]
+        usable = usable[singularity(M[usable], exact[usable]) < SINGULAR]
+        for k, norm in zip(usable, block_norm(exact[usable], structure), strict=True):
+            if best is None or 1 / norm > best[0]:
+                best = (float(1 / norm), float(omega[k]), exact[k])
+    return best
+
+
+def _leading(A: Array) -> Array:
+    """The eigenvalue of largest real part (B,) of each matrix."""
+    values = np.linalg.eigvals(A)
+    return np.take_along_axis(values, np.argmax(values.real, axis=1)[:, None], axis=1)[:, 0]
+
+
+def _response_and_slope(N: StateSpace, omega: Array) -> tuple[Array, Array]:
+    """N(j omega) and dN/d omega = -j C inv(j omega I - A)^2 B, each (n, n_z, n_w)."""
+    resolvent = 1j * omega[:, None, None] * np.eye(N.nstates) - N.A
+    X = np.linalg.solve(resolvent, N.B.astype(complex))
+    return N.C @ X + N.D, -1j * N.C @ np.linalg.solve(resolvent, X)

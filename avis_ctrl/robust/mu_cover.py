@@ -1,0 +1,190 @@
+"""A guarantee between frequencies: fixed scalings hold up to an imaginary eigenvalue of a Hamiltonian matrix.
+
+For N(s) = D + C inv(sI - A) B and constant scalings X, G the function
+
+    Phi(omega) = X_w - N^H X_z N - j (G N - N^H G^H) = [.]^H [Q S; S^H R] [inv(j omega I - A) B; I],
+    Q = -C^H X_z C,   S = C^H (j G^H - X_z D),   R = X_w - D^H X_z D - j (G D - D^H G^H),
+
+is singular only where j omega is an eigenvalue of
+
+    H = [A - B inv(R) S^H,  -B inv(R) B^H;  S inv(R) S^H - Q,  S inv(R) B^H - A^H]
+
+(Zhou, Doyle and Glover, Robust and Optimal Control, 1996, chapter 13; here with complex weights). Where Phi > 0
+at one frequency it is so on the whole interval between the eigenvalues around it: intervals that cover the
+band prove mu <= 1 at every frequency of it, not at those computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.lti import StateSpace
+from avis_ctrl.robust.mu_lmi import Array, Scalings, dagger, residual
+from avis_ctrl.robust.mu_upper import upper_bound
+from avis_ctrl.uncertainty.blocks import BlockStructure
+
+Interval = tuple[float, float]
+NARROW = 1e-6
+POINTS = 4
+
+
+def midpoint(low: float, high: float) -> float:
+    """A frequency between two others: geometric mean, half or double where one of them is 0 or inf."""
+    if low == 0.0:
+        return 1.0 if np.isinf(high) else high / 2
+    return 2 * low if np.isinf(high) else float(np.sqrt(low) * np.sqrt(high))
+
+
+def possible_crossings(N: StateSpace, scalings: Scalings) -> Array:
+    """Frequencies [rad/s] >= 0 where Phi may turn singular: a superset, sorted. Scalings without a batch axis."""
+    if not N.nstates:
+        return np.zeros(0)
+    X_z, X_w, G = scalings
+    A, B, C, D = N.A, N.B, N.C, N.D
+    if not np.any(G) and not np.any(X_z.imag) and not np.any(X_w.imag):
+        X_z, X_w = X_z.real, X_w.real
+        R, S = X_w - D.T @ X_z @ D, -C.T @ X_z @ D
+    else:
+        GD = G @ D
+        R, S = X_w - D.T @ X_z @ D - 1j * (GD - dagger(GD)), C.T @ (1j * dagger(G) - X_z @ D)
+    RB, RS = np.linalg.solve(R, B.T), np.linalg.solve(R, dagger(S))
+    F, BRB = A - B @ RS, B @ RB
+    Q = S @ RS + C.T @ X_z @ C
+    size_b, size_q = np.linalg.norm(BRB), np.linalg.norm(Q)
+    # Both halves alike in size, so that the eigenvalue computation does not mix magnitudes.
+    t = np.sqrt(size_q / size_b) if size_b > 0 and size_q > 0 else 1.0
+    H = np.block([[F, -t * BRB], [Q / t, -dagger(F)]])
+    values = la.eigvals(H, check_finite=False)
+    size = np.max(np.abs(values))
+    near = np.abs(values.real) <= 1e-3 * np.abs(values) + 1e-10 * size
+    return np.unique(np.abs(values.imag[near & (values.imag >= -1e-10 * size)]))
+
+
+def _positive(N: StateSpace, scalings: Scalings, omega: Array) -> Array:
+    """Whether Phi(omega) > 0, for each frequency, with a margin of round-off."""
+    M = N.frequency_response(omega)[:, None]
+    repeated = Scalings(*(np.broadcast_to(s, (omega.size, *s.shape)) for s in scalings))
+    level = np.ones(N.ninputs, bool)
+    F = residual(M, repeated, np.ones(omega.size), level)[:, 0]
+    root = np.linalg.inv(np.linalg.cholesky(scalings.X_w))
+    return np.linalg.eigvalsh(root @ F @ dagger(root))[:, 0] > 1e-10
+
+
+def proved_intervals(N: StateSpace, scalings: Scalings, inside: Interval) -> list[Interval]:
+    """Closed parts of an interval on which fixed scalings keep Phi > 0."""
+    low, high = inside
+    crossings = possible_crossings(N, scalings)
+    crossings = crossings[(crossings > low) & (crossings < high)]
+    edges = np.concatenate([[low], crossings, [high]])
+    middles = np.array([midpoint(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    at_edge, between = np.split(_positive(N, scalings, np.concatenate([edges, middles])), [edges.size])
+    parts: list[Interval] = []
+    start = None
+    for k in range(middles.size):
+        # A true crossing has a singular Phi, so an edge that is positive is only near the axis.
+        if not between[k]:
+            start = None
+            continue
+        if start is None:
+            start = edges[k] if at_edge[k] else middles[k]
+        if not at_edge[k + 1] or k + 1 == middles.size:
+            end = edges[k + 1] if at_edge[k + 1] else middles[k]
+            if end > start:
+                parts.append((float(start), float(end)))
+            start = None
+    return parts
+
+
+@dataclass
+class Cover:
+    """What came out: the level reached, the gaps that are left, and where the level had to be raised."""
+
+    level: float
+    gaps: list[Interval] = field(default_factory=list)
+    raised_at: list[float] = field(default_factory=list)
+    intervals: int = 0
+
+
+def cover(N: StateSpace, structure: BlockStructure, scaled: Callable[[StateSpace, float], StateSpace],
+          bound: Callable[[Array], Array], level: float, band: Interval, samples: Array, *, slack: float,
+          rounds: int = 60, most: int = 4000) -> Cover:
+    """Prove the level on a whole band, raising it where a gap's own bound asks for it.
+
+    scaled(N, level) is the system whose mu must stay at or below 1 for the level to hold; bound(M) gives the level
+    that scalings shared along axis 1 of M (B, n_shared, n_z, n_w) prove. `samples` are frequencies worth a look.
+    """
+    state = Cover(level)
+    samples = np.unique(samples[(samples >= band[0]) & (samples <= band[1])])
+    edges = np.unique(np.concatenate([[band[0]], samples, [band[1]]]))
+    state.gaps = list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+    for _ in range(rounds):
+        if not state.gaps or state.intervals > most or not np.isfinite(state.level):
+            break
+        _one_round(N, structure, scaled, bound, state, slack)
+    return state
+
+
+def _points(low: float, high: float) -> list[float]:
+    middle = midpoint(low, high)
+    return [low, middle, midpoint(low, middle), high]
+
+
+def _one_round(N: StateSpace, structure: BlockStructure, scaled: Callable[[StateSpace, float], StateSpace],
+               bound: Callable[[Array], Array], state: Cover, slack: float) -> None:
+    unit = scaled(N, state.level)
+    gaps, state.gaps = state.gaps, []
+    omega = np.array([_points(*gap) for gap in gaps])
+    M = unit.frequency_response(omega.ravel()).reshape(*omega.shape, unit.noutputs, unit.ninputs)
+    shared = upper_bound(M, structure, 1e-4, 1.0)
+    open_gaps = []
+    for k, gap in enumerate(gaps):
+        if shared.beta[k] >= 1.0:
+            open_gaps.append(gap)
+            continue
+        state.intervals += 1
+        proved = proved_intervals(unit, Scalings(*(s[k] for s in shared.scalings)), gap)
+        state.gaps += _without(gap, proved)
+    if open_gaps:
+        _split_or_raise(N, bound, state, open_gaps, slack)
+
+
+def _split_or_raise(N: StateSpace, bound: Callable[[Array], Array], state: Cover, open_gaps: list[Interval],
+                    slack: float) -> None:
+    """Halve the gaps; where a single frequency in them (or a gap too narrow to halve) needs more, raise the level."""
+    middles = np.array([midpoint(*gap) for gap in open_gaps])
+    needed = bound(N.frequency_response(middles)[:, None])
+    narrow = [gap for gap in open_gaps if _is_narrow(gap)]
+    for (low, high), middle in zip(open_gaps, middles.tolist(), strict=True):
+        state.gaps += [(low, high)] if _is_narrow((low, high)) else [(low, middle), (middle, high)]
+    if narrow:
+        points = np.array([_points(*gap) for gap in narrow])
+        raw = N.frequency_response(points.ravel()).reshape(*points.shape, N.noutputs, N.ninputs)
+        shared = bound(raw)
+        needed, middles = np.concatenate([needed, shared]), np.concatenate([middles, points[:, 1]])
+    worst = int(np.argmax(needed))
+    if needed[worst] > state.level:
+        state.level = float(needed[worst]) * (1 + slack)
+        state.raised_at.append(float(middles[worst]))
+
+
+def _is_narrow(gap: Interval) -> bool:
+    return gap[1] - gap[0] <= NARROW * gap[1]
+
+
+def _without(gap: Interval, parts: list[Interval]) -> list[Interval]:
+    """What the parts leave of a gap; halves where they took nothing of it."""
+    left, at = [], gap[0]
+    for low, high in parts:
+        if low > at:
+            left.append((at, low))
+        at = high
+    if gap[1] > at:
+        left.append((at, gap[1]))
+    if left == [gap]:
+        middle = midpoint(*gap)
+        return [(gap[0], middle), (middle, gap[1])]
+    return left

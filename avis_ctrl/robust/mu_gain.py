@@ -1,0 +1,87 @@
+"""Gain under the worst perturbation of norm 1 at given frequencies: a lower bound by ascent.
+
+With E = N22 + N21 Delta inv(I - N11 Delta) N12 and its largest singular triple u, sigma, v
+
+    d sigma = Re(a^H dDelta x),   x = inv(I - N11 Delta) N12 v,   a = inv(I - Delta N11)^H N21^H u,
+
+so the block that raises sigma most is a_k x_k^H / (|a_k| |x_k|), the phase of x^H a or the sign of Re(x^H a).
+The performance block absorbs every phase, hence nothing has to be kept real here.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from avis_ctrl.robust.mu_lmi import Array, dagger
+from avis_ctrl.uncertainty.blocks import BlockStructure
+
+STEPS = (1.0, 0.5, 0.2, 0.05)
+
+
+class WorstGain(NamedTuple):
+    """gain (B,) reached by delta (B, n_w, n_z) with ||delta|| <= 1."""
+
+    gain: Array
+    delta: Array
+
+
+def perturbed(M: Array, delta: Array) -> Array:
+    """Upper LFT of matrices: the map from d to e (.., n_e, n_d) with Delta (.., n_w, n_z) closed."""
+    n_w, n_z = delta.shape[-2:]
+    M11, M12, M21, M22 = M[..., :n_z, :n_w], M[..., :n_z, n_w:], M[..., n_z:, :n_w], M[..., n_z:, n_w:]
+    return M22 + M21 @ delta @ np.linalg.solve(np.eye(n_z) - M11 @ delta, M12)
+
+
+def _gain(M: Array, delta: Array) -> Array:
+    return np.linalg.norm(perturbed(M, delta), ord=2, axis=(-2, -1))
+
+
+def _steepest(M: Array, delta: Array, structure: BlockStructure) -> Array:
+    """The Delta of norm 1 that raises the largest singular value most, to first order."""
+    n_w, n_z = structure.n_w, structure.n_z
+    U, _, Vh = np.linalg.svd(perturbed(M, delta))
+    u, v = U[:, :, 0], np.conj(Vh[:, 0])
+    M11, M12, M21 = M[:, :n_z, :n_w], M[:, :n_z, n_w:], M[:, n_z:, :n_w]
+    x = np.linalg.solve(np.eye(n_z) - M11 @ delta, M12 @ v[..., None])[..., 0]
+    a = np.linalg.solve(dagger(np.eye(n_w) - delta @ M11), dagger(M21) @ u[..., None])[..., 0]
+    new = np.zeros_like(delta)
+    for block, w, z in structure.slices():
+        ak, xk = a[:, w], x[:, z]
+        if block.kind == "full":
+            size = np.linalg.norm(ak, axis=1) * np.linalg.norm(xk, axis=1)
+            new[:, w, z] = ak[:, :, None] * np.conj(xk[:, None, :]) / np.where(size > 0, size, 1.0)[:, None, None]
+            continue
+        product = np.sum(ak * np.conj(xk), axis=1)
+        if block.kind == "real":
+            value = np.where(product.real >= 0, 1.0, -1.0).astype(complex)
+        else:
+            value = np.where(np.abs(product) > 0, product / np.maximum(np.abs(product), 1e-300), 1.0)
+        new[:, w, z] = value[:, None, None] * np.eye(block.rows)
+    return new
+
+
+def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iterations: int = 20, seed: int = 0) -> WorstGain:
+    """Ascent from Delta = 0 and random perturbations for M (B, n_z + n_e, n_w + n_d); monotone in every step."""
+    rng = np.random.default_rng(seed)
+    batch = M.shape[0]
+    best = WorstGain(_gain(M, np.zeros((batch, structure.n_w, structure.n_z), complex)),
+                     np.zeros((batch, structure.n_w, structure.n_z), complex))
+    for start in range(count):
+        delta = np.zeros_like(best.delta) if start == 0 else np.stack([structure.random(rng) for _ in range(batch)])
+        gain = _gain(M, delta)
+        for _ in range(iterations):
+            direction = _steepest(M, delta, structure) - delta
+            trials = np.stack([delta + t * direction for t in STEPS])
+            gains = _gain(M[None], trials)
+            chosen = np.argmax(gains, axis=0)
+            value = np.take_along_axis(gains, chosen[None], axis=0)[0]
+            better = value > gain * (1 + 1e-9)
+            if not np.any(better):
+                break
+            delta = np.where(better[:, None, None], trials[chosen, np.arange(batch)], delta)
+            gain = np.where(better, value, gain)
+        raised = gain > best.gain
+        best.gain[raised], best.delta[raised] = gain[raised], delta[raised]
+    return best

@@ -1,0 +1,219 @@
+"""Peak over all frequencies of the structured singular value, and of the gain under the worst perturbation.
+
+             Delta <--.
+        w |           | z          mu_peak:          sup over omega of mu(N(j omega))
+          '--> [ N ] -'            worst_case_gain:  sup over omega and ||Delta|| <= 1 of
+        d ---> [   ] ---> e                          sigma_max of the map from d to e
+
+The upper bound is proved between the frequencies computed (see `mu_cover`), or the result says that it is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti import StateSpace, balance
+from avis_ctrl.lti.norms import bilinear_to_continuous
+from avis_ctrl.robust.mu_cover import Cover, Interval, cover
+from avis_ctrl.robust.mu_gain import worst_gain
+from avis_ctrl.robust.mu_lmi import Array
+from avis_ctrl.robust.mu_lower import LowerBound, lower_bound, singular_frequency
+from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
+from avis_ctrl.robust.mu_upper import UpperBound, skewed_upper_bound, upper_bound
+from avis_ctrl.uncertainty.blocks import Block, BlockStructure
+
+SLACK = 5e-4
+ALL_FREQUENCIES: Interval = (0.0, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class MuPeak:
+    """Bounds of a supremum over frequency.
+
+    upper : never exceeded in the band if `guaranteed`; else the largest value found, proved at its frequency only.
+    lower : reached at `omega` [rad/s] by `delta`.
+    delta : (n_w, n_z). For mu_peak ||delta|| = 1/lower and I - N(j omega) delta is singular; for worst_case_gain
+        (first blocks only) ||delta|| <= 1. None where there is none (lower 0).
+    covers : in words, what the upper bound covers.
+    frequencies, upper_curve, lower_curve : (n,) [rad/s] and both bounds there, for plotting.
+    """
+
+    upper: float
+    lower: float
+    omega: float
+    delta: Array | None
+    guaranteed: bool
+    covers: str
+    frequencies: Array
+    upper_curve: Array
+    lower_curve: Array
+
+
+def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
+            band: Interval = ALL_FREQUENCIES) -> MuPeak:
+    """Supremum of mu(N(j omega)) over a band, by default all frequencies including 0 and infinity.
+
+    Parameters
+    ----------
+    N : stable system (avis_ctrl or python-control) with sum(cols) outputs z and sum(rows) inputs w.
+    band : (low, high) in rad/s; the Nyquist frequency replaces infinity for sampled systems.
+
+    Raises
+    ------
+    InputError : blocks that do not fit N, an empty band.
+    ComputationError : N has a pole that is not stable (named): mu says nothing about such a loop.
+    """
+    system, structure = _checked(N, blocks)
+    if (system.noutputs, system.ninputs) != (structure.n_z, structure.n_w):
+        raise InputError(f"the blocks need {structure.n_z} outputs and {structure.n_w} inputs, N has "
+                         f"{system.noutputs} and {system.ninputs}", field="blocks")
+    with threadpool_limits(1):
+        return _in_rad_s(N, _mu_peak(system, structure, _continuous_band(N, band)))
+
+
+def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
+                    band: Interval = ALL_FREQUENCIES) -> MuPeak:
+    """Largest gain from the inputs d to the outputs e of N over all perturbations of norm at most 1.
+
+    Parameters
+    ----------
+    N : stable system; the first sum(cols) outputs and sum(rows) inputs belong to the blocks, the rest are e and d.
+    band : (low, high) in rad/s. The gain is that in the band; robust stability is asked at all frequencies.
+
+    upper is inf where robust stability is not proved; lower is inf where `delta` (norm at most 1) destabilises.
+
+    Raises
+    ------
+    InputError : blocks that leave no performance channel, an empty band.
+    ComputationError : N has a pole that is not stable (named).
+    """
+    system, structure = _checked(N, blocks)
+    n_d, n_e = system.ninputs - structure.n_w, system.noutputs - structure.n_z
+    if n_d < 1 or n_e < 1:
+        raise InputError(f"the blocks take {structure.n_z} outputs and {structure.n_w} inputs of N's "
+                         f"{system.noutputs} and {system.ninputs}: no performance channel is left", field="blocks")
+    with threadpool_limits(1):
+        return _in_rad_s(N, _worst_case_gain(system, structure, _continuous_band(N, band)))
+
+
+def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> tuple[StateSpace, BlockStructure]:
+    """N as a balanced continuous-time system, and its blocks."""
+    N = N if isinstance(N, StateSpace) else StateSpace.from_control(N)
+    if not N.is_stable():
+        poles = N.poles()
+        worst = poles[np.argmax(np.abs(poles) if N.dt else poles.real)]
+        raise ComputationError("the bounds of mu need a stable system", measured=f"pole {worst:.6g}",
+                               cause="the nominal closed loop is unstable or has a mode that the controller misses",
+                               next_step="stabilise N, or remove the mode by lti.minimal if no channel sees it")
+    return balance(bilinear_to_continuous(N) if N.dt else N), BlockStructure.of(blocks)
+
+
+def _continuous_band(N: StateSpace, band: Interval) -> Interval:
+    low, high = float(band[0]), float(band[1])
+    if not 0 <= low < high:
+        raise InputError("expected 0 <= low < high in rad/s", field="band", value=band)
+    if not getattr(N, "dt", 0.0):
+        return low, high
+    nyquist = np.pi / N.dt
+    return (2 / N.dt * float(np.tan(low * N.dt / 2)),
+            np.inf if high >= nyquist else 2 / N.dt * float(np.tan(high * N.dt / 2)))
+
+
+def _in_rad_s(N: StateSpace, result: MuPeak) -> MuPeak:
+    """Frequencies of the bilinear image of a sampled system turned back into its own."""
+    dt = getattr(N, "dt", 0.0)
+    if not dt:
+        return result
+    return replace(result, omega=2 / dt * float(np.arctan(result.omega * dt / 2)),
+                   frequencies=2 / dt * np.arctan(result.frequencies * dt / 2))
+
+
+def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval) -> MuPeak:
+    def bound(M: Array) -> Array:
+        return upper_bound(M, structure, 1e-4).beta
+
+    omega, _ = _scan(N, band, lambda w: bound(N.frequency_response(w)[:, None]))
+    M = N.frequency_response(omega)
+    found = upper_bound(M[:, None], structure, 1e-4)
+    lower = lower_bound(M, structure, found.beta, found.scalings, enough=0.9)
+    done = cover(N, structure, lambda system, level: system.scaled(left=1 / level), bound,
+                 _first_level(found.beta), band, _extremes(omega, found.beta), slack=SLACK)
+    best, at, delta = _best_singular(N, structure, omega, found, lower, done, band)
+    if best == 0.0:
+        at = float(omega[np.argmax(found.beta)])
+    return MuPeak(done.level if not done.gaps else float(np.max(found.beta)), best, at, delta, not done.gaps,
+                      _in_words(done, band), omega, found.beta, lower.beta)
+
+
+def _first_level(upper: Array) -> float:
+    # A level of zero proves nothing: a small positive one lets an identically vanishing mu be covered.
+    return max(float(np.max(upper)) * (1 + SLACK), 1e-9)
+
+
+def _scan(N: StateSpace, band: Interval, value) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
+    omega = first_frequencies(N, band)
+    return refine_maxima(value, omega, value(omega))
+
+
+def _extremes(omega: Array, values: Array) -> Array:
+    """The frequency of the highest value: the first place to split the band."""
+    return omega[[int(np.argmax(values))]]
+
+
+def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found: UpperBound, lower: LowerBound,
+                   done: Cover, band: Interval) -> tuple[float, float, Array | None]:
+    """Largest verified lower bound: harder search at the highest peaks, with a free frequency for real blocks."""
+    top = np.unique(np.concatenate([np.argsort(found.beta)[-3:], np.argsort(lower.beta)[-3:]]))
+    M = N.frequency_response(omega[top])
+    scalings = type(found.scalings)(*(s[top] for s in found.scalings))
+    hard = lower_bound(M, structure, found.beta[top], scalings, enough=0.995, seed=1)
+    values = np.maximum(hard.beta, lower.beta[top])
+    deltas = np.where((hard.beta >= lower.beta[top])[:, None, None], hard.delta, lower.delta[top])
+    k = int(np.argmax(values))
+    best, at, delta = float(values[k]), float(omega[top[k]]), deltas[k]
+    if any(block.kind == "real" for block in structure.blocks) and best < 0.999 * done.level:
+        near = np.concatenate([omega[top], done.raised_at])
+        moved = singular_frequency(N, structure, near, done.level, band)
+        if moved is not None and moved[0] > best:
+            best, at, delta = moved
+    return (best, at, delta) if best > 0 else (0.0, at, None)
+
+
+def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval) -> MuPeak:
+    robust = _mu_peak(N.select(range(structure.n_z), range(structure.n_w)), structure, ALL_FREQUENCIES)
+    n_d, n_e = N.ninputs - structure.n_w, N.noutputs - structure.n_z
+    whole = structure.with_performance(n_d, n_e)
+
+    def bound(M: Array) -> Array:
+        return skewed_upper_bound(M, whole, 1e-4).beta
+
+    def scaled(system: StateSpace, level: float) -> StateSpace:
+        return system.scaled(left=np.r_[np.ones(structure.n_z), np.full(n_e, 1 / level)])
+
+    omega, upper = _scan(N, band, lambda w: bound(N.frequency_response(w)[:, None]))
+    lower = worst_gain(N.frequency_response(omega), structure)
+    if robust.lower >= 1.0:
+        return MuPeak(np.inf, np.inf, robust.omega, robust.delta, True, "a perturbation of norm at most 1 "
+                          "destabilises the loop", omega, upper, lower.gain)
+    k = int(np.argmax(lower.gain))
+    best, at, delta = float(lower.gain[k]), float(omega[k]), lower.delta[k]
+    if robust.upper >= 1.0 or not robust.guaranteed or not np.all(np.isfinite(upper)):
+        words = f"robust stability is not proved: mu of the blocks is between {robust.lower:.6g} and {robust.upper:.6g}"
+        return MuPeak(np.inf, best, at, delta, True, words, omega, upper, lower.gain)
+    done = cover(N, whole, scaled, bound, _first_level(upper), band, _extremes(omega, upper), slack=SLACK)
+    return MuPeak(done.level if not done.gaps else float(np.max(upper)), best, at, delta, not done.gaps,
+                      _in_words(done, band), omega, upper, lower.gain)
+
+
+def _in_words(done: Cover, band: Interval) -> str:
+    span = "all frequencies from 0 to infinity" if band == ALL_FREQUENCIES else f"{band[0]:g} to {band[1]:g} rad/s"
+    if not done.gaps:
+        return f"{span}: {done.intervals} intervals with constant scalings prove the upper bound between the points"
+    shown = ", ".join(f"{a:.6g} to {b:.6g}" for a, b in done.gaps[:3])
+    return (f"the frequencies computed within {span}; not proved in {len(done.gaps)} gaps ({shown} rad/s) at the "
+            f"level {done.level:.6g}")
