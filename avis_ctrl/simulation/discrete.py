@@ -119,7 +119,7 @@ def held_and_ramped(A: np.ndarray, B: np.ndarray, step_s: float) -> tuple[np.nda
 def step_arrays(loop: SampledLoop, extra_substeps: int = 1) -> StepArrays:
     """Pack a loop; each of its substeps is divided by `extra_substeps` once more."""
     linear, controller = linear_part(loop), digital_controller(loop)
-    n, n_u, n_s = linear.nstates, loop.n_drives, len(loop.sensors.chains)
+    n_u, n_s = loop.n_drives, len(loop.sensors.chains)
     volts, floor, excess = slice(0, n_u), slice(n_u, n_u + N_Q), slice(n_u + N_Q, n_u + 2 * N_Q)
     Phi, held, ramped = held_and_ramped(linear.A, linear.B, loop.period_s / (loop.substeps * extra_substeps))
     advance = np.hstack([Phi, held[:, volts], held[:, floor] - ramped[:, floor], ramped[:, floor],
@@ -127,7 +127,8 @@ def step_arrays(loop: SampledLoop, extra_substeps: int = 1) -> StepArrays:
     observe = np.hstack([linear.C, linear.D[:, :n_u + N_Q]])[:n_u + N_Q]
     sense = np.hstack([linear.C, linear.D[:, n_u:]])[-n_s:]
     control = np.block([[controller.A, controller.B], [controller.C, controller.D]])
-    return StepArrays(*(np.ascontiguousarray(a) for a in (advance, observe, sense, control)),
+    packed = np.ascontiguousarray
+    return StepArrays(packed(advance), packed(observe), packed(sense), packed(control),
                       rig_arrays(loop.plant.mounted_body()))
 
 

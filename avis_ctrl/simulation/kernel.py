@@ -25,10 +25,11 @@ def _excess(out, x, w, u, arrays, s_observe, observed):
 @njit(cache=True)
 def _gone(x, far_m, far_rad):
     """Whether the table has left the range in which it can move at all."""
+    # Written so that a number that is not finite counts as gone.
+    inside = True
     for i in range(3):
-        if not (abs(x[i]) < far_m and abs(x[3 + i]) < far_rad):
-            return True
-    return False
+        inside = inside and abs(x[i]) < far_m and abs(x[3 + i]) < far_rad
+    return not inside
 
 
 @njit(cache=True)

@@ -71,7 +71,7 @@ def floor_velocity(loop: SampledLoop, samples: int, rng: np.random.Generator) ->
     return velocity
 
 
-def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int = 1, *, settle_s: float = 10.0,
+def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int, ...] = 1, *, settle_s: float = 10.0,
              nonlinear: bool = True, extra_substeps: int = 1, floor: np.ndarray | None = None,
              initial: np.ndarray | None = None) -> SimulationRecord:
     """Run the loop and keep the last `duration_s`.

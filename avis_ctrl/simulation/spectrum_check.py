@@ -5,6 +5,9 @@ expectation and variance for a Gaussian process of the predicted density: leakag
 segments and of neighbouring lines, and resonances narrower than a line are all in them. The estimate is then taken as
 chi-square distributed with matching mean and variance (Welch, IEEE Trans. Audio Electroacoust. AU-15 (1967);
 Percival and Walden, Spectral Analysis for Physical Applications, 1993, section 6.10).
+
+The simulated velocity is sampled at the controller's rate, so what lies above half of it folds down: the prediction
+folds the same images (`prediction`), and the bands may be compared up to half the sample rate.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy import signal, stats
 
 from avis_ctrl.errors import InputError
@@ -76,44 +80,26 @@ class SpectrumAgreement:
                 "false_alarm": self.false_alarm, "agrees": self.agrees}
 
 
-@dataclass(frozen=True, eq=False)
-class WelchMoments:
-    """Expectation and covariance of Welch's estimate for a given density."""
+def welch_moments(psd: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (n,) and covariance (n, REACH_LINES + 1) of Welch's estimate at lines 0..n-1; column d: with line j + d.
 
-    segment: int
-    segments: int
-    sample_rate_Hz: float
+    psd : the true density at 0, 1/4, 2/4 .. lines (POINTS_PER_LINE), reaching REACH_LINES beyond line n-1.
+    segments : Hann windows that overlap by half.
 
-    @property
-    def window(self) -> np.ndarray:
-        return signal.get_window("hann", self.segment)
-
-    @property
-    def line_Hz(self) -> float:
-        return self.sample_rate_Hz / self.segment
-
-    def fine_grid(self, highest_line: int) -> np.ndarray:
-        """Frequencies [Hz] at which the density is wanted, the first one a step above zero."""
-        return np.arange(1, (highest_line + REACH_LINES) * POINTS_PER_LINE + 1) * self.line_Hz / POINTS_PER_LINE
-
-    def band(self, psd: np.ndarray, first: int, last: int) -> tuple[float, float, np.ndarray]:
-        """Mean and variance of the sum over lines first..last, and the mean of each; psd on the fine grid.
-
-        With X_m(j) the transform of segment m at line j, cov(|X_m(j)|^2, |X_n(k)|^2) = |E X_m(j) conj X_n(k)|^2.
-        """
-        lo, hi = max(first - REACH_LINES, 0), last + REACH_LINES
-        fine = np.arange(max(lo * POINTS_PER_LINE, 1), hi * POINTS_PER_LINE + 1) / POINTS_PER_LINE
-        density = psd[np.round(fine * POINTS_PER_LINE).astype(int) - 1] / POINTS_PER_LINE
-        lines = np.arange(first, last + 1)
-        A = np.sqrt(density)[:, None] * _hann_transform(fine[:, None] - lines)
-        mean = np.sum(A ** 2, axis=0)
-        variance = 0.0
-        for lag in range(min(REACH_SEGMENTS, self.segments)):
-            # Segments half a window apart: frequency f turns by pi f / line_Hz from one to the next.
-            E = A.T @ (np.exp(1j * np.pi * fine * lag)[:, None] * A)
-            share = (self.segments - lag) * (1 if lag == 0 else 2) / self.segments ** 2
-            variance += share * float(np.sum(np.abs(E) ** 2))
-        return float(np.sum(mean)), variance, mean
+    With X_m(j) the transform of segment m at line j of a Gaussian process, cov(|X_m(j)|^2, |X_n(k)|^2) =
+    |E X_m(j) conj X_n(k)|^2, where E is the integral of psd(f) W(f - j) conj W(f - k) exp(i pi f (m - n)).
+    """
+    reach = REACH_LINES * POINTS_PER_LINE
+    around = sliding_window_view(np.concatenate([np.zeros(reach), psd]), 2 * reach + 1)[::POINTS_PER_LINE]
+    x = np.arange(-reach, reach + 1) / POINTS_PER_LINE
+    apart, W = np.arange(REACH_LINES + 1), _hann_transform(x)
+    pairs = W[:, None] * _hann_transform(x[:, None] - apart) / POINTS_PER_LINE
+    covariance = np.zeros((around.shape[0], apart.size))
+    for lag in range(min(REACH_SEGMENTS, segments)):
+        share = (segments - lag) * (1 if lag == 0 else 2) / segments ** 2
+        turned = np.exp(1j * np.pi * x * lag)[:, None] * pairs
+        covariance += share * ((around @ turned.real) ** 2 + (around @ turned.imag) ** 2)
+    return around @ pairs[:, 0], covariance
 
 
 def _hann_transform(x: np.ndarray) -> np.ndarray:
@@ -143,28 +129,33 @@ def check_spectrum_agreement(record: SimulationRecord, band_Hz: tuple[float, flo
     segments = 2 * len(record.time) // segment - 1
     if segments < 2:
         raise InputError("a record of at least one and a half segments", field="segment_s", value=segment_s)
-    moments = WelchMoments(segment, segments, fs)
-    mid, first, last = _bands(band_Hz, moments.line_Hz)
+    line_Hz = fs / segment
+    mid, first, last = _bands(band_Hz, line_Hz)
     kept = [COORDINATES.index(axis) for axis in axes]
     arms = lever_arms(loop.rig)[kept]
-    fine = moments.fine_grid(int(last[-1]))
-    predicted = sampled_response(loop, 2 * np.pi * fine).velocity_psd()[:, kept].T * arms[:, None] ** 2
+    lines = int(last[-1]) + 1
+    fine = np.arange(1, (lines + REACH_LINES) * POINTS_PER_LINE + 1) * line_Hz / POINTS_PER_LINE
+    # The density at zero frequency is taken as zero: the estimate removes each segment's mean.
+    predicted = sampled_response(loop, 2 * np.pi * fine).velocity_psd()[:, kept] * arms ** 2
+    psd = np.pad(predicted.T, ((0, 0), (1, 0)))
     estimated = np.array([signal.welch(record.velocity(axis), fs, "hann", segment, segment // 2,
-                                       detrend="constant")[1] for axis in axes])
+                                       detrend="constant")[1][:lines] for axis in axes])
+    moments = [welch_moments(one, segments) for one in psd]
+    expected = np.array([mean[:lines] for mean, _ in moments])
     shape = (len(axes), len(mid))
     mean, dof, power = np.empty(shape), np.empty(shape), np.empty(shape)
-    expected_lines = np.full((len(axes), int(last[-1]) + 1), np.nan)
-    for i in range(len(axes)):
+    for i, (_, covariance) in enumerate(moments):
         for b, (lo, hi) in enumerate(zip(first, last, strict=True)):
-            mean[i, b], variance, expected_lines[i, lo:hi + 1] = moments.band(predicted[i], int(lo), int(hi))
+            mean[i, b], power[i, b] = np.sum(expected[i, lo:hi + 1]), np.sum(estimated[i, lo:hi + 1])
+            # Each pair of different lines of the band counts twice.
+            variance = sum((1 if d == 0 else 2) * np.sum(covariance[lo:hi + 1 - d, d])
+                           for d in range(min(REACH_LINES, hi - lo) + 1))
             dof[i, b] = 2 * mean[i, b] ** 2 / variance
-            power[i, b] = np.sum(estimated[i, lo:hi + 1])
     tail = false_alarm / mean.size / 2
-    shown = slice(int(first[0]), int(last[-1]) + 1)
-    return SpectrumAgreement(axes, mid, np.sqrt(power * moments.line_Hz), np.sqrt(mean * moments.line_Hz), dof,
+    shown = slice(int(first[0]), lines)
+    return SpectrumAgreement(axes, mid, np.sqrt(power * line_Hz), np.sqrt(mean * line_Hz), dof,
                              stats.chi2.ppf(tail, dof) / dof, stats.chi2.isf(tail, dof) / dof, false_alarm,
-                             np.arange(shown.start, shown.stop) * moments.line_Hz, estimated[:, shown],
-                             expected_lines[:, shown])
+                             np.arange(shown.start, shown.stop) * line_Hz, estimated[:, shown], expected[:, shown])
 
 
 def _bands(band_Hz: tuple[float, float], line_Hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,0 +1,132 @@
+"""The simulation check of a design: many plants under one controller, each with its pass or fail."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.simulation.discrete import spectral_radius
+from avis_ctrl.simulation.loop import SimulationRecord, simulate
+from avis_ctrl.simulation.sampled_loop import SampledLoop
+from avis_ctrl.simulation.spectrum_check import SpectrumAgreement, check_spectrum_agreement
+
+# (plants done, plants in all, name of the one just done)
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class PlantCheck:
+    """One plant's line of the report.
+
+    Attributes
+    ----------
+    diverged : the nonlinear simulation left the stops.
+    spectral_radius : of the linear sampled loop; an instability too slow for the simulated time shows here.
+    spectrum : agreement with the linear prediction; None where the run diverged.
+    peak_V, rms_V : of the demanded voltages, over all drives; limit_V the limit.
+    clipped_dac, clipped_adc : samples beyond the limits.
+    payload_rms : r.m.s. velocity by controlled axis [m/s], rotations at the edge.
+    """
+
+    name: str
+    diverged: bool
+    spectral_radius: float
+    spectrum: SpectrumAgreement | None
+    peak_V: float
+    rms_V: float
+    limit_V: float
+    clipped_dac: int
+    clipped_adc: int
+    payload_rms: dict[str, float]
+
+    @property
+    def stable(self) -> bool:
+        return not self.diverged and self.spectral_radius < 1.0
+
+    @property
+    def within_limits(self) -> bool:
+        """No voltage beyond its limit, at the drives or at the converter."""
+        return self.clipped_dac == 0 and self.clipped_adc == 0
+
+    @property
+    def agrees(self) -> bool:
+        return self.spectrum is not None and self.spectrum.agrees
+
+    @property
+    def passed(self) -> bool:
+        return self.stable and self.agrees and self.within_limits
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"name": self.name, "passed": self.passed, "stable": self.stable, "diverged": self.diverged,
+                "spectral_radius": self.spectral_radius, "spectrum_agrees": self.agrees,
+                "spectrum": self.spectrum.as_dict() if self.spectrum else None, "within_limits": self.within_limits,
+                "peak_V": self.peak_V, "rms_V": self.rms_V, "limit_V": self.limit_V,
+                "clipped_dac": self.clipped_dac, "clipped_adc": self.clipped_adc, "payload_rms": self.payload_rms}
+
+
+@dataclass(frozen=True, eq=False)
+class SimulationCheck:
+    """All plants; `first` is the full record of the first one, for plotting against time."""
+
+    plants: tuple[PlantCheck, ...]
+    duration_s: float
+    seed: int
+    false_alarm: float
+    first: SimulationRecord
+
+    @property
+    def passed(self) -> bool:
+        return all(plant.passed for plant in self.plants)
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-able summary, without time series and line spectra."""
+        return {"passed": self.passed, "duration_s": self.duration_s, "seed": self.seed,
+                "false_alarm": self.false_alarm, "plants": [plant.as_dict() for plant in self.plants]}
+
+
+def check_designs(loops: Sequence[SampledLoop], duration_s: float = 60.0, seed: int = 1,
+                  progress: Progress | None = None, *, band_Hz: tuple[float, float] = (1.0, 80.0),
+                  false_alarm: float = 0.01, settle_s: float = 10.0) -> SimulationCheck:
+    """Simulate each loop with floor and noise of its own, and judge it.
+
+    Parameters
+    ----------
+    loops : nominal first, then the worst case and the random plants; their names head the lines.
+    seed : loop k draws from (seed, k).
+    progress : called after each plant; an exception that it raises stops the campaign.
+    band_Hz : midbands of the spectrum comparison.
+    false_alarm : probability that chance alone makes any band of any plant disagree.
+
+    Raises
+    ------
+    InputError : no loops; what `simulate` and `check_spectrum_agreement` raise.
+    """
+    if not loops:
+        raise InputError("at least one loop", field="loops", value=[])
+    plants, first = [], None
+    for k, loop in enumerate(loops):
+        record = simulate(loop, duration_s, (seed, k), settle_s=settle_s)
+        first = record if first is None else first
+        plants.append(judge(record, band_Hz, false_alarm / len(loops)))
+        if progress is not None:
+            progress(k + 1, len(loops), loop.name)
+    assert first is not None
+    return SimulationCheck(tuple(plants), duration_s, seed, false_alarm, first)
+
+
+def judge(record: SimulationRecord, band_Hz: tuple[float, float] = (1.0, 80.0),
+          false_alarm: float = 0.01) -> PlantCheck:
+    """One record's line."""
+    loop = record.loop
+    radius = spectral_radius(loop)
+    # Without a stable linear loop there is no stationary spectrum to predict.
+    steady = not record.diverged and radius < 1.0
+    spectrum = check_spectrum_agreement(record, band_Hz, false_alarm=false_alarm) if steady else None
+    return PlantCheck(loop.name, record.diverged, radius, spectrum, float(np.max(np.abs(record.demanded))),
+                      float(np.max(np.sqrt(np.mean(record.demanded ** 2, axis=0)))), loop.limit_V,
+                      record.clipped_dac, record.clipped_adc,
+                      {axis: float(np.sqrt(np.mean(record.velocity(axis) ** 2))) for axis in loop.axes})
