@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import scipy.linalg as la
@@ -80,7 +81,7 @@ def proved_intervals(N: StateSpace, scalings: Scalings, inside: Interval) -> lis
     crossings = possible_crossings(N, scalings)
     crossings = crossings[(crossings > low) & (crossings < high)]
     edges = np.concatenate([[low], crossings, [high]])
-    middles = np.array([midpoint(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    middles = np.array([midpoint(a, b) for a, b in pairwise(edges.tolist())])
     at_edge, between = np.split(_positive(N, scalings, np.concatenate([edges, middles])), [edges.size])
     parts: list[Interval] = []
     start = None
@@ -120,7 +121,7 @@ def cover(N: StateSpace, structure: BlockStructure, scaled: Callable[[StateSpace
     state = Cover(level)
     samples = np.unique(samples[(samples >= band[0]) & (samples <= band[1])])
     edges = np.unique(np.concatenate([[band[0]], samples, [band[1]]]))
-    state.gaps = list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+    state.gaps = list(pairwise(edges.tolist()))
     for _ in range(rounds):
         if not state.gaps or state.intervals > most or not np.isfinite(state.level):
             break

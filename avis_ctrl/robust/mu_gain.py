@@ -62,7 +62,8 @@ def _steepest(M: Array, delta: Array, structure: BlockStructure) -> Array:
     return new
 
 
-def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iterations: int = 20, seed: int = 0) -> WorstGain:
+def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iterations: int = 20,
+               seed: int = 0) -> WorstGain:
     """Ascent from Delta = 0 and random perturbations for M (B, n_z + n_e, n_w + n_d); monotone in every step."""
     rng = np.random.default_rng(seed)
     batch = M.shape[0]
@@ -82,6 +83,15 @@ def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iteration
                 break
             delta = np.where(better[:, None, None], trials[chosen, np.arange(batch)], delta)
             gain = np.where(better, value, gain)
+        # At a maximum a full block is the dyad of the gradient; only that form is realised with constant norm.
+        dyads = _steepest(M, delta, structure)
+        delta_dyads = delta.copy()
+        for block, w, z in structure.slices():
+            if block.kind == "full":
+                delta_dyads[:, w, z] = dyads[:, w, z]
+        value = _gain(M, delta_dyads)
+        take = value >= gain * (1 - 1e-4)
+        delta, gain = np.where(take[:, None, None], delta_dyads, delta), np.where(take, value, gain)
         raised = gain > best.gain
         best.gain[raised], best.delta[raised] = gain[raised], delta[raised]
     return best

@@ -10,7 +10,7 @@ The upper bound is proved between the frequencies computed (see `mu_cover`), or 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from avis_ctrl.lti import StateSpace, balance
 from avis_ctrl.lti.norms import bilinear_to_continuous
 from avis_ctrl.robust.mu_cover import Cover, Interval, cover
 from avis_ctrl.robust.mu_gain import worst_gain
-from avis_ctrl.robust.mu_lmi import Array
+from avis_ctrl.robust.mu_lmi import Array, Scalings
 from avis_ctrl.robust.mu_lower import LowerBound, lower_bound, singular_frequency
 from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
 from avis_ctrl.robust.mu_upper import UpperBound, skewed_upper_bound, upper_bound
@@ -35,7 +35,7 @@ ALL_FREQUENCIES: Interval = (0.0, np.inf)
 class MuPeak:
     """Bounds of a supremum over frequency.
 
-    upper : never exceeded in the band if `guaranteed`; else the largest value found, proved at its frequency only.
+    upper : never exceeded in the band if `guaranteed`; else proved at the frequencies computed only.
     lower : reached at `omega` [rad/s] by `delta`.
     delta : (n_w, n_z). For mu_peak ||delta|| = 1/lower and I - N(j omega) delta is singular; for worst_case_gain
         (first blocks only) ||delta|| <= 1. None where there is none (lower 0).
@@ -133,36 +133,49 @@ def _in_rad_s(N: StateSpace, result: MuPeak) -> MuPeak:
                    frequencies=2 / dt * np.arctan(result.frequencies * dt / 2))
 
 
+@dataclass
+class _Scan:
+    """Upper bounds with their scalings at the frequencies looked at."""
+
+    omega: Array
+    bound: UpperBound
+
+    @staticmethod
+    def of(N: StateSpace, band: Interval, bound: Callable[[Array], UpperBound]) -> _Scan:
+        seen: list[tuple[Array, UpperBound]] = []
+
+        def value(omega: Array) -> Array:
+            found = bound(N.frequency_response(omega)[:, None])
+            seen.append((omega, found))
+            return found.beta
+        first = first_frequencies(N, band)
+        refine_maxima(value, first, value(first))
+        omega = np.concatenate([w for w, _ in seen])
+        order = np.argsort(omega)
+        scalings = Scalings(*(np.concatenate(s)[order] for s in zip(*(u.scalings for _, u in seen), strict=True)))
+        return _Scan(omega[order], UpperBound(np.concatenate([u.beta for _, u in seen])[order], scalings))
+
+    @property
+    def peak(self) -> Array:
+        """The frequency of the highest value, the first place to split the band, as an array."""
+        return self.omega[[int(np.argmax(self.bound.beta))]]
+
+    @property
+    def level(self) -> float:
+        # A level of zero proves nothing: a small positive one lets an identically vanishing mu be covered.
+        return max(float(np.max(self.bound.beta)) * (1 + SLACK), 1e-9)
+
+
 def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval) -> MuPeak:
-    def bound(M: Array) -> Array:
-        return upper_bound(M, structure, 1e-4).beta
-
-    omega, _ = _scan(N, band, lambda w: bound(N.frequency_response(w)[:, None]))
-    M = N.frequency_response(omega)
-    found = upper_bound(M[:, None], structure, 1e-4)
-    lower = lower_bound(M, structure, found.beta, found.scalings, enough=0.9)
-    done = cover(N, structure, lambda system, level: system.scaled(left=1 / level), bound,
-                 _first_level(found.beta), band, _extremes(omega, found.beta), slack=SLACK)
-    best, at, delta = _best_singular(N, structure, omega, found, lower, done, band)
+    scan = _Scan.of(N, band, lambda M: upper_bound(M, structure, 1e-4))
+    lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9)
+    done = cover(N, structure, lambda system, level: system.scaled(left=1 / level),
+                 lambda M: upper_bound(M, structure, 1e-4).beta, scan.level, band, scan.peak, slack=SLACK)
+    best, at, delta = _best_singular(N, structure, scan.omega, scan.bound, lower, done, band)
     if best == 0.0:
-        at = float(omega[np.argmax(found.beta)])
-    return MuPeak(done.level if not done.gaps else float(np.max(found.beta)), best, at, delta, not done.gaps,
-                      _in_words(done, band), omega, found.beta, lower.beta)
-
-
-def _first_level(upper: Array) -> float:
-    # A level of zero proves nothing: a small positive one lets an identically vanishing mu be covered.
-    return max(float(np.max(upper)) * (1 + SLACK), 1e-9)
-
-
-def _scan(N: StateSpace, band: Interval, value) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
-    omega = first_frequencies(N, band)
-    return refine_maxima(value, omega, value(omega))
-
-
-def _extremes(omega: Array, values: Array) -> Array:
-    """The frequency of the highest value: the first place to split the band."""
-    return omega[[int(np.argmax(values))]]
+        at = float(scan.peak[0])
+    return MuPeak(done.level, best, at, delta, not done.gaps, _in_words(done, band), scan.omega, scan.bound.beta,
+                  lower.beta)
 
 
 def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found: UpperBound, lower: LowerBound,
@@ -170,7 +183,7 @@ def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found
     """Largest verified lower bound: harder search at the highest peaks, with a free frequency for real blocks."""
     top = np.unique(np.concatenate([np.argsort(found.beta)[-3:], np.argsort(lower.beta)[-3:]]))
     M = N.frequency_response(omega[top])
-    scalings = type(found.scalings)(*(s[top] for s in found.scalings))
+    scalings = Scalings(*(s[top] for s in found.scalings))
     hard = lower_bound(M, structure, found.beta[top], scalings, enough=0.995, seed=1)
     values = np.maximum(hard.beta, lower.beta[top])
     deltas = np.where((hard.beta >= lower.beta[top])[:, None, None], hard.delta, lower.delta[top])
@@ -185,29 +198,46 @@ def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found
 
 
 def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval) -> MuPeak:
-    robust = _mu_peak(N.select(range(structure.n_z), range(structure.n_w)), structure, ALL_FREQUENCIES)
-    n_d, n_e = N.ninputs - structure.n_w, N.noutputs - structure.n_z
-    whole = structure.with_performance(n_d, n_e)
-
-    def bound(M: Array) -> Array:
-        return skewed_upper_bound(M, whole, 1e-4).beta
+    n_z, n_w = structure.n_z, structure.n_w
+    n_e = N.noutputs - n_z
+    whole = structure.with_performance(N.ninputs - n_w, n_e)
 
     def scaled(system: StateSpace, level: float) -> StateSpace:
-        return system.scaled(left=np.r_[np.ones(structure.n_z), np.full(n_e, 1 / level)])
+        return system.scaled(left=np.r_[np.ones(n_z), np.full(n_e, 1 / level)])
 
-    omega, upper = _scan(N, band, lambda w: bound(N.frequency_response(w)[:, None]))
-    lower = worst_gain(N.frequency_response(omega), structure)
-    if robust.lower >= 1.0:
-        return MuPeak(np.inf, np.inf, robust.omega, robust.delta, True, "a perturbation of norm at most 1 "
-                          "destabilises the loop", omega, upper, lower.gain)
+    scan = _Scan.of(N, band, lambda M: skewed_upper_bound(M, whole, 1e-4))
+    M = N.frequency_response(scan.omega)
+    done = None
+    if np.all(np.isfinite(scan.bound.beta)) and _robustly_stable(N.select(range(n_z), range(n_w)), structure, band):
+        done = cover(N, whole, scaled, lambda m: skewed_upper_bound(m, whole, 1e-4).beta, scan.level, band, scan.peak,
+                     slack=SLACK)
+    if done is not None and np.isfinite(done.level):
+        lower = worst_gain(M, structure)
+        k = int(np.argmax(lower.gain))
+        return MuPeak(done.level, float(lower.gain[k]), float(scan.omega[k]), lower.delta[k], not done.gaps,
+                      _in_words(done, band), scan.omega, scan.bound.beta, lower.gain)
+    robust = _mu_peak(N.select(range(n_z), range(n_w)), structure, ALL_FREQUENCIES)
+    words = f"robust stability is not proved: mu of the blocks is between {robust.lower:.6g} and {robust.upper:.6g}"
+    # Only perturbations that provably keep the loop stable have a gain.
+    radius = min(1.0, (1 - 1e-9) / robust.upper) if robust.guaranteed else 0.0
+    lower = worst_gain(M * np.r_[np.full(n_z, radius), np.ones(n_e)][:, None], structure)
     k = int(np.argmax(lower.gain))
-    best, at, delta = float(lower.gain[k]), float(omega[k]), lower.delta[k]
-    if robust.upper >= 1.0 or not robust.guaranteed or not np.all(np.isfinite(upper)):
-        words = f"robust stability is not proved: mu of the blocks is between {robust.lower:.6g} and {robust.upper:.6g}"
-        return MuPeak(np.inf, best, at, delta, True, words, omega, upper, lower.gain)
-    done = cover(N, whole, scaled, bound, _first_level(upper), band, _extremes(omega, upper), slack=SLACK)
-    return MuPeak(done.level if not done.gaps else float(np.max(upper)), best, at, delta, not done.gaps,
-                      _in_words(done, band), omega, upper, lower.gain)
+    found = MuPeak(np.inf, float(lower.gain[k]), float(scan.omega[k]), radius * lower.delta[k], True, words, scan.omega,
+                   scan.bound.beta, lower.gain)
+    if robust.lower >= 1.0:
+        return replace(found, lower=np.inf, omega=robust.omega, delta=robust.delta,
+                       covers="a perturbation of norm at most 1 makes the loop unstable")
+    return found
+
+
+def _robustly_stable(N: StateSpace, structure: BlockStructure, band: Interval) -> bool:
+    """Whether mu < 1 is proved at all frequencies; a cover of all of them with performance proves it on its own."""
+    if band == ALL_FREQUENCIES:
+        return True
+    done = cover(N, structure, lambda system, level: system.scaled(left=1 / level),
+                 lambda M: upper_bound(M, structure, 1e-4).beta, 1.0 - 1e-6, ALL_FREQUENCIES,
+                 first_frequencies(N, ALL_FREQUENCIES, 0), slack=SLACK)
+    return not done.gaps and done.level < 1.0
 
 
 def _in_words(done: Cover, band: Interval) -> str:

@@ -41,7 +41,7 @@ def refine_maxima(value: Callable[[Array], Array], omega: Array, values: Array, 
         peaks = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]) & (values >= worth * np.max(values)))
         peaks = peaks[np.argsort(values[peaks])[::-1]][:most]
         new: list[float] = []
-        for k in peaks:
+        for k in peaks.tolist():
             low, high = max(k - 1, 0), min(k + 1, omega.size - 1)
             drop = values[k] - min(values[low], values[high])
             if drop > tolerance * values[k]:

@@ -1,0 +1,56 @@
+"""SLICOT routines through slycot, as a second opinion: the only module that imports it (slycot is GPL-2.0).
+
+Nothing in the package depends on it; the tests and benchmarks compare with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti import StateSpace
+from avis_ctrl.robust.mu_lmi import Array
+from avis_ctrl.uncertainty.blocks import Block, BlockStructure
+
+
+def mu_upper_slicot(M: Array, blocks: BlockStructure | Sequence[Block]) -> float:
+    """Upper bound of mu of one matrix (n, n) by AB13MD (Fan, Tits and Doyle's method).
+
+    Raises InputError for what AB13MD does not treat: repeated scalars and full blocks that are not square.
+    """
+    import slycot
+
+    structure = BlockStructure.of(blocks)
+    for block in structure.blocks:
+        if block.repeated or block.rows != block.cols:
+            raise InputError("AB13MD takes single scalars and square full blocks only", field="blocks", value=block)
+    sizes = np.array([block.rows for block in structure.blocks])
+    kinds = np.array([1 if block.kind == "real" else 2 for block in structure.blocks])
+    return float(slycot.ab13md(np.asarray(M, complex), sizes, kinds)[0])
+
+
+def hinf_norm_slicot(system: StateSpace, tolerance: float = 1e-9) -> float:
+    """H-infinity norm of a stable system by AB13DD."""
+    import slycot
+
+    n, m, p = system.nstates, system.ninputs, system.noutputs
+    try:
+        gain, _ = slycot.ab13dd("D" if system.dt else "C", "I", "S", "D", n, m, p, system.A, np.eye(n), system.B,
+                                system.C, system.D, tolerance)
+    except slycot.exceptions.SlycotError as error:
+        raise ComputationError("AB13DD failed", measured=str(error)) from error
+    return float(gain)
+
+
+def h2_norm_slicot(system: StateSpace) -> float:
+    """H2 norm of a stable system by AB13BD."""
+    import slycot
+
+    n, m, p = system.nstates, system.ninputs, system.noutputs
+    try:
+        return float(slycot.ab13bd("D" if system.dt else "C", "H", n, m, p, system.A.copy(), system.B.copy(),
+                                   system.C.copy(), system.D.copy()))
+    except slycot.exceptions.SlycotError as error:
+        raise ComputationError("AB13BD failed", measured=str(error)) from error
