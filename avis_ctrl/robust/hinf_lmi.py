@@ -52,7 +52,7 @@ def lmi_gamma(P: Any, nmeas: int, ncon: int) -> LmiOptimum:
     P = as_plant(P, nmeas, ncon)
     plant = Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon)
     check_stabilisable(plant)
-    first = size = float(la.norm(plant.channel(plant.B1, plant.C1, plant.D11))) or 1.0
+    first = size = float(plant.size(plant.B1, plant.C1, plant.D11))
     best: LmiOptimum | None = None
     # The solver's tolerances are absolute: the norm is measured in units of the last answer until that is 1.
     for _ in range(6):

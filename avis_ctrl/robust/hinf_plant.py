@@ -58,12 +58,19 @@ class Plant:
         sizes = np.unique(np.concatenate([sizes[sizes > 0], [1.0]]))
         return sizes * np.exp(0.25j * np.pi)
 
-    def channel(self, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> np.ndarray:
-        """|transfer matrix| of one channel, largest over the sample points and infinity, entry by entry."""
-        size = np.abs(D)
-        for s in self.sample_points() if self.n else ():
-            size = np.maximum(size, np.abs(C @ np.linalg.solve(s * np.eye(self.n) - self.A, B.astype(complex)) + D))
-        return size
+    def at(self, s: complex, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> np.ndarray:
+        """Transfer matrix of one channel at the point s."""
+        return C @ np.linalg.solve(s * np.eye(self.n) - self.A, B.astype(complex)) + D if self.n else D.astype(complex)
+
+    def size(self, B: np.ndarray, C: np.ndarray, D: np.ndarray, axis: int | None = None) -> np.ndarray:
+        """Typical size of one channel, whole or by column (axis 0) or row (axis 1); 1 where it is zero.
+
+        A geometric mean over the sample points: neither a weight's huge gain at rest nor its roll-off decides.
+        """
+        sizes = [la.norm(self.at(s, B, C, D), axis=axis) for s in self.sample_points()]
+        logs = np.mean([np.log(np.maximum(size, 1e-300)) for size in sizes if np.any(size)] or [0.0], axis=0)
+        size = np.exp(logs) * np.ones(() if axis is None else D.shape[1 - axis])
+        return np.where(size > 1e-100, size, 1.0)
 
 
 def as_plant(P: Any, nmeas: int, ncon: int) -> StateSpace:
@@ -89,7 +96,7 @@ def check_stabilisable(plant: Plant) -> None:
             (plant.A.T, plant.C2.T, plant.y, "not seen by any of the measurements", "a sensor")):
         for pole in np.unique(la.eigvals(A)) if plant.n else ():
             size = la.norm(np.hstack([A, B]), 2)
-            if pole.imag < 0 or pole.real < -1e-12 * size:
+            if pole.imag < 0 or pole.real < -1e-15 * size:
                 continue
             margin = la.svdvals(np.hstack([A - pole * np.eye(plant.n), B]))[-1] / size
             if margin < PBH_TOLERANCE:
@@ -125,19 +132,23 @@ def normal_form(plant: Plant) -> NormalForm:
 
 
 def channel_scales(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
-    """Size of each input's effect on z, and of w's effect on each measurement: the yardsticks of the rank tests."""
-    of_u = np.max(plant.channel(plant.B2, plant.C1, plant.D12), axis=0)
-    of_y = np.max(plant.channel(plant.B1, plant.C2, plant.D21), axis=1)
-    return np.where(of_u > 0, of_u, 1.0), np.where(of_y > 0, of_y, 1.0)
+    """Typical size of each input's effect on z, and of w's on each measurement: the yardsticks of extra channels."""
+    return plant.size(plant.B2, plant.C1, plant.D12, 0), plant.size(plant.B1, plant.C2, plant.D21, 1)
 
 
 def rank_margins(plant: Plant) -> tuple[float, float]:
-    """Smallest singular values of D12 (columns) and D21 (rows) in units of the channel sizes; 0 where too narrow."""
+    """Smallest singular values of D12 (columns of unit length) and D21 (rows of unit length).
+
+    A column below 1e-12 of its input's typical effect on z counts as zero; 0 where there are too few rows.
+    """
     of_u, of_y = channel_scales(plant)
 
-    def margin(D: np.ndarray) -> float:
-        return float(la.svdvals(D)[-1]) if D.shape[0] >= D.shape[1] else 0.0
-    return margin(plant.D12 / of_u), margin((plant.D21 / of_y[:, None]).T)
+    def margin(D: np.ndarray, sizes: np.ndarray) -> float:
+        length = la.norm(D, axis=0)
+        if D.shape[0] < D.shape[1] or np.any(length <= 1e-12 * sizes):
+            return 0.0
+        return float(la.svdvals(D / length)[-1])
+    return margin(plant.D12, of_u), margin(plant.D21.T, of_y)
 
 
 def regularised(plant: Plant, epsilon: float, of_D12: bool, of_D21: bool, of_states: bool) -> Plant:

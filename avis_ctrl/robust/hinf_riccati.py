@@ -236,5 +236,4 @@ def filter_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.n
 
 def _natural_gamma(plant: Plant) -> float:
     """A first gamma of the right order: the open channel w -> z, off the imaginary axis."""
-    size = plant.channel(plant.B1, plant.C1, plant.D11)
-    return float(la.norm(size)) if np.any(size) else 1.0
+    return float(plant.size(plant.B1, plant.C1, plant.D11))

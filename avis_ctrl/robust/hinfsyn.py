@@ -28,6 +28,7 @@ from avis_ctrl.robust.hinf_plant import (
     regularised,
 )
 from avis_ctrl.robust.hinf_riccati import GammaBracket, central_controller, find_gamma, gamma_test
+from avis_ctrl.robust.riccati import ON_AXIS
 
 
 class Status(Enum):
@@ -122,6 +123,9 @@ def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
     problem = _Problem.of(P, nmeas, ncon)
     form, notes = problem.form(*problem.singular, 1e-5)
     test = gamma_test(form.plant, gamma)
+    if not test.feasible and ON_AXIS in test.reason:
+        form, notes = problem.form(*problem.singular, 1e-5, of_states=True)
+        test = gamma_test(form.plant, gamma)
     if not test.feasible:
         raise ComputationError(f"no controller reaches gamma = {gamma:.6g}", cause=test.reason,
                                measured=f"rho(XY)/gamma^2 = {test.coupling:.4g}", next_step="ask for a larger gamma")
@@ -173,7 +177,7 @@ class _Problem:
                 of_states = True
         best: tuple[NormalForm, GammaBracket, tuple[str, ...]] | None = None
         failure: ComputationError | None = None
-        for epsilon in (1e-3, 1e-4, 1e-5, 1e-6):
+        for epsilon in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7):
             form, notes = self.form(*self.singular, epsilon, of_states)
             try:
                 bracket = find_gamma(form.plant, tolerance, hint)
@@ -184,8 +188,8 @@ class _Problem:
                 failure = error
                 continue
             cost = np.inf if best is None else best[1].upper.gamma / bracket.upper.gamma - 1
-            said = "" if best is None else f"; gamma fell by {100 * cost:.2g} % over the last decade of that size"
-            best = form, bracket, (notes[0] + said,)
+            fall = f"; gamma fell by {100 * max(cost, 0.0):.2g} % over the last decade of that size"
+            best = form, bracket, (notes[0] + ("" if best is None else fall),)
             hint = bracket.upper.gamma
             if cost < 0.01:
                 break

@@ -16,6 +16,7 @@ import scipy.linalg as la
 
 AXIS_TOLERANCE = 1e-10
 LAGRANGIAN_TOLERANCE = 1e-6
+ON_AXIS = "the Hamiltonian has eigenvalues on the imaginary axis"
 
 
 @dataclass(frozen=True)
@@ -44,12 +45,12 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolutio
     poles = _schur_eigenvalues(T)
     on_axis = np.abs(poles.real) <= AXIS_TOLERANCE * np.abs(poles) + 1e-15 * la.norm(H)
     if stable != n or np.any(on_axis):
-        return RiccatiSolution(None, False, "the Hamiltonian has eigenvalues on the imaginary axis")
+        return RiccatiSolution(None, False, ON_AXIS)
     X1, X2 = U[:n, :n], U[n:, :n]
     gram = X1.T @ X2
     asymmetry = float(la.norm(gram - gram.T, 2))
     if asymmetry > LAGRANGIAN_TOLERANCE:
-        return RiccatiSolution(None, False, "the Hamiltonian has eigenvalues on the imaginary axis")
+        return RiccatiSolution(None, False, ON_AXIS)
     lowest = float(la.eigvalsh((gram + gram.T) / 2)[0])
     lu, piv = la.lu_factor(X1.T, check_finite=False)
     if np.min(np.abs(np.diag(lu))) < 1e-15:

@@ -19,7 +19,7 @@ from avis_ctrl.lti import (
     tf,
 )
 from avis_ctrl.lti.realisation import hankel_singular_values
-from avis_ctrl.robust.hinf_bounds import hinf_lower_bound
+from avis_ctrl.robust.hinf_bounds import hinf_lower_bound, limiting_weights
 from avis_ctrl.robust.hinf_lmi import lmi_gamma
 from avis_ctrl.robust.hinfsyn import Status, hinf_suboptimal, hinfsyn
 
@@ -192,6 +192,26 @@ class TestAgainstMatrixInequalities:
         assert bound.gamma <= lmi_gamma(P, 1, 1).upper * (1 + 1e-6)
 
 
+class TestWhichWeightForbids:
+    def test_elasticities_add_up_to_one(self):
+        """Euler's theorem: the optimum is homogeneous of degree one in all weights of z, and in all of w."""
+        P = mixed_sensitivity(([1 / 1.5, 10.0], [1, 1e-3]))
+        found = dict(limiting_weights(P, 1, 1))
+        assert found["wp_e"] + found["wu_u"] == pytest.approx(1, abs=1e-3)
+        assert found["r"] == pytest.approx(1, abs=1e-3)
+        assert found["wp_e"] > found["wu_u"] > 0
+
+    def test_a_weight_that_does_not_matter(self):
+        """Two loops side by side: only the worse one's weights count."""
+        parts = [mixed_sensitivity(([k / 1.5, k * 10.0], [1, 1e-3])) for k in (1.0, 0.1)]
+        both = append(*(p.renamed([f"{n}{k}" for n in p.inputs], [f"{n}{k}" for n in p.outputs])
+                        for k, p in enumerate(parts)))
+        both = both.select(["wp_e0", "wu_u0", "wp_e1", "wu_u1", "y0", "y1"], ["r0", "r1", "u0", "u1"])
+        found = dict(limiting_weights(both, 2, 2))
+        assert found["wp_e1"] == pytest.approx(0, abs=1e-3) and found["wu_u1"] == pytest.approx(0, abs=1e-3)
+        assert found["r0"] == pytest.approx(1, abs=1e-3)
+
+
 class TestSingularProblems:
     def test_both_rank_deficient(self, rng):
         P = random_plant(rng, 3, 2, 2, 1, 1, direct=0.0)
@@ -210,6 +230,7 @@ class TestSingularProblems:
         result = hinfsyn(P, 1, 1)
         assert result.status is Status.REGULARISED and "imaginary axis" in result.notes[0]
         assert result.abscissa < 0
+        assert hinf_suboptimal(P, 1, 1, 1.2).gamma < 1.2
 
     def test_fewer_outputs_than_controls(self, rng):
         P = random_plant(rng, 3, 3, 1, 2, 1)
@@ -278,6 +299,21 @@ class TestUse:
         scaled = P.similar(np.diag(10.0 ** rng.uniform(-5, 5, 5))).scaled([1, 1, 1e6], [1, 1, 1e-4])
         assert hinfsyn(scaled, 1, 1).gamma_optimal_bounds[1] == pytest.approx(
             hinfsyn(P, 1, 1).gamma_optimal_bounds[1], rel=2e-3)
+
+    @pytest.mark.parametrize("w_u", [1.0, 1e-3, 1e-6])
+    def test_fourteen_decades_between_the_poles(self, w_u):
+        """A nearly integrating weight and a very fast actuator change the optimum by little, and none is called
+        singular: the same problem with poles from 1e-3 to 1e5 rad/s and from 1e-7 to 1e7 rad/s."""
+        optima = []
+        for slow, fast in ((1e-3, 1e5), (1e-7, 1e7)):
+            P = connect([tf(*DISTURBANCE_PROCESS, ["force"], ["g"]), tf([fast], [1, fast], ["u"], ["force"]),
+                         summing_junction("e", ["r", "-g"]), tf([1 / 1.5, 10], [1, slow], ["e"], ["z1"]),
+                         gain([[w_u]], ["u"], ["z2"]), gain([[1.0]], ["e"], ["y"])], ["r", "u"], ["z1", "z2", "y"])
+            result = hinfsyn(P, 1, 1)
+            assert result.status is Status.OPTIMAL
+            check(P, 1, 1, result)
+            optima.append(result.gamma_optimal_bounds[1])
+        assert optima[0] == pytest.approx(optima[1], rel=0.01)
 
     def test_sampled_plant_gets_a_sampled_controller(self):
         P = mixed_sensitivity(([1 / 1.5, 10.0], [1, 1e-3]))
