@@ -1,0 +1,21 @@
+"""What the report says, once for all renderers."""
+
+from __future__ import annotations
+
+from avis_ctrl.report.pieces import Document
+from avis_ctrl.report.sections.bounds import bounds
+from avis_ctrl.report.sections.provenance import provenance, stamp
+from avis_ctrl.report.sections.transmissibility import transmissibility
+from avis_ctrl.report.sections.verdict import comparison, verdict
+from avis_ctrl.report.words import axis, joined
+from avis_ctrl.study.model import DesignResult
+
+SECTIONS = (verdict, comparison, transmissibility, bounds, provenance)
+
+
+def document(result: DesignResult) -> Document:
+    """The report of a study."""
+    kept = joined([axis(name) for name in result.plant.axes])
+    made = str(result.provenance.get("date", ""))[:10]
+    return Document(result.design.title, f"Design report: {kept} of the rig {result.rig.name}"
+                    + (f", {made}" if made else ""), stamp(result), tuple(make(result) for make in SECTIONS))

@@ -1,0 +1,143 @@
+"""Figures described as data, so that every backend draws the same curves with the same words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+Dash = Literal["solid", "dash", "dot", "dashdot"]
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a thing looks wherever it appears; colours of Okabe and Ito, told apart by the colour-blind."""
+
+    colour: str
+    dash: Dash = "solid"
+    width: float = 1.6
+
+
+STYLES: dict[str, Style] = {
+    "passive": Style("#7a7a7a", "dot", 1.8),
+    "skyhook_classical": Style("#56b4e9", "dashdot"),
+    "skyhook": Style("#e69f00", "dash", 2.0),
+    "hinf": Style("#009e73", "dashdot", 1.8),
+    "mu": Style("#0072b2", "solid", 2.4),
+    "limit": Style("#b3261e", "dash", 1.4),
+    "filter": Style("#cc79a7", "solid", 1.6),
+    "plain": Style("#222222", "solid", 1.6),
+    "faint": Style("#9a9a9a", "solid", 0.9),
+}
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#222222", "#7a7a7a")
+DASHES: tuple[Dash, ...] = ("solid", "dash", "dashdot", "dot")
+
+
+def numbered(k: int) -> Style:
+    """A style for the k-th of several alike things."""
+    return Style(PALETTE[k % len(PALETTE)], DASHES[k % len(DASHES)], 1.6)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Label with its unit, scale and range (None: as the data asks)."""
+
+    label: str
+    scale: Literal["linear", "log"] = "linear"
+    range: tuple[float, float] | None = None
+
+
+HERTZ = Axis("frequency [Hz]", "log", (0.1, 100.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """x, y (n,); a value that is not finite leaves a gap. Without a label it is not in the legend."""
+
+    x: np.ndarray
+    y: np.ndarray
+    label: str
+    style: Style
+    points: bool = False
+    line: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The area between low and high over x (n,)."""
+
+    x: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    label: str
+    style: Style
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One pair of axes."""
+
+    x: Axis
+    y: Axis
+    curves: tuple[Curve, ...]
+    bands: tuple[Band, ...] = ()
+    title: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """Panels under each other, one legend and a caption that says what is seen."""
+
+    name: str
+    caption: str
+    panels: tuple[Panel, ...]
+
+    def legend(self) -> list[Curve | Band]:
+        """What the legend shows: each label once, in order."""
+        seen: dict[str, Curve | Band] = {}
+        for panel in self.panels:
+            for thing in (*panel.curves, *panel.bands):
+                if thing.label:
+                    seen.setdefault(thing.label, thing)
+        return list(seen.values())
+
+
+def hertz(low: float = 0.1, high: float = 100.0) -> Axis:
+    """The frequency axis over a range."""
+    return Axis(HERTZ.label, "log", (low, high))
+
+
+def level(low: float, high: float, value: float, label: str, style: Style = STYLES["limit"]) -> Curve:
+    """A horizontal line."""
+    return Curve(np.array([low, high]), np.array([value, value]), label, style)
+
+
+def decibels(magnitude: np.ndarray | Sequence[float]) -> np.ndarray:
+    """20 log10 |magnitude|; nan where it is zero or not finite."""
+    size = np.abs(np.asarray(magnitude))
+    known = np.isfinite(size) & (size > 0)
+    return np.where(known, 20 * np.log10(np.where(known, size, 1.0)), np.nan)
+
+
+def ticks_log(low: float, high: float) -> tuple[list[float], list[str]]:
+    """Labelled ticks of a logarithmic axis: decades, and 2 and 5 between them where there are few."""
+    first, last = int(np.floor(np.log10(low) + 1e-9)), int(np.ceil(np.log10(high) - 1e-9))
+    steps = (1, 2, 5) if last - first <= 2 else (1,)
+    stride = 1 if last - first <= 8 else 2
+    places = [m * 10.0 ** d for d in range(first, last + 1, stride) for m in steps]
+    shown = [p for p in places if low * (1 - 1e-9) <= p <= high * (1 + 1e-9)]
+    return shown, [f"{p:g}" if 1e-3 <= p <= 1e4 else f"{p:.0e}".replace("e-0", "e-").replace("e+0", "e") for p in shown]
+
+
+def log_range(panel: Panel) -> tuple[float, float]:
+    """Range of the y axis of a logarithmic panel, from the data where none is given."""
+    if panel.y.range is not None:
+        return panel.y.range
+    values = [np.asarray(v, float) for v in (*(c.y for c in panel.curves), *(b.low for b in panel.bands),
+                                             *(b.high for b in panel.bands))]
+    kept = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values] or [np.array([])])
+    if not kept.size:
+        return 0.1, 10.0
+    return float(kept.min()) / 1.3, float(kept.max()) * 1.3

@@ -1,0 +1,64 @@
+"""The report as PDF, compiled by Typst from a fixed template; all content reaches it as data, never as markup."""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import typst
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.report import matplotlib_backend
+from avis_ctrl.report.figures import Figure
+from avis_ctrl.report.pieces import Bullets, Cell, Document, Drawing, Formula, Heading, Mark, Paragraph, Piece, Table
+
+
+def render(document: Document) -> bytes:
+    """The document as PDF.
+
+    Raises
+    ------
+    ComputationError : the typesetter refuses, with what it says.
+    """
+    content = {"title": document.title, "subtitle": document.subtitle, "stamp": document.stamp, "sections": [
+        {"title": s.title, "pieces": [_piece(p) for p in s.pieces]} for s in document.sections]}
+    template = (resources.files("avis_ctrl.report") / "report.typ").read_bytes()
+    # The drawings' sans-serif text is set in the font that matplotlib brings, the same on every machine.
+    fonts = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
+    try:
+        made = typst.compile(template, format="pdf", font_paths=[str(fonts)], ignore_system_fonts=True, timestamp=0,
+                             sys_inputs={"document": json.dumps(content, allow_nan=False)})
+    except typst.TypstError as error:
+        raise ComputationError("the PDF report was not typeset", cause=str(error),
+                               next_step="the HTML report has the same content") from error
+    assert isinstance(made, bytes)  # one PDF, whatever its number of pages
+    return made
+
+
+def _piece(piece: Piece) -> dict[str, Any]:
+    match piece:
+        case Heading(text):
+            return {"kind": "heading", "text": text}
+        case Paragraph(text, kind, good):
+            return {"kind": kind, "text": text, "good": good}
+        case Bullets(items):
+            return {"kind": "bullets", "items": list(items)}
+        case Formula(source, _):
+            return {"kind": "formula", "typst": source}
+        case Table():
+            return {"kind": "table", "caption": piece.caption, "header": list(piece.header),
+                    "align": [piece.alignment(k) for k in range(len(piece.header))],
+                    "rows": [[_cell(c) for c in row] for row in piece.rows]}
+        case Drawing(_, caption, image, alternative):
+            return {"kind": "figure", "caption": caption, "svg": image, "alternative": alternative}
+        case Figure():
+            return {"kind": "figure", "caption": piece.caption, "svg": matplotlib_backend.svg(piece),
+                    "alternative": piece.caption}
+    raise TypeError(f"no piece of a report: {type(piece).__name__}")
+
+
+def _cell(cell: Cell) -> dict[str, Any]:
+    return {"text": cell.text, "good": cell.good} if isinstance(cell, Mark) else {"text": cell, "good": None}

@@ -1,0 +1,87 @@
+"""Bounds of mu over frequency, robust stability, and the worst plants in physical words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, level
+from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
+
+Pick = Callable[[ControllerResult], Bound]
+
+
+def bounds(result: DesignResult) -> Section:
+    """mu of the weighted performance and of stability alone, and what reaches them."""
+    pieces: list[Piece] = [_guarantee(result)]
+    pieces += [_figure("mu_performance", result, lambda c: c.mu, "mu of the weighted performance",
+                       "Below 1 (dashed line) every requirement put into the weights holds for every plant of the "
+                       "set."),
+               _figure("mu_stability", result, lambda c: c.stability, "mu of the uncertainty alone",
+                       "Below 1 the loop is stable for every plant of the set; its inverse is the factor by which the "
+                       "whole set could grow.")]
+    pieces += [_stability(result), _worst(result)]
+    return Section("Bounds of mu", "bounds", tuple(pieces))
+
+
+def _guarantee(result: DesignResult) -> Paragraph:
+    mu = result.controller("mu").mu
+    gap = 100 * (1 - mu.lower / mu.upper) if np.isfinite(mu.upper) and mu.upper > 0 else np.nan
+    between = ("The upper bound is guaranteed at every frequency, between the computed points too."
+               if mu.guaranteed else "The upper bound holds at the computed frequencies; between them it is not "
+               "guaranteed, though the grid was refined about every local peak.")
+    return Paragraph(f"The mu controller has a peak between {words.bound(mu.lower, 4)} and {words.bound(mu.upper, 4)} "
+                     f"at {words.hertz(mu.omega)}"
+                     + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
+                     + f". The lower bound is a perturbation that makes the loop singular. {between}")
+
+
+def _figure(name: str, result: DesignResult, pick: Pick, label: str, meaning: str) -> Figure:
+    curves = []
+    for c in result.controllers:
+        if c.name == "passive":
+            continue
+        b, style = pick(c), STYLES[c.name]
+        order = np.argsort(b.frequencies)
+        f = b.frequencies[order] / (2 * np.pi)
+        curves.append(Curve(f, b.upper_curve[order], c.title, style))
+        curves.append(Curve(f, b.lower_curve[order], "", Style(style.colour, "dot", 0.9)))
+    passive = pick(result.controller("passive"))
+    order = np.argsort(passive.frequencies)
+    curves.append(Curve(passive.frequencies[order] / (2 * np.pi), passive.upper_curve[order], "passive",
+                        STYLES["passive"]))
+    curves.append(level(0.01, 1000.0, 1.0, "1", STYLES["limit"]))
+    finite = [float(np.max(c.y[np.isfinite(c.y)], initial=1.0)) for c in curves]
+    top = min(max(finite) * 1.3, 30.0)
+    panel = Panel(hertz(0.1, 500.0), Axis(label, "log", (0.05, top)), tuple(curves))
+    return Figure(name, f"Upper bounds (thick) and lower bounds (thin, dotted) of {label}. {meaning}", (panel,))
+
+
+def _stability(result: DesignResult) -> Table:
+    rows = []
+    for c in result.controllers:
+        b = c.stability
+        shown = not c.stable or b.lower >= 1
+        verdict = Mark("no", False) if shown else Mark("yes", True) if b.upper < 1 else Mark("not shown", False)
+        margin = words.number(1 / b.upper) if c.stable and np.isfinite(b.upper) and b.upper > 0 else "none"
+        rows.append((c.title, words.bound(b.upper, 4), words.bound(b.lower, 4), words.hertz(b.omega), margin, verdict))
+    return table("Robust stability. The margin is the factor by which the whole uncertainty set may grow before the "
+                 "upper bound of mu reaches 1.",
+                 ("controller", "mu upper", "mu lower", "peak at", "margin", "stable for the set"), rows, "lrrrrc")
+
+
+def _worst(result: DesignResult) -> Table:
+    rows = []
+    for name in ("mu", "skyhook", "hinf"):
+        c = next((one for one in result.controllers if one.name == name), None)
+        if c is None:
+            continue
+        for what, b, gain in (("mu of the weighted performance", c.mu, False), ("stability", c.stability, False),
+                              ("peak transmissibility", c.worst_peak, True)):
+            value = words.decibel(b.lower) if gain else words.bound(b.lower, 4)
+            rows.append((f"{c.title}: {what}", value, words.hertz(b.omega), "; ".join(b.words) or "none was found"))
+    return table("The worst plants that were found, in physical words. Each reaches the lower bound named beside it.",
+                 ("what it makes worst", "reaches", "at", "perturbation"), rows, "lrrl")

@@ -1,0 +1,88 @@
+"""Floor to payload: nominal, sampled and worst case, and each axis alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, decibels, hertz
+from avis_ctrl.report.pieces import Section
+from avis_ctrl.study.model import ControllerResult, DesignResult
+
+GAIN_DB = (-60.0, 40.0)
+
+
+def transmissibility(result: DesignResult) -> Section:
+    """The figures of transmissibility."""
+    return Section("Transmissibility", "transmissibility", (_nominal(result), _uncertain(result), _by_axis(result)))
+
+
+def asked_dB(result: DesignResult, omega: np.ndarray) -> np.ndarray:
+    """The limit of the design, with its steps [dB]."""
+    limits = result.design.transmissibility
+    f = omega / (2 * np.pi)
+    inside = (f >= limits.band_Hz[0]) & (f <= limits.band_Hz[1])
+    return np.where(inside, limits.band_dB, limits.peak_dB)
+
+
+def _limit(result: DesignResult) -> Curve:
+    omega = 2 * np.pi * np.geomspace(0.1, 200.0, 2000)
+    return Curve(omega / (2 * np.pi), asked_dB(result, omega), "asked of the synthesis", STYLES["limit"])
+
+
+def _sigma(c: ControllerResult) -> Curve:
+    return Curve(_hz(c), decibels(c.transmissibility.sigma), c.title, STYLES[c.name])
+
+
+def _hz(c: ControllerResult) -> np.ndarray:
+    return c.transmissibility.omega / (2 * np.pi)
+
+
+def _panel(curves: list[Curve], bands: list[Band], title: str, ranged: tuple[float, float] = GAIN_DB) -> Panel:
+    return Panel(hertz(0.1, 200.0), Axis("largest gain [dB]", "linear", ranged), tuple(curves), tuple(bands), title)
+
+
+def _nominal(result: DesignResult) -> Figure:
+    mu, passive = result.controller("mu"), result.controller("passive")
+    caption = (f"Largest singular value from floor velocity to payload velocity, nominal plant. At rest the table "
+               f"peaks at {words.decibel(passive.peak_transmissibility)}, under the mu controller at "
+               f"{words.decibel(mu.peak_transmissibility)}.")
+    curves = [_sigma(c) for c in result.controllers]
+    unstable = [c.title for c in result.controllers if not c.stable]
+    if unstable:
+        caption += f" Not stable, so its curve is a frequency response only: {words.joined(unstable)}."
+    return Figure("transmissibility_nominal", caption, (_panel([*curves, _limit(result)], [], ""),))
+
+
+def _uncertain(result: DesignResult) -> Figure:
+    panels = []
+    for name in ("mu", "skyhook"):
+        c = result.controller(name)
+        T = c.transmissibility
+        style = STYLES[name]
+        worst = Curve(_hz(c), decibels(T.worst), "upper bound over the whole set", STYLES["plain"])
+        band = Band(_hz(c), decibels(T.low), decibels(T.high), f"{c.title}: range over sampled plants", style)
+        panels.append(_panel([_sigma(c), worst, _limit(result)], [band], c.title))
+    return Figure("transmissibility_uncertain", _spread_words(result), tuple(panels))
+
+
+def _spread_words(result: DesignResult) -> str:
+    parts = []
+    for name in ("mu", "skyhook"):
+        c = result.controller(name)
+        parts.append(f"{c.title}: sampled plants peak at {words.decibel(float(np.max(c.transmissibility.high)))}, the "
+                     f"bound at {words.decibel(c.worst_peak.upper)}")
+    return ("Largest singular value over the uncertainty set: nominal (line), range over the sampled plants (area), and "
+            f"the upper bound that no plant of the set exceeds. {'; '.join(parts)}. A bound that is missing at some "
+            "frequency was not computed there.")
+
+
+def _by_axis(result: DesignResult) -> Figure:
+    panels = []
+    for k, axis in enumerate(result.plant.axes):
+        curves = [Curve(_hz(c), decibels(c.transmissibility.nominal[:, k, k]), c.title, STYLES[c.name])
+                  for c in result.controllers]
+        panels.append(Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", GAIN_DB), tuple(curves), (),
+                            f"{words.axis(axis)}: floor to payload along the same axis"))
+    return Figure("transmissibility_axes", "Each axis alone, nominal plant: payload velocity over floor velocity along "
+                  "the same axis, without the coupling between axes.", tuple(panels))

@@ -1,0 +1,98 @@
+"""What was asked, what was measured; and the controllers beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from avis_ctrl.report import words
+from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Section, table
+from avis_ctrl.study.model import Bound, ControllerResult, DesignResult, Requirement
+
+
+def verdict(result: DesignResult) -> Section:
+    """The verdict table, with one sentence above it that says what was achieved."""
+    rows = [(r.name, f"{r.comparison} {words.quantity(r.limit, r.unit)}", words.quantity(r.value, r.unit),
+             Mark("met" if r.met else "NOT MET", r.met), r.note) for r in result.requirements]
+    asked = [table("What the design asks and what was measured on the mu controller. Decibels count the largest "
+                   "singular value from floor to payload, rotations as displacement of the edge.",
+                   ("requirement", "asked", "measured", "verdict", "note"), rows, "lrrcl")] if rows else []
+    notes = [Paragraph(note, "note") for note in result.notes]
+    return Section("Verdict", "verdict", (_sentence(result), *asked, *notes))
+
+
+def _sentence(result: DesignResult) -> Paragraph:
+    missed = [r for r in result.requirements if not r.met]
+    simulation = getattr(result.simulation, "passed", None)
+    begin = _counted(result.requirements, missed)
+    if simulation is False:
+        begin += " The closed-loop simulation did not pass every check."
+    good = None if not result.requirements else not missed and simulation is not False
+    return Paragraph(f"{begin} {_achieved(result)}", "verdict", good)
+
+
+def _counted(requirements: tuple[Requirement, ...], missed: list[Requirement]) -> str:
+    if not requirements:
+        return "The design file asks for nothing, so nothing is judged."
+    if missed:
+        return (f"{len(missed)} of {len(requirements)} requirements {'is' if len(missed) == 1 else 'are'} not met: "
+                f"{words.joined([r.name for r in missed])}.")
+    return f"All {len(requirements)} requirements are met."
+
+
+def _achieved(result: DesignResult) -> str:
+    mu = result.controller("mu")
+    low, high = result.design.transmissibility.band_Hz
+    if not np.isfinite(mu.worst_peak.upper):
+        return ("The mu controller is not shown to be stable for every plant of the uncertainty set, so no worst-case "
+                "transmissibility can be stated.")
+    sure = "" if mu.worst_peak.guaranteed and mu.worst_band.guaranteed else " at the computed frequencies"
+    return (f"For every plant of the uncertainty set the mu controller keeps the transmissibility at or below "
+            f"{words.decibel(mu.worst_peak.upper)} at any frequency and {words.decibel(mu.worst_band.upper)} from "
+            f"{low:g} to {high:g} Hz{sure}; the table at rest amplifies by "
+            f"{words.decibel(result.controller('passive').peak_transmissibility)} at its resonance.")
+
+
+def comparison(result: DesignResult) -> Section:
+    """All controllers in one table."""
+    low, high = result.design.transmissibility.band_Hz
+    rows: list[tuple[str, Callable[[ControllerResult], Cell]]] = [
+        ("order", lambda c: str(c.order)),
+        ("gamma, nominal weighted loop", lambda c: words.bound(c.gamma)),
+        ("mu, upper bound", lambda c: words.bound(c.mu.upper, 4)),
+        ("mu, lower bound", lambda c: words.bound(c.mu.lower, 4)),
+        ("mu peaks at", lambda c: words.hertz(c.mu.omega)),
+        ("stable, nominal", lambda c: Mark("yes", True) if c.stable else Mark("no", False)),
+        ("stable for the whole set", _robustly_stable),
+        ("peak transmissibility, nominal", lambda c: words.decibel(c.peak_transmissibility)),
+        ("peak transmissibility, worst case", lambda c: words.decibel(c.worst_peak.upper)),
+        (f"worst case over {low:g} to {high:g} Hz", lambda c: words.decibel(c.worst_band.upper)),
+        ("payload velocity r.m.s., worst axis", lambda c: words.micro(max(c.site.velocity_rms.values()), "m/s")),
+        ("of which from sensor noise", lambda c: words.micro(max(c.site.noise_rms.values()), "m/s")),
+        ("vibration criterion met", lambda c: c.site.rating or "none"),
+        ("largest voltage r.m.s.", lambda c: _volts(c.site.volts_rms)),
+        ("largest voltage, once in 10 min", lambda c: _volts(c.site.volts_peak)),
+        ("fastest pole", lambda c: f"{words.number(c.fastest_pole_Hz)} Hz" if c.K is not None else "none"),
+    ]
+    controllers = result.controllers
+    body = [(name, *(value(c) for c in controllers)) for name, value in rows]
+    notes = [Paragraph(f"{c.title}: {'; '.join(c.notes)}", "note") for c in controllers if c.notes]
+    floor = controllers[0].site.floor_rating
+    return Section("Controllers compared", "comparison", (
+        table("Every controller measured in the same way on the same plants. Worst cases are upper bounds over the "
+              "whole uncertainty set; \"unstable\" means that the set holds a plant that the controller does not "
+              f"stabilise, or is not shown to. The floor itself meets {floor or 'no criterion'}.",
+              ("", *(c.title for c in controllers)), body), *notes))
+
+
+def _robustly_stable(c: ControllerResult) -> Cell:
+    bound: Bound = c.stability
+    if not c.stable or bound.lower >= 1:
+        return Mark("no", False)
+    return Mark("yes", True) if bound.upper < 1 else Mark("not shown", False)
+
+
+def _volts(channels: dict[str, float]) -> str:
+    largest = max(channels.values(), default=0.0)
+    return f"{words.number(largest)} V" if largest > 0 else "none"

@@ -1,0 +1,67 @@
+"""Numbers as people read them: what is not finite is said in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+AXIS_WORDS = {"phi_x_edge": "phi_x (edge)", "phi_y_edge": "phi_y (edge)", "phi_z_edge": "phi_z (edge)"}
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number with so many digits; thousands not as powers of ten."""
+    if np.isnan(value):
+        return "not computed"
+    if np.isinf(value):
+        return "unbounded"
+    if value != 0 and (abs(value) >= 1e5 or abs(value) < 1e-3):
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{mantissa}e{int(exponent)}".replace("-", "−")
+    rounded = float(f"{value:.{digits}g}")
+    places = max(0, digits - 1 - int(np.floor(np.log10(abs(rounded))))) if rounded else 0
+    return f"{rounded:.{places}f}".replace("-", "−")
+
+
+def bound(value: float, digits: int = 3) -> str:
+    """A bound of mu or of a gain; infinite where the set holds an unstable plant."""
+    return "unstable" if np.isinf(value) else number(value, digits)
+
+
+def decibel(gain: float) -> str:
+    """A gain in dB, with its sign."""
+    if np.isnan(gain):
+        return "not computed"
+    if np.isinf(gain):
+        return "unstable"
+    return f"{20 * np.log10(gain):+.1f} dB".replace("-", "−") if gain > 0 else "none"
+
+
+def quantity(value: float, unit: str, digits: int = 3) -> str:
+    """A number with its unit; a decibel with its sign."""
+    if unit == "dB":
+        return "unstable" if np.isposinf(value) else f"{value:+.1f} dB".replace("-", "−")
+    return f"{bound(value, digits)} {unit}".strip()
+
+
+def micro(value: float, unit: str) -> str:
+    """A small number in millionths of its unit."""
+    return f"{number(1e6 * value)} µ{unit}"
+
+
+def hertz(omega: float) -> str:
+    """A frequency [rad/s] in Hz."""
+    return f"{number(omega / (2 * np.pi))} Hz" if np.isfinite(omega) else "none"
+
+
+def axis(name: str) -> str:
+    """An axis as it is called in text."""
+    return AXIS_WORDS.get(name, name)
+
+
+def yes(value: bool) -> str:
+    """yes or no."""
+    return "yes" if value else "no"
+
+
+def joined(names: list[str] | tuple[str, ...]) -> str:
+    """a, b and c."""
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else list(names))
