@@ -42,7 +42,10 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
     if not system.ninputs or not system.noutputs:
         return PeakGain(0.0, 0.0)
     poles = system.poles()
-    candidates = np.concatenate([[0.0, np.inf], np.abs(poles), np.abs(poles.imag),
+    sizes = np.abs(poles[poles != 0]) if np.any(poles) else np.ones(1)
+    # A coarse grid catches flat responses, whose Hamiltonian eigenvalues are ill conditioned.
+    grid = np.geomspace(0.1 * np.min(sizes), 10 * np.max(sizes), 100)
+    candidates = np.concatenate([[0.0, np.inf], grid, np.abs(poles), np.abs(poles.imag),
                                  np.sqrt(np.maximum(np.abs(poles) ** 2 - 2 * poles.real ** 2, 0.0))])
     omega, level = _best(system, candidates)
     if level == 0.0:
@@ -86,15 +89,24 @@ def _level_crossings(system: StateSpace, level: float) -> np.ndarray:
     F = A + B @ gain_x
     BR = B @ np.linalg.solve(R, B.T)
     Q = C.T @ C + C.T @ D @ gain_x
-    # Scale the two halves alike, so that one eigenvalue call does not mix magnitudes.
-    t = np.sqrt(np.linalg.norm(Q) / np.linalg.norm(BR)) if np.any(BR) and np.any(Q) else 1.0
-    H = np.block([[F, t * BR], [-Q / t, -F.T]])
-    eigenvalues = la.eigvals(H)
-    scale = np.maximum(np.abs(eigenvalues), 1e-8 * np.max(np.abs(eigenvalues)))
+    scale = symplectic_scale(F, BR, Q)
+    eigenvalues = la.eigvals(np.block([[F / scale[:, None] * scale, BR / np.outer(scale, scale)],
+                                       [-Q * np.outer(scale, scale), -(F / scale[:, None] * scale).T]]))
+    size = np.maximum(np.abs(eigenvalues), 1e-12 * np.max(np.abs(eigenvalues)))
     # Round-off moves the crossings of a flat response far off the axis (a nearly multiple eigenvalue). The caller
     # evaluates the response at every frequency returned, so one too many costs little and one too few the norm.
-    on_axis = np.abs(eigenvalues.real) < NEAR_AXIS * scale
+    on_axis = np.abs(eigenvalues.real) < NEAR_AXIS * size
     return np.unique(np.abs(eigenvalues[on_axis].imag))
+
+
+def symplectic_scale(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
+    """State scaling d (powers of two): diag(d, 1/d) evens out the Hamiltonian [A R; -Q -A'] and keeps it one."""
+    n = A.shape[0]
+    magnitude = np.abs(np.block([[A, R], [-Q, -A.T]]))
+    np.fill_diagonal(magnitude, 0.0)
+    _, (both, _) = la.matrix_balance(magnitude, permute=False, separate=True)
+    logs = np.log2(both)
+    return np.exp2(np.round((logs[:n] - logs[n:]) / 2))
 
 
 def bilinear_to_continuous(system: StateSpace) -> StateSpace:

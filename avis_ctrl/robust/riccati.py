@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
+from avis_ctrl.lti.norms import symplectic_scale
+
 AXIS_TOLERANCE = 1e-10
 LAGRANGIAN_TOLERANCE = 1e-6
 ON_AXIS = "the Hamiltonian has eigenvalues on the imaginary axis"
@@ -36,7 +38,7 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolutio
     n = A.shape[0]
     if n == 0:
         return RiccatiSolution(np.zeros((0, 0)), True)
-    scale = _symplectic_scale(A, R, Q)
+    scale = symplectic_scale(A, R, Q)
     a, r, q = A / scale[:, None] * scale, R / np.outer(scale, scale), Q * np.outer(scale, scale)
     H = np.block([[a, r], [-q, -a.T]])
     if not np.all(np.isfinite(H)):
@@ -66,16 +68,6 @@ def riccati_residual(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray)
     terms = (A.T @ X, X @ R @ X, Q)
     size = max(float(la.norm(term)) for term in terms) or 1.0
     return float(la.norm(terms[0] + terms[0].T + terms[1] + Q)) / size
-
-
-def _symplectic_scale(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """State scaling d (powers of two): diag(d, 1/d) evens out the Hamiltonian and keeps it Hamiltonian."""
-    n = A.shape[0]
-    magnitude = np.abs(np.block([[A, R], [-Q, -A.T]]))
-    np.fill_diagonal(magnitude, 0.0)
-    _, (both, _) = la.matrix_balance(magnitude, permute=False, separate=True)
-    logs = np.log2(both)
-    return np.exp2(np.round((logs[:n] - logs[n:]) / 2))
 
 
 def _schur_eigenvalues(T: np.ndarray) -> np.ndarray:
