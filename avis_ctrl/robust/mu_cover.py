@@ -173,7 +173,8 @@ def _split_or_raise(N: StateSpace, bound: Callable[[Array], Array], state: Cover
 
 
 def _is_narrow(gap: Interval) -> bool:
-    return gap[1] - gap[0] <= NARROW * gap[1]
+    # A gap that ends at 0 or infinity is halved (doubled) until the response there has settled.
+    return np.isfinite(gap[1]) and gap[1] - gap[0] <= NARROW * gap[1]
 
 
 def _without(gap: Interval, parts: list[Interval]) -> list[Interval]:

@@ -283,5 +283,6 @@ def follow(space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array 
     if held.size:
         centred, _ = _centre(space, M[held], theta[held], lam[held])
         good = np.all(np.isfinite(centred), axis=1)
+        good[good] &= _inside(space, M[held[good]], centred[good], lam[held[good]])
         theta[held[good]] = centred[good]
     return theta, lam

@@ -55,7 +55,8 @@ def _all_pass(value: complex, omega: float) -> StateSpace:
         return gain(value.real)
     if not 0 < omega < np.inf:
         raise ComputationError("a real system cannot be complex at frequency 0 or infinity",
-                               measured=f"delta {value:.6g}", next_step="take the perturbation of a neighbouring frequency")
+                               measured=f"delta {value:.6g}",
+                               next_step="take the perturbation of a neighbouring frequency")
     sign, phase = (1.0, angle) if angle > 0 else (-1.0, angle + np.pi)
     a = omega / float(np.tan((np.pi - phase) / 2))
     # (s - a)/(s + a) = 1 - 2a/(s + a)
