@@ -81,7 +81,7 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
     floor, natural = direct_term_bound(plant), _natural_gamma(plant)
     nothing = ZERO_GAMMA * natural
     start = max(hint or natural, floor * (1 + 2 * tolerance), nothing)
-    search = _Search(plant, floor, start)
+    search = _Search(plant, floor)
     step, factor = start, 1.05 if hint else 4.0
     while search.upper is None:
         search.try_gamma(step)
@@ -107,8 +107,8 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
 class _Search:
     """State of the search for gamma: the bracket and the couplings seen so far."""
 
-    def __init__(self, plant: Plant, floor: float, start: float):
-        self.plant, self.lower, self.start = plant, floor, start
+    def __init__(self, plant: Plant, floor: float):
+        self.plant, self.lower = plant, floor
         self.upper: GammaTest | None = None
         self.below: GammaTest | None = None
         self.second: GammaTest | None = None

@@ -63,13 +63,6 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolutio
     return RiccatiSolution(X, lowest >= -max(1e-13 * n, 10 * asymmetry))
 
 
-def riccati_residual(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> float:
-    """Norm of A'X + XA + XRX + Q, relative to the largest of its terms."""
-    terms = (A.T @ X, X @ R @ X, Q)
-    size = max(float(la.norm(term)) for term in terms) or 1.0
-    return float(la.norm(terms[0] + terms[0].T + terms[1] + Q)) / size
-
-
 def _schur_eigenvalues(T: np.ndarray) -> np.ndarray:
     """Eigenvalues of a real quasi-triangular matrix in LAPACK's standard form (equal diagonals in 2 x 2 blocks)."""
     values = np.diag(T).astype(complex)

@@ -1,0 +1,68 @@
+"""Riccati equations with an indefinite quadratic term, against scipy, closed forms and their own residual."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from avis_ctrl.robust.riccati import ON_AXIS, solve_riccati
+
+
+def residual(A, R, Q, X):
+    terms = (A.T @ X, X @ A, X @ R @ X, Q)
+    return la.norm(sum(terms)) / max(la.norm(term) for term in terms)
+
+
+@given(st.integers(0, 2 ** 31), st.integers(1, 12))
+@settings(max_examples=40, deadline=None)
+def test_definite_case_agrees_with_scipy(seed, n):
+    rng = np.random.default_rng(seed)
+    A, B, C = rng.standard_normal((n, n)), rng.standard_normal((n, 2)), rng.standard_normal((n, n))
+    ours = solve_riccati(A, -B @ B.T, C.T @ C)
+    assert ours.X is not None and ours.semidefinite
+    np.testing.assert_allclose(ours.X, la.solve_continuous_are(A, B, C.T @ C, np.eye(2)), rtol=1e-6,
+                               atol=1e-8 * la.norm(ours.X))
+
+
+@pytest.mark.parametrize("gamma", [0.6, 1.5, 10.0])
+def test_indefinite_scalar_in_closed_form(gamma):
+    """2 a x + (1/gamma^2 - 1) x^2 + 1 = 0, stabilising root x = 1 / (sqrt(a^2 + 1 - 1/gamma^2) - a)."""
+    a = -2.0
+    found = solve_riccati(np.array([[a]]), np.array([[gamma ** -2 - 1]]), np.eye(1))
+    assert found.X is not None and found.semidefinite
+    assert found.X[0, 0] == pytest.approx(1 / (np.sqrt(a * a + 1 - gamma ** -2) - a))
+
+
+def test_negative_solution_is_seen():
+    """x^2 / 2 + 2 x + 1 = 0 has roots -2 +- sqrt(2); 1 + x / 2 is stable for the lower one."""
+    found = solve_riccati(np.array([[1.0]]), np.array([[0.5]]), np.array([[1.0]]))
+    assert found.X is not None and not found.semidefinite
+    assert found.X[0, 0] == pytest.approx(-(2 + np.sqrt(2)))
+
+
+def test_no_solution_when_the_gain_is_below_the_norm():
+    """Bounded real lemma for 1/(s^2 + 2 zeta s + 1): a solution exists only for gamma above the peak gain."""
+    zeta = 0.01
+    A, B, C = np.array([[0.0, 1.0], [-1.0, -2 * zeta]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
+    norm = 1 / (2 * zeta * np.sqrt(1 - zeta ** 2))
+    below, above = (solve_riccati(A, B @ B.T / (f * norm) ** 2, C.T @ C) for f in (0.9999, 1.0001))
+    assert below.X is None and below.reason == ON_AXIS
+    assert above.X is not None and above.semidefinite
+
+
+@given(st.integers(0, 2 ** 31))
+@settings(max_examples=30, deadline=None)
+def test_units_of_the_states_do_not_matter(seed):
+    rng = np.random.default_rng(seed)
+    A, B, C = rng.standard_normal((5, 5)), rng.standard_normal((5, 1)), rng.standard_normal((2, 5))
+    d = 10.0 ** rng.uniform(-6, 6, 5)
+    A_d, R_d, Q_d = A / d[:, None] * d, -(B @ B.T) / np.outer(d, d), C.T @ C * np.outer(d, d)
+    plain, scaled = solve_riccati(A, -B @ B.T, C.T @ C), solve_riccati(A_d, R_d, Q_d)
+    assert plain.X is not None and scaled.X is not None
+    back = scaled.X / np.outer(d, d)
+    np.testing.assert_allclose(back, plain.X, rtol=1e-6, atol=1e-8 * la.norm(plain.X))
+    assert residual(A, -B @ B.T, C.T @ C, back) < 1e-9
+    assert np.max(la.eigvals(A - B @ B.T @ back).real) < 0
