@@ -23,7 +23,8 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 FIT_TOLERANCE = 3e-3
 MATRIX_FIT_TOLERANCE = 1e-2
 MAX_ORDER = 6
-FLOOR = 0.5
+# Below this share of the peak a loop has room for any misfit; from here up its own mu is the yardstick.
+PROFILE_FLOOR = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +46,11 @@ class PointwiseScalings:
     def peak(self) -> float:
         return float(np.max(self.mu))
 
+    @property
+    def yardstick(self) -> np.ndarray:
+        """What the loop scaled by realised D(s) is compared with (n_omega,): mu, or a share of its peak."""
+        return np.maximum(self.mu, PROFILE_FLOOR * self.peak)
+
     @staticmethod
     def of(omega: np.ndarray, M: np.ndarray, structure: BlockStructure, tolerance: float = 2e-3) -> PointwiseScalings:
         """From the response M (n_omega, n_z, n_w) of the loop; the last block is performance, none is real."""
@@ -61,7 +67,7 @@ class PointwiseScalings:
 
 @dataclass(frozen=True)
 class DStep:
-    """Realised scalings, the peak of the loop they scale, and its ratio to the peak of mu (1 + cost)."""
+    """Realised scalings, the peak of the loop they scale, and their cost: largest excess over the yardstick."""
 
     scalings: Scalings
     peak: float
@@ -72,7 +78,7 @@ def choose_scalings(points: PointwiseScalings, allowed_cost: float = 0.01, max_s
                     start: Scalings | None = None) -> DStep:
     """Greedy search for the smallest orders whose realised scalings cost less than `allowed_cost` of peak mu.
 
-    All orders start at zero; the block whose misfit accounts for most of the excess gets one more, as long as
+    All orders start at zero; the blocks whose misfit accounts for most of the excess get one more, as long as
     the scaled plant gains at most `max_states` states. `start` (scalings of the last iteration) is tried too.
     """
     best = _evaluated(points, _refined(points, _constants(points)))
@@ -80,27 +86,23 @@ def choose_scalings(points: PointwiseScalings, allowed_cost: float = 0.01, max_s
         again = _evaluated(points, _refined(points, start))
         if again.cost <= allowed_cost < best.cost and again.scalings.added_states <= max_states:
             best = again
-    exhausted: set[int] = set()
     while best.cost > allowed_cost:
         share = _blame(points, best.scalings)
-        share[list(exhausted)] = 0.0
-        if not np.any(share > 0):
+        candidates = (_raised(points, best, np.flatnonzero(share >= part * np.max(share)), max_states, by)
+                      # One more order may not pay where two do: a resonance needs a pair of roots.
+                      for part, by in ((0.4, 1), (0.4, 2), (0.999, 1), (0.999, 2)))
+        better = next((new for new in candidates if new is not None and new.cost < max(0.9 * best.cost, allowed_cost)),
+                      None)
+        if better is None or not np.any(share > 0):
             break
-        k = int(np.argmax(share))
-        candidate = _raised(points, best, k, max_states)
-        if candidate is None or candidate.cost > max(0.9 * best.cost, allowed_cost):
-            # One more order did not pay; two may (a resonance needs a pair of roots).
-            candidate = _raised(points, best, k, max_states, 2)
-        if candidate is None or candidate.cost > max(0.95 * best.cost, allowed_cost):
-            exhausted.add(k)
-            continue
-        best, exhausted = candidate, set()
+        best = better
     return best
 
 
 def band_of(omega: np.ndarray) -> tuple[float, float]:
-    """Where roots of scalings may lie [rad/s]: beyond the frequencies looked at they would only cost accuracy."""
-    return float(np.min(omega)), float(np.max(omega))
+    """Where roots of scalings may lie [rad/s]: a decade inside the frequencies looked at, so that D is flat beyond."""
+    low, high = float(np.min(omega)), float(np.max(omega))
+    return (10 * low, high / 10) if high > 1e3 * low else (low, high)
 
 
 def peak_of(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
@@ -111,8 +113,7 @@ def peak_of(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
 
 def _evaluated(points: PointwiseScalings, scalings: Scalings) -> DStep:
     sigma = peak_of(points, scalings)
-    reference = np.maximum(points.mu, FLOOR * points.peak)
-    return DStep(scalings, float(np.max(sigma)), float(np.max(sigma / reference)) - 1)
+    return DStep(scalings, float(np.max(sigma)), float(np.max(sigma / points.yardstick)) - 1)
 
 
 def _constants(points: PointwiseScalings) -> Scalings:
@@ -127,25 +128,26 @@ def _constants(points: PointwiseScalings) -> Scalings:
     return Scalings(points.structure, tuple(parts))
 
 
-def _raised(points: PointwiseScalings, step: DStep, k: int, max_states: int, by: int = 1) -> DStep | None:
-    """The step with block k refitted at a higher order and everything refined; None where it may not grow."""
-    part = step.scalings.parts[k]
-    weight = _sensitivity(points, step.scalings, k)
-    new: ScalarScaling | MatrixScaling
-    if isinstance(part, MatrixScaling):
-        degree = part.order // part.system.ninputs + by
-        if degree > MAX_ORDER // 2:
+def _raised(points: PointwiseScalings, step: DStep, blocks: np.ndarray, max_states: int, by: int) -> DStep | None:
+    """The step with some blocks refitted at a higher order and everything refined; None where they may not grow."""
+    scalings = step.scalings
+    for k in blocks:
+        order = scalings.parts[k].order // (points.structure.blocks[k].rows if k in points.X else 1) + by
+        if order > (MAX_ORDER // 2 if k in points.X else MAX_ORDER):
             return None
-        new = fit_hermitian(points.omega, points.X[k], degree, weight, MATRIX_FIT_TOLERANCE).scaling
-    else:
-        if part.order + by > MAX_ORDER:
-            return None
-        fit = fit_magnitude(points.omega, np.exp(points.log_d[:, k]), part.order + by, weight, FIT_TOLERANCE)
-        new = fit.scaling.within(band_of(points.omega))
-    scalings = step.scalings.replace(k, new)
+        scalings = scalings.replace(k, _fitted(points, step.scalings, k, order))
     if scalings.added_states > max_states:
         return None
     return _evaluated(points, _refined(points, scalings))
+
+
+def _fitted(points: PointwiseScalings, scalings: Scalings, k: int, order: int) -> ScalarScaling | MatrixScaling:
+    """Block k fitted to its best scalings at each frequency, weighted by what a misfit costs."""
+    weight = _sensitivity(points, scalings, k)
+    if k in points.X:
+        return fit_hermitian(points.omega, points.X[k], order, weight, MATRIX_FIT_TOLERANCE).scaling
+    fit = fit_magnitude(points.omega, np.exp(points.log_d[:, k]), order, weight, FIT_TOLERANCE)
+    return fit.scaling.within(band_of(points.omega))
 
 
 def _closeness(points: PointwiseScalings) -> np.ndarray:
@@ -168,7 +170,7 @@ def _blame(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
     """How much of the excess over the peak each block's misfit explains (n_blocks,), to first order."""
     left, right = scalings.response(points.omega)
     U, s, Vh = np.linalg.svd(left @ points.M @ right)
-    excess = np.maximum(np.log(s[:, 0] / np.maximum(points.mu, FLOOR * points.peak)), 0.0)
+    excess = np.maximum(np.log(s[:, 0] / points.yardstick), 0.0)
     share = np.zeros(len(scalings.parts))
     for k, (_, w, z) in enumerate(points.structure.slices()):
         part = scalings.parts[k]
@@ -186,7 +188,7 @@ def _blame(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
     return share
 
 
-def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 12) -> Scalings:
+def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 8) -> Scalings:
     """Sequential linear programs in a trust region on max over frequency of log sigma_max(D N D^-1)."""
     if not free_parameters(scalings):
         return scalings
@@ -216,7 +218,7 @@ def _linearised(points: PointwiseScalings, scalings: Scalings, kept: int = 3) ->
     U, s, Vh = np.linalg.svd(left @ points.M @ right)
     kept = min(kept, s.shape[1])
     log_s = np.log(np.maximum(s[:, :kept], 1e-300))
-    log_ref = np.log(np.maximum(points.mu, FLOOR * points.peak))
+    log_ref = np.log(points.yardstick)
     top = np.argwhere(log_s - log_ref[:, None] > np.max(log_s[:, 0] - log_ref) - 0.7)
     at, which = top[:, 0], top[:, 1]
     u, v = np.swapaxes(U, 1, 2)[at, which], Vh[at, which]

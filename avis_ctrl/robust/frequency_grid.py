@@ -25,7 +25,9 @@ def frequency_grid(system: StateSpace, change: float = 1e-3) -> np.ndarray:
     last = min(wide.size - int(np.argmax(from_end[::-1])), wide.size - 1)
     low, high = wide[min(first, last - 1)], wide[max(last, first + 1)]
     even = np.geomspace(low, high, max(30, int(POINTS_PER_DECADE * np.log10(high / low))))
-    return merged(even, _resonances(poles, low, high))
+    # A decade more on either side shows scalings settle where the loop has settled already.
+    ends = np.concatenate([low / np.array([10.0, 3.0]), high * np.array([3.0, 10.0])])
+    return merged(np.concatenate([even, ends]), _resonances(poles, low, high))
 
 
 def _resonances(poles: np.ndarray, low: float, high: float) -> np.ndarray:

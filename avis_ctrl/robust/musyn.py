@@ -12,26 +12,28 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import StateSpace, lft_lower
-from avis_ctrl.robust.dstep import PointwiseScalings, choose_scalings
-from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
+from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
+from avis_ctrl.robust.dstep import DStep, PointwiseScalings, band_of, choose_scalings
+from avis_ctrl.robust.frequency_grid import frequency_grid, merged, refined_grid
 from avis_ctrl.robust.gamma_descent import descend, grown
 from avis_ctrl.robust.hinf_plant import as_plant
-from avis_ctrl.robust.hinfsyn import hinfsyn
+from avis_ctrl.robust.hinfsyn import Synthesis, hinfsyn
 from avis_ctrl.robust.mu_peak import mu_peak
-from avis_ctrl.robust.musyn_state import Iteration, Loop, State
+from avis_ctrl.robust.musyn_state import Iteration, Loop, State, analysed
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 # An iteration that lowers the best gamma by less than this share has stalled.
 STALL = 0.005
+NORM_TOLERANCE = 1e-6
 DONE = "done"
+FOLLOWING = {"D-K": "descent", "descent": "growth", "growth": DONE}
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +54,7 @@ class MuSynthesis:
     omega_peak: float
     mu_upper_complex: float
     guaranteed: bool
-    delta: np.ndarray
+    delta: np.ndarray | None
     blocks: BlockStructure
     scalings: Scalings
     gamma: float
@@ -70,13 +72,14 @@ class _Options:
     deadline: float
     max_iterations: int
     backoff: float
+    polish: bool
     max_added_states: int
     callback: Callable[[Iteration], Any] | None
 
 
 def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: int, *,
           callback: Callable[[Iteration], Any] | None = None, target: float | None = None,
-          time_limit: float | None = None, max_iterations: int = 30, backoff: float = 0.01,
+          time_limit: float | None = None, max_iterations: int = 30, backoff: float = 0.01, polish: bool = True,
           max_added_states: int | None = None, state: dict[str, Any] | None = None,
           sample_rate_Hz: float | None = None) -> MuSynthesis:
     """Controller u = K y of least peak mu.
@@ -90,6 +93,7 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     target : stop once the scaled loop is measured below this (mu is then below it at every frequency).
     time_limit : seconds after which no further iteration starts.
     backoff : distance from the H-infinity optimum at which each controller is taken.
+    polish : go on with descent on gamma where D-K iteration stalls (and orders that grow where that pays).
     max_added_states : most states that all scalings together may add to the plant.
     state : `saved_state` of an earlier result, to go on from.
     sample_rate_Hz : the controller's fastest pole is compared with half of it, in `notes`.
@@ -101,8 +105,8 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     """
     P = as_plant(P, nmeas, ncon)
     uncertainty, structure = _structures(P, blocks, nmeas, ncon)
-    cap = 2 * P.nstates + 20 if max_added_states is None else max_added_states
-    options = _options(target, time_limit, max_iterations, backoff, cap, callback)
+    cap = P.nstates + 20 if max_added_states is None else max_added_states
+    options = _options(target, time_limit, max_iterations, backoff, polish, cap, callback)
     problem = _Problem(P, structure, nmeas, ncon)
     with threadpool_limits(1, user_api="blas"):
         current = State() if state is None else State.from_dict(state, structure, P, nmeas, ncon)
@@ -126,19 +130,19 @@ def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: 
     return full, full.complexified()
 
 
-def _options(target: float | None, time_limit: float | None, max_iterations: int, backoff: float, cap: int,
-             callback: Callable[[Iteration], Any] | None) -> _Options:
+def _options(target: float | None, time_limit: float | None, max_iterations: int, backoff: float, polish: bool,
+             cap: int, callback: Callable[[Iteration], Any] | None) -> _Options:
     for field, value in (("target", target), ("time_limit", time_limit)):
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError("expected a positive number or None", field=field, value=value)
     if int(max_iterations) != max_iterations or max_iterations < 1:
         raise InputError("expected a whole number of at least 1", field="max_iterations", value=max_iterations)
-    if not (np.isfinite(backoff) and 0 < backoff < 1):
-        raise InputError("expected a number between 0 and 1", field="backoff", value=backoff)
+    if not (np.isfinite(backoff) and 0 <= backoff < 1):
+        raise InputError("expected a number from 0 to below 1", field="backoff", value=backoff)
     if cap < 0:
         raise InputError("expected a number of at least 0", field="max_added_states", value=cap)
     deadline = np.inf if time_limit is None else time.monotonic() + time_limit
-    return _Options(target, deadline, int(max_iterations), backoff, int(cap), callback)
+    return _Options(target, deadline, int(max_iterations), backoff, polish, int(cap), callback)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,28 +159,39 @@ def _iterate(problem: _Problem, state: State, options: _Options) -> tuple[State,
         if status := _no_further(state, options):
             return state, status
         began = time.monotonic()
-        scalings, cost, kind = _proposed(problem, state, options)
-        if scalings is None:
-            state = replace(state, phase="descent" if state.phase == "D-K" else DONE)
+        proposal = _proposed(problem, state, options)
+        synthesis = _k_step(problem, state, proposal, options) if proposal else None
+        if proposal is None or synthesis is None:
+            state = replace(state, phase=FOLLOWING[state.phase])
             continue
-        hint = state.best.gamma if state.best else None
-        synthesis = hinfsyn(scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff,
-                            gamma_hint=hint)
+        scalings, cost, kind = proposal
         loop = Loop(synthesis.K, scalings, synthesis.gamma)
-        omega = frequency_grid(synthesis.closed_loop) if not state.omega.size else state.omega
-        points = _analysed(problem, loop, omega)
+        points = analysed(problem.P, loop.K, problem.structure, _next_grid(state, synthesis.closed_loop))
         row = Iteration(len(state.history), synthesis.gamma, points.peak, synthesis.K.nstates, cost,
                         sum(scalings.orders), time.monotonic() - began, kind)
-        state = _recorded(state, loop, row, refined_grid(omega, points.mu))
+        state = _recorded(state, loop, row, points)
         answer = options.callback(row) if options.callback else None
         if answer is False or answer == "stop":
             return state, "stopped by the callback"
+
+
+def _k_step(problem: _Problem, state: State, proposal: _Proposal, options: _Options) -> Synthesis | None:
+    """H-infinity controller of the scaled plant; None where scalings, not the plant, make it fail."""
+    try:
+        return hinfsyn(proposal.scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff,
+                       gamma_hint=state.best.gamma if state.best else None)
+    except ComputationError:
+        if state.best is None:
+            raise
+        return None
 
 
 def _no_further(state: State, options: _Options) -> str:
     """Why no further iteration starts; empty where one does."""
     if state.phase == DONE:
         return f"converged: neither D-K iteration nor descent on gamma gains {100 * STALL:g} % more"
+    if state.phase != "D-K" and not options.polish:
+        return f"D-K iteration stalled: the last step gained less than {100 * STALL:g} %"
     if options.target is not None and state.best and state.best.gamma <= options.target:
         return f"target {options.target:g} reached"
     if len(state.history) >= options.max_iterations:
@@ -186,42 +201,62 @@ def _no_further(state: State, options: _Options) -> str:
     return ""
 
 
-def _proposed(problem: _Problem, state: State, options: _Options) -> tuple[Scalings | None, float, str]:
-    """The next scalings, what their realisation costs against the best at each frequency, and how they were made."""
-    if state.last is None or state.best is None:
-        return Scalings.identity(problem.structure), 0.0, "H-infinity"
+class _Proposal(NamedTuple):
+    """Scalings, what their realisation costs against the best at each frequency, and how they were made."""
+
+    scalings: Scalings
+    cost: float
+    kind: str
+
+
+def _proposed(problem: _Problem, state: State, options: _Options) -> _Proposal | None:
+    """The next scalings; None where the phase has nothing more to offer."""
+    if state.last is None or state.best is None or state.points is None:
+        return _Proposal(Scalings.identity(problem.structure), 0.0, "H-infinity")
     if state.phase == "D-K":
-        points = _analysed(problem, state.last, state.omega)
-        step = choose_scalings(points, max_states=options.max_added_states, start=state.last.scalings)
-        return step.scalings, step.cost, "D-K"
-    band = (float(state.omega[0]), float(state.omega[-1]))
+        step = _d_step(problem, state.last, state.points, options)
+        return _Proposal(step.scalings, step.cost, "D-K")
+    band = band_of(state.points.omega)
     start = state.best.scalings
     if state.phase == "growth":
         larger = grown(problem.P, problem.nmeas, problem.ncon, start, band, options.max_added_states)
         if larger is None:
-            return None, 0.0, ""
+            return None
         start = larger
     target = 0.0 if options.target is None else options.target / (1 + options.backoff)
     try:
         descent = descend(problem.P, problem.nmeas, problem.ncon, start, band,
                           stop=lambda gamma: gamma <= target or time.monotonic() > options.deadline)
     except ComputationError:
-        return None, 0.0, ""
-    return descent.scalings, 0.0, state.phase
+        return None
+    return _Proposal(descent.scalings, 0.0, state.phase)
 
 
-def _analysed(problem: _Problem, loop: Loop, omega: np.ndarray) -> PointwiseScalings:
-    closed = lft_lower(problem.P, loop.K)
-    return PointwiseScalings.of(omega, closed.frequency_response(omega), problem.structure)
+def _d_step(problem: _Problem, last: Loop, points: PointwiseScalings, options: _Options) -> DStep:
+    """Scalings chosen on the grid and measured on the axis: a peak between the points is added to them."""
+    closed = lft_lower(problem.P, last.K)
+    for _ in range(3):
+        step = choose_scalings(points, max_states=options.max_added_states, start=last.scalings)
+        worst = hinf_norm(step.scalings.scale(closed), 1e-3)
+        if worst.gain <= 1.02 * step.peak or not 0 < worst.omega < np.inf:
+            break
+        points = analysed(problem.P, last.K, problem.structure, merged(points.omega, np.array([worst.omega])))
+    return step
 
 
-def _recorded(state: State, loop: Loop, row: Iteration, omega: np.ndarray) -> State:
+def _next_grid(state: State, closed_loop: StateSpace) -> np.ndarray:
+    """Frequencies of the next analysis: those of the last one, denser at its peaks."""
+    if state.points is None:
+        return frequency_grid(closed_loop)
+    return refined_grid(state.points.omega, state.points.mu)
+
+
+def _recorded(state: State, loop: Loop, row: Iteration, points: PointwiseScalings) -> State:
     """The state after an iteration: the best loop kept, the phase moved on where nothing was gained."""
     gained = np.inf if state.best is None else 1 - loop.gamma / state.best.gamma
     best = loop if gained > 0 else state.best
-    following = {"D-K": "descent", "descent": "growth", "growth": DONE}
-    phase = state.phase if gained > STALL else following[state.phase]
-    return State(phase, omega, loop, best, (*state.history, row))
+    phase = state.phase if gained > STALL else FOLLOWING[state.phase]
+    return State(phase, points, loop, best, (*state.history, row))
 
 
 def _result(problem: _Problem, uncertainty: BlockStructure, state: State, status: str,
@@ -230,17 +265,20 @@ def _result(problem: _Problem, uncertainty: BlockStructure, state: State, status
     best = state.best
     assert best is not None
     closed = lft_lower(problem.P, best.K)
+    # The norm of the scaled loop holds between all frequencies; with real blocks taken as complex it bounds theirs.
+    gamma = hinf_norm(best.scalings.scale(closed), NORM_TOLERANCE).gain * (1 + NORM_TOLERANCE)
     peak = mu_peak(closed, uncertainty)
     has_real = any(block.kind == "real" for block in uncertainty.blocks)
-    complex_peak = mu_peak(closed, problem.structure) if has_real else peak
+    mu_upper = min(peak.upper, gamma)
+    complex_upper = gamma if has_real else mu_upper
     fastest = float(np.max(np.abs(best.K.poles()), initial=0.0))
     notes = []
     if has_real:
-        notes.append(f"real blocks were synthesised for as complex ones: peak mu {complex_peak.upper:.4g} so, "
-                     f"{peak.upper:.4g} with the real blocks real")
+        notes.append(f"real blocks were synthesised for as complex ones: peak mu {complex_upper:.4g} so, "
+                     f"{mu_upper:.4g} with the real blocks real")
     if sample_rate_Hz is not None:
         ratio = fastest / (np.pi * sample_rate_Hz)
         notes.append(f"fastest controller pole {fastest:.4g} rad/s is {ratio:.2g} of half the sample rate")
-    return MuSynthesis(best.K, peak.upper, peak.lower, peak.omega, complex_peak.upper, peak.guaranteed, peak.delta,
-                       uncertainty, best.scalings, best.gamma, closed, fastest, state.history, status, tuple(notes),
+    guaranteed = peak.guaranteed or mu_upper == gamma
+    return MuSynthesis(best.K, mu_upper, peak.lower, peak.omega, complex_upper, guaranteed, peak.delta, uncertainty, best.scalings, gamma, closed, fastest, state.history, status, tuple(notes),
                        state.as_dict(problem.P, problem.nmeas, problem.ncon))

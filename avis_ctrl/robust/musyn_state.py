@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti import StateSpace
+from avis_ctrl.lti import StateSpace, lft_lower
+from avis_ctrl.robust.dstep import PointwiseScalings
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -52,19 +53,19 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Phase ("D-K", "descent", "growth" or "done"), grid [rad/s], last and best loop, history."""
+    """Phase ("D-K", "descent", "growth" or "done"), last loop with its analysis, best loop, history."""
 
     phase: str = "D-K"
-    omega: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    points: PointwiseScalings | None = None
     last: Loop | None = None
     best: Loop | None = None
     history: tuple[Iteration, ...] = ()
 
     def as_dict(self, P: StateSpace, nmeas: int, ncon: int) -> dict[str, Any]:
         """JSON form, with the sizes of the problem it belongs to."""
-        assert self.last is not None and self.best is not None
+        assert self.last is not None and self.best is not None and self.points is not None
         return {"format": FORMAT, "version": VERSION, "problem": [P.nstates, P.ninputs, P.noutputs, nmeas, ncon],
-                "phase": self.phase, "omega": self.omega.tolist(), "last": self.last.as_dict(),
+                "phase": self.phase, "omega": self.points.omega.tolist(), "last": self.last.as_dict(),
                 "best": self.best.as_dict(), "history": [asdict(row) for row in self.history]}
 
     @staticmethod
@@ -82,5 +83,12 @@ class State:
             A, B, C, D = (np.array(item["K"][key], float) for key in "ABCD")
             return Loop(StateSpace(A, B, C, D, 0.0, n_y, n_u), Scalings.from_dicts(structure, item["scalings"]),
                         float(item["gamma"]))
-        return State(str(saved["phase"]), np.array(saved["omega"], float), loop(saved["last"]), loop(saved["best"]),
+        last = loop(saved["last"])
+        points = analysed(P, last.K, structure, np.array(saved["omega"], float))
+        return State(str(saved["phase"]), points, last, loop(saved["best"]),
                      tuple(Iteration(**row) for row in saved["history"]))
+
+
+def analysed(P: StateSpace, K: StateSpace, structure: BlockStructure, omega: np.ndarray) -> PointwiseScalings:
+    """mu and the best scalings of the loop F_l(P, K) at each frequency [rad/s]."""
+    return PointwiseScalings.of(omega, lft_lower(P, K).frequency_response(omega), structure)

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.linalg as la
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, gain
-from avis_ctrl.uncertainty.blocks import Block, BlockStructure
+from avis_ctrl.uncertainty.blocks import BlockStructure
+
+Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,18 +105,24 @@ class ScalarScaling:
         return np.hstack([np.ones((np.size(omega), 1)), _log_modulus(self.theta[1:1 + n], omega)[1],
                           -_log_modulus(self.theta[1 + n:], omega)[1]])
 
-    def realise(self) -> StateSpace:
-        """A cascade of first- and second-order sections, slow ones first."""
+    @cached_property
+    def matrices(self) -> Matrices:
+        """A, B, C, D of a cascade of first- and second-order sections, slow ones first."""
         n = self.order
-        zeros, poles = self.theta[1:1 + n], self.theta[1 + n:]
-        system = gain(np.exp(self.theta[0]))
-        for k in range(n // 2):
-            system = _biquad(*np.exp(zeros[2 * k:2 * k + 2]), *np.exp(poles[2 * k:2 * k + 2])) @ system
-        if n % 2:
-            z, p = np.exp(zeros[-1]), np.exp(poles[-1])
-            root = np.sqrt(p)
-            system = StateSpace(-p, np.array([[root]]), np.array([[(z - p) / root]]), np.ones((1, 1))) @ system
-        return system
+        A, B, C, D = np.zeros((n, n)), np.zeros((n, 1)), np.zeros((1, n)), np.exp(self.theta[:1])[:, None]
+        zeros, poles = np.exp(self.theta[1:1 + n]), np.exp(self.theta[1 + n:])
+        for k in range(0, n, 2):
+            section = slice(k, min(k + 2, n))
+            # Fast states first: block upper triangular, as a Schur form is, which keeps eight decades accurate.
+            here, before = slice(n - section.stop, n - k), slice(n - k, n)
+            a, b, c = _section(zeros[section], poles[section])
+            A[here, here], A[here, before], B[here] = a, b @ C[:, before], b @ D
+            C[:, here] = c
+        return A, B, C, D
+
+    def realise(self) -> StateSpace:
+        """d(s) as a state space."""
+        return StateSpace(*self.matrices)
 
     def as_dict(self) -> dict[str, Any]:
         return {"theta": self.theta.tolist()}
@@ -167,11 +175,17 @@ def _log_modulus(theta: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.n
     return value, slope
 
 
-def _biquad(wz: float, zz: float, wp: float, zp: float) -> StateSpace:
-    """(s^2 + 2 zz wz s + wz^2) / (s^2 + 2 zp wp s + wp^2) with states of like size."""
-    c = np.array([[(wz ** 2 - wp ** 2) / wp, 2 * zz * wz - 2 * zp * wp]])
-    root = np.sqrt(wp)
-    return StateSpace(np.array([[0.0, wp], [-wp, -2 * zp * wp]]), np.array([[0.0], [root]]), c / root, np.ones((1, 1)))
+def _section(zeros: np.ndarray, poles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A, b, c of 1 + c inv(s - A) b for a pair (w, zeta) of zeros over one of poles, or for lone roots (a,)."""
+    if zeros.size == 1:
+        a, b, c = np.array([[-poles[0]]]), np.ones((1, 1)), np.array([[zeros[0] - poles[0]]])
+    else:
+        (wz, zz), (wp, zp) = zeros, poles
+        a, b = np.array([[0.0, wp], [-wp, -2 * zp * wp]]), np.array([[0.0], [1.0]])
+        c = np.array([[(wz ** 2 - wp ** 2) / wp, 2 * zz * wz - 2 * zp * wp]])
+    # b and c of like size, smoothly in the roots even where they cancel
+    root = (np.sum(c ** 2) + (0.01 * poles[0]) ** 2) ** 0.25
+    return a, b * root, c / root
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,21 +198,29 @@ class MatrixScaling:
         D = self.system
         if D.ninputs != D.noutputs or np.linalg.matrix_rank(D.D) < D.ninputs:
             raise InputError("a matrix scaling is square with an invertible direct term", value=D.D.shape)
-        if not (D.is_stable() and self.inverse().is_stable()):
-            raise InputError("a matrix scaling needs stable poles and zeros", value=D.poles().real.max(initial=-1.0))
+        zeros = np.linalg.eigvals(_inverse(D)[0])
+        if not D.is_stable() or np.any(zeros.real >= 0):
+            raise InputError("a matrix scaling needs stable poles and zeros", value=[*D.poles(), *zeros])
 
     @property
     def order(self) -> int:
         return self.system.nstates
 
-    def inverse(self) -> StateSpace:
+    def inverse(self) -> MatrixScaling:
         """D(s)^-1."""
-        A, B, C, D = self.system.A, self.system.B, self.system.C, self.system.D
-        Di = np.linalg.inv(D)
-        return StateSpace(A - B @ Di @ C, B @ Di, -Di @ C, Di)
+        return MatrixScaling(StateSpace(*_inverse(self.system)))
+
+    @property
+    def matrices(self) -> Matrices:
+        return self.system.A, self.system.B, self.system.C, self.system.D
 
     def as_dict(self) -> dict[str, Any]:
         return {key: getattr(self.system, key).tolist() for key in "ABCD"}
+
+
+def _inverse(system: StateSpace) -> Matrices:
+    A, B, C, D = system.A, system.B, system.C, np.linalg.inv(system.D)
+    return A - B @ D @ C, B @ D, -D @ C, D
 
 
 Part = ScalarScaling | MatrixScaling
@@ -233,12 +255,11 @@ class Scalings:
 
     def left(self) -> StateSpace:
         """D_z(s) (n_z, n_z), to the left of N."""
-        return _side_by_side([self._copies(part, block.cols) for part, block in self._pairs()])
+        return StateSpace(*self._diagonal(inverse=False))
 
     def right_inverse(self) -> StateSpace:
         """D_w(s)^-1 (n_w, n_w), to the right of N."""
-        return _side_by_side([part.inverse() if isinstance(part, MatrixScaling) else
-                              self._copies(part.inverse(), block.rows) for part, block in self._pairs()])
+        return StateSpace(*self._diagonal(inverse=True))
 
     def response(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """D_z (n_omega, n_z, n_z) and D_w^-1 (n_omega, n_w, n_w) at omega [rad/s], scalar blocks without their phase.
@@ -260,10 +281,26 @@ class Scalings:
 
     def scale(self, P: StateSpace) -> StateSpace:
         """diag(D_z, I) P diag(D_w^-1, I): the plant whose H-infinity problem is the K-step."""
-        nmeas, ncon = P.noutputs - self.structure.n_z, P.ninputs - self.structure.n_w
-        left = _side_by_side([self.left(), gain(np.eye(nmeas))])
-        right = _side_by_side([self.right_inverse(), gain(np.eye(ncon))])
-        return (left @ P @ right).renamed(P.inputs, P.outputs)
+        z, w = self.structure.n_z, self.structure.n_w
+        Al, Bl, Cl, Dl = self._diagonal(inverse=False)
+        Ar, Br, Cr, Dr = self._diagonal(inverse=True)
+        C = np.vstack([Dl @ P.C[:z], P.C[z:]])
+        B = np.hstack([P.B[:, :w] @ Dr, P.B[:, w:]])
+        D = P.D.copy()
+        D[:z] = Dl @ D[:z]
+        through = D[:, :w] @ Cr
+        D[:, :w] = D[:, :w] @ Dr
+        n_l, n, n_r = Al.shape[0], P.nstates, Ar.shape[0]
+        A = np.zeros((n_l + n + n_r,) * 2)
+        left, own, right = slice(0, n_l), slice(n_l, n_l + n), slice(n_l + n, None)
+        A[left, left], A[left, own], A[left, right] = Al, Bl @ P.C[:z], Bl @ P.D[:z, :w] @ Cr
+        A[own, own], A[own, right], A[right, right] = P.A, P.B[:, :w] @ Cr, Ar
+        Bl_all = Bl @ P.D[:z]
+        Bl_all[:, :w] = Bl_all[:, :w] @ Dr
+        Br_all = np.hstack([Br, np.zeros((n_r, P.ninputs - w))])
+        Cl_all = np.vstack([Cl, np.zeros((P.noutputs - z, n_l))])
+        return StateSpace(A, np.vstack([Bl_all, B, Br_all]), np.hstack([Cl_all, C, through]), D, 0.0,
+                          P.inputs, P.outputs)
 
     def as_dicts(self) -> list[dict[str, Any]]:
         """JSON form of the parts."""
@@ -281,17 +318,21 @@ class Scalings:
                                             np.reshape(item["C"], (D.shape[0], n)), D))
         return Scalings(structure, tuple(part(item) for item in items))
 
-    def _pairs(self) -> list[tuple[Part, Block]]:
-        return list(zip(self.parts, self.structure.blocks, strict=True))
-
-    @staticmethod
-    def _copies(part: Part, count: int) -> StateSpace:
-        if isinstance(part, MatrixScaling):
-            return part.system
-        return _side_by_side([part.realise()] * count)
-
-
-def _side_by_side(systems: Sequence[StateSpace]) -> StateSpace:
-    """Block-diagonal stack with numbered signals; the names of the parts may repeat."""
-    return StateSpace(la.block_diag(*(s.A for s in systems)), la.block_diag(*(s.B for s in systems)),
-                      la.block_diag(*(s.C for s in systems)), la.block_diag(*(s.D for s in systems)))
+    def _diagonal(self, inverse: bool) -> Matrices:
+        """Block-diagonal A, B, C, D of D_z, or of the inverse of D_w."""
+        stack: list[Matrices] = []
+        for part, block in zip(self.parts, self.structure.blocks, strict=True):
+            one = part.inverse().matrices if inverse else part.matrices
+            copies = 1 if isinstance(part, MatrixScaling) else block.rows if inverse else block.cols
+            stack += [one] * copies
+        states, signals = sum(A.shape[0] for A, *_ in stack), sum(D.shape[0] for *_, D in stack)
+        whole = (np.zeros((states, states)), np.zeros((states, signals)), np.zeros((signals, states)),
+                 np.zeros((signals, signals)))
+        x = v = 0
+        for one in stack:
+            n, m = one[1].shape
+            at, to = slice(x, x + n), slice(v, v + m)
+            for target, place, matrix in zip(whole, ((at, at), (at, to), (to, at), (to, to)), one, strict=True):
+                target[place] = matrix
+            x, v = x + n, v + m
+        return whole
