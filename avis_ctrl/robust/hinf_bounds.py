@@ -91,7 +91,7 @@ def _optimum(P: StateSpace, nmeas: int, ncon: int) -> float:
     plant = Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon)
     singular = [margin < RANK_TOLERANCE for margin in rank_margins(plant)]
     if any(singular):
-        plant = regularised(plant, 1e-4, singular[0], singular[1], False)
+        plant = regularised(plant, 1e-3, singular[0], singular[1], False)
     return find_gamma(normal_form(plant).plant, 1e-6).upper.gamma
 
 

@@ -28,7 +28,7 @@ from avis_ctrl.robust.hinf_plant import (
     regularised,
 )
 from avis_ctrl.robust.hinf_riccati import GammaBracket, central_controller, find_gamma, gamma_test
-from avis_ctrl.robust.riccati import ON_AXIS
+from avis_ctrl.robust.riccati import INACCURATE, ON_AXIS
 
 
 class Status(Enum):
@@ -123,7 +123,7 @@ def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
     problem = _Problem.of(P, nmeas, ncon)
     form, notes = problem.form(*problem.singular, 1e-5)
     test = gamma_test(form.plant, gamma)
-    if not test.feasible and ON_AXIS in test.reason:
+    if not test.feasible and (ON_AXIS in test.reason or INACCURATE in test.reason):
         form, notes = problem.form(*problem.singular, 1e-5, of_states=True)
         test = gamma_test(form.plant, gamma)
     if not test.feasible:
@@ -161,41 +161,48 @@ class _Problem:
             said.append(f"D21 has not full row rank: not every measurement {list(self.plant.y)} is noisy "
                         "at infinite frequency")
         if of_states:
-            said.append("a zero of u -> z or w -> y lies on the imaginary axis")
+            said.append("a zero of u -> z or w -> y lies on, or too near, the imaginary axis or infinity")
         extra = f"; extra channels of relative size {epsilon:.0e} were added for the synthesis alone"
         plant = regularised(self.plant, epsilon, of_D12, of_D21, of_states)
         return normal_form(plant), ("; ".join(said) + extra,)
 
     def solve(self, tolerance: float, hint: float | None) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
         """The bracket of the optimum; extra channels are shrunk until they cost less than a per cent."""
-        of_states = False
         if not any(self.singular):
             form, _ = self.form(False, False, 0.0)
             try:
                 return form, find_gamma(form.plant, tolerance, hint), ()
             except ComputationError:
-                of_states = True
+                pass
         best: tuple[NormalForm, GammaBracket, tuple[str, ...]] | None = None
         failure: ComputationError | None = None
         for epsilon in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7):
-            form, notes = self.form(*self.singular, epsilon, of_states)
             try:
-                bracket = find_gamma(form.plant, tolerance, hint)
+                form, bracket, notes = self._regularised(epsilon, tolerance, hint)
             except ComputationError as error:
-                if best is None and not of_states:
-                    of_states, failure = True, error
-                    continue
                 failure = error
                 continue
             cost = np.inf if best is None else best[1].upper.gamma / bracket.upper.gamma - 1
-            fall = f"; gamma fell by {100 * max(cost, 0.0):.2g} % over the last decade of that size"
-            best = form, bracket, (notes[0] + ("" if best is None else fall),)
-            hint = bracket.upper.gamma
+            if best is not None and cost >= 0:
+                notes = (notes[0] + f"; gamma fell by {100 * cost:.2g} % over the last decade of that size",)
+            if cost >= 0:
+                best, hint = (form, bracket, notes), bracket.upper.gamma
             if cost < 0.01:
                 break
         if best is None:
             raise failure or ComputationError("no controller was found")
         return best
+
+    def _regularised(self, epsilon: float, tolerance: float,
+                     hint: float | None) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
+        """The bracket with extra channels on u and y where they are missing, and on the states where those fail."""
+        for of_states in (False, True) if any(self.singular) else (True,):
+            form, notes = self.form(*self.singular, epsilon, of_states)
+            try:
+                return form, find_gamma(form.plant, tolerance, hint), notes
+            except ComputationError as error:
+                failure = error
+        raise failure
 
     def realise(self, form: NormalForm, gamma: float, backoff: float) -> tuple[Synthesis, str]:
         """The first controller above the optimum whose measured closed loop keeps its promise."""

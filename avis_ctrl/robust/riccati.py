@@ -18,6 +18,7 @@ from avis_ctrl.lti.norms import symplectic_scale
 
 AXIS_TOLERANCE = 1e-10
 LAGRANGIAN_TOLERANCE = 1e-6
+INACCURATE = "the Hamiltonian is too badly conditioned for its stable subspace"
 ON_AXIS = "the Hamiltonian has eigenvalues on the imaginary axis"
 
 
@@ -52,7 +53,7 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolutio
     gram = X1.T @ X2
     asymmetry = float(la.norm(gram - gram.T, 2))
     if asymmetry > LAGRANGIAN_TOLERANCE:
-        return RiccatiSolution(None, False, ON_AXIS)
+        return RiccatiSolution(None, False, INACCURATE)
     lowest = float(la.eigvalsh((gram + gram.T) / 2)[0])
     lu, piv = la.lu_factor(X1.T, check_finite=False)
     if np.min(np.abs(np.diag(lu))) < 1e-15:
