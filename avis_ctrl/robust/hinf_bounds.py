@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.lti.norms import bilinear_to_continuous
 from avis_ctrl.robust.hinf_plant import (
@@ -72,6 +73,7 @@ def limiting_weights(P: Any, nmeas: int, ncon: int, step: float = 0.02) -> tuple
     An elasticity of 0.7 says that a weight lowered by 1 % lowers the optimum by 0.7 %; those of all z add up to 1,
     and so do those of all w, since the optimum is proportional to either. Central differences of the bracketed
     optimum over the relative `step`; in singular problems of the plant with its small extra channels.
+    ComputationError where they do not add up, to 10 %: then round-off or those channels decide.
     """
     P = as_plant(P, nmeas, ncon)
     check_stabilisable(Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon))
@@ -84,6 +86,12 @@ def limiting_weights(P: Any, nmeas: int, ncon: int, step: float = 0.02) -> tuple
                 scale[k] = factor
                 gammas.append(_optimum(P.scaled(left=scale) if of_outputs else P.scaled(right=scale), nmeas, ncon))
             found.append((names[k], float(np.log(gammas[0] / gammas[1]) / np.log((1 + step) / (1 - step)))))
+        total = sum(one for _, one in found[-count:])
+        if abs(total - 1) > 0.1:
+            raise ComputationError("the weights that limit gamma cannot be told",
+                                   measured=f"elasticities of {list(names[:count])} add up to {total:.3g}, not 1",
+                                   cause="a singular problem, decided by its regularisation",
+                                   next_step="give every control a weight and every measurement white noise")
     return tuple(sorted(found, key=lambda one: -one[1]))
 
 
@@ -91,7 +99,7 @@ def _optimum(P: StateSpace, nmeas: int, ncon: int) -> float:
     plant = Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon)
     singular = [margin < RANK_TOLERANCE for margin in rank_margins(plant)]
     if any(singular):
-        plant = regularised(plant, 1e-3, singular[0], singular[1], False)
+        plant = regularised(plant, 1e-4, singular[0], singular[1], True)
     return find_gamma(normal_form(plant).plant, 1e-6).upper.gamma
 
 
