@@ -1,6 +1,11 @@
-"""The compiled inner loop of the simulation: a few matrix-vector products and one evaluation of the table a step."""
+"""The compiled inner loop of the simulation: a few matrix-vector products and one evaluation of the table a step.
+
+Plain loops throughout: slice assignments and calls of BLAS would double the time of compilation and save none after it.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -11,88 +16,166 @@ from avis_ctrl.rigs.nonlinear import payload_acceleration
 _quantise = njit(cache=True)(quantise)
 
 
+class Records(NamedTuple):
+    """Rows at the samples: (n, 6) payload, (n, n_u) held and demanded volts, (n, n_s) volts at the converter."""
+
+    q: np.ndarray
+    q_dot: np.ndarray
+    volts: np.ndarray
+    demanded: np.ndarray
+    sensed: np.ndarray
+
+
+class Work(NamedTuple):
+    """What changes from step to step.
+
+    x : state of the linear part. u, w, w_end : held volts, floor velocity at the start and end of the step.
+    N, N_before : excess acceleration now and a step ago.
+    line : (delay + 1, n_u) voltages on their way, by the step of their arrival.
+    advance_in, observe_in, sense_in, control_in : what each matrix of the step is multiplied with; the last keeps
+        the controller's state. observed, sensed, controlled : what comes out.
+    """
+
+    x: np.ndarray
+    u: np.ndarray
+    w: np.ndarray
+    w_end: np.ndarray
+    N: np.ndarray
+    N_before: np.ndarray
+    line: np.ndarray
+    advance_in: np.ndarray
+    observe_in: np.ndarray
+    sense_in: np.ndarray
+    control_in: np.ndarray
+    observed: np.ndarray
+    sensed: np.ndarray
+    controlled: np.ndarray
+
+
+def workspace(arrays, state: np.ndarray, delay: int) -> Work:
+    """A loop that starts in `state` with its controller at rest; delay in steps."""
+    matrices = (arrays.advance, arrays.observe, arrays.sense, arrays.control)
+    n_u = arrays.observe.shape[0] - 6
+    w, w_end, N, N_before = np.zeros((4, 6))
+    advance_in, observe_in, sense_in, control_in = (np.zeros(matrix.shape[1]) for matrix in matrices)
+    observed, sensed, controlled = (np.zeros(matrix.shape[0]) for matrix in matrices[1:])
+    return Work(state, np.zeros(n_u), w, w_end, N, N_before, np.zeros((delay + 1, n_u)), advance_in, observe_in,
+                sense_in, control_in, observed, sensed, controlled)
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def _multiply(out, A, x):
+    for i in range(A.shape[0]):
+        total = 0.0
+        for j in range(A.shape[1]):
+            total += A[i, j] * x[j]
+        out[i] = total
+
+
 @njit(cache=True)
-def _excess(out, x, w, u, arrays, s_observe, observed):
+def _put(out, start, values):
+    """out[start:start + len(values)] = values"""
+    for i in range(values.shape[0]):
+        out[start + i] = values[i]
+
+
+@njit(cache=True)
+def _excess(arrays, work):
     """N: the nonlinear table's acceleration less the linear one's."""
-    n, n_u = x.shape[0], u.shape[0]
-    s_observe[:n], s_observe[n:n + n_u], s_observe[n + n_u:] = x, u, w
-    np.dot(arrays.observe, s_observe, observed)
-    true = payload_acceleration(x[:6], x[6:12], observed[:n_u], x[12:18], w, arrays.table)
+    x, n, n_u = work.x, work.x.shape[0], work.u.shape[0]
+    _put(work.observe_in, 0, x)
+    _put(work.observe_in, n, work.u)
+    _put(work.observe_in, n + n_u, work.w)
+    _multiply(work.observed, arrays.observe, work.observe_in)
+    true = payload_acceleration(x[:6], x[6:12], work.observed[:n_u], x[12:18], work.w, arrays.table)
     for i in range(6):
-        out[i] = true[i] - observed[n_u + i]
+        work.N[i] = true[i] - work.observed[n_u + i]
 
 
 @njit(cache=True)
-def _gone(x, far_m, far_rad):
-    """Whether the table has left the range in which it can move at all."""
-    # Written so that a number that is not finite counts as gone.
+def _sense_and_control(arrays, work, noise, adc, sensed_row):
+    """The converter's reading of sample noise (n_s,) and motion, and the controller's answer to it."""
+    n, n_s = work.x.shape[0], work.sensed.shape[0]
+    n_c = work.control_in.shape[0] - n_s
+    _put(work.sense_in, 0, work.x)
+    _put(work.sense_in, n, work.w)
+    _put(work.sense_in, n + 6, work.N)
+    _multiply(work.sensed, arrays.sense, work.sense_in)
+    for i in range(n_s):
+        volts = work.sensed[i] + noise[i]
+        sensed_row[i] = volts
+        work.control_in[n_c + i] = _quantise(volts, adc[0], adc[1], adc[2]) if adc[0] > 0 else volts
+    _multiply(work.controlled, arrays.control, work.control_in)
+    for i in range(n_c):
+        work.control_in[i] = work.controlled[i]
+
+
+@njit(cache=True)
+def _demand(work, step, limit_V, demanded_row):
+    """Puts the limited voltages on their way; without delay they act at once."""
+    n_u, delay = work.u.shape[0], work.line.shape[0] - 1
+    n_c = work.controlled.shape[0] - n_u
+    slot = (step + delay) % (delay + 1)
+    for i in range(n_u):
+        demanded_row[i] = work.controlled[n_c + i]
+        work.line[slot, i] = min(max(work.controlled[n_c + i], -limit_V), limit_V)
+        if delay == 0:
+            work.u[i] = work.line[slot, i]
+
+
+@njit(cache=True)
+def _advance(arrays, work):
+    n, n_u = work.x.shape[0], work.u.shape[0]
+    _put(work.advance_in, 0, work.x)
+    _put(work.advance_in, n, work.u)
+    _put(work.advance_in, n + n_u, work.w)
+    _put(work.advance_in, n + n_u + 6, work.w_end)
+    for i in range(6):
+        work.advance_in[n + n_u + 12 + i] = work.N[i]
+        work.advance_in[n + n_u + 18 + i] = work.N[i] - work.N_before[i]
+        work.N_before[i] = work.N[i]
+    _multiply(work.x, arrays.advance, work.advance_in)
+
+
+@njit(cache=True)
+def _gone(x, far):
+    """Whether the table has left the range in which it can move; written so that what is not finite has left it."""
     inside = True
     for i in range(3):
-        inside = inside and abs(x[i]) < far_m and abs(x[3 + i]) < far_rad
+        inside = inside and abs(x[i]) < far[0] and abs(x[3 + i]) < far[1]
     return not inside
 
 
 @njit(cache=True)
-def run(arrays, floor, noise, substeps, delay, nonlinear, acceleration, adc, limit_V, far, state, records):
-    """Steps through the control periods; returns how many were completed before divergence.
+def run(arrays, work, floor, noise, substeps, nonlinear, acceleration, adc, limit_V, far, records):
+    """Steps through the control periods; returns how many were completed when the table left its range, or all.
 
     floor : (n + 1, 6) floor velocity at the samples; noise : (n, n_s) V.
-    substeps, delay : steps a period, and delay in steps. nonlinear, acceleration : flags.
-    adc : (lsb, lower, upper), lsb = 0 for none. far : (m, rad) beyond which the table has diverged.
-    state : initial x, overwritten by the final one.
-    records : (q, q', volts, demanded volts, sensor volts), rows at the samples.
+    substeps : steps a period. nonlinear : the table's; acceleration : what the sensors see, which needs N first.
+    adc : (lsb, lower, upper) V, lsb = 0 for none. far : (m, rad) beyond which the table has diverged.
     """
-    x, w = state, np.zeros(6)
-    n, n_u, n_s = x.shape[0], arrays.observe.shape[0] - 6, arrays.sense.shape[0]
-    n_c = arrays.control.shape[0] - n_u
-    q_out, v_out, volts_out, demand_out, sensed_out = records
-    s, s_observe, s_sense = np.zeros(n + n_u + 24), np.zeros(n + n_u + 6), np.zeros(n + 12)
-    observed, sensed = np.zeros(n_u + 6), np.zeros(n_s)
-    s_control, controlled = np.zeros(n_c + n_s), np.zeros(n_c + n_u)
-    N, N_before, started = np.zeros(6), np.zeros(6), False
-    line = np.zeros((delay + 1, n_u))  # voltages on their way, by substep of arrival
-    u = np.zeros(n_u)
-    step = 0
+    delay, step = work.line.shape[0] - 1, 0
     for k in range(floor.shape[0] - 1):
         for j in range(substeps):
-            fraction = j / substeps
             for i in range(6):
-                w[i] = floor[k, i] + (floor[k + 1, i] - floor[k, i]) * fraction
-            slot = step % (delay + 1)
-            if delay > 0 and (step >= delay) and (step - delay) % substeps == 0:
-                u[:] = line[slot]
+                rise = (floor[k + 1, i] - floor[k, i]) / substeps
+                work.w[i], work.w_end[i] = floor[k, i] + rise * j, floor[k, i] + rise * (j + 1)
+            if delay > 0 and step >= delay and (step - delay) % substeps == 0:
+                _put(work.u, 0, work.line[step % (delay + 1)])
             if nonlinear and acceleration:
-                _excess(N, x, w, u, arrays, s_observe, observed)
+                _excess(arrays, work)
             if j == 0:
-                s_sense[:n], s_sense[n:n + 6], s_sense[n + 6:] = x, w, N
-                np.dot(arrays.sense, s_sense, sensed)
-                for i in range(n_s):
-                    sensed[i] += noise[k, i]
-                    sensed_out[k, i] = sensed[i]
-                    if adc[0] > 0:
-                        sensed[i] = _quantise(sensed[i], adc[0], adc[1], adc[2])
-                s_control[n_c:] = sensed
-                np.dot(arrays.control, s_control, controlled)
-                s_control[:n_c] = controlled[:n_c]
-                arrival = (step + delay) % (delay + 1)
-                for i in range(n_u):
-                    demand_out[k, i] = controlled[n_c + i]
-                    line[arrival, i] = min(max(controlled[n_c + i], -limit_V), limit_V)
-                if delay == 0:
-                    u[:] = line[0]
-                q_out[k], v_out[k], volts_out[k] = x[:6], x[6:12], u
+                _sense_and_control(arrays, work, noise[k], adc, records.sensed[k])
+                _demand(work, step, limit_V, records.demanded[k])
+                _put(records.volts[k], 0, work.u)
+                _put(records.q[k], 0, work.x[:6])
+                _put(records.q_dot[k], 0, work.x[6:12])
             if nonlinear and not acceleration:
-                _excess(N, x, w, u, arrays, s_observe, observed)
-            if not started:
-                N_before[:], started = N, True
-            s[:n], s[n:n + n_u], s[n + n_u:n + n_u + 6] = x, u, w
-            for i in range(6):
-                s[n + n_u + 6 + i] = floor[k, i] + (floor[k + 1, i] - floor[k, i]) * (j + 1) / substeps
-                s[n + n_u + 12 + i] = N[i]
-                s[n + n_u + 18 + i] = N[i] - N_before[i]
-                N_before[i] = N[i]
-            np.dot(arrays.advance, s, x)
+                _excess(arrays, work)
+            if step == 0:
+                _put(work.N_before, 0, work.N)
+            _advance(arrays, work)
             step += 1
-        if _gone(x, far[0], far[1]):
+        if _gone(work.x, far):
             return k + 1
     return floor.shape[0] - 1

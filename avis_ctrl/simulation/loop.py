@@ -104,10 +104,11 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
         state[:12] = initial
     converter = loop.sensors.converter
     adc = np.array((converter.lsb_V, *converter.limits_V) if converter else (0.0, 0.0, 0.0))
-    records = tuple(np.empty((samples, width)) for width in (6, 6, n_u, n_u, n_s))
-    done = kernel.run(step_arrays(loop, extra_substeps), floor, noise, loop.substeps * extra_substeps,
-                      loop.delay_substeps * extra_substeps, nonlinear, loop.sensors.quantity == "acceleration", adc,
-                      loop.limit_V, STOPS, state, records)
+    records = kernel.Records(*(np.empty((samples, width)) for width in (6, 6, n_u, n_u, n_s)))
+    arrays = step_arrays(loop, extra_substeps)
+    work = kernel.workspace(arrays, state, loop.delay_substeps * extra_substeps)
+    done = kernel.run(arrays, work, floor, noise, loop.substeps * extra_substeps, nonlinear,
+                      loop.sensors.quantity == "acceleration", adc, loop.limit_V, STOPS, records)
     kept = slice(min(settle, done - 1), done)
     q, q_dot, volts, demanded, sensed = (record[kept].copy() for record in records)
     time = (np.arange(samples)[kept] - settle) * loop.period_s
