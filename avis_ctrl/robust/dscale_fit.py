@@ -62,7 +62,7 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
     Raises
     ------
     InputError : shapes that differ, magnitudes or frequencies that are not positive and finite, a negative order.
-    ComputationError : the conic solver gives no answer.
+    ComputationError : the spectral factorisation fails.
     """
     omega, target, weight = _checked(omega, magnitude, order, weight)
     best, error = _constant_fit(target, weight)
@@ -73,8 +73,12 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
     lower, solves = 0.0, 0
     while error - lower > tolerance and solves < 40:
         level = (lower + error) / 2
-        candidate = problem.solve(2 * level)
         solves += 1
+        try:
+            candidate = problem.solve(2 * level)
+        except ComputationError:
+            # Neither fitted nor proved impossible: what was found so far stands, with its bound.
+            break
         if candidate is None:
             lower = level
             continue
@@ -146,9 +150,15 @@ class _Feasibility:
         self.centre = np.ones(y.size) if ratio is None else ratio
 
     def recentred(self, zeros: np.ndarray, poles: np.ndarray) -> _Feasibility:
-        """The same problem in a basis around the latest solution."""
-        ratio = np.prod(np.abs(self.y[:, None] - poles) / (self.y[:, None] + np.abs(poles)), axis=1)
-        return _Feasibility(self.y, self.log_target, self.weight, self.order, zeros, poles, np.maximum(ratio, 1e-6))
+        """The same problem in a basis around the latest solution, its roots held within a decade of the band.
+
+        A basis that followed a root to infinity would lose sight of every solution with that root in the band.
+        """
+        low, high = np.min(self.y) / 100, np.max(self.y) * 100
+        near_zeros, near_poles = (np.clip(np.abs(roots), low, high) for roots in (zeros, poles))
+        log_ratio = np.sum(np.log(np.abs(self.y[:, None] - poles) / (self.y[:, None] + near_poles)), axis=1)
+        return _Feasibility(self.y, self.log_target, self.weight, self.order, near_zeros, near_poles,
+                            np.exp(np.maximum(log_ratio - np.max(log_ratio), -14.0)))
 
     def solve(self, log_t: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Coefficients of p and q, ascending in y, or None where the level is infeasible."""
@@ -172,7 +182,7 @@ class _Feasibility:
         A = sp.csc_matrix(np.vstack([normal, upper, lower, -np.eye(n_p + n_q, n_p + n_q + 1)]))
         b = np.concatenate([[1.0], bound, np.zeros(n_p + n_q)])
         x = maximise_last(A, b, cones)
-        if x is None or x[-1] <= 0:
+        if x[-1] <= 0:
             return None
         p = half_line_coefficients(x[:n_p], self.gram_p, self.e_p) * np.exp(self.shift)
         return p, half_line_coefficients(x[n_p:-1], self.gram_q, self.e_q)
@@ -219,8 +229,8 @@ def gram_cone(size: int) -> Any:
     return clarabel.NonnegativeConeT(1) if size == 1 else clarabel.PSDTriangleConeT(size)
 
 
-def maximise_last(A: sp.csc_matrix, b: np.ndarray, cones: list[Any]) -> np.ndarray | None:
-    """Solution of max x[-1] subject to b - A x in the cones; None where the solver stops without one."""
+def maximise_last(A: sp.csc_matrix, b: np.ndarray, cones: list[Any]) -> np.ndarray:
+    """Solution of max x[-1] subject to b - A x in the cones; ComputationError where the solver stops without one."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
@@ -228,8 +238,10 @@ def maximise_last(A: sp.csc_matrix, b: np.ndarray, cones: list[Any]) -> np.ndarr
     cost = np.zeros(size)
     cost[-1] = -1.0
     solution = clarabel.DefaultSolver(sp.csc_matrix((size, size)), cost, A, b, cones, settings).solve()
-    accepted = (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved)
-    return np.asarray(solution.x) if solution.status in accepted else None
+    if solution.status not in (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved):
+        raise ComputationError("the semidefinite program of a scaling was not solved", measured=str(solution.status),
+                               cause="magnitudes or weights spanning too many decades", next_step="a lower order")
+    return np.asarray(solution.x)
 
 
 def _spectral_factor(p: np.ndarray, q: np.ndarray, unit: float) -> ScalarScaling:

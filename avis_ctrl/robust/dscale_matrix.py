@@ -67,8 +67,11 @@ def fit_hermitian(omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndar
     error, lower, solves = _error(best, omega, X, weight), 0.0, 0
     while error - lower > tolerance and solves < 40:
         level = (lower + error) / 2
-        found = problem.solve(2 * level)
         solves += 1
+        try:
+            found = problem.solve(2 * level)
+        except ComputationError:
+            break
         if found is None:
             lower = level
             continue
@@ -165,7 +168,7 @@ class _Feasibility:
         cones += [gram_cone(size) for size in (self.size * self.e.size, *self.gram_q) if size]
         A = sp.csc_matrix(np.vstack([normal, upper, lower, -np.eye(n_P + n_q, n_P + n_q + 1)]))
         x = maximise_last(A, np.r_[1.0, bound, np.zeros(n_P + n_q)], cones)
-        if x is None or x[-1] <= 0:
+        if x[-1] <= 0:
             return None
         gram = np.zeros((self.size * self.e.size,) * 2)
         i, j = triangle(gram.shape[0])

@@ -280,5 +280,6 @@ def _result(problem: _Problem, uncertainty: BlockStructure, state: State, status
         ratio = fastest / (np.pi * sample_rate_Hz)
         notes.append(f"fastest controller pole {fastest:.4g} rad/s is {ratio:.2g} of half the sample rate")
     guaranteed = peak.guaranteed or mu_upper == gamma
-    return MuSynthesis(best.K, mu_upper, peak.lower, peak.omega, complex_upper, guaranteed, peak.delta, uncertainty, best.scalings, gamma, closed, fastest, state.history, status, tuple(notes),
+    return MuSynthesis(best.K, mu_upper, peak.lower, peak.omega, complex_upper, guaranteed, peak.delta, uncertainty,
+                       best.scalings, gamma, closed, fastest, state.history, status, tuple(notes),
                        state.as_dict(problem.P, problem.nmeas, problem.ncon))

@@ -1,0 +1,198 @@
+"""D-scale fit: known rational functions, brute-force optimisation, positivity and factorisation off the grid."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import scipy.optimize as so
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti import StateSpace
+from avis_ctrl.robust.dscale_fit import fit_magnitude, stable_roots
+from avis_ctrl.robust.dscale_matrix import fit_hermitian
+from avis_ctrl.robust.scalings import MatrixScaling, ScalarScaling, Scalings
+from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar
+
+EIGHT_DECADES = np.logspace(-4, 4, 90)
+
+
+def rational(rng: np.random.Generator, order: int) -> ScalarScaling:
+    """A random d(s) with roots spread over six decades, one pair of zeros lightly damped."""
+    zeros, poles = (-(10.0 ** rng.uniform(-3, 3, order)).astype(complex) for _ in range(2))
+    if order >= 2:
+        zeros[0] = 10 ** rng.uniform(-2, 2) * np.exp(1j * np.deg2rad(100))
+        zeros[1] = np.conj(zeros[0])
+    return ScalarScaling.from_roots(10 ** rng.uniform(-1, 1), zeros, poles)
+
+
+def poly_magnitude(d: ScalarScaling, omega: np.ndarray) -> np.ndarray:
+    """|d(j omega)| from its roots, factor by factor, without the package's formulas."""
+    s = 1j * omega[:, None]
+    return np.exp(d.theta[0]) * np.prod(np.abs(s - d.zeros), axis=1) / np.prod(np.abs(s - d.poles), axis=1)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_known_rational_function_is_recovered_at_its_order(rng, order):
+    d = rational(rng, order)
+    fit = fit_magnitude(EIGHT_DECADES, poly_magnitude(d, EIGHT_DECADES), order, tolerance=1e-4)
+    between = np.sqrt(EIGHT_DECADES[1:] * EIGHT_DECADES[:-1])
+    ratio = np.abs(fit.scaling.realise().frequency_response(between)[:, 0, 0]) / poly_magnitude(d, between)
+    assert np.max(np.abs(np.log(ratio))) < 1e-3
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_no_better_fit_is_found_by_brute_force(rng, order):
+    """Minimax over the parameters by SLSQP from many starts never beats the semidefinite optimum."""
+    omega = np.logspace(-2, 2, 40)
+    target = np.exp(np.sin(np.log(omega)) + 0.4 * np.cos(2.3 * np.log(omega)))
+    weight = rng.uniform(0.3, 1.0, omega.size)
+    fit = fit_magnitude(omega, target, order, weight, tolerance=1e-4)
+
+    def misfit(theta):
+        return weight * (ScalarScaling(theta).log_magnitude(omega) - np.log(target))
+
+    def refine(theta):
+        constraint = {"type": "ineq", "fun": lambda x: np.r_[x[-1] - misfit(x[:-1]), x[-1] + misfit(x[:-1])]}
+        start = np.r_[theta, np.max(np.abs(misfit(theta)))]
+        found = so.minimize(lambda x: x[-1], start, method="SLSQP", constraints=constraint, options={"maxiter": 100})
+        return np.max(np.abs(misfit(found.x[:-1])))
+
+    starts = [fit.scaling.theta, *(rng.normal(0, 1.5, 1 + 2 * order) for _ in range(6))]
+    best = min(refine(start) for start in starts)
+    assert best >= fit.error_bound - 1e-6
+    assert fit.error <= best + 2e-4
+
+
+def test_optimal_error_alternates_in_sign_as_chebyshev_theory_asks():
+    """p/q of degrees (n, n) in one variable has 2 n + 1 degrees of freedom: 2 n + 2 alternations."""
+    omega, n = np.logspace(-2, 2, 200), 2
+    target = np.exp(np.arctan(np.log(omega)) + 0.1 * np.sin(3 * np.log(omega)))
+    fit = fit_magnitude(omega, target, n, tolerance=1e-5)
+    error = fit.scaling.log_magnitude(omega) - np.log(target)
+    extreme = error[np.abs(error) > 0.97 * fit.error]
+    assert np.sum(np.diff(np.sign(extreme)) != 0) + 1 >= 2 * n + 2
+
+
+def test_higher_order_never_fits_worse():
+    target = np.exp(np.tanh(np.log(EIGHT_DECADES)) + 0.3 * np.sin(np.log(EIGHT_DECADES)))
+    errors = [fit_magnitude(EIGHT_DECADES, target, n).error for n in range(6)]
+    assert all(after <= before + 1e-3 for before, after in pairwise(errors))
+    assert errors[5] < errors[0] / 2
+
+
+def test_constant_fit_is_the_weighted_chebyshev_centre():
+    fit = fit_magnitude(np.array([1.0, 2.0, 3.0]), np.exp([0.0, 1.0, 3.0]), 0, np.array([1.0, 1.0, 0.5]))
+    # errors c and (3 - c)/2 balance at c = 1
+    assert fit.scaling.theta[0] == pytest.approx(1.0)
+    assert fit.error == pytest.approx(1.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(st.floats(-3, 3), st.floats(-2.5, 2.5), st.floats(0.3, 2)), min_size=1, max_size=4),
+       st.integers(1, 4))
+def test_every_fit_is_stable_and_minimum_phase(bumps, order):
+    """Random smooth magnitudes: roots in the open left half plane, realised response equal to the roots'."""
+    x = np.log10(EIGHT_DECADES)
+    target = np.exp(sum(height * np.exp(-((x - centre) / width) ** 2) for centre, height, width in bumps))
+    fit = fit_magnitude(EIGHT_DECADES, target, order)
+    system = fit.scaling.realise()
+    assert np.all(system.poles().real < 0)
+    zeros = np.linalg.eigvals(system.A - system.B @ system.C / system.D[0, 0])
+    assert np.all(zeros.real < 0)
+    dense = np.logspace(-6, 6, 400)
+    realised = np.abs(system.frequency_response(dense)[:, 0, 0])
+    assert np.max(np.abs(np.log(realised / poly_magnitude(fit.scaling, dense)))) < 1e-5
+    assert fit.error == pytest.approx(np.max(np.abs(fit.scaling.log_magnitude(EIGHT_DECADES) - np.log(target))))
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 5), st.integers(0, 2 ** 32 - 1))
+def test_spectral_factor_of_a_sum_of_squares(half_order, seed):
+    """p(y) = s0(y)^2 + y s1(y)^2 is |f(j omega)|^2 of the factor, at frequencies of no grid."""
+    rng = np.random.default_rng(seed)
+    s0, s1 = rng.normal(size=half_order + 1), rng.normal(size=half_order)
+    p = np.polynomial.polynomial.polyadd(np.convolve(s0, s0), np.r_[0.0, np.convolve(s1, s1)])
+    roots = stable_roots(p)
+    assert np.all(roots.real < 0)
+    omega = rng.uniform(0, 5, 50)
+    square = p[-1] * np.prod(np.abs(1j * omega[:, None] - roots) ** 2, axis=1)
+    assert np.allclose(square, np.polynomial.polynomial.polyval(omega ** 2, p), rtol=1e-5, atol=1e-6 * p[0])
+
+
+@pytest.mark.parametrize(("n", "degree"), [(2, 1), (2, 2), (3, 1)])
+def test_matrix_scaling_recovers_a_known_one(rng, n, degree):
+    """X = D^H D of a known D: recovered to 1 % with stable poles and zeros, between the points too."""
+    omega = np.logspace(-2, 3, 40)
+    poles = -(10.0 ** rng.uniform(-1, 2, degree))
+    A, B = np.kron(np.diag(poles), np.eye(n)), np.kron(np.sqrt(-poles)[:, None], np.eye(n))
+    C = 0.8 * rng.standard_normal((n, n * degree)) * np.repeat(np.sqrt(-poles), n)
+    truth = StateSpace(A, B, C, np.eye(n) + 0.2 * rng.standard_normal((n, n)))
+
+    def square(system, at):
+        F = system.frequency_response(at)
+        return np.conj(np.swapaxes(F, 1, 2)) @ F
+
+    fit = fit_hermitian(omega, square(truth, omega), degree, tolerance=2e-3)
+    assert fit.error < 5e-3
+    D = fit.scaling.system
+    assert D.nstates == n * degree
+    assert np.all(D.poles().real < 0)
+    assert np.all(fit.scaling.inverse().system.poles().real < 0)
+    between = np.sqrt(omega[1:] * omega[:-1])
+    ratio = np.linalg.eigvals(np.linalg.solve(square(truth, between), square(D, between)))
+    assert np.max(np.abs(np.log(np.abs(ratio)))) < 2e-2
+
+
+def test_one_by_one_matrix_fit_agrees_with_the_scalar_fit():
+    omega = np.logspace(-2, 2, 40)
+    target = np.exp(np.tanh(np.log(omega)) + 0.2 * np.sin(np.log(omega)))
+    scalar = fit_magnitude(omega, target, 2, tolerance=1e-4)
+    matrix = fit_hermitian(omega, (target ** 2)[:, None, None].astype(complex), 2, tolerance=1e-4)
+    assert matrix.error == pytest.approx(scalar.error, abs=3e-4)
+
+
+def test_scaled_plant_is_the_product_of_its_parts(rng):
+    """scale(P) against the frequency responses of D, P and D^-1, for scalar, full and repeated blocks."""
+    structure = BlockStructure.of([ComplexScalar(2), ComplexFull(1, 2)]).with_performance(2, 1)
+    D = MatrixScaling(StateSpace(-np.eye(2), np.eye(2), 0.3 * np.eye(2), np.eye(2)))
+    scalings = Scalings(structure, (D, rational(rng, 3), ScalarScaling.constant(1.0)))
+    P = StateSpace(-np.diag(rng.uniform(1, 5, 4)), rng.normal(size=(4, 7)), rng.normal(size=(6, 4)),
+                   rng.normal(size=(6, 7)))
+    omega = np.logspace(-2, 2, 9)
+    left, right = scalings.left().frequency_response(omega), scalings.right_inverse().frequency_response(omega)
+    F = P.frequency_response(omega)
+    expected = F.copy()
+    expected[:, :5] = left @ expected[:, :5]
+    expected[:, :, :5] = expected[:, :, :5] @ right
+    assert np.allclose(scalings.scale(P).frequency_response(omega), expected, atol=1e-9)
+    assert scalings.scale(P).nstates == P.nstates + scalings.added_states
+    again = Scalings.from_dicts(structure, scalings.as_dicts())
+    assert np.allclose(again.scale(P).frequency_response(omega), expected, atol=1e-9)
+
+
+def test_slopes_of_the_magnitude_are_its_derivatives(rng):
+    d = rational(rng, 5)
+    h = 1e-6
+    numeric = np.stack([(ScalarScaling(d.theta + h * e).log_magnitude(EIGHT_DECADES)
+                         - ScalarScaling(d.theta - h * e).log_magnitude(EIGHT_DECADES)) / (2 * h)
+                        for e in np.eye(d.theta.size)], axis=1)
+    assert np.max(np.abs(d.jacobian(EIGHT_DECADES) - numeric)) < 1e-6
+
+
+@pytest.mark.parametrize(("change", "field"), [
+    ({"omega": [1.0, -2.0]}, "omega"), ({"magnitude": [1.0, 0.0]}, "magnitude"), ({"magnitude": [1.0, np.nan]}, "magn"),
+    ({"order": -1}, "order"), ({"order": 1.5}, "order"), ({"weight": [2.0, 1.0]}, "weight"),
+    ({"magnitude": [1.0, 2.0, 3.0]}, "magnitude"), ({"weight": [0.0, 0.0]}, "weight")])
+def test_bad_input_is_named(change, field):
+    good = {"omega": [1.0, 2.0], "magnitude": [1.0, 2.0], "order": 1, "weight": None}
+    with pytest.raises(InputError, match=field):
+        fit_magnitude(**(good | change))
+
+
+def test_matrix_that_is_not_positive_is_refused():
+    with pytest.raises(InputError, match="positive definite"):
+        fit_hermitian(np.array([1.0]), np.diag([1.0, -1.0])[None].astype(complex), 0)
