@@ -82,6 +82,7 @@ class ScalingSpace:
     core: LinearForm
     is_level: Array
     trace: Array
+    is_g: Array
 
     @staticmethod
     def of(structure: BlockStructure, level: Array | None = None) -> ScalingSpace:
@@ -111,7 +112,8 @@ class ScalingSpace:
                     p += 1
         kform, kcore = LinearForm(n_w + n_z, p, form), LinearForm(c, p, core)
         on_level = (kform.row < n_w) & (kform.col < n_w) & np.r_[level, np.zeros(n_z, bool)][kform.row]
-        return ScalingSpace(structure, level, kform, kcore, on_level, kcore.gradient(np.eye(c)[None])[0])
+        in_core = np.any(kcore.incidence > 0, axis=1)
+        return ScalingSpace(structure, level, kform, kcore, on_level, kcore.gradient(np.eye(c)[None])[0], ~in_core)
 
     def scalings(self, theta: Array) -> Scalings:
         n_w = self.structure.n_w
@@ -222,10 +224,17 @@ def _step_to_boundary(space: ScalingSpace, M: Array, theta: Array, lam: Array, d
     return 1.0 / np.maximum(rate, 1e-300)
 
 
-def _newton(hessian: Array, gradient: Array) -> Array:
-    """-inv(hessian) gradient with unit-diagonal scaling; a ridge of round-off size where it is singular."""
-    d = 1.0 / np.sqrt(np.maximum(np.diagonal(hessian, axis1=1, axis2=2), 1e-300))
-    scaled = hessian * d[:, :, None] * d[:, None, :] + 1e-13 * np.eye(d.shape[1])
+def _newton(space: ScalingSpace, hessian: Array, gradient: Array) -> Array:
+    """-inv(hessian) gradient with unit-diagonal scaling; ridges of round-off size where it is singular.
+
+    A G that multiplies a real entry of M has no effect and no curvature: its ridge is measured against the
+    largest curvature, so that round-off does not drive it away.
+    """
+    diagonal = np.diagonal(hessian, axis1=1, axis2=2)
+    ridge = np.where(space.is_g, 1e-11 * np.max(diagonal, axis=1, keepdims=True), 0.0)
+    d = 1.0 / np.sqrt(np.maximum(diagonal + ridge, 1e-300))
+    eye = np.eye(d.shape[1])
+    scaled = hessian * d[:, :, None] * d[:, None, :] + (1e-13 + ridge * d ** 2)[:, :, None] * eye
     return -d * np.linalg.solve(scaled, (d * gradient)[..., None])[..., 0]
 
 
@@ -234,7 +243,7 @@ def _centre(space: ScalingSpace, M: Array, theta: Array, lam: Array, accuracy: f
     """Damped Newton steps towards the analytic centre at fixed lambda."""
     for _ in range(steps):
         point = _barrier(space, M, theta, lam)
-        step = _newton(point.hessian, point.gradient)
+        step = _newton(space, point.hessian, point.gradient)
         decrement = np.sqrt(np.maximum(-np.sum(step * point.gradient, axis=1), 0.0))
         if np.all(decrement < accuracy):
             break
@@ -265,7 +274,7 @@ def follow(space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array 
             if not active.size:
                 break
         theta[active] = th
-        direction = _newton(point.hessian, point.slope)
+        direction = _newton(space, point.hessian, point.slope)
         reach = _step_to_boundary(space, Ma, th, la, direction)
         fall = np.minimum(0.9 * reach, la - end)
         for _ in range(30):

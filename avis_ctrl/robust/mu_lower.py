@@ -50,7 +50,8 @@ def _least_norm(g: Array, C: Array, t_fixed: Array | None = None) -> _Step:
         t, kink = t_fixed[:, None], np.full((batch, 1), -1)
     else:
         with np.errstate(divide="ignore", invalid="ignore"):
-            kinks = np.where(np.abs(b) > 1e-12 * np.abs(a), -a / b, 0.0)
+            bends = np.abs(b) > 1e-12 * np.abs(a)
+            kinks = np.where(bends, -a / b, 0.0)
         order = np.argsort(kinks, axis=1)
         sorted_kinks = np.take_along_axis(kinks, order, axis=1)
         edges = np.concatenate([np.full((batch, 1), -np.inf), sorted_kinks, np.full((batch, 1), np.inf)], axis=1)
@@ -64,7 +65,8 @@ def _least_norm(g: Array, C: Array, t_fixed: Array | None = None) -> _Step:
         flat = np.where(inner > 0, -slope / np.sqrt(np.maximum(inner, 1e-300)), 0.0)
         # Kinks first: where an interval's own minimum is clipped to its end, the kink is what is meant.
         t = np.concatenate([sorted_kinks, np.clip(flat, low, high), np.zeros((batch, 1))], axis=1)
-        kink = np.concatenate([order, np.full((batch, m + 2), -1)], axis=1)
+        owner = np.where(np.take_along_axis(bends, order, axis=1), order, -1)
+        kink = np.concatenate([owner, np.full((batch, m + 2), -1)], axis=1)
     best = np.argmin(height(t), axis=1)[:, None]
     t, kink = np.take_along_axis(t, best, axis=1), np.take_along_axis(kink, best, axis=1)[:, 0]
     k = 1.0 / np.maximum(height(t)[:, 0], 1e-12)

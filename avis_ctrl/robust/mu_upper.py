@@ -122,7 +122,7 @@ def _skewed_from(M: Array, structure: BlockStructure, start: Scalings, tolerance
     X_w = np.repeat(np.eye(structure.n_w, dtype=complex)[None], batch, axis=0)
     X_z = np.repeat(np.eye(structure.n_z, dtype=complex)[None], batch, axis=0)
     G = np.zeros((batch, structure.n_w, structure.n_z), complex)
-    X_w[:, :r_w, :r_w], X_z[:, :r_z, :r_z], G[:, :r_w, :r_z] = start
+    X_w[:, :r_w, :r_w], X_z[:, :r_z, :r_z], G[:, :r_w, :r_z] = start.X_w, start.X_z, start.G
     room = residual(M[:, :, :r_z, :r_w], start, np.ones(batch), np.ones(r_w, bool))
     L = np.linalg.inv(np.linalg.cholesky(room))
     taken = np.max(np.linalg.norm(M[:, :, r_z:, :r_w] @ dagger(L), ord=2, axis=(2, 3)), axis=1)

@@ -1,0 +1,259 @@
+"""Peaks over frequency: printed examples, spikes that no grid meets, exact norms, and the guarantee itself."""
+
+import numpy as np
+import pytest
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti import StateSpace, append, discretise, gain, hinf_norm, lft_upper, tf
+from avis_ctrl.robust.mu import mu_upper
+from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
+from avis_ctrl.robust.mu_realise import realise_delta
+from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
+
+C, R, F = ComplexScalar, RealScalar, ComplexFull
+
+
+def spinning_satellite(a=10.0):
+    """Skogestad and Postlethwaite, section 3.7.1 with K = I: T = 1/(s+1) [1 a; -a 1]; N = -T (input uncertainty)."""
+    return StateSpace(-np.eye(2), np.eye(2), -np.array([[1, a], [-a, 1]]), np.zeros((2, 2)))
+
+
+def distillation():
+    """Skogestad and Postlethwaite (1996), section 8.11.3, inverse-based controller K = 0.7/s inv(G).
+
+    w_I = (s + 0.2)/(0.5 s + 1), w_P = (s/2 + 0.05)/s; S = s/(s + 0.7) I, so that every entry of N is a scalar
+    times a constant matrix and the integrators cancel.
+    """
+    G0 = np.array([[87.8, -86.4], [108.2, -109.6]])
+    T_wI = np.polymul([1, 0.2], [0.7]), np.polymul([0.5, 1], [1, 0.7])
+    entries = [((-T_wI[0], T_wI[1]), np.eye(2)), ((-np.polymul(T_wI[0], [75, 1]), T_wI[1]), np.linalg.inv(G0)),
+               (([0.5, 0.05], np.polymul([1, 0.7], [75, 1])), G0), (([0.5, 0.05], [1, 0.7]), np.eye(2))]
+    parts = []
+    for k, ((num, den), matrix) in enumerate(entries):
+        one = tf(num, den)
+        both = append(one.renamed([f"u{k}a"], [f"y{k}a"]), one.renamed([f"u{k}b"], [f"y{k}b"]))
+        parts.append(both @ gain(matrix, [f"v{k}a", f"v{k}b"], [f"u{k}a", f"u{k}b"]))
+    I, O = np.eye(2), np.zeros((2, 2))
+    return append(*parts).scaled(left=np.block([[I, I, O, O], [O, O, I, I]]),
+                                 right=np.block([[I, O], [O, I], [I, O], [O, I]]))
+
+
+def flexible(rng, n_w, n_z, modes=6, damping=1e-3):
+    """Lightly damped modes, each seen by every channel."""
+    omega = np.sort(10 ** rng.uniform(-1, 2, modes))
+    A = np.zeros((2 * modes, 2 * modes))
+    B, C_ = np.zeros((2 * modes, n_w)), np.zeros((n_z, 2 * modes))
+    for k, w in enumerate(omega):
+        A[2 * k:2 * k + 2, 2 * k:2 * k + 2] = [[0, w], [-w, -2 * damping * w]]
+        B[2 * k + 1] = rng.standard_normal(n_w) * np.sqrt(w * damping)
+        C_[:, 2 * k] = rng.standard_normal(n_z) * np.sqrt(w * damping)
+    return StateSpace(A, B, C_, 0.1 * rng.standard_normal((n_z, n_w)))
+
+
+def singular_at(N, found):
+    A = np.eye(N.noutputs) - N(1j * found.omega) @ found.delta
+    return np.linalg.svd(A, compute_uv=False)[-1] < 1e-8 * (1 + np.linalg.norm(A, 2))
+
+
+# -- printed values -----------------------------------------------------------------------------------------
+
+def test_spinning_satellite_real_repeated_is_one_at_one_frequency():
+    """Skogestad and Postlethwaite (1996), example 8.10: mu is 1 at one frequency, 0 at all others.
+
+    -T(j omega) has eigenvalues -(1 +- j a)/(1 + j omega), real (equal to -1) at omega = a only.
+    """
+    N = spinning_satellite()
+    found = mu_peak(N, [R(2)])
+    assert found.guaranteed
+    assert 1.0 <= found.upper < 1.002
+    assert found.lower == pytest.approx(1.0, rel=1e-6) and found.omega == pytest.approx(10.0, rel=1e-6)
+    assert found.delta == pytest.approx(-np.eye(2), abs=1e-6) and singular_at(N, found)
+    grid = N.frequency_response(np.geomspace(0.1, 1e3, 50))
+    assert np.max(mu_upper(grid, [R(2)]).upper) < 1e-3
+
+
+@pytest.mark.parametrize("blocks", [[F(2)], [C(2)], [C(), C()]])
+def test_spinning_satellite_complex(blocks):
+    """sigma_max(T(0)) = sqrt(1 + a^2), and |eig T(0)| = |1 +- j a| is the same: all three structures coincide."""
+    expected = np.sqrt(101)
+    found = mu_peak(spinning_satellite(), blocks)
+    assert found.guaranteed and found.omega == 0.0
+    assert expected * (1 - 1e-4) <= found.upper <= expected * (1 + 1e-3)
+    assert found.lower == pytest.approx(expected, rel=1e-4)
+
+
+def test_distillation_robust_stability_and_performance():
+    """Printed peaks: RS 0.53, RP 5.77 (section 8.11.3, figure 8.15; read off a grid, hence 0.5 %)."""
+    N = distillation()
+    stability = mu_peak(N.select(slice(2), slice(2)), [C(), C()])
+    performance = mu_peak(N, [C(), C(), F(2)])
+    assert stability.upper == pytest.approx(0.53, abs=5e-3) and stability.lower == pytest.approx(0.53, abs=5e-3)
+    assert performance.guaranteed and performance.upper == pytest.approx(5.77, rel=5e-3)
+    assert performance.lower >= (1 - 1e-3) * performance.upper and singular_at(N, performance)
+
+
+def test_distillation_worst_case_gain():
+    """Printed peak of the skewed mu: 44.93 (section 8.11.3, remark on worst-case performance; off a grid)."""
+    N = distillation()
+    found = worst_case_gain(N, [C(), C()])
+    assert found.guaranteed and found.upper == pytest.approx(44.93, rel=5e-3)
+    assert found.lower == pytest.approx(44.93, rel=5e-3)
+    # The scaled system has mu 1 exactly at the worst-case gain (definition of the skewed mu).
+    skewed = mu_peak(N.scaled(left=[1, 1, 1 / found.upper, 1 / found.upper]), [C(), C(), F(2)])
+    assert skewed.upper == pytest.approx(1.0, rel=2e-3)
+
+
+def test_mass_spring_damper_with_uncertain_damping():
+    """MathWorks, "Getting Reliable Estimates of Robustness Margins": m = k = 1, c = 1 +- 100 %: margin 1 at 1 rad/s."""
+    N = StateSpace([[0, 1], [-1, -1]], [[0], [-1]], [[0, 1]], [[0]])
+    found = mu_peak(N, [R()])
+    assert found.guaranteed and found.upper == pytest.approx(1.0, rel=1e-3)
+    assert found.lower == pytest.approx(1.0, rel=1e-9) and found.omega == pytest.approx(1.0, rel=1e-6)
+
+
+# -- exact values -------------------------------------------------------------------------------------------
+
+def test_full_block_is_the_hinf_norm(rng):
+    N = flexible(rng, 2, 3)
+    found = mu_peak(N, [F(2, 3)])
+    norm = hinf_norm(N)
+    assert found.guaranteed and norm.gain * (1 - 1e-6) <= found.upper <= norm.gain * (1 + 2e-3)
+    assert found.lower == pytest.approx(norm.gain, rel=1e-3) and found.omega == pytest.approx(norm.omega, rel=1e-3)
+
+
+def test_narrow_resonance_between_grid_points():
+    """A mode of damping 1e-7 (half-width 1e-7 of its frequency) beside a broad one."""
+    narrow, broad = tf([1e-6, 0], [1, 2e-7 * 3.7, 3.7 ** 2]), tf([1], [1, 1])
+    N = append(narrow.renamed(["a"], ["b"]), broad.renamed(["c"], ["d"]))
+    found = mu_peak(N, [C(), C()])
+    assert found.guaranteed
+    assert found.upper == pytest.approx(1e-6 / (2e-7 * 3.7), rel=1e-3) and found.omega == pytest.approx(3.7, rel=1e-6)
+
+
+def test_spike_of_a_real_parameter_away_from_every_pole():
+    """1 + delta L(s), L = 2/(s+1)^3: the phase is -180 degrees at sqrt(3) alone, |L| = 1/4 there; L(0) = 2."""
+    N = -tf([2], [1, 3, 3, 1])
+    spike = mu_peak(N, [R()], band=(0.5, 10.0))
+    assert spike.guaranteed and spike.upper == pytest.approx(0.25, rel=1e-3)
+    assert spike.lower == pytest.approx(0.25, rel=1e-8) and spike.omega == pytest.approx(np.sqrt(3), rel=1e-8)
+    assert mu_peak(N, [R()]).lower == pytest.approx(2.0, rel=1e-9)
+
+
+def test_real_perturbation_puts_a_pole_on_the_axis(rng):
+    N = flexible(rng, 3, 3, modes=4, damping=0.05)
+    found = mu_peak(N, [R(), R(), R()])
+    assert found.guaranteed and 0 < found.lower <= found.upper
+    closed = N.A + N.B @ found.delta.real @ np.linalg.solve(np.eye(3) - N.D @ found.delta.real, N.C)
+    assert np.min(np.abs(np.linalg.eigvals(closed) - 1j * found.omega)) < 1e-6 * max(found.omega, 1.0)
+    for _ in range(200):
+        delta = np.diag(rng.uniform(-1, 1, 3)) / found.upper
+        perturbed = N.A + N.B @ delta @ np.linalg.solve(np.eye(3) - N.D @ delta, N.C)
+        assert np.max(np.linalg.eigvals(perturbed).real) < 0
+
+
+# -- the guarantee, bands, clocks ---------------------------------------------------------------------------
+
+def test_upper_bound_holds_between_the_points(rng):
+    blocks = [R(), C(), C(2), F(2)]
+    N = flexible(rng, 6, 6, modes=8)
+    found = mu_peak(N, blocks)
+    assert found.guaranteed and "from 0 to infinity" in found.covers
+    dense = np.concatenate([np.abs(N.poles()) * (1 + d) for d in np.linspace(-5e-3, 5e-3, 41)])
+    assert np.max(mu_upper(N.frequency_response(dense), blocks).upper) <= found.upper * (1 + 1e-6)
+    assert found.lower >= 0.9 * found.upper and singular_at(N, found)
+    assert found.upper_curve.shape == found.lower_curve.shape == found.frequencies.shape
+    assert np.all(found.lower_curve <= found.upper_curve * (1 + 1e-6)) and np.max(found.upper_curve) <= found.upper
+
+
+def test_band():
+    N = distillation()
+    low = mu_peak(N, [C(), C(), F(2)], band=(0.0, 0.1))
+    assert low.guaranteed and low.omega == pytest.approx(0.1)
+    assert low.upper == pytest.approx(mu_upper(N(0.1j), [C(), C(), F(2)]).upper, rel=1e-3)
+    high = worst_case_gain(N, [C(), C()], band=(100.0, np.inf))
+    assert high.guaranteed and high.upper < 0.5 * worst_case_gain(N, [C(), C()]).upper
+
+
+def test_sampled_system_has_the_mu_of_its_bilinear_image():
+    N, blocks = distillation(), [C(), C(), F(2)]
+    continuous, sampled = mu_peak(N, blocks), mu_peak(discretise(N, 0.1, "tustin"), blocks)
+    assert sampled.upper == pytest.approx(continuous.upper, rel=1e-3)
+    assert np.tan(sampled.omega * 0.05) / 0.05 == pytest.approx(continuous.omega, rel=1e-2)
+    assert sampled.frequencies[-1] == pytest.approx(np.pi / 0.1)
+
+
+def test_static_and_zero_systems():
+    assert mu_peak(gain([[2, 2], [-1, -1]]), [C(), C()]).upper == pytest.approx(3.0, rel=1e-3)
+    nothing = mu_peak(tf([1], [1, 1]).scaled(left=0.0), [C()])
+    assert nothing.upper < 1e-8 and nothing.lower == 0 and nothing.delta is None
+
+
+# -- worst-case gain and simulation -------------------------------------------------------------------------
+
+def test_worst_case_gain_is_what_the_perturbed_system_has(rng):
+    blocks = [R(2), C(2), C(), F(2, 1)]
+    structure = BlockStructure.of(blocks)
+    N = flexible(rng, structure.n_w + 2, structure.n_z + 2, modes=5, damping=0.02)
+    robust = mu_peak(N.select(range(structure.n_z), range(structure.n_w)), blocks)
+    N = N.scaled(left=np.r_[np.full(structure.n_z, 0.5 / robust.upper), np.ones(2)])
+    found = worst_case_gain(N, blocks)
+    assert found.guaranteed and hinf_norm(N.select([-2, -1], [-2, -1])).gain < found.lower <= found.upper
+    delta = realise_delta(found.delta, found.omega, blocks)
+    assert hinf_norm(delta).gain <= 1 + 1e-9
+    closed = lft_upper(N, delta)
+    assert np.linalg.norm(closed(1j * found.omega), 2) == pytest.approx(found.lower, rel=1e-6)
+    assert found.lower * (1 - 1e-6) <= hinf_norm(closed).gain <= found.upper
+    for _ in range(100):
+        response = lft_upper(N, structure.random(rng, real=True).real).frequency_response(found.frequencies)
+        assert np.max(np.linalg.norm(response, 2, axis=(1, 2))) <= found.upper
+
+
+def test_worst_case_gain_of_an_unstable_family():
+    N = distillation().scaled(left=[4, 4, 1, 1])
+    found = worst_case_gain(N, [C(), C()])
+    assert found.upper == np.inf and found.lower == np.inf and "unstable" in found.covers
+    assert np.linalg.norm(found.delta, 2) <= 1
+    assert singular_at(N.select(slice(2), slice(2)), found)
+
+
+def test_realised_perturbation_puts_a_pole_on_the_axis(rng):
+    blocks = [R(), C(2), F(2, 3)]
+    structure = BlockStructure.of(blocks)
+    N = flexible(rng, structure.n_w, structure.n_z, modes=4, damping=0.02)
+    found = mu_peak(N, blocks)
+    delta = realise_delta(found.delta, found.omega, blocks)
+    assert delta.is_stable() and hinf_norm(delta).gain == pytest.approx(1 / found.lower, rel=1e-6)
+    assert np.max(np.abs(delta(1j * found.omega) - found.delta)) < 1e-6 / found.lower
+    doubled = N.scaled(left=np.vstack([np.eye(structure.n_z)] * 2), right=np.hstack([np.eye(structure.n_w)] * 2))
+    poles = lft_upper(doubled, delta).poles()
+    assert np.min(np.abs(poles - 1j * found.omega)) < 1e-5 * found.omega
+
+
+@pytest.mark.parametrize("value", [0.3 + 0.4j, -0.3 + 0.4j, 0.3 - 0.4j, -0.3 - 0.4j, 0.5, -0.5])
+def test_realised_scalar_is_all_pass(value):
+    delta = realise_delta([[value]], 7.0, [C()])
+    assert delta(7j)[0, 0] == pytest.approx(value, abs=1e-12)
+    assert np.abs(delta.frequency_response(np.geomspace(1e-3, 1e4, 30))) == pytest.approx(0.5, rel=1e-9)
+
+
+# -- input --------------------------------------------------------------------------------------------------
+
+def test_unstable_system_names_its_pole():
+    with pytest.raises(ComputationError, match=r"pole 0\.25"):
+        mu_peak(tf([1], [1, -0.25]), [C()])
+
+
+def test_wrong_input_is_named():
+    N = tf([1], [1, 1])
+    with pytest.raises(InputError, match="blocks"):
+        mu_peak(N, [C(), C()])
+    with pytest.raises(InputError, match="band"):
+        mu_peak(N, [C()], band=(2.0, 1.0))
+    with pytest.raises(InputError, match="performance"):
+        worst_case_gain(N, [C()])
+    with pytest.raises(InputError, match="structure"):
+        realise_delta(np.eye(3), 1.0, [C()])
+    with pytest.raises(ComputationError, match="frequency 0"):
+        realise_delta([[1j]], 0.0, [C()])
+    with pytest.raises(ComputationError, match="rank one"):
+        realise_delta(np.eye(2), 1.0, [F(2)])
