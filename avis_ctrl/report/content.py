@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from avis_ctrl.report.pieces import Document
 from avis_ctrl.report.sections.bounds import bounds
+from avis_ctrl.report.sections.controllers import controllers
+from avis_ctrl.report.sections.method import method
+from avis_ctrl.report.sections.plant import generalized_plant
 from avis_ctrl.report.sections.provenance import provenance, stamp
+from avis_ctrl.report.sections.rig import rig
+from avis_ctrl.report.sections.simulation import simulation
+from avis_ctrl.report.sections.site import site
+from avis_ctrl.report.sections.synthesis import synthesis
 from avis_ctrl.report.sections.transmissibility import transmissibility
 from avis_ctrl.report.sections.verdict import comparison, verdict
 from avis_ctrl.report.words import axis, joined
 from avis_ctrl.study.model import DesignResult
 
-SECTIONS = (verdict, comparison, transmissibility, bounds, provenance)
+SECTIONS = (verdict, comparison, transmissibility, rig, generalized_plant, bounds, synthesis, controllers, site,
+            simulation, method, provenance)
 
 
 def document(result: DesignResult) -> Document:

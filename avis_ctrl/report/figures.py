@@ -98,7 +98,8 @@ class Figure:
         """What the legend shows: each label once, in order."""
         seen: dict[str, Curve | Band] = {}
         for panel in self.panels:
-            for thing in (*panel.curves, *panel.bands):
+            things: list[Curve | Band] = [*panel.curves, *panel.bands]
+            for thing in things:
                 if thing.label:
                     seen.setdefault(thing.label, thing)
         return list(seen.values())

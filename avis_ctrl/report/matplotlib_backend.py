@@ -17,7 +17,7 @@ from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, lo
 WIDTH_IN, PANEL_IN, LEGEND_IN, LEGEND_COLUMNS = 6.7, 2.35, 0.2, 3
 LINES = {"solid": "-", "dash": (0, (5, 2)), "dot": (0, (1, 1.5)), "dashdot": (0, (5, 1.5, 1, 1.5))}
 # Same input, same bytes: element names follow from the salt, and no date is written.
-SETTINGS: dict[str, Any] = {"svg.fonttype": "path", "svg.hashsalt": "avis_ctrl", "font.size": 8.0,
+SETTINGS: Any = {"svg.fonttype": "path", "svg.hashsalt": "avis_ctrl", "font.size": 8.0,
                             "axes.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False,
                             "axes.unicode_minus": True, "path.simplify": True}
 

@@ -27,9 +27,10 @@ def render(document: Document) -> bytes:
         {"title": s.title, "pieces": [_piece(p) for p in s.pieces]} for s in document.sections]}
     template = (resources.files("avis_ctrl.report") / "report.typ").read_bytes()
     # The drawings' sans-serif text is set in the font that matplotlib brings, the same on every machine.
-    fonts = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
+    folder = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
+    fonts = typst.Fonts(include_system_fonts=False, include_embedded_fonts=True, font_paths=[str(folder)])
     try:
-        made = typst.compile(template, format="pdf", font_paths=[str(fonts)], ignore_system_fonts=True, timestamp=0,
+        made = typst.compile(template, format="pdf", font_paths=fonts, ignore_system_fonts=True, timestamp=0,
                              sys_inputs={"document": json.dumps(content, allow_nan=False)})
     except typst.TypstError as error:
         raise ComputationError("the PDF report was not typeset", cause=str(error),

@@ -31,7 +31,8 @@ def graph(figure: Figure) -> dict[str, Any]:
         layout[f"yaxis{suffix}"] = {**_axis(panel.y, limits), "anchor": f"x{suffix}", "domain": domain}
         if panel.title:
             layout["annotations"].append(_title(panel, domain[1]))
-        for thing in (*panel.bands, *panel.curves):
+        things: list[Band | Curve] = [*panel.bands, *panel.curves]
+        for thing in things:
             drawn = _band(thing) if isinstance(thing, Band) else [_curve(thing)]
             for trace in drawn:
                 in_legend = bool(thing.label) and trace.pop("key") and thing.label not in shown

@@ -72,9 +72,9 @@ def _spread_words(result: DesignResult) -> str:
         c = result.controller(name)
         parts.append(f"{c.title}: sampled plants peak at {words.decibel(float(np.max(c.transmissibility.high)))}, the "
                      f"bound at {words.decibel(c.worst_peak.upper)}")
-    return ("Largest singular value over the uncertainty set: nominal (line), range over the sampled plants (area), and "
-            f"the upper bound that no plant of the set exceeds. {'; '.join(parts)}. A bound that is missing at some "
-            "frequency was not computed there.")
+    return ("Largest singular value over the uncertainty set: nominal (line), range over the sampled plants (area), "
+            f"and the upper bound that no plant of the set exceeds. {'; '.join(parts)}. A bound that is missing "
+            "at some frequency was not computed there.")
 
 
 def _by_axis(result: DesignResult) -> Figure:

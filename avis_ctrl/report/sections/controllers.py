@@ -1,0 +1,101 @@
+"""The controllers: gain over frequency, poles, loop and sensitivity."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, decibels, hertz, numbered
+from avis_ctrl.report.pieces import Piece, Section, Table, table
+from avis_ctrl.study.model import ControllerResult, DesignResult
+
+HZ = np.geomspace(0.01, 500.0, 500)
+MOST_POLES = 60
+
+
+def controllers(result: DesignResult) -> Section:
+    """The section on the controllers."""
+    made = [c for c in result.controllers if c.K is not None]
+    pieces: list[Piece] = [_files(result, made), _gains(made), _bode(result), _loops(result, made),
+                           _poles(result.controller("mu"))]
+    return Section("Controllers", "controllers", tuple(pieces))
+
+
+def _system(c: ControllerResult) -> StateSpace:
+    assert c.K is not None  # the caller leaves the passive rig out
+    return c.K
+
+
+def _files(result: DesignResult, made: list[ControllerResult]) -> Table:
+    rate = result.rig.sample_rate_Hz
+    rows = [(c.title, f"controllers/{c.name}.json", str(c.order), f"{words.number(c.fastest_pole_Hz)} Hz",
+             words.number(2 * c.fastest_pole_Hz / rate), words.yes(_system(c).is_stable())) for c in made]
+    return table(f"The controllers and their state-space files. The fastest pole is set against half the sample "
+                 f"rate of {words.number(rate, 4)} Hz.",
+                 ("controller", "file", "order", "fastest pole", "over half the rate", "stable itself"), rows, "llrrrc")
+
+
+def _gains(made: list[ControllerResult]) -> Figure:
+    omega = 2 * np.pi * HZ
+    curves = []
+    for c in made:
+        sigma = np.linalg.svd(_system(c).frequency_response(omega), compute_uv=False)
+        curves.append(Curve(HZ, sigma[:, 0], c.title, STYLES[c.name]))
+        if sigma.shape[1] > 1:
+            style = STYLES[c.name]
+            curves.append(Curve(HZ, sigma[:, -1], "", Style(style.colour, style.dash, 0.8)))
+    return Figure("controller_gains", "Singular values of the controllers, from measured velocity to force: largest "
+                  "(thick) and smallest (thin).",
+                  (Panel(hertz(0.01, 500.0), Axis("gain [N s/m]", "log"), tuple(curves)),))
+
+
+def _bode(result: DesignResult) -> Figure:
+    K = _system(result.controller("mu"))
+    response = K.frequency_response(2 * np.pi * HZ)
+    sizes, phases = [], []
+    for i in range(K.noutputs):
+        for j in range(K.ninputs):
+            style = numbered(i * K.ninputs + j)
+            label = f"{words.axis(result.plant.axes[j])} to {words.axis(result.plant.axes[i])}"
+            sizes.append(Curve(HZ, np.abs(response[:, i, j]), label, style))
+            phases.append(Curve(HZ, (np.degrees(np.angle(response[:, i, j])) + 180) % 360 - 180, label, style))
+    x = hertz(0.01, 500.0)
+    return Figure("controller_bode", "Bode plot of the mu controller, each measurement to each command; the phase is "
+                  "wrapped into ±180 degrees.",
+                  (Panel(x, Axis("gain [N s/m]", "log"), tuple(sizes)),
+                   Panel(x, Axis("phase [deg]", "linear", (-190.0, 190.0)), tuple(phases))))
+
+
+def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
+    P = result.plant.synthesis.P
+    omega = 2 * np.pi * HZ
+    y, u = list(result.plant.synthesis.y), list(result.plant.synthesis.u)
+    G = P.select(y, u).frequency_response(omega)
+    loops, sensitivities = [], []
+    peaks = []
+    for c in made:
+        L = G @ _system(c).frequency_response(omega)
+        S = np.linalg.inv(np.eye(L.shape[1]) - L)
+        size = np.linalg.norm(S, ord=2, axis=(1, 2))
+        peaks.append(f"{c.title} {words.decibel(float(size.max()))}")
+        loops.append(Curve(HZ, decibels(np.linalg.norm(L, ord=2, axis=(1, 2))), c.title, STYLES[c.name]))
+        sensitivities.append(Curve(HZ, decibels(size), c.title, STYLES[c.name]))
+    x = hertz(0.01, 500.0)
+    return Figure("loops", "Largest singular value of the open loop G K at the measurement (above) and of the "
+                  f"sensitivity (I − G K)⁻¹ (below); nominal plant. Peaks of the sensitivity: {'; '.join(peaks)}.",
+                  (Panel(x, Axis("open loop [dB]", "linear", (-80.0, 50.0)), tuple(loops)),
+                   Panel(x, Axis("sensitivity [dB]", "linear", (-40.0, 20.0)), tuple(sensitivities))))
+
+
+def _poles(mu: ControllerResult) -> Table:
+    poles = _system(mu).poles()
+    shown = sorted((p for p in poles if p.imag >= 0), key=abs)
+    rows = []
+    for p in shown[:MOST_POLES]:
+        kind = "pair" if p.imag > 0 else "real"
+        damping = -p.real / abs(p) if abs(p) > 0 else 1.0
+        rows.append((f"{words.number(abs(p) / (2 * np.pi), 4)} Hz", words.number(damping), kind))
+    left = f" The fastest {len(shown) - MOST_POLES} are in the file." if len(shown) > MOST_POLES else ""
+    return table(f"Poles of the mu controller, slowest first; a pair counts once.{left}",
+                 ("frequency", "damping ratio", "kind"), rows, "rrl")

@@ -1,0 +1,147 @@
+"""The generalized plant: its diagram, signals, uncertainty and weights."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.report import words
+from avis_ctrl.report.block_diagram import block_diagram
+from avis_ctrl.report.families import EXTERNAL, Families
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, decibels, hertz, level, numbered
+from avis_ctrl.report.pieces import Bullets, Drawing, Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.sections.transmissibility import asked_dB
+from avis_ctrl.study.model import ControllerResult, DesignResult
+from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.uncertainty.weights import NeglectedDynamics
+
+ROLES = {"w": "disturbance", "z": "judged", "u": "command", "y": "measurement", "internal": "internal",
+         "w_delta": "from Delta", "z_delta": "to Delta"}
+KINDS = {"real": "real", "complex": "complex scalar", "full": "complex"}
+HZ = np.geomspace(0.1, 500.0, 400)
+
+
+def generalized_plant(result: DesignResult) -> Section:
+    """The section on the generalized plant."""
+    plant = result.plant
+    P = plant.synthesis
+    drawing = Drawing("blocks", "Connection of the generalized plant, drawn from its parts and signals. A star stands "
+                      "for the axes or channels; ×n is the number of alike parts. Red: disturbances; blue: judged "
+                      "outputs; Δ: what the model does not know.", block_diagram(plant),
+                      "Block diagram of the loop: controller, actuators, rig, sensors, weights and uncertainty")
+    summary = Paragraph(f"The plant that synthesis works on has {P.P.nstates} states, {P.ncon} commands, {P.nmeas} "
+                        f"measurements, {len(P.w)} disturbances, {len(P.z)} weighted outputs and "
+                        f"{len(P.blocks.blocks)} blocks of uncertainty. The axes are "
+                        f"{words.joined([words.axis(a) for a in plant.axes])}.")
+    pieces: list[Piece] = [summary, drawing, _signals(plant), Heading("Uncertainty"), _blocks(result),
+                           Heading("Weights"), Bullets(tuple(f"{n}: {w.meaning}" for n, w in plant.weights.items())),
+                           _transmissibility_weight(result), _effort(result)]
+    pieces += [*_chains(plant), _noise(result), *_compliance(result)]
+    return Section("Generalized plant", "plant", tuple(pieces))
+
+
+def _signals(plant: DesignPlant) -> Table:
+    rows = []
+    for s in Families(plant).signals:
+        inside = "1" if len(s.members) == 1 else str(len(s.members))
+        readers = ", ".join(s.readers) or ("controller" if s.role == "y" else "Delta" if s.role == "z_delta" else "")
+        source = {"u": "controller", "w_delta": "Delta"}.get(s.role, "outside" if s.source == EXTERNAL else s.source)
+        rows.append((s.name, inside, s.meaning or _delta_words(s.role), s.unit or "1", source, readers, ROLES[s.role]))
+    return table("Signals of the connection; a star stands for an axis or a channel.",
+                 ("signal", "number", "meaning", "unit", "made by", "read by", "role"), rows, "lclllll")
+
+
+def _delta_words(role: str) -> str:
+    return {"w_delta": "what the unknown adds", "z_delta": "what the unknown acts on"}.get(role, "")
+
+
+def _blocks(result: DesignResult) -> Table:
+    plant = result.plant
+    real = {p.name: p for p in plant.rig.parameters}
+    described = {name: p.description for name, p in result.rig.parameters().items()}
+    chain = next((w for w in plant.weights.values() if isinstance(w, NeglectedDynamics)), None)
+    rows = []
+    for block in plant.synthesis.blocks.blocks:
+        size = f"{block.rows}" if block.is_scalar_delta else f"{block.rows} × {block.cols}"
+        if block.name in real:
+            half = real[block.name].half_range(plant.rig.nominal[block.name])
+            nominal, unit = plant.rig.nominal[block.name], plant.rig.units[block.name]
+            spread = f"{nominal:.6g} ± {half:.4g} {unit}".replace("-", "−")
+            meaning = described.get(block.name, "parameter of the rig")
+        else:
+            spread = "see the weight" if chain is None else "|W| of the weight"
+            meaning = "neglected dynamics of this channel, of any phase"
+        rows.append((block.name, KINDS[block.kind], size, spread, meaning))
+    return table("Blocks of the uncertainty, in the order of Delta. A real block repeats a parameter as often as the "
+                 "equations need it; each block is at most 1 in size.",
+                 ("block", "kind", "size", "range", "what it stands for"), rows, "llcll")
+
+
+def _mu(result: DesignResult) -> ControllerResult:
+    return result.controller("mu")
+
+
+def _transmissibility_weight(result: DesignResult) -> Figure:
+    mu = _mu(result)
+    omega = mu.transmissibility.omega
+    f = omega / (2 * np.pi)
+    limit = result.plant.weights["transmissibility"].bound(omega)
+    curves = (Curve(f, asked_dB(result, omega), "asked", STYLES["limit"]),
+              Curve(f, decibels(limit), "1/|W_T|, the filter", STYLES["filter"]),
+              Curve(f, decibels(mu.transmissibility.sigma), "mu synthesis, nominal", STYLES["mu"]),
+              Curve(f, decibels(mu.transmissibility.worst), "mu synthesis, upper bound over the set", STYLES["plain"]))
+    return Figure("weight_transmissibility", "The transmissibility bound as asked, as the rational filter realises it, "
+                  "and what the loop achieves. The loop meets the bound where its curves lie below the filter's.",
+                  (Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", (-60.0, 20.0)), curves),))
+
+
+def _effort(result: DesignResult) -> Figure:
+    plant = result.plant
+    omega = 2 * np.pi * HZ
+    weight = plant.weights["control effort"]
+    curves = [Curve(HZ, weight.bound(omega), "1/|W_u|, allowed", STYLES["limit"])]
+    for k, axis in enumerate(plant.axes):
+        closed = plant.full.closed(_mu(result).K).select([f"effort_{axis}"], plant.floor_velocities)
+        gain = np.linalg.norm(closed.frequency_response(omega), ord=2, axis=(1, 2)) / weight.magnitude(omega)
+        curves.append(Curve(HZ, gain, f"mu synthesis, {words.axis(axis)}", numbered(k)))
+    return Figure("weight_effort", "Control effort: volts on the most loaded channel per m/s of floor velocity, "
+                  "against what the weight allows; nominal plant.",
+                  (Panel(hertz(0.1, 500.0), Axis("V per m/s", "log"), tuple(curves)),))
+
+
+def _chains(plant: DesignPlant) -> list[Piece]:
+    chains = {n: w for n, w in plant.weights.items() if isinstance(w, NeglectedDynamics)}
+    if not chains:
+        return []
+    omega = 2 * np.pi * HZ
+    curves = [Curve(HZ, 100 * w.magnitude(omega), f"{n.removesuffix(' *')}s", numbered(k))
+              for k, (n, w) in enumerate(chains.items())]
+    curves.append(level(0.1, 500.0, 100.0, "100 %"))
+    return [Figure("weight_chains", "Neglected dynamics of each channel: relative uncertainty over frequency. Above "
+                   "the frequency of 100 % not even the sign of the channel is known.",
+                   (Panel(hertz(0.1, 500.0), Axis("uncertainty [%]", "log", (1.0, 1000.0)), tuple(curves)),))]
+
+
+def _noise(result: DesignResult) -> Figure:
+    plant = result.plant
+    omega = 2 * np.pi * HZ
+    noise = np.abs(plant.sensor_noise.frequency_response(omega)[:, 0, 0])
+    inside = (plant.floor.low_Hz <= HZ) & (plant.floor.high_Hz >= HZ)
+    floor = np.where(inside, plant.floor.asd(HZ, "velocity"), np.nan)
+    curves = (Curve(HZ, floor, f"floor ({plant.floor.name})", STYLES["plain"]),
+              Curve(HZ, noise, "noise of one sensor", STYLES["hinf"]),
+              level(0.1, 500.0, plant.floor_density, "mean floor density, unit of the noise inputs"))
+    return Figure("weight_noise", "Density of the floor's velocity at the site, where its model holds, and of the "
+                  "noise of one sensor with its converter. Where the noise lies above the floor, the sensor sees "
+                  "itself.",
+                  (Panel(hertz(0.1, 500.0), Axis("velocity [m/s/√Hz]", "log"), curves),))
+
+
+def _compliance(result: DesignResult) -> list[Piece]:
+    if "compliance" not in result.plant.weights:
+        return []
+    omega = _mu(result).transmissibility.omega
+    f = omega / (2 * np.pi)
+    curves = (Curve(f, result.plant.weights["compliance"].bound(omega), "1/|W_c|, allowed", STYLES["limit"]),
+              Curve(f, _mu(result).compliance, "mu synthesis", STYLES["mu"]))
+    return [Figure("weight_compliance", "Compliance against what the weight allows; nominal plant.",
+                   (Panel(hertz(0.1, 200.0), Axis("compliance [m/N]", "log"), curves),))]

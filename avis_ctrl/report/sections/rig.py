@@ -1,0 +1,124 @@
+"""The rig: drawing, parameters, natural frequencies, and what the model with few coordinates leaves out."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, decibels, hertz, numbered
+from avis_ctrl.report.pieces import Drawing, Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.rig_drawing import rig_drawing
+from avis_ctrl.rigs.rig import Parameter, Rig
+from avis_ctrl.study.model import DesignResult
+
+_NUMBERED = re.compile(r"(?P<group>[A-Za-z_]+)(?P<number>\d+)\.(?P<rest>.+)")
+
+
+def rig(result: DesignResult) -> Section:
+    """The section on the rig."""
+    one = result.rig
+    drawing = Drawing("rig", f"The rig {one.name} by its named points, to scale; the outline is drawn around the "
+                      "points and is not the real contour. The edge lever turns the rotation phi_x into a "
+                      "displacement.", rig_drawing(one), f"Top view and side view of the rig {one.name}")
+    pieces: list[Piece] = [drawing, *_parameters(one), _modes(one), _electronics(result), *_reduction(result)]
+    return Section("The rig", "rig", tuple(pieces))
+
+
+def _parameters(one: Rig) -> list[Piece]:
+    plain: list[tuple[str, str, str, str]] = []
+    grouped: dict[str, dict[str, dict[int, Parameter]]] = {}
+    for name, p in one.parameters().items():
+        if match := _NUMBERED.fullmatch(name):
+            rows = grouped.setdefault(match["group"], {})
+            rows.setdefault(match["rest"], {})[int(match["number"])] = p
+        else:
+            plain.append((name, _value(p.value), p.unit, p.description))
+    found: list[Piece] = [table("Parameters of the rig.", ("name", "value", "unit", "what it is"), plain, "lrll")]
+    for group, rows in grouped.items():
+        numbers = sorted({n for row in rows.values() for n in row})
+        body = [(rest, next(iter(row.values())).unit, *(_value(row[n].value) if n in row else "" for n in numbers))
+                for rest, row in rows.items()]
+        found.append(table(f"Parameters by {group}: stiffness k, damping c and place p along each axis, the place from "
+                           f"the geometric centre.", ("name", "unit", *(f"{group} {n}" for n in numbers)), body,
+                           "ll" + "r" * len(numbers)))
+    return found
+
+
+def _value(value: float) -> str:
+    return f"{value:.6g}".replace("-", "−")
+
+
+def _modes(one: Rig) -> Table:
+    eom = one.equations_of_motion()
+    edge = np.array([one.edge_m if name.startswith("phi") else 1.0 for name in eom.coordinates])
+    modes = eom.natural_frequencies()
+    rows = []
+    for frequency, shape in zip(modes.frequencies_Hz, modes.shapes.T, strict=True):
+        damping = float(shape @ eom.C @ shape) / (4 * np.pi * frequency)
+        moved = np.abs(shape * edge)
+        moved /= moved.max()
+        main = sorted(((share, name) for share, name in zip(moved, eom.coordinates, strict=True) if share > 0.1),
+                      reverse=True)
+        rows.append((f"{words.number(frequency)} Hz", words.number(damping, 2),
+                     ", ".join(f"{name} {share:.2f}" for share, name in main)))
+    return table("Natural frequencies of the six degrees of freedom without control, modal damping, and how the "
+                 "coordinates take part (largest = 1, rotations as displacement at the edge lever).",
+                 ("frequency", "damping ratio", "moves mainly"), rows, "rrl")
+
+
+def _electronics(result: DesignResult) -> Table:
+    one, loop = result.rig, result.design.loop
+    rows = [("sample rate", f"{words.number(one.sample_rate_Hz, 4)} Hz"),
+            ("delay from sample to voltage", f"{words.number(1e3 * one.loop_delay_s)} ms"),
+            ("largest voltage of an actuator", f"{words.number(one.drive_limit_V)} V"),
+            ("amplifier corner", f"{words.number(loop.amplifier_corner_Hz)} Hz"),
+            ("edge lever of phi_x", f"{words.number(one.edge_m)} m")]
+    if one.geophones is not None:
+        g = one.geophones
+        rows += [("geophones", ", ".join(g.names)),
+                 ("geophone corner, raw and compensated",
+                  f"{words.number(g.suspension_Hz)} Hz and {words.number(g.compensated_Hz)} Hz")]
+    elif one.accelerometers is not None:
+        rows.append(("accelerometers at", ", ".join(one.accelerometers.at)))
+    if one.acquisition is not None:
+        rows.append(("converter", f"{one.acquisition.adc_bits} bits, ±{words.number(one.acquisition.adc_range_V)} V"))
+    return table("Sensors, drives and clock.", ("what", "value"), rows, "ll")
+
+
+def _reduction(result: DesignResult) -> list[Piece]:
+    error = result.reduction
+    n = len(error.keep)
+    rows = [(words.axis(out), name, f"{words.number(error.max_dB[out, name])} dB",
+             f"{words.number(error.rms_dB[out, name])} dB") for out, name in error.max_dB]
+    kept = words.joined(list(error.keep))
+    text = (f"The controller is designed on {kept} alone, with the other coordinates locked. Against all six degrees "
+            "of freedom this misses what the table and the figure show: the difference, as a share of the largest gain "
+            "at the same frequency. The floor's motion along the other axes, which the small model does not have, "
+            f"reaches {kept} with at most {words.decibel(float(np.max(np.abs(error.left_out), initial=0.0)))}.")
+    return [Heading("What the small model leaves out"), Paragraph(text),
+            table("Difference between the small model and six degrees of freedom, relative to the largest gain, over "
+                  "0.1 to 100 Hz.", ("output", "input", "largest", "r.m.s."), rows, "llrr"), _compared(result, n)]
+
+
+def _compared(result: DesignResult, n: int) -> Figure:
+    error = result.reduction
+    f = error.omega / (2 * np.pi)
+    curves = []
+    for k, name in enumerate(error.keep):
+        colour = numbered(k).colour
+        curves += [Curve(f, decibels(error.full[:, k, k]), f"{name}, six degrees of freedom",
+                         Style(colour, "solid", 2.2)),
+                   Curve(f, decibels(error.reduced[:, k, k]), f"{name}, small model", Style("#111111", "dot", 1.6))]
+    largest = np.linalg.norm(error.left_out, ord=2, axis=(1, 2)) if error.left_out.size else np.zeros(f.size)
+    curves.append(Curve(f, decibels(largest), "from the floor's other axes", numbered(3)))
+    panel = Panel(hertz(), Axis("gain [dB]", "linear", (-80.0, 40.0)), tuple(curves),
+                  title="transmissibility along each kept axis")
+    apart = [Curve(f, decibels(error.relative[:, k, k]), f"{name}, difference", Style(numbered(k).colour, "dash", 1.4))
+             for k, name in enumerate(error.keep)]
+    lower = Panel(hertz(), Axis("difference [dB]", "linear", (-140.0, 20.0)), tuple(apart),
+                  title="difference, relative to the largest gain")
+    return Figure("reduction", "Transmissibility without control, floor to payload along each kept axis: six degrees "
+                  "of freedom (coloured) and the small model on top of it (black, dotted), with what the floor's other "
+                  "axes contribute. Below, their difference.", (panel, lower))

@@ -1,0 +1,92 @@
+"""The closed loop of the nonlinear rig, simulated: pass or fail by plant, spectrum against prediction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz
+from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table
+from avis_ctrl.simulation.campaign import PlantCheck, SimulationCheck
+from avis_ctrl.simulation.spectrum_check import SpectrumAgreement
+from avis_ctrl.study.model import DesignResult
+
+
+def simulation(result: DesignResult) -> Section:
+    """The section on the simulation."""
+    check = result.simulation
+    if not isinstance(check, SimulationCheck):
+        return Section("Simulation of the nonlinear rig", "simulation", (Paragraph("No simulation was run."),))
+    passed = sum(p.passed for p in check.plants)
+    text = (f"{passed} of {len(check.plants)} plants pass. Each is the nonlinear rig with six degrees of freedom under "
+            f"the sampled mu controller, the other axes under loops of their own, for "
+            f"{words.number(check.duration_s)} s with hold, delay, converter, limits, sensors, floor motion and "
+            "noise. A plant passes if it is stable, no voltage reaches its limit, and its spectrum agrees with the linear prediction within what chance allows "
+            f"(false alarm over the whole campaign: {words.number(100 * check.false_alarm, 2)} %).")
+    pieces: list[Piece] = [Paragraph(text, "verdict", passed == len(check.plants)), _plants(check)]
+    for plant in check.plants[:1]:
+        if plant.spectrum is not None:
+            pieces += [_spectrum(plant.name, plant.spectrum), _ratios(check)]
+    pieces.append(_record(check))
+    return Section("Simulation of the nonlinear rig", "simulation", tuple(pieces))
+
+
+def _plants(check: SimulationCheck) -> Table:
+    rows = [(p.name, Mark("pass", True) if p.passed else Mark("FAIL", False),
+             Mark("yes", True) if p.stable else Mark("diverged" if p.diverged else "no", False), _agreement(p),
+             f"{words.number(p.peak_V)} V", str(p.clipped_dac + p.clipped_adc),
+             ", ".join(f"{words.axis(a)} {words.number(1e6 * v)}" for a, v in p.payload_rms.items()))
+            for p in check.plants]
+    limit = check.plants[0].limit_V
+    return table(f"Every simulated plant. Voltages as demanded, limit {words.number(limit)} V; clipped samples at "
+                 "drives and converter together.",
+                 ("plant", "verdict", "stable", "bands that agree", "peak voltage", "clipped",
+                  "velocity r.m.s. [µm/s]"), rows, "lcccrrl")
+
+
+def _agreement(p: PlantCheck) -> Mark | str:
+    if p.spectrum is None:
+        return "none computed"
+    outside = int(np.count_nonzero(p.spectrum.outside))
+    return Mark(f"{p.spectrum.ratio.size - outside} of {p.spectrum.ratio.size}", outside == 0)
+
+
+def _spectrum(name: str, s: SpectrumAgreement) -> Figure:
+    panels = []
+    for k, axis in enumerate(s.axes):
+        curves = (Curve(s.frequency_Hz, np.sqrt(s.estimated_psd[k]), "simulated", Style("#e69f00", "solid", 1.2)),
+                  Curve(s.frequency_Hz, np.sqrt(s.predicted_psd[k]), "predicted", STYLES["mu"]))
+        panels.append(Panel(hertz(float(s.frequency_Hz[0]), 100.0), Axis("velocity [m/s/√Hz]", "log"), curves, (),
+                            words.axis(axis)))
+    return Figure("spectrum", f"Payload velocity density of the plant \"{name}\": simulated, by Welch's method, and as "
+                  "the linear model of the sampled loop predicts it.", tuple(panels))
+
+
+def _ratios(check: SimulationCheck) -> Figure:
+    axes = next(p.spectrum.axes for p in check.plants if p.spectrum is not None)
+    panels = []
+    for k, axis in enumerate(axes):
+        curves = []
+        for p in check.plants:
+            if p.spectrum is not None:
+                curves.append(Curve(p.spectrum.midband_Hz, 10 * np.log10(p.spectrum.ratio[k]), "each plant",
+                                    Style("#0072b2", "solid", 0.7), points=True, line=False))
+        s = next(p.spectrum for p in check.plants if p.spectrum is not None)
+        for edge in (s.lower, s.upper):
+            curves.append(Curve(s.midband_Hz, 10 * np.log10(edge[k]), "what chance allows", STYLES["limit"]))
+        panels.append(Panel(hertz(0.8, 100.0), Axis("simulated over predicted [dB]", "linear"), tuple(curves), (),
+                            words.axis(axis)))
+    return Figure("spectrum_ratio", "Power in third octaves, simulated over predicted, for every plant. The dashed "
+                  "lines are the bounds of the first plant; each plant is judged against its own.", tuple(panels))
+
+
+def _record(check: SimulationCheck) -> Figure:
+    first = check.first
+    part = slice(0, min(5000, len(first.time)))
+    motion = [Curve(first.time[part], 1e6 * first.velocity(axis)[part], words.axis(axis),
+                    Style(("#0072b2", "#d55e00", "#009e73")[k % 3], "solid", 0.9))
+              for k, axis in enumerate(first.loop.axes)]
+    span = (float(first.time[part][0]), float(first.time[part][-1]))
+    return Figure("record", f"The first seconds of the plant \"{check.plants[0].name}\" against time: payload "
+                  "velocity, rotations at the edge.",
+                  (Panel(Axis("time [s]", "linear", span), Axis("velocity [µm/s]"), tuple(motion)),))

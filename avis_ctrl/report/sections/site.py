@@ -1,0 +1,71 @@
+"""What the site's floor motion, forces on the payload and sensor noise do."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz
+from avis_ctrl.report.pieces import Paragraph, Section, Table, table
+from avis_ctrl.rigs.vibration_criteria import CRITERIA
+from avis_ctrl.study.model import DesignResult
+
+
+def site(result: DesignResult) -> Section:
+    """The section on the site."""
+    floor = result.plant.floor
+    text = Paragraph(f"The floor moves like {floor.name} ({floor.source}), along each kept axis alike and "
+                     "independently; sensor noise is added. Nominal plant, by the linear model.")
+    return Section("On the site", "site", (text, _third_octaves(result), _motion(result), _volts(result),
+                                           _compliance(result)))
+
+
+def _third_octaves(result: DesignResult) -> Figure:
+    first = result.controllers[0].site
+    bands = first.third_octave_Hz
+    curves = []
+    for c in CRITERIA:
+        limit = c.limit(bands)
+        curves.append(Curve(bands, np.where(np.isfinite(limit), 1e6 * limit, np.nan),
+                            "VC-A (top) to VC-G" if c.name == "VC-A" else "", STYLES["faint"]))
+    curves.append(Curve(bands, 1e6 * first.floor_third_octaves, "floor", STYLES["plain"]))
+    for one in result.controllers:
+        curves.append(Curve(bands, 1e6 * one.site.payload_third_octaves.max(axis=1), one.title, STYLES[one.name]))
+    ratings = "; ".join(f"{c.title} {c.site.rating or 'none'}" for c in result.controllers)
+    panel = Panel(hertz(1.0, 100.0), Axis("velocity [µm/s r.m.s.]", "log"), tuple(curves))
+    return Figure("third_octaves", "Velocity in third octaves on the site's floor, payload by its worst axis, against "
+                  f"the generic vibration criteria. Criterion met: floor {first.floor_rating or 'none'}; {ratings}.",
+                  (panel,))
+
+
+def _motion(result: DesignResult) -> Table:
+    axes = result.plant.axes
+    rows = [(c.title, *(words.number(1e6 * c.site.velocity_rms[a]) for a in axes),
+             *(words.number(1e6 * c.site.noise_rms[a]) for a in axes), c.site.rating or "none")
+            for c in result.controllers]
+    header = ("controller", *(f"{words.axis(a)} [µm/s]" for a in axes),
+              *(f"{words.axis(a)}, noise alone [µm/s]" for a in axes), "criterion")
+    return table("Payload velocity r.m.s., from floor and sensor noise together and from the noise alone.", header,
+                 rows, "l" + "r" * 2 * len(axes) + "c")
+
+
+def _volts(result: DesignResult) -> Table:
+    rows = []
+    for c in result.controllers:
+        if c.K is not None:
+            rows += [(c.title, name, words.number(rms), words.number(c.site.volts_peak[name]),
+                      f"{words.number(100 * c.site.volts_peak[name] / result.rig.drive_limit_V, 2)} %")
+                     for name, rms in c.site.volts_rms.items()]
+    return table("Voltages on the site. The peak is what a Gaussian signal passes once in ten minutes, and its share "
+                 f"of the limit of {words.number(result.rig.drive_limit_V)} V.",
+                 ("controller", "channel", "r.m.s. [V]", "peak [V]", "share of the limit"), rows, "llrrr")
+
+
+def _compliance(result: DesignResult) -> Figure:
+    curves = []
+    for c in result.controllers:
+        style: Style = STYLES[c.name]
+        curves.append(Curve(c.transmissibility.omega / (2 * np.pi), 1e6 * c.compliance, c.title, style))
+    return Figure("compliance", "Compliance: displacement of the payload against the floor per force on it, largest "
+                  "singular value, floor at rest; nominal plant. Low is stiff.",
+                  (Panel(hertz(0.1, 200.0), Axis("compliance [µm/N]", "log"), tuple(curves)),))

@@ -1,0 +1,43 @@
+"""History of the mu synthesis."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, level, numbered
+from avis_ctrl.report.pieces import Paragraph, Section, table
+from avis_ctrl.study.model import DesignResult
+
+
+def synthesis(result: DesignResult) -> Section:
+    """Each iteration of the mu synthesis."""
+    history = result.dk_history
+    if not history:
+        return Section("D-K iteration", "synthesis", (Paragraph("No iteration was made."),))
+    rows = [(str(h.iteration), h.kind, words.bound(h.gamma, 4), words.bound(h.mu_upper, 4), str(h.order),
+             str(h.d_order), f"{words.number(100 * h.d_fit_error, 2)} %", f"{words.number(h.seconds, 2)} s")
+            for h in history]
+    steps = np.array([h.iteration for h in history], float)
+    marked = Axis("iteration", "linear", (steps[0] - 0.5, steps[-1] + 0.5))
+    gamma, mu = np.array([h.gamma for h in history]), np.array([h.mu_upper for h in history])
+    both = np.concatenate([gamma, mu])
+    both = both[np.isfinite(both)]
+    top = 1.1 * float(np.max(both, initial=1.0))
+    values = Panel(marked, Axis("gamma, mu", "linear", (0.0, top)), (
+        Curve(steps, gamma, "gamma of the scaled loop", numbered(1), points=True),
+        Curve(steps, mu, "peak of the upper bound of mu", STYLES["mu"], points=True),
+        level(steps[0] - 0.5, steps[-1] + 0.5, 1.0, "1")))
+    order = np.array([h.order for h in history], float)
+    orders = Panel(marked, Axis("states", "linear", (0.0, 1.15 * float(order.max()))), (
+        Curve(steps, order, "states of the controller", STYLES["plain"], points=True),
+        Curve(steps, np.array([h.d_order for h in history], float), "states of the scalings", numbered(3),
+              points=True)))
+    total = sum(h.seconds for h in history)
+    caption = (f"Course of the mu synthesis: {len(history)} iterations in {words.number(total)} s. gamma is measured "
+               "on the scaled loop and bounds mu with every block taken as complex.")
+    return Section("D-K iteration", "synthesis", (
+        table("The iterations. \"fit\" is what the realised scalings cost against the best ones at each frequency; the "
+              "best controller of all is kept.",
+              ("step", "kind", "gamma", "mu upper", "order", "order of D", "fit", "time"), rows, "rlrrrrrr"),
+        Figure("dk_history", caption, (values, orders))))
