@@ -54,9 +54,8 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
 def bound(plant: DesignPlant, blocks: BlockStructure, found: MuPeak) -> Bound:
     """A mu or worst-case result with its perturbation in physical words."""
     words = describe(plant, blocks, found.delta) if found.delta is not None else ()
-    curve = found.curve
-    return Bound(found.upper, found.lower, found.omega, found.guaranteed, found.delta, words, curve.omega, curve.upper,
-                 curve.lower)
+    return Bound(found.upper, found.lower, found.omega, found.guaranteed, found.delta, words, found.frequencies,
+                 found.upper_curve, found.lower_curve)
 
 
 def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> tuple[str, ...]:

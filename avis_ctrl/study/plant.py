@@ -205,7 +205,9 @@ def sensor_chain(design: Design, rig: Rig) -> tuple[StateSpace, StateSpace]:
         raise InputError("the rig file has no sensors", field="geophones")
     acc, leak = rig.accelerometers, 2 * np.pi * design.loop.integrator_corner_Hz
     chain = cascade(np.zeros(2), [-2 * np.pi * acc.low_corner_Hz, -leak], 1.0)
-    return chain, cascade([], [-leak], acc.noise_m_per_s2_rtHz)
+    # The integrated noise falls as 1/s up to the clock, and is white above, where sampling folds it back.
+    nyquist = np.pi * acc.sample_rate_Hz
+    return chain, cascade([-nyquist], [-leak], acc.noise_m_per_s2_rtHz / nyquist)
 
 
 def _sensor_side(diagram: Diagram, axes: tuple[str, ...], chain: StateSpace, noise: StateSpace,

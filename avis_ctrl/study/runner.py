@@ -31,6 +31,7 @@ from avis_ctrl.study.design_file import Design, read_design
 from avis_ctrl.study.model import ControllerResult, DesignResult
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.requirements import judge
+from avis_ctrl.study.sampling import random_perturbations
 from avis_ctrl.study.simulation import simulate_study
 
 Progress = Callable[[str], None]
@@ -61,7 +62,7 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
         plant = build_plant(design, rig)
         reduction = reduction_error(rig, design.keep)
         candidates, made = _synthesise(design, plant, rig, progress)
-        samples = real_samples(plant, SAMPLES, design.simulation.seed)
+        samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
         results = [_measured(design, plant, c, samples, progress) for c in candidates]
         by_name = {c.name: c for c in results}
         progress("skyhook tuned to the same worst-case peak")
@@ -90,13 +91,6 @@ def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndar
               progress: Progress) -> ControllerResult:
     progress(f"bounds of {c.title}")
     return analyse(design, plant, c.K, c.name, c.title, c.kind, samples, c.notes)
-
-
-def real_samples(plant: DesignPlant, count: int, seed: int) -> np.ndarray:
-    """(count, n_w, n_z) random perturbations: parameters in their ranges, chains of random size and phase."""
-    rng = np.random.default_rng(seed)
-    blocks = plant.synthesis.blocks
-    return np.array([blocks.random(rng) for _ in range(count)]).reshape(count, blocks.n_w, blocks.n_z)
 
 
 def provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:
