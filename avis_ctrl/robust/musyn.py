@@ -44,7 +44,7 @@ class MuSynthesis:
     mu_upper_complex : the same upper bound with real blocks taken as complex, as the synthesis did.
     delta : the perturbation behind mu_lower, at omega_peak [rad/s].
     guaranteed : whether mu_upper is an upper bound between the frequencies computed, too.
-    gamma : measured norm of the loop scaled by `scalings`.
+    gamma : measured norm of the loop scaled by `scalings`: no less than complex mu at any frequency.
     saved_state : JSON-able; `musyn(..., state=saved_state)` goes on from here.
     """
 
@@ -165,8 +165,8 @@ def _iterate(problem: _Problem, state: State, options: _Options) -> tuple[State,
             state = replace(state, phase=FOLLOWING[state.phase])
             continue
         scalings, cost, kind = proposal
-        loop = Loop(synthesis.K, scalings, synthesis.gamma)
-        points = analysed(problem.P, loop.K, problem.structure, _next_grid(state, synthesis.closed_loop))
+        points = analysed(problem.P, synthesis.K, problem.structure, _next_grid(state, synthesis.closed_loop))
+        loop = Loop(synthesis.K, scalings, synthesis.gamma, points.peak)
         row = Iteration(len(state.history), synthesis.gamma, points.peak, synthesis.K.nstates, cost,
                         sum(scalings.orders), time.monotonic() - began, kind)
         state = _recorded(state, loop, row, points)
@@ -217,7 +217,7 @@ def _proposed(problem: _Problem, state: State, options: _Options) -> _Proposal |
         step = _d_step(problem, state.last, state.points, options)
         return _Proposal(step.scalings, step.cost, "D-K")
     band = band_of(state.points.omega)
-    start = state.best.scalings
+    start = min(state.last, state.best, key=lambda loop: loop.gamma).scalings
     if state.phase == "growth":
         larger = grown(problem.P, problem.nmeas, problem.ncon, start, band, options.max_added_states)
         if larger is None:
@@ -253,10 +253,20 @@ def _next_grid(state: State, closed_loop: StateSpace) -> np.ndarray:
 
 def _recorded(state: State, loop: Loop, row: Iteration, points: PointwiseScalings) -> State:
     """The state after an iteration: the best loop kept, the phase moved on where nothing was gained."""
-    gained = np.inf if state.best is None else 1 - loop.gamma / state.best.gamma
+    gained = np.inf if state.best is None else 1 - loop.mu / state.best.mu
     best = loop if gained > 0 else state.best
     phase = state.phase if gained > STALL else FOLLOWING[state.phase]
     return State(phase, points, loop, best, (*state.history, row))
+
+
+def _certificate(problem: _Problem, best: Loop) -> tuple[Scalings, float]:
+    """Realised scalings that bound mu of a loop at every frequency, and the bound: those K was made with, or fresh."""
+    closed = lft_lower(problem.P, best.K)
+    points = analysed(problem.P, best.K, problem.structure, frequency_grid(closed))
+    fresh = choose_scalings(points, max_states=10 * problem.P.nstates, start=best.scalings).scalings
+    bounds = [(hinf_norm(one.scale(closed), NORM_TOLERANCE).gain, one) for one in (best.scalings, fresh)]
+    gamma, scalings = min(bounds, key=lambda bound: bound[0])
+    return scalings, gamma * (1 + NORM_TOLERANCE)
 
 
 def _result(problem: _Problem, uncertainty: BlockStructure, state: State, status: str,
@@ -266,7 +276,7 @@ def _result(problem: _Problem, uncertainty: BlockStructure, state: State, status
     assert best is not None
     closed = lft_lower(problem.P, best.K)
     # The norm of the scaled loop holds between all frequencies; with real blocks taken as complex it bounds theirs.
-    gamma = hinf_norm(best.scalings.scale(closed), NORM_TOLERANCE).gain * (1 + NORM_TOLERANCE)
+    scalings, gamma = _certificate(problem, best)
     peak = mu_peak(closed, uncertainty)
     has_real = any(block.kind == "real" for block in uncertainty.blocks)
     mu_upper = min(peak.upper, gamma)
@@ -281,5 +291,5 @@ def _result(problem: _Problem, uncertainty: BlockStructure, state: State, status
         notes.append(f"fastest controller pole {fastest:.4g} rad/s is {ratio:.2g} of half the sample rate")
     guaranteed = peak.guaranteed or mu_upper == gamma
     return MuSynthesis(best.K, mu_upper, peak.lower, peak.omega, complex_upper, guaranteed, peak.delta, uncertainty,
-                       best.scalings, gamma, closed, fastest, state.history, status, tuple(notes),
+                       scalings, gamma, closed, fastest, state.history, status, tuple(notes),
                        state.as_dict(problem.P, problem.nmeas, problem.ncon))

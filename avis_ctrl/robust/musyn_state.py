@@ -40,15 +40,16 @@ class Iteration:
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A controller, the scalings it was made with, and the measured norm of the loop they scale."""
+    """A controller, the scalings it was made with, the norm of the loop they scale, and its peak mu on the grid."""
 
     K: StateSpace
     scalings: Scalings
     gamma: float
+    mu: float
 
     def as_dict(self) -> dict[str, Any]:
         return {"K": {key: getattr(self.K, key).tolist() for key in "ABCD"}, "scalings": self.scalings.as_dicts(),
-                "gamma": self.gamma}
+                "gamma": self.gamma, "mu": self.mu}
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class State:
         def loop(item: dict[str, Any]) -> Loop:
             A, B, C, D = (np.array(item["K"][key], float) for key in "ABCD")
             return Loop(StateSpace(A, B, C, D, 0.0, n_y, n_u), Scalings.from_dicts(structure, item["scalings"]),
-                        float(item["gamma"]))
+                        float(item["gamma"]), float(item["mu"]))
         last = loop(saved["last"])
         points = analysed(P, last.K, structure, np.array(saved["omega"], float))
         return State(str(saved["phase"]), points, last, loop(saved["best"]),
