@@ -21,7 +21,7 @@ from avis_ctrl.lti.realisation import discretise
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.nonlinear import RigArrays, rig_arrays
-from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.rigs.rigid_body import COORDINATES, EquationsOfMotion
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
 
 N_Q = len(COORDINATES)
@@ -44,7 +44,12 @@ class StepArrays(NamedTuple):
 
 
 def sampled(system: StateSpace, period_s: float) -> StateSpace:
-    """The system at that sample time: by Tustin's rule, or as it is when already sampled so."""
+    """The system at that sample time: by Tustin's rule, or as it is when already sampled so.
+
+    Tustin's rule bends frequency: at 50 Hz and 1 kHz by 0.8 %, well inside the band of these loops, so that no
+    frequency is singled out for prewarping. A pole much faster than the clock becomes one near -1, which rings at half
+    the sample rate: let a controller's fast poles be removed before, as its fastest pole tells.
+    """
     if system.dt and abs(system.dt - period_s) > 1e-9 * period_s:
         raise InputError(f"a continuous system, or one sampled at {period_s:g} s", field="dt", value=system.dt)
     return replace(system, dt=period_s) if system.dt else discretise(system, period_s, "tustin")
@@ -86,7 +91,7 @@ def linear_part(loop: SampledLoop) -> StateSpace:
     return connect(parts, inputs, outputs)
 
 
-def _table(eom, H: np.ndarray, sensors: tuple[str, ...], quantity: str) -> StateSpace:
+def _table(eom: EquationsOfMotion, H: np.ndarray, sensors: tuple[str, ...], quantity: str) -> StateSpace:
     """M q'' = -C q' - K q + K_f q_f + C_f q_f' + T u + M excess, with states (q, q', q_f)."""
     n_u, zero, one = len(eom.actuators), np.zeros((N_Q, N_Q)), np.eye(N_Q)
     acceleration_x = la.solve(eom.M, np.hstack([-eom.K, -eom.C, eom.K_floor]))

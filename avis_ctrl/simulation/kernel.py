@@ -12,6 +12,7 @@ from numba import njit
 
 from avis_ctrl.rigs.converter import quantise
 from avis_ctrl.rigs.nonlinear import payload_acceleration
+from avis_ctrl.simulation.discrete import StepArrays
 
 _quantise = njit(cache=True)(quantise)
 
@@ -52,7 +53,7 @@ class Work(NamedTuple):
     controlled: np.ndarray
 
 
-def workspace(arrays, state: np.ndarray, delay: int) -> Work:
+def workspace(arrays: StepArrays, state: np.ndarray, delay: int) -> Work:
     """A loop that starts in `state` with its controller at rest; delay in steps."""
     matrices = (arrays.advance, arrays.observe, arrays.sense, arrays.control)
     n_u = arrays.observe.shape[0] - 6

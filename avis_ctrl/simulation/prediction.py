@@ -11,11 +11,13 @@ is exact in the limit of many images; they die out with the second power of k at
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.discrete import digital_controller
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
@@ -116,7 +118,7 @@ def _image(loop: SampledLoop, image: np.ndarray) -> list[np.ndarray]:
     return [velocity[:, :, :n], velocity[:, :, n:], sensed[:, :, :n], sensed[:, :, n:]]
 
 
-def _diagonal(systems, omega: np.ndarray) -> np.ndarray:
+def _diagonal(systems: Sequence[StateSpace], omega: np.ndarray) -> np.ndarray:
     """(n_omega, n) responses of scalar systems; the same object is evaluated once."""
     known = {id(system): system.frequency_response(omega)[:, 0, 0] for system in systems}
     return np.stack([known[id(system)] for system in systems], axis=1)

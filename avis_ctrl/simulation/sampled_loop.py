@@ -2,7 +2,9 @@
 
     floor --> table --> sensors --> noise, converter --> controller --> limit --> delay, hold --> drives --> table
 
-The controller knows `rig`; the table that moves is `plant`, which may differ from it.
+The controller knows `rig`; the table that moves is `plant`, which may differ from it. Sensors see the payload's motion
+along axes fixed in space: that they turn with it is left out, parts per million at micrometre amplitudes, and so is the
+gravity that a tilted horizontal sensor feels, which neither source models.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +27,8 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 
 # Finer steps than this per control period would be needed to place the delay: a sign of a mistyped delay.
 MAX_SUBSTEPS = 20
+# Default that stands for the rig's own value.
+_AS_RIG: Any = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +65,7 @@ class SensorBank:
 
     @property
     def white_variance_V2(self) -> np.ndarray:
-        """(n_s,) variance of noise and rounding of one sample."""
+        """(n_s,) variance of one sample: noise, and rounding as if white, true where signal or noise moves by codes."""
         return self.noise_rms_V ** 2 + (self.converter.noise_rms_V ** 2 if self.converter else 0.0)
 
 
@@ -107,7 +112,8 @@ class SampledLoop:
     sensors : the chains, in the order of the rig's sensors.
     floor : spectrum of the floor's motion by coordinate [m or rad]; others are at rest.
     plant : the table that moves; `rig` by default.
-    drive_errors : one system a drive, volts to volts (1 + W Delta of neglected dynamics), None where nominal.
+    drive_errors : one system a drive, volts to volts (1 + W Delta of neglected dynamics), None where nominal;
+        empty when all are.
     amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
     sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage.
 
@@ -122,25 +128,23 @@ class SampledLoop:
     loops: Mapping[str, StateSpace]
     sensors: SensorBank
     floor: Mapping[str, SpectrumModel]
-    plant: Rig = None  # type: ignore[assignment]
+    plant: Rig = _AS_RIG
     drive_errors: tuple[StateSpace | None, ...] = ()
     amplifier_corner_Hz: float | None = None
-    sample_rate_Hz: float = 0.0
-    loop_delay_s: float = -1.0
-    limit_V: float = 0.0
+    sample_rate_Hz: float = _AS_RIG
+    loop_delay_s: float = _AS_RIG
+    limit_V: float = _AS_RIG
     name: str = "nominal"
     substeps: int = field(init=False, default=1)
 
     def __post_init__(self) -> None:
-        def default(name: str, absent: object, value: object) -> None:
-            if getattr(self, name) == absent:
+        rig = self.rig
+        of_rig = {"plant": rig, "sample_rate_Hz": rig.sample_rate_Hz, "loop_delay_s": rig.loop_delay_s,
+                  "limit_V": rig.drive_limit_V}
+        for name, value in of_rig.items():
+            if getattr(self, name) is _AS_RIG:
                 object.__setattr__(self, name, value)
-        if self.plant is None:
-            object.__setattr__(self, "plant", self.rig)
-        default("sample_rate_Hz", 0.0, self.rig.sample_rate_Hz)
-        default("loop_delay_s", -1.0, self.rig.loop_delay_s)
-        default("limit_V", 0.0, self.rig.drive_limit_V)
-        default("drive_errors", (), (None,) * self.n_drives)
+        object.__setattr__(self, "drive_errors", tuple(self.drive_errors) or (None,) * self.n_drives)
         self._check()
         periods = Fraction(self.loop_delay_s * self.sample_rate_Hz).limit_denominator(MAX_SUBSTEPS)
         if abs(float(periods) - self.loop_delay_s * self.sample_rate_Hz) > 1e-6:

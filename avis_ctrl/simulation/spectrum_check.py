@@ -121,7 +121,7 @@ def check_spectrum_agreement(record: SimulationRecord, band_Hz: tuple[float, flo
 
     Raises
     ------
-    InputError : a record shorter than two segments, a band without lines, unknown axes.
+    InputError : a record shorter than one and a half segments, a band without lines or beyond half the sample rate.
     """
     loop = record.loop
     axes = loop.axes if axes is None else axes
@@ -130,7 +130,7 @@ def check_spectrum_agreement(record: SimulationRecord, band_Hz: tuple[float, flo
     if segments < 2:
         raise InputError("a record of at least one and a half segments", field="segment_s", value=segment_s)
     line_Hz = fs / segment
-    mid, first, last = _bands(band_Hz, line_Hz)
+    mid, first, last = _bands(band_Hz, line_Hz, fs)
     kept = [COORDINATES.index(axis) for axis in axes]
     arms = lever_arms(loop.rig)[kept]
     lines = int(last[-1]) + 1
@@ -142,15 +142,10 @@ def check_spectrum_agreement(record: SimulationRecord, band_Hz: tuple[float, flo
                                        detrend="constant")[1][:lines] for axis in axes])
     moments = [welch_moments(one, segments) for one in psd]
     expected = np.array([mean[:lines] for mean, _ in moments])
-    shape = (len(axes), len(mid))
-    mean, dof, power = np.empty(shape), np.empty(shape), np.empty(shape)
-    for i, (_, covariance) in enumerate(moments):
-        for b, (lo, hi) in enumerate(zip(first, last, strict=True)):
-            mean[i, b], power[i, b] = np.sum(expected[i, lo:hi + 1]), np.sum(estimated[i, lo:hi + 1])
-            # Each pair of different lines of the band counts twice.
-            variance = sum((1 if d == 0 else 2) * np.sum(covariance[lo:hi + 1 - d, d])
-                           for d in range(min(REACH_LINES, hi - lo) + 1))
-            dof[i, b] = 2 * mean[i, b] ** 2 / variance
+    power, mean = (np.add.reduceat(one, first, axis=1) for one in (estimated, expected))
+    variance = np.array([[_variance_of_sum(covariance, lo, hi) for lo, hi in zip(first, last, strict=True)]
+                         for _, covariance in moments])
+    dof = 2 * mean ** 2 / variance
     tail = false_alarm / mean.size / 2
     shown = slice(int(first[0]), lines)
     return SpectrumAgreement(axes, mid, np.sqrt(power * line_Hz), np.sqrt(mean * line_Hz), dof,
@@ -158,12 +153,22 @@ def check_spectrum_agreement(record: SimulationRecord, band_Hz: tuple[float, flo
                              np.arange(shown.start, shown.stop) * line_Hz, estimated[:, shown], expected[:, shown])
 
 
-def _bands(band_Hz: tuple[float, float], line_Hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _variance_of_sum(covariance: np.ndarray, first: int, last: int) -> float:
+    """Variance of the sum over lines first..last; each pair of different lines counts twice."""
+    return float(sum((1 if d == 0 else 2) * np.sum(covariance[first:last + 1 - d, d])
+                     for d in range(min(REACH_LINES, last - first) + 1)))
+
+
+def _bands(band_Hz: tuple[float, float], line_Hz: float,
+           sample_rate_Hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Midbands and the first and last line of each, every line in one band only."""
     mid = third_octave_midbands(*band_Hz)
     lower, upper = third_octave_edges(mid)
-    first, last = np.ceil(lower / line_Hz).astype(int), np.ceil(upper / line_Hz).astype(int) - 1
+    edges = np.ceil(np.append(lower, upper[-1]) / line_Hz).astype(int)
+    first, last = edges[:-1], edges[1:] - 1
     if np.any(last < first):
         raise InputError(f"segments long enough for a line in every third octave from {band_Hz[0]:g} Hz",
                          field="segment_s", value=1 / line_Hz)
+    if (last[-1] + REACH_LINES) * line_Hz >= sample_rate_Hz / 2:
+        raise InputError(f"bands below half the sample rate of {sample_rate_Hz:g} Hz", field="band_Hz", value=band_Hz)
     return mid, first, last

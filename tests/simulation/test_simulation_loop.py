@@ -8,7 +8,7 @@ import scipy.linalg as la
 from scipy.integrate import solve_ivp
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti import gain
+from avis_ctrl.lti import discretise, gain
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.nonlinear import NonlinearRig
@@ -168,6 +168,14 @@ def test_nonlinear_and_linear_tables_agree_in_closed_loop_at_micrometres(make_lo
     for name in ("avis", "halcyonics_loaded"):
         true, linear = (simulate(make_loop(name), 5.0, nonlinear=nonlinear) for nonlinear in (True, False))
         assert np.all(np.abs(true.q_dot - linear.q_dot).max(axis=0) < 1e-5 * np.abs(linear.q_dot).max(axis=0))
+
+
+def test_a_controller_that_is_already_sampled_is_taken_as_it_is(make_loop):
+    loop = make_loop()
+    given = replace(loop, K=discretise(loop.K, 1e-3))
+    assert np.array_equal(simulate(loop, 1.0).volts, simulate(given, 1.0).volts)
+    with pytest.raises(InputError, match="dt"):
+        simulate(replace(loop, K=discretise(loop.K, 2e-3)), 1.0)
 
 
 def test_wrong_sizes_and_names_are_named(make_loop):

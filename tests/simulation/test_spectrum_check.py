@@ -85,6 +85,8 @@ def test_short_records_and_empty_bands_are_refused(make_loop):
         check_spectrum_agreement(record)
     with pytest.raises(InputError, match="third octave"):
         check_spectrum_agreement(record, (0.5, 80.0), segment_s=1.0)
+    with pytest.raises(InputError, match="half the sample rate"):
+        check_spectrum_agreement(record, (2.0, 500.0), segment_s=4.0)
 
 
 def test_campaign_judges_each_plant_and_says_so_in_json(make_loop):
