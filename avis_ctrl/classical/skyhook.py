@@ -52,11 +52,13 @@ class Skyhook:
         tilt, roll = 2 * np.pi * self.tilt_corner_Hz, 2 * np.pi * self.roll_off_Hz
         return cascade(np.zeros(1), [-tilt, -roll], roll)
 
+    def loop(self, axis: str) -> StateSpace:
+        """One axis: seen velocity [m/s] -> force [N]."""
+        return self.filter.scaled(left=-self.gains[self.axes.index(axis)])
+
     def controller(self) -> StateSpace:
         """K with u = K y: inputs "seen_AXIS_dot" [m/s], outputs "command_AXIS" [N]."""
-        loops = [self.filter.scaled(left=-gain).renamed([f"seen_{axis}_dot"], [f"command_{axis}"])
-                 for axis, gain in zip(self.axes, self.gains, strict=True)]
-        return append(*loops)
+        return append(*(self.loop(axis).renamed([f"seen_{axis}_dot"], [f"command_{axis}"]) for axis in self.axes))
 
 
 def critical_damping(mass: Sequence[float], stiffness: Sequence[float], damping: Sequence[float]) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,10 +72,14 @@ def mu_optimal(design: Design, plant: DesignPlant, rig: Rig,
 
 def classical_skyhook(plant: DesignPlant, rig: Rig, design: Design) -> Candidate:
     """Critical damping of each axis taken alone, corners in the middle of their ranges."""
-    tilt, roll = (float(np.sqrt(np.prod(limits))) for limits in (design.skyhook.tilt_corner_Hz,
-                                                                 design.skyhook.roll_off_Hz))
-    loops = Skyhook(plant.axes, critical_gains(rig, design), tilt, roll)
+    loops = Skyhook(plant.axes, critical_gains(rig, design.keep), *middle_corners(design))
     return Candidate("skyhook_classical", "skyhook, critical damping", "skyhook", loops.controller(), (_words(loops),))
+
+
+def middle_corners(design: Design) -> tuple[float, float]:
+    """Tilt corner and roll-off [Hz] in the (logarithmic) middle of the design's ranges."""
+    tilt, roll = design.skyhook.tilt_corner_Hz, design.skyhook.roll_off_Hz
+    return float(np.sqrt(tilt[0] * tilt[1])), float(np.sqrt(roll[0] * roll[1]))
 
 
 def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: float) -> Candidate:
@@ -87,7 +91,7 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
     omega = 2 * np.pi * TUNING_HZ
     scenarios = Scenarios.sample(plant.full, plant.floor_velocities, plant.velocities, omega, TUNING_SAMPLES,
                                  design.simulation.seed)
-    search = TuningRange(critical_gains(rig, design), tilt_corner_Hz=_pair(design.skyhook.tilt_corner_Hz),
+    search = TuningRange(critical_gains(rig, design.keep), tilt_corner_Hz=_pair(design.skyhook.tilt_corner_Hz),
                          roll_off_Hz=_pair(design.skyhook.roll_off_Hz))
     band = _pair(design.transmissibility.band_Hz)
     motion = plant.full.restricted(plant.floor_velocities, plant.velocities)
@@ -103,11 +107,11 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
     return Candidate("skyhook", "skyhook, tuned", "skyhook", loops.controller(), (_words(loops),))
 
 
-def critical_gains(rig: Rig, design: Design) -> tuple[float, ...]:
-    """Classical gains [N s/m] of the kept axes, rotations at the edge."""
+def critical_gains(rig: Rig, axes: Sequence[str]) -> tuple[float, ...]:
+    """Classical gains [N s/m] of some axes, rotations at the edge."""
     equations = rig.equations_of_motion()
-    kept = [equations.coordinates.index(name) for name in design.keep]
-    scale = np.array([1.0 / rig.edge_m ** 2 if name.startswith("phi") else 1.0 for name in design.keep])
+    kept = [equations.coordinates.index(name) for name in axes]
+    scale = np.array([1.0 / rig.edge_m ** 2 if name.startswith("phi") else 1.0 for name in axes])
     return tuple(critical_damping(*(np.diag(X)[kept] * scale for X in (equations.M, equations.K, equations.C))))
 
 

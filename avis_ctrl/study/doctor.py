@@ -88,7 +88,7 @@ def _typst() -> str:
 
 
 def _synthesis() -> str:
-    """min ||W S|| = |W(z)| for a zero z of the plant in the right half plane (Skogestad and Postlethwaite, eq. 5.20)."""
+    """min ||W S|| = |W(z)| for a plant zero z in the right half plane (Skogestad and Postlethwaite, section 5.7)."""
     from avis_ctrl.lti import connect, gain, summing_junction, tf
     from avis_ctrl.robust.hinfsyn import hinfsyn
 

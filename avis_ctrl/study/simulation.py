@@ -1,0 +1,101 @@
+"""The mu controller on the nonlinear six-degree-of-freedom rig, the other axes under their skyhook loops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from avis_ctrl.classical.skyhook import Skyhook
+from avis_ctrl.lti.statespace import StateSpace, gain
+from avis_ctrl.rigs.floor_spectrum import SpectrumModel
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.robust.mu_realise import realise_delta
+from avis_ctrl.simulation.campaign import SimulationCheck, check_designs
+from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, accelerometer_bank, geophone_bank
+from avis_ctrl.study.controllers import critical_gains, middle_corners
+from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.model import ControllerResult
+from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.study.sampling import random_perturbations
+
+
+def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult,
+                   progress: Callable[[str], None]) -> SimulationCheck:
+    """Nominal, worst-case and random plants in closed loop, each judged against the linear prediction."""
+    loop = nominal_loop(design, rig, plant, result.K)
+    loops = [loop, *perturbed_loops(design, rig, plant, result, loop)]
+
+    def shown(done: int, of: int, name: str) -> None:
+        if done == of or done % 8 == 0:
+            progress(f"simulated {done} of {of} plants, {design.simulation.duration_s:g} s each")
+    return check_designs(loops, design.simulation.duration_s, design.simulation.seed, shown)
+
+
+def nominal_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None) -> SampledLoop:
+    """The design's controller on its nominal rig, the floor moving along x, y, z and the kept rotations."""
+    if K is None:
+        K = gain(np.zeros((len(design.keep), len(design.keep))))
+    others = tuple(name for name in COORDINATES if name not in design.keep)
+    loops = Skyhook(others, critical_gains(rig, others), *middle_corners(design))
+    return SampledLoop(rig, K, tuple(design.keep), {name: loops.loop(name) for name in others},
+                       sensor_bank(design, rig), floor_by_coordinate(design, rig, plant.floor), name="nominal",
+                       amplifier_corner_Hz=design.loop.amplifier_corner_Hz)
+
+
+def sensor_bank(design: Design, rig: Rig) -> SensorBank:
+    """The rig's geophones, or its accelerometers with the design's integrator."""
+    return geophone_bank(rig) if rig.geophones is not None else accelerometer_bank(
+        rig, design.loop.integrator_corner_Hz)
+
+
+def floor_by_coordinate(design: Design, rig: Rig, spectrum: SpectrumModel) -> dict[str, SpectrumModel]:
+    """Each translation at the site's level; each kept rotation so that the edge has that level too."""
+    rms, (low, high) = spectrum.rms(*_band(design)), _band(design)
+    turning = spectrum.scaled_to_rms(rms / rig.edge_m, low, high)
+    return {name: turning if name.startswith("phi") else spectrum
+            for name in COORDINATES if name in design.keep or not name.startswith("phi")}
+
+
+def _band(design: Design) -> tuple[float, float]:
+    return design.floor.band_Hz[0], design.floor.band_Hz[1]
+
+
+def perturbed_loops(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult,
+                    nominal: SampledLoop) -> Iterator[SampledLoop]:
+    """The worst case of transmissibility, then the random plants, as rigs with changed parameters and chains."""
+    blocks = plant.synthesis.blocks
+    if result.worst_peak.delta is not None:
+        delta = result.worst_peak.delta[:blocks.n_w, :blocks.n_z]
+        yield with_delta(rig, plant, nominal, "worst case", delta, result.worst_peak.omega)
+    rng = np.random.default_rng((design.simulation.seed, 2))
+    samples = random_perturbations(plant, design.simulation.random_plants, design.simulation.seed)
+    for k, delta in enumerate(samples, 1):
+        # A chain's random phase is met at a random frequency of the loop's band.
+        yield with_delta(rig, plant, nominal, f"random {k}", delta, 2 * np.pi * 10 ** rng.uniform(0.0, 2.0))
+
+
+def with_delta(rig: Rig, plant: DesignPlant, nominal: SampledLoop, name: str, delta: np.ndarray,
+               omega: float) -> SampledLoop:
+    """The loop around the rig that a perturbation stands for."""
+    blocks = plant.synthesis.blocks
+    real = {block.name: complex(np.ravel(value)[0]).real
+            for value, block in zip(blocks.values(delta), blocks.blocks, strict=True) if block.kind == "real"}
+    changed = rig.with_parameters(plant.rig.values([real[p.name] for p in plant.rig.parameters]))
+    chains = {block.name: (value, block) for value, block in zip(blocks.values(delta), blocks.blocks, strict=True)
+              if block.kind != "real"}
+    actuators = rig.equations_of_motion().actuators
+    drives = [_chain(plant, chains, "actuator chain", one, omega) for one in actuators]
+    return nominal.with_plant(name, changed, drives)
+
+
+def _chain(plant: DesignPlant, chains: dict, kind: str, name: str, omega: float) -> StateSpace | None:
+    """1 + W(s) delta(s) of one channel, None where it is certain."""
+    if f"{kind} {name}" not in chains:
+        return None
+    value, block = chains[f"{kind} {name}"]
+    delta = realise_delta(np.atleast_2d(value), omega, [block])
+    weight = plant.weights[f"{kind} *"].system("u", "z")
+    error = delta.renamed(["z"], ["w"]) @ weight
+    return gain(1.0, ["u"], ["w"]) + error
