@@ -95,25 +95,25 @@ def _body_rates(omega, angles, rates):
 @njit(cache=True)
 def _point_motion(place, speed, R, omega, p, q, q_dot):
     """Displacement from p and velocity of the body-fixed point p, earth axes."""
-    turning = np.empty_like(omega)
-    _cross(turning, omega, p)
+    # Scalars, not small arrays: this runs for every mount at every step.
+    t0, t1, t2 = omega[1] * p[2] - omega[2] * p[1], omega[2] * p[0] - omega[0] * p[2], omega[0] * p[1] - omega[1] * p[0]
     for i in range(3):
-        place[i], speed[i] = q[i] - p[i], q_dot[i]
-        for j in range(3):
-            place[i] += R[i, j] * p[j]
-            speed[i] += R[i, j] * turning[j]
+        place[i] = q[i] - p[i] + R[i, 0] * p[0] + R[i, 1] * p[1] + R[i, 2] * p[2]
+        speed[i] = q_dot[i] + R[i, 0] * t0 + R[i, 1] * t1 + R[i, 2] * t2
 
 
 @njit(cache=True)
 def _add_force(wrench, arm, R, force):
     """Adds an earth-axes force at the body point `arm` to the body-axes force and moment."""
-    turned, moment = np.empty_like(force), np.empty_like(force)
-    for i in range(3):
-        turned[i] = R[0, i] * force[0] + R[1, i] * force[1] + R[2, i] * force[2]
-    _cross(moment, arm, turned)
-    for i in range(3):
-        wrench[i] += turned[i]
-        wrench[3 + i] += moment[i]
+    f0 = R[0, 0] * force[0] + R[1, 0] * force[1] + R[2, 0] * force[2]
+    f1 = R[0, 1] * force[0] + R[1, 1] * force[1] + R[2, 1] * force[2]
+    f2 = R[0, 2] * force[0] + R[1, 2] * force[1] + R[2, 2] * force[2]
+    wrench[0] += f0
+    wrench[1] += f1
+    wrench[2] += f2
+    wrench[3] += arm[1] * f2 - arm[2] * f1
+    wrench[4] += arm[2] * f0 - arm[0] * f2
+    wrench[5] += arm[0] * f1 - arm[1] * f0
 
 
 @njit(cache=True)
