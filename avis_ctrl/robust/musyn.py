@@ -277,7 +277,7 @@ def _result(problem: _Problem, uncertainty: BlockStructure, state: State, status
     closed = lft_lower(problem.P, best.K)
     # The norm of the scaled loop holds between all frequencies; with real blocks taken as complex it bounds theirs.
     scalings, gamma = _certificate(problem, best)
-    peak = mu_peak(closed, uncertainty)
+    peak = mu_peak(closed, uncertainty, known_upper=gamma)
     has_real = any(block.kind == "real" for block in uncertainty.blocks)
     mu_upper = min(peak.upper, gamma)
     complex_upper = gamma if has_real else mu_upper
