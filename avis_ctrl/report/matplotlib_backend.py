@@ -14,27 +14,34 @@ from matplotlib.patches import Patch
 
 from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, log_range, ticks_log
 
-WIDTH_IN, PANEL_IN, LEGEND_IN, LEGEND_COLUMNS = 6.7, 2.35, 0.2, 3
+WIDTH_IN, LEFT_IN, RIGHT_IN, PLOT_IN = 6.7, 0.66, 0.14, 1.75
+TITLE_IN, FOOT_IN, LEGEND_IN = 0.2, 0.42, 0.18
+CHARACTER_IN, KEY_IN = 0.068, 0.5
 LINES = {"solid": "-", "dash": (0, (5, 2)), "dot": (0, (1, 1.5)), "dashdot": (0, (5, 1.5, 1, 1.5))}
 # Same input, same bytes: element names follow from the salt, and no date is written.
-SETTINGS: Any = {"svg.fonttype": "path", "svg.hashsalt": "avis_ctrl", "font.size": 8.0,
-                            "axes.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False,
-                            "axes.unicode_minus": True, "path.simplify": True}
+SETTINGS: Any = {"svg.fonttype": "none", "svg.hashsalt": "avis_ctrl", "font.size": 8.0,
+                 "axes.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False,
+                 "axes.unicode_minus": True, "path.simplify": True}
 
 
 def svg(figure: Figure) -> str:
     """The figure as SVG."""
     with matplotlib.rc_context(SETTINGS):
         entries = figure.legend()
-        rows = -(-len(entries) // LEGEND_COLUMNS) if len(entries) > 1 else 0
-        height = sum(PANEL_IN + (0.15 if p.title else 0.0) for p in figure.panels) + LEGEND_IN * rows + 0.25
-        canvas = Canvas(figsize=(WIDTH_IN, height), layout="constrained")
-        axes = canvas.subplots(len(figure.panels), 1, squeeze=False)[:, 0]
-        for ax, panel in zip(axes, figure.panels, strict=True):
-            _draw(ax, panel)
+        # As many columns as the longest label leaves room for.
+        longest = max((len(e.label) for e in entries), default=0)
+        columns = max(1, min(len(entries), int(WIDTH_IN / (KEY_IN + CHARACTER_IN * longest))))
+        rows = -(-len(entries) // columns) if len(entries) > 1 else 0
+        height = (TITLE_IN + PLOT_IN + FOOT_IN) * len(figure.panels) + LEGEND_IN * rows + 0.05
+        canvas = Canvas(figsize=(WIDTH_IN, height))
+        # Fixed places: a layout engine would take most of the time of the whole report.
+        for k, panel in enumerate(figure.panels):
+            bottom = height - (TITLE_IN + PLOT_IN) * (k + 1) - FOOT_IN * k
+            _draw(canvas.add_axes((LEFT_IN / WIDTH_IN, bottom / height, 1 - (LEFT_IN + RIGHT_IN) / WIDTH_IN,
+                                   PLOT_IN / height)), panel)
         if rows:
-            canvas.legend([_key(e) for e in entries], [e.label for e in entries], loc="outside lower center",
-                          ncols=min(LEGEND_COLUMNS, len(entries)), frameon=False, handlelength=2.6)
+            canvas.legend([_key(e) for e in entries], [e.label for e in entries], loc="lower center", borderaxespad=0.1,
+                          ncols=columns, frameon=False, handlelength=2.6)
         buffer = io.StringIO()
         canvas.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()

@@ -25,7 +25,8 @@
       margin: { l: phone ? 52 : 68, r: 12, t: 26, b: foot },
       legend: { orientation: "h", x: 0, xanchor: "left", y: -48 / plot, yanchor: "top", itemsizing: "constant" },
       hovermode: "closest", dragmode: phone ? false : "zoom",
-    }, { responsive: true, displaylogo: false, displayModeBar: phone ? false : "hover" });
+    }, { responsive: true, displaylogo: false, displayModeBar: phone ? false : "hover",
+      modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]] });
   };
   const seen = new IntersectionObserver(entries => entries.filter(e => e.isIntersecting).forEach(e => {
     seen.unobserve(e.target);

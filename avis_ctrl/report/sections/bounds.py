@@ -17,10 +17,10 @@ Pick = Callable[[ControllerResult], Bound]
 def bounds(result: DesignResult) -> Section:
     """mu of the weighted performance and of stability alone, and what reaches them."""
     pieces: list[Piece] = [_guarantee(result)]
-    pieces += [_figure("mu_performance", result, lambda c: c.mu, "mu of the weighted performance",
+    pieces += [_figure("mu_performance", result, lambda c: c.mu, "mu, performance", "mu of the weighted performance",
                        "Below 1 (dashed line) every requirement put into the weights holds for every plant of the "
                        "set."),
-               _figure("mu_stability", result, lambda c: c.stability, "mu of the uncertainty alone",
+               _figure("mu_stability", result, lambda c: c.stability, "mu, stability", "mu of the uncertainty alone",
                        "Below 1 the loop is stable for every plant of the set; its inverse is the factor by which the "
                        "whole set could grow.")]
     pieces += [_stability(result), _worst(result)]
@@ -39,7 +39,7 @@ def _guarantee(result: DesignResult) -> Paragraph:
                      + f". The lower bound is a perturbation that makes the loop singular. {between}")
 
 
-def _figure(name: str, result: DesignResult, pick: Pick, label: str, meaning: str) -> Figure:
+def _figure(name: str, result: DesignResult, pick: Pick, label: str, what: str, meaning: str) -> Figure:
     curves = []
     for c in result.controllers:
         if c.name == "passive":
@@ -57,7 +57,7 @@ def _figure(name: str, result: DesignResult, pick: Pick, label: str, meaning: st
     finite = [float(np.max(c.y[np.isfinite(c.y)], initial=1.0)) for c in curves]
     top = min(max(finite) * 1.3, 30.0)
     panel = Panel(hertz(0.1, 500.0), Axis(label, "log", (0.05, top)), tuple(curves))
-    return Figure(name, f"Upper bounds (thick) and lower bounds (thin, dotted) of {label}. {meaning}", (panel,))
+    return Figure(name, f"Upper bounds (thick) and lower bounds (thin, dotted) of {what}. {meaning}", (panel,))
 
 
 def _stability(result: DesignResult) -> Table:

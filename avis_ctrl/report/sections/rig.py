@@ -11,6 +11,7 @@ from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, decibels
 from avis_ctrl.report.pieces import Drawing, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.rig_drawing import rig_drawing
 from avis_ctrl.rigs.rig import Parameter, Rig
+from avis_ctrl.rigs.subsystem import ReductionError
 from avis_ctrl.study.model import DesignResult
 
 _NUMBERED = re.compile(r"(?P<group>[A-Za-z_]+)(?P<number>\d+)\.(?P<rest>.+)")
@@ -90,16 +91,26 @@ def _electronics(result: DesignResult) -> Table:
 def _reduction(result: DesignResult) -> list[Piece]:
     error = result.reduction
     n = len(error.keep)
-    rows = [(words.axis(out), name, f"{words.number(error.max_dB[out, name])} dB",
-             f"{words.number(error.rms_dB[out, name])} dB") for out, name in error.max_dB]
+    rows = [(words.axis(out), name, words.quantity(error.max_dB[out, name], "dB"),
+             words.quantity(error.rms_dB[out, name], "dB")) for out, name in error.max_dB]
     kept = words.joined(list(error.keep))
     text = (f"The controller is designed on {kept} alone, with the other coordinates locked. Against all six degrees "
             "of freedom this misses what the table and the figure show: the difference, as a share of the largest gain "
             "at the same frequency. The floor's motion along the other axes, which the small model does not have, "
-            f"reaches {kept} with at most {words.decibel(float(np.max(np.abs(error.left_out), initial=0.0)))}.")
+            f"reaches {kept} with at most {words.decibel(float(np.max(np.abs(error.left_out), initial=0.0)))}. "
+            + _largest(error))
     return [Heading("What the small model leaves out"), Paragraph(text),
             table("Difference between the small model and six degrees of freedom, relative to the largest gain, over "
                   "0.1 to 100 Hz.", ("output", "input", "largest", "r.m.s."), rows, "llrr"), _compared(result, n)]
+
+
+def _largest(error: ReductionError) -> str:
+    """Where the small model is worst, and whether that is at an entry that matters."""
+    out, name = max(error.max_dB, key=lambda channel: error.max_dB[channel])
+    k, j = error.keep.index(out), error.inputs.index(name)
+    place = int(np.argmax(error.relative[:, k, j]))
+    return (f"It is worst at {words.hertz(float(error.omega[place]))}, from {name} to {out}: "
+            f"{words.number(100 * float(error.relative[place, k, j]))} % of the largest gain there.")
 
 
 def _compared(result: DesignResult, n: int) -> Figure:

@@ -21,7 +21,8 @@ def simulation(result: DesignResult) -> Section:
     text = (f"{passed} of {len(check.plants)} plants pass. Each is the nonlinear rig with six degrees of freedom under "
             f"the sampled mu controller, the other axes under loops of their own, for "
             f"{words.number(check.duration_s)} s with hold, delay, converter, limits, sensors, floor motion and "
-            "noise. A plant passes if it is stable, no voltage reaches its limit, and its spectrum agrees with the linear prediction within what chance allows "
+            "noise. A plant passes if it is stable, no voltage reaches its limit, and its "
+            "spectrum agrees with the linear prediction within what chance allows "
             f"(false alarm over the whole campaign: {words.number(100 * check.false_alarm, 2)} %).")
     pieces: list[Piece] = [Paragraph(text, "verdict", passed == len(check.plants)), _plants(check)]
     for plant in check.plants[:1]:

@@ -43,22 +43,18 @@ def _motion(result: DesignResult) -> Table:
     rows = [(c.title, *(words.number(1e6 * c.site.velocity_rms[a]) for a in axes),
              *(words.number(1e6 * c.site.noise_rms[a]) for a in axes), c.site.rating or "none")
             for c in result.controllers]
-    header = ("controller", *(f"{words.axis(a)} [µm/s]" for a in axes),
-              *(f"{words.axis(a)}, noise alone [µm/s]" for a in axes), "criterion")
-    return table("Payload velocity r.m.s., from floor and sensor noise together and from the noise alone.", header,
-                 rows, "l" + "r" * 2 * len(axes) + "c")
+    header = ("controller", *(words.axis(a) for a in axes), *(f"noise in {words.axis(a)}" for a in axes), "criterion")
+    return table("Payload velocity r.m.s. [µm/s], from floor and sensor noise together and from the noise alone.",
+                 header, rows, "l" + "r" * 2 * len(axes) + "c")
 
 
 def _volts(result: DesignResult) -> Table:
-    rows = []
-    for c in result.controllers:
-        if c.K is not None:
-            rows += [(c.title, name, words.number(rms), words.number(c.site.volts_peak[name]),
-                      f"{words.number(100 * c.site.volts_peak[name] / result.rig.drive_limit_V, 2)} %")
-                     for name, rms in c.site.volts_rms.items()]
-    return table("Voltages on the site. The peak is what a Gaussian signal passes once in ten minutes, and its share "
-                 f"of the limit of {words.number(result.rig.drive_limit_V)} V.",
-                 ("controller", "channel", "r.m.s. [V]", "peak [V]", "share of the limit"), rows, "llrrr")
+    rows = [(c.title, *(f"{words.number(rms)} / {words.number(c.site.volts_peak[name])}"
+                        for name, rms in c.site.volts_rms.items()))
+            for c in result.controllers if c.K is not None]
+    return table("Voltages on the site by channel, r.m.s. / peak [V]. The peak is what a Gaussian signal passes once "
+                 f"in ten minutes; the limit is {words.number(result.rig.drive_limit_V)} V.",
+                 ("controller", *result.plant.actuators), rows)
 
 
 def _compliance(result: DesignResult) -> Figure:

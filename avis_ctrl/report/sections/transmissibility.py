@@ -44,8 +44,8 @@ def _panel(curves: list[Curve], bands: list[Band], title: str, ranged: tuple[flo
 
 def _nominal(result: DesignResult) -> Figure:
     mu, passive = result.controller("mu"), result.controller("passive")
-    caption = (f"Largest singular value from floor velocity to payload velocity, nominal plant. At rest the table "
-               f"peaks at {words.decibel(passive.peak_transmissibility)}, under the mu controller at "
+    caption = (f"Largest singular value from floor velocity to payload velocity, nominal plant. Without control the "
+               f"table peaks at {words.decibel(passive.peak_transmissibility)}, under the mu controller at "
                f"{words.decibel(mu.peak_transmissibility)}.")
     curves = [_sigma(c) for c in result.controllers]
     unstable = [c.title for c in result.controllers if not c.stable]
@@ -83,6 +83,6 @@ def _by_axis(result: DesignResult) -> Figure:
         curves = [Curve(_hz(c), decibels(c.transmissibility.nominal[:, k, k]), c.title, STYLES[c.name])
                   for c in result.controllers]
         panels.append(Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", GAIN_DB), tuple(curves), (),
-                            f"{words.axis(axis)}: floor to payload along the same axis"))
+                            words.axis(axis)))
     return Figure("transmissibility_axes", "Each axis alone, nominal plant: payload velocity over floor velocity along "
                   "the same axis, without the coupling between axes.", tuple(panels))

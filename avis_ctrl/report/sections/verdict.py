@@ -13,11 +13,11 @@ from avis_ctrl.study.model import Bound, ControllerResult, DesignResult, Require
 
 def verdict(result: DesignResult) -> Section:
     """The verdict table, with one sentence above it that says what was achieved."""
-    rows = [(r.name, f"{r.comparison} {words.quantity(r.limit, r.unit)}", words.quantity(r.value, r.unit),
-             Mark("met" if r.met else "NOT MET", r.met), r.note) for r in result.requirements]
+    rows = [(r.name, Mark("met" if r.met else "NOT MET", r.met), words.quantity(r.value, r.unit),
+             f"{r.comparison} {words.quantity(r.limit, r.unit)}", r.note) for r in result.requirements]
     asked = [table("What the design asks and what was measured on the mu controller. Decibels count the largest "
                    "singular value from floor to payload, rotations as displacement of the edge.",
-                   ("requirement", "asked", "measured", "verdict", "note"), rows, "lrrcl")] if rows else []
+                   ("requirement", "verdict", "measured", "asked", "note"), rows, "lcrrl")] if rows else []
     notes = [Paragraph(note, "note") for note in result.notes]
     return Section("Verdict", "verdict", (_sentence(result), *asked, *notes))
 
@@ -38,7 +38,7 @@ def _counted(requirements: tuple[Requirement, ...], missed: list[Requirement]) -
     if missed:
         return (f"{len(missed)} of {len(requirements)} requirements {'is' if len(missed) == 1 else 'are'} not met: "
                 f"{words.joined([r.name for r in missed])}.")
-    return f"All {len(requirements)} requirements are met."
+    return f"All {len(requirements)} requirements are met." if len(requirements) > 1 else "The requirement is met."
 
 
 def _achieved(result: DesignResult) -> str:
@@ -50,7 +50,7 @@ def _achieved(result: DesignResult) -> str:
     sure = "" if mu.worst_peak.guaranteed and mu.worst_band.guaranteed else " at the computed frequencies"
     return (f"For every plant of the uncertainty set the mu controller keeps the transmissibility at or below "
             f"{words.decibel(mu.worst_peak.upper)} at any frequency and {words.decibel(mu.worst_band.upper)} from "
-            f"{low:g} to {high:g} Hz{sure}; the table at rest amplifies by "
+            f"{low:g} to {high:g} Hz{sure}; without control the table amplifies by "
             f"{words.decibel(result.controller('passive').peak_transmissibility)} at its resonance.")
 
 

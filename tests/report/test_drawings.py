@@ -1,0 +1,96 @@
+"""Axes, words and drawings of the report."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from avis_ctrl.report import words
+from avis_ctrl.report.block_diagram import BlockDiagram
+from avis_ctrl.report.canvas import Canvas
+from avis_ctrl.report.families import Families
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, decibels, ticks_log
+from avis_ctrl.report.matplotlib_backend import svg
+from avis_ctrl.report.plotly_backend import graph
+from avis_ctrl.report.rig_drawing import rig_drawing
+from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.study.model import DesignResult
+
+
+@pytest.mark.parametrize(("low", "high", "labels"), [
+    (0.1, 100.0, ["0.1", "1", "10", "100"]), (1.0, 100.0, ["1", "2", "5", "10", "20", "50", "100"]),
+    (0.05, 30.0, ["0.1", "1", "10"]), (1e-9, 1e-6, ["1e-9", "1e-8", "1e-7", "1e-6"])])
+def test_ticks(low: float, high: float, labels: list[str]) -> None:
+    assert ticks_log(low, high)[1] == labels
+
+
+@given(st.floats(1e-6, 1e6), st.floats(1.5, 1e8))
+def test_ticks_lie_inside(low: float, ratio: float) -> None:
+    places, labels = ticks_log(low, low * ratio)
+    assert all(low * 0.999 <= p <= low * ratio * 1.001 for p in places) and len(labels) == len(places)
+    np.testing.assert_allclose([float(text) for text in labels], places, rtol=1e-9)
+
+
+@given(st.floats(1e-12, 1e12))
+def test_number_keeps_three_digits(value: float) -> None:
+    assert float(words.number(value).replace("−", "-")) == pytest.approx(value, rel=0.0051)
+
+
+def test_what_is_not_finite_is_said_in_words() -> None:
+    assert words.decibel(np.inf) == words.bound(np.inf) == words.quantity(np.inf, "dB") == "unstable"
+    assert words.number(np.nan) == "not computed"
+    assert words.decibel(0.5) == "−6.0 dB" and words.decibel(2.0) == "+6.0 dB"
+    assert np.isnan(decibels([0.0, np.inf, np.nan])).all()
+
+
+@pytest.mark.parametrize("name", ["avis", "halcyonics"])
+def test_rig_drawing_names_every_point(name: str) -> None:
+    rig = load_rig(name)
+    drawn = " ".join(ElementTree.fromstring(rig_drawing(rig)).itertext())
+    for point in rig.points():
+        assert point in drawn
+    assert f"{rig.edge_m:.3g} m" in drawn
+
+
+def test_block_diagram_shows_every_part_and_signal(fabricated: DesignResult) -> None:
+    plant = fabricated.plant
+    diagram, families = BlockDiagram(plant), Families(plant)
+    assert diagram.chain == ["K", "delay and amplifier *", "allocation", "actuator chain *", "rig", "sensor chain *",
+                             "sum *"]
+    assert {families.of(part.name) for part in plant.full.parts} <= set(diagram.nodes)
+    assert sum(p.count for p in families.parts) == len(plant.full.parts)
+    assert sorted(m for s in families.signals for m in s.members) == sorted(s.name for s in plant.full.signals)
+    drawn = " ".join(ElementTree.fromstring(diagram.svg()).itertext())
+    for s in families.signals:
+        if s.role in ("w", "z", "u", "y"):
+            assert s.name in drawn
+
+
+def test_boxes_of_the_block_diagram_do_not_overlap(fabricated: DesignResult) -> None:
+    diagram = BlockDiagram(fabricated.plant)
+    boxes = [(x - w / 2, x + w / 2, y - diagram._height(n) / 2, y + diagram._height(n) / 2)
+             for n, (x, y, w) in diagram.nodes.items()]
+    for k, (l1, r1, t1, b1) in enumerate(boxes):
+        assert not any(l1 < r2 and l2 < r1 and t1 < b2 and t2 < b1 for l2, r2, t2, b2 in boxes[:k])
+
+
+def test_canvas_escapes() -> None:
+    canvas = Canvas(10, 10)
+    canvas.text((1, 1), "<script>&")
+    assert [*ElementTree.fromstring(canvas.svg()).itertext()] == ["<script>&"]
+
+
+def test_both_backends_draw_labels_units_and_legend() -> None:
+    x = np.geomspace(1, 10, 5)
+    figure = Figure("f", "caption", (Panel(Axis("frequency [Hz]", "log", (1.0, 10.0)), Axis("gain [V]"), (
+        Curve(x, x, "first", Style("#0072b2")), Curve(x, 2 * x, "second", Style("#d55e00", "dash"))), (), "panel"),))
+    drawn = " ".join(ElementTree.fromstring(svg(figure)).itertext())
+    for text in ("frequency [Hz]", "gain [V]", "first", "second", "panel", "10"):
+        assert text in drawn
+    layout = graph(figure)["layout"]
+    assert layout["xaxis"]["title"]["text"] == "frequency [Hz]" and layout["xaxis"]["range"] == [0.0, 1.0]
+    assert [t["name"] for t in graph(figure)["data"] if t["showlegend"]] == ["first", "second"]
