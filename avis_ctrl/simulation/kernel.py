@@ -1,6 +1,8 @@
 """The compiled inner loop of the simulation: a few matrix-vector products and one evaluation of the table a step.
 
 Plain loops throughout: slice assignments and calls of BLAS would double the time of compilation and save none after it.
+The cache of compiled code looks at the date of this file only: after a change in `rigs.nonlinear` or `rigs.converter`,
+delete the .nbi and .nbc files of this package (numba's rule for functions of other files).
 """
 
 from __future__ import annotations
