@@ -6,7 +6,7 @@ the matrix M seen by Delta (z_delta = M w_delta) has sum(cols) rows and sum(rows
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -28,7 +28,7 @@ class Block:
 
     def __post_init__(self) -> None:
         for label, size in (("rows", self.rows), ("cols", self.cols)):
-            if int(size) != size or size < 1:
+            if not isinstance(size, (int, np.integer)) or size < 1:
                 raise InputError("a block needs a whole number of at least 1", field=label, value=size)
 
     @property
@@ -90,10 +90,12 @@ class BlockStructure:
         return BlockStructure(blocks)
 
     @staticmethod
-    def from_dicts(items: Sequence[dict[str, Any]]) -> BlockStructure:
+    def from_dicts(items: Sequence[Mapping[str, Any]]) -> BlockStructure:
         """From the contract's JSON form."""
         made: list[Block] = []
         for item in items:
+            if not isinstance(item, Mapping):
+                raise InputError("expected a table with kind, rows, cols and name", field="blocks", value=item)
             kind, name = item.get("kind"), str(item.get("name") or "")
             rows, cols = item.get("rows", 0), item.get("cols", 0)
             if kind == "full":

@@ -1,41 +1,58 @@
 """Fewer copies of each repeated scalar in an LFT, without changing it.
 
-Seen from one block delta I with all others left open, the LFT is F_u(M, delta I): a one-parameter realisation
-with delta where a dynamic system has 1/s. What delta does not reach, or what cannot be seen of it, is
-removed as in the Kalman decomposition, block after block, until none shrinks (Zhou, Doyle and Glover, Robust
-and Optimal Control, section 10.4; D'Andrea and Khatri 1997 for the several-parameter case: the result need not be
-minimal, but it is exact).
+M with blocks delta_k I is a realisation in several parameters, delta_k in place of 1/s. Directions of a block that no
+input reaches, directly or through the other blocks, and then those that no output sees, are removed: the
+Kalman decomposition with one subspace a block (D'Andrea and Khatri 1997, Kalman decomposition of linear fractional
+transformation representations and minimality). The result is exact, and minimal as long as products of
+different parameters are not exchanged.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
-from avis_ctrl.lti.realisation import minimal
+from avis_ctrl.lti.realisation import balance
 from avis_ctrl.lti.statespace import StateSpace
 
 
-def reduce_copies(M: np.ndarray, sizes: list[int]) -> tuple[np.ndarray, list[int]]:
+def reduce_copies(M: np.ndarray, sizes: list[int], tolerance: float = 1e-10) -> tuple[np.ndarray, list[int]]:
     """M (n_delta + p, n_delta + m) with leading square blocks of the given sizes -> the same LFT, smaller blocks."""
-    sizes = list(sizes)
-    shrunk = True
-    while shrunk:
-        shrunk = False
-        for k in range(len(sizes)):
-            start, stop = sum(sizes[:k]), sum(sizes[:k + 1])
-            inside = np.arange(start, stop)
-            rows, cols = np.delete(np.arange(M.shape[0]), inside), np.delete(np.arange(M.shape[1]), inside)
-            one = StateSpace(M[np.ix_(inside, inside)], M[np.ix_(inside, cols)], M[np.ix_(rows, inside)],
-                             M[np.ix_(rows, cols)])
-            small = minimal(one, 1e-10)
-            if small.nstates == one.nstates:
-                continue
-            shrunk = True
-            n = small.nstates
-            new = np.zeros((M.shape[0] - len(inside) + n, M.shape[1] - len(inside) + n))
-            own = np.arange(start, start + n)
-            other_rows, other_cols = np.delete(np.arange(new.shape[0]), own), np.delete(np.arange(new.shape[1]), own)
-            new[np.ix_(own, own)], new[np.ix_(own, other_cols)] = small.A, small.B
-            new[np.ix_(other_rows, own)], new[np.ix_(other_rows, other_cols)] = small.C, small.D
-            M, sizes[k] = new, n
-    return M, sizes
+    n = sum(sizes)
+    # Diagonal scalings of the copies commute with Delta.
+    system = balance(StateSpace(M[:n, :n], M[:n, n:], M[n:, :n], M[n:, n:]))
+    A, B, C = system.A, system.B, system.C
+    V, reached = _reached(A, B, sizes, tolerance)
+    A, B, C = V.T @ A @ V, V.T @ B, C @ V
+    W, left = _reached(A.T, C.T, reached, tolerance)
+    if left == list(sizes):
+        return M, left
+    return np.block([[W.T @ A @ W, W.T @ B], [C @ W, system.D]]), left
+
+
+def _reached(A: np.ndarray, B: np.ndarray, sizes: list[int], tolerance: float) -> tuple[np.ndarray, list[int]]:
+    """Orthonormal block-diagonal V, smallest with range B and A V inside, and its number of columns a block."""
+    ends = [0, *np.cumsum(sizes)]
+    blocks = [slice(start, stop) for start, stop in pairwise(ends)]
+    bases = [np.zeros((size, 0)) for size in sizes]
+    limit = tolerance * max(np.linalg.norm(A, 2) if A.size else 0.0, np.linalg.norm(B, 2) if B.size else 0.0)
+    step = B
+    while True:
+        fresh = []
+        for k, block in enumerate(blocks):
+            new = step[block]
+            for _ in range(2):  # twice is enough for orthogonality to round-off
+                new = new - bases[k] @ (bases[k].T @ new)
+            Q, sigma, _ = np.linalg.svd(new, full_matrices=False)
+            Q = Q[:, sigma > limit]
+            bases[k] = np.hstack([bases[k], Q])
+            fresh.append(A[:, block] @ Q)
+        step = np.hstack([np.zeros((A.shape[0], 0)), *fresh])
+        if not step.shape[1]:
+            break
+    V = np.zeros((A.shape[0], sum(basis.shape[1] for basis in bases)))
+    columns = [0, *np.cumsum([basis.shape[1] for basis in bases])]
+    for block, basis, (start, stop) in zip(blocks, bases, pairwise(columns), strict=True):
+        V[block, start:stop] = basis
+    return V, [basis.shape[1] for basis in bases]

@@ -53,19 +53,18 @@ def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float =
 
 def _monomials(function: MatrixFunction, n: int, base: np.ndarray) -> list[Exponents]:
     """Exponents that may occur: single parameters, and products of those that interact."""
-    def unit(*which: int) -> np.ndarray:
-        delta = np.zeros(n)
-        delta[list(which)] = [0.83 + 0.05 * k for k in range(len(which))]
-        return delta
-    single = [function(unit(i)) - base for i in range(n)]
+    # About a generic point: at zero a product of three parameters would hide that any two of them interact.
+    origin = np.random.default_rng(n).uniform(0.2, 0.6, n)
+
+    def moved(*which: int) -> np.ndarray:
+        delta = origin.copy()
+        delta[list(which)] -= 1.0
+        return function(delta)
+    reference = moved()
+    single = [moved(i) - reference for i in range(n)]
     scale = np.max(np.abs(single), axis=0, initial=0.0) + np.abs(base)
-    interacting = set()
-    for i, j in combinations(range(n), 2):
-        delta = np.zeros(n)
-        delta[i] = delta[j] = 0.83
-        mixed = function(delta) - base - single[i] - single[j]
-        if np.any(np.abs(mixed) > 1e-12 * scale):
-            interacting.add((i, j))
+    interacting = {(i, j) for i, j in combinations(range(n), 2)
+                   if np.any(np.abs(moved(i, j) - reference - single[i] - single[j]) > 1e-12 * scale)}
     exponents = []
     for i in range(n):
         exponents += [_exponent(n, {i: 1}), _exponent(n, {i: 2})]
