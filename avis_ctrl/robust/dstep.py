@@ -17,12 +17,13 @@ from avis_ctrl.robust.dscale_fit import fit_magnitude
 from avis_ctrl.robust.dscale_matrix import fit_hermitian
 from avis_ctrl.robust.gamma_descent import free_parameters, parameter_box, parameters, with_parameters
 from avis_ctrl.robust.mu_upper import upper_bound
-from avis_ctrl.robust.scalings import MatrixScaling, ScalarScaling, Scalings
+from avis_ctrl.robust.scalings import MAX_ORDER, MatrixScaling, ScalarScaling, Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 FIT_TOLERANCE = 3e-3
 MATRIX_FIT_TOLERANCE = 1e-2
-MAX_ORDER = 6
+# Gain of a linear program below which refining a fit is not worth another: a tenth of what a fit may cost.
+REFINEMENT = 1e-3
 # Below this share of the peak a loop has room for any misfit; from here up its own mu is the yardstick.
 PROFILE_FLOOR = 0.8
 
@@ -200,7 +201,7 @@ def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 8) -> S
     for _ in range(steps):
         move, predicted = _trust_step(values, slopes, np.maximum(box[:, 0] - theta, -radius),
                                       np.minimum(box[:, 1] - theta, radius))
-        if level - predicted < 1e-4 or radius < 1e-3:
+        if level - predicted < REFINEMENT or radius < 1e-3:
             break
         trial = with_parameters(scalings, theta + move)
         new_values, new_slopes = _linearised(points, trial)

@@ -25,12 +25,11 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, balance
 from avis_ctrl.robust.hinf_plant import RANK_TOLERANCE, NormalForm, Plant, normal_form, rank_margins, regularised
 from avis_ctrl.robust.hinf_riccati import GammaBracket, control_riccati, filter_riccati, find_gamma, gamma_test
-from avis_ctrl.robust.scalings import ScalarScaling, Scalings
+from avis_ctrl.robust.scalings import MAX_ORDER, ScalarScaling, Scalings
 
 COUPLED = "rho(X Y)"
 STEP = 1e-6
 GAMMA_TOLERANCE = 1e-5
-MAX_ORDER = 6
 REGULARISATION = 1e-4
 
 

@@ -28,6 +28,7 @@ from avis_ctrl.robust.mu_upper import UpperBound, skewed_upper_bound, upper_boun
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 SLACK = 5e-4
+KNOWN_SLACK = 5e-3
 ALL_FREQUENCIES: Interval = (0.0, np.inf)
 
 
@@ -63,7 +64,7 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     N : stable system (avis_ctrl or python-control) with sum(cols) outputs z and sum(rows) inputs w.
     band : (low, high) in rad/s; the Nyquist frequency replaces infinity for sampled systems.
     known_upper : a bound that the caller has proved for the whole band, such as the measured norm of the loop scaled
-        by a realised D(s); where it is within 0.1 % of the peak found, it is taken for the upper bound as it is.
+        by a realised D(s); where it is within 0.5 % of the peak found, it is taken for the upper bound as it is.
 
     Raises
     ------
@@ -171,7 +172,7 @@ class _Scan:
 def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, known_upper: float | None = None) -> MuPeak:
     scan = _Scan.of(N, band, lambda M: upper_bound(M, structure, 1e-4))
     lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9)
-    if known_upper is not None and known_upper <= (1 + SLACK) * scan.level:
+    if known_upper is not None and known_upper <= (1 + KNOWN_SLACK) * scan.level:
         done = Cover(known_upper)
     else:
         done = cover(N, structure, lambda system, level: system.scaled(left=1 / level),

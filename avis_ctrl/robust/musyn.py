@@ -260,13 +260,20 @@ def _recorded(state: State, loop: Loop, row: Iteration, points: PointwiseScaling
 
 
 def _certificate(problem: _Problem, best: Loop) -> tuple[Scalings, float]:
-    """Realised scalings that bound mu of a loop at every frequency, and the bound: those K was made with, or fresh."""
+    """Realised scalings that bound mu of a loop at every frequency, and the bound.
+
+    Those that K was made with, or better ones where they leave more than a stall's worth above mu on the grid.
+    """
     closed = lft_lower(problem.P, best.K)
+
+    def bound(scalings: Scalings) -> float:
+        return hinf_norm(scalings.scale(closed), NORM_TOLERANCE).gain * (1 + NORM_TOLERANCE)
+    gamma = bound(best.scalings)
+    if gamma < (1 + STALL) * best.mu:
+        return best.scalings, gamma
     points = analysed(problem.P, best.K, problem.structure, frequency_grid(closed))
     fresh = choose_scalings(points, max_states=10 * problem.P.nstates, start=best.scalings).scalings
-    bounds = [(hinf_norm(one.scale(closed), NORM_TOLERANCE).gain, one) for one in (best.scalings, fresh)]
-    gamma, scalings = min(bounds, key=lambda bound: bound[0])
-    return scalings, gamma * (1 + NORM_TOLERANCE)
+    return min(((best.scalings, gamma), (fresh, bound(fresh))), key=lambda pair: pair[1])
 
 
 def _result(problem: _Problem, uncertainty: BlockStructure, state: State, status: str,

@@ -18,6 +18,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, gain
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
+# Beyond this a d(s) adds states to the controller faster than it lowers mu.
+MAX_ORDER = 6
 Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
