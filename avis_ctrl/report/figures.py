@@ -31,6 +31,13 @@ STYLES: dict[str, Style] = {
     "plain": Style("#222222", "solid", 1.6),
     "faint": Style("#9a9a9a", "solid", 0.9),
 }
+
+
+def controller_style(name: str) -> Style:
+    """The look of a controller, the same in every figure."""
+    return STYLES.get(name, STYLES["plain"])
+
+
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#222222", "#7a7a7a")
 DASHES: tuple[Dash, ...] = ("solid", "dash", "dashdot", "dot")
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from avis_ctrl.report.canvas import Canvas, Point
+from avis_ctrl.report.canvas import Anchor, Canvas, Point
 from avis_ctrl.rigs.rig import Rig
 
 ACTUATOR, SENSOR, ISOLATOR, MASS, MARK = "#0072b2", "#00785a", "#555555", "#b3261e", "#8a5a00"
@@ -78,8 +78,11 @@ def _mark(canvas: Canvas, place: Point, name: str, kind: str) -> None:
     colour = MASS if kind == "centre of mass" else MARK
     canvas.line([(x - 6, y), (x + 6, y)], colour, 1.6)
     canvas.line([(x, y - 6), (x, y + 6)], colour, 1.6)
-    below = kind == "measured point"
-    canvas.text((x, y + 18) if below else (x, y - 10), name, 11, colour)
+    # Marks may coincide: each kind has its own side for its name.
+    sides: dict[str, tuple[float, float, Anchor]] = {"centre of mass": (9, 4, "start"), "load": (0, -10, "middle"),
+                                                     "measured point": (0, 18, "middle")}
+    dx, dy, anchor = sides[kind]
+    canvas.text((x + dx, y + dy), name, 11, colour, anchor)
 
 
 def _labels(canvas: Canvas, rig: Rig, at: View) -> None:
@@ -91,9 +94,11 @@ def _labels(canvas: Canvas, rig: Rig, at: View) -> None:
             groups.setdefault((round(x), round(y)), {}).setdefault(place.kind, []).append(name)
     colours = {"isolator": ISOLATOR, "actuator": ACTUATOR, "sensor": SENSOR}
     centre = at(np.zeros(3))[1]
+    rim = 0.9 * max(abs(y - centre) for _, y in groups)
     for (x, y), kinds in groups.items():
         lines = [(kind, " ".join(names)) for kind, names in kinds.items()]
-        first = y - 42 - 14 * (len(lines) - 1) if y < centre else y + 38
+        away = 42 if abs(y - centre) > rim else 20
+        first = y - away - 14 * (len(lines) - 1) if y < centre else y + away
         for k, (kind, text) in enumerate(lines):
             canvas.text((x, first + 14 * k), text, 11.5, colours[kind])
 
@@ -119,7 +124,7 @@ def _side(canvas: Canvas, rig: Rig, reach: np.ndarray, at: View) -> None:
     _lever(canvas, rig, at)
     for name, place in rig.points().items():
         if place.kind in ("centre of mass", "load"):
-            _mark(canvas, at(place.position), name, place.kind)
+            _mark(canvas, at(place.position), "" if place.kind == "centre of mass" else name, place.kind)
 
 
 def _lever(canvas: Canvas, rig: Rig, at: View) -> None:
@@ -127,7 +132,7 @@ def _lever(canvas: Canvas, rig: Rig, at: View) -> None:
     (x0, y0), (x1, _) = at(np.zeros(3)), at(np.array([0.0, rig.edge_m, 0.0]))
     canvas.line([(x1, y0 - 9), (x1, y0 + 9)], MARK, 1.2)
     canvas.line([(x0, y0), (x1, y0)], MARK, 1.4, arrow=True)
-    canvas.text(((x0 + x1) / 2, y0 + 16), f"edge lever {rig.edge_m:.3g} m", 11.5, MARK)
+    canvas.text((x1 - 10, y0 + 16), f"edge lever {rig.edge_m:.3g} m", 11.5, MARK, "end")
     arc = [(x1 + 34, y0 - 26 + 52 * k / 8) for k in range(9)]
     bent = [(x - 12 * ((k - 4) / 4) ** 2, y) for k, (x, y) in enumerate(arc)]
     canvas.line(bent[::-1], "#333333", 1.4, arrow=True)

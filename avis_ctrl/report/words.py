@@ -57,6 +57,11 @@ def axis(name: str) -> str:
     return AXIS_WORDS.get(name, name)
 
 
+def unit(text: str) -> str:
+    """A unit with its powers raised."""
+    return text.replace("^2", "²").replace("^3", "³")
+
+
 def yes(value: bool) -> str:
     """yes or no."""
     return "yes" if value else "no"

@@ -14,6 +14,7 @@ import pytest
 
 from avis_ctrl.report import render_html, render_pdf
 from avis_ctrl.report.content import document
+from avis_ctrl.report.figures import Figure
 from avis_ctrl.report.pieces import Mark, Table
 from avis_ctrl.study.model import DesignResult
 
@@ -161,9 +162,19 @@ def test_no_cell_shows_a_programmer_s_nothing(fabricated: DesignResult) -> None:
     assert not [c for c in cells if re.search(r"\b(inf|nan|None|np\.|array)\b", c)]
 
 
+def test_an_unstable_loop_has_no_steady_motion(fabricated: DesignResult) -> None:
+    section = next(s for s in document(fabricated).sections if s.anchor == "site")
+    shown = {row[0] for p in section.pieces if isinstance(p, Table) for row in p.rows}
+    shown |= {curve.label for p in section.pieces if isinstance(p, Figure) for curve in p.panels[0].curves}
+    assert "skyhook, tuned" in shown and "skyhook, critical damping" not in shown
+    captions = [p.caption for p in section.pieces if isinstance(p, Figure)]
+    assert all("Left out, its nominal loop being unstable: skyhook, critical damping." in c for c in captions)
+
+
 def test_comparison_says_who_is_unstable(fabricated: DesignResult) -> None:
     table = next(p for p in document(fabricated).sections[1].pieces if isinstance(p, Table))
     column = table.header.index("skyhook, critical damping")
     rows = {row[0]: row[column] for row in table.rows}
     assert rows["stable, nominal"] == Mark("no", False)
+    assert rows["largest voltage r.m.s."] == rows["vibration criterion met"] == "unstable"
     assert rows["mu, upper bound"] == rows["peak transmissibility, worst case"] == "unstable"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, level
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz, level
 from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
 
@@ -44,7 +44,7 @@ def _figure(name: str, result: DesignResult, pick: Pick, label: str, what: str, 
     for c in result.controllers:
         if c.name == "passive":
             continue
-        b, style = pick(c), STYLES[c.name]
+        b, style = pick(c), controller_style(c.name)
         order = np.argsort(b.frequencies)
         f = b.frequencies[order] / (2 * np.pi)
         curves.append(Curve(f, b.upper_curve[order], c.title, style))

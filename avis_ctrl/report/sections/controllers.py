@@ -6,7 +6,17 @@ import numpy as np
 
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, decibels, hertz, numbered
+from avis_ctrl.report.figures import (
+    Axis,
+    Curve,
+    Figure,
+    Panel,
+    Style,
+    controller_style,
+    decibels,
+    hertz,
+    numbered,
+)
 from avis_ctrl.report.pieces import Piece, Section, Table, table
 from avis_ctrl.study.model import ControllerResult, DesignResult
 
@@ -41,9 +51,9 @@ def _gains(made: list[ControllerResult]) -> Figure:
     curves = []
     for c in made:
         sigma = np.linalg.svd(_system(c).frequency_response(omega), compute_uv=False)
-        curves.append(Curve(HZ, sigma[:, 0], c.title, STYLES[c.name]))
+        curves.append(Curve(HZ, sigma[:, 0], c.title, controller_style(c.name)))
         if sigma.shape[1] > 1:
-            style = STYLES[c.name]
+            style = controller_style(c.name)
             curves.append(Curve(HZ, sigma[:, -1], "", Style(style.colour, style.dash, 0.8)))
     return Figure("controller_gains", "Singular values of the controllers, from measured velocity to force: largest "
                   "(thick) and smallest (thin).",
@@ -79,8 +89,8 @@ def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
         S = np.linalg.inv(np.eye(L.shape[1]) - L)
         size = np.linalg.norm(S, ord=2, axis=(1, 2))
         peaks.append(f"{c.title} {words.decibel(float(size.max()))}")
-        loops.append(Curve(HZ, decibels(np.linalg.norm(L, ord=2, axis=(1, 2))), c.title, STYLES[c.name]))
-        sensitivities.append(Curve(HZ, decibels(size), c.title, STYLES[c.name]))
+        loops.append(Curve(HZ, decibels(np.linalg.norm(L, ord=2, axis=(1, 2))), c.title, controller_style(c.name)))
+        sensitivities.append(Curve(HZ, decibels(size), c.title, controller_style(c.name)))
     x = hertz(0.01, 500.0)
     return Figure("loops", "Largest singular value of the open loop G K at the measurement (above) and of the "
                   f"sensitivity (I − G K)⁻¹ (below); nominal plant. Peaks of the sensitivity: {'; '.join(peaks)}.",

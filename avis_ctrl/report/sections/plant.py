@@ -64,7 +64,7 @@ def _blocks(result: DesignResult) -> Table:
         size = f"{block.rows}" if block.is_scalar_delta else f"{block.rows} × {block.cols}"
         if block.name in real:
             half = real[block.name].half_range(plant.rig.nominal[block.name])
-            nominal, unit = plant.rig.nominal[block.name], plant.rig.units[block.name]
+            nominal, unit = plant.rig.nominal[block.name], words.unit(plant.rig.units[block.name])
             spread = f"{nominal:.6g} ± {half:.4g} {unit}".replace("-", "−")
             meaning = described.get(block.name, "parameter of the rig")
         else:

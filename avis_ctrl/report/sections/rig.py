@@ -35,12 +35,12 @@ def _parameters(one: Rig) -> list[Piece]:
             rows = grouped.setdefault(match["group"], {})
             rows.setdefault(match["rest"], {})[int(match["number"])] = p
         else:
-            plain.append((name, _value(p.value), p.unit, p.description))
+            plain.append((name, _value(p.value), words.unit(p.unit), p.description))
     found: list[Piece] = [table("Parameters of the rig.", ("name", "value", "unit", "what it is"), plain, "lrll")]
     for group, rows in grouped.items():
         numbers = sorted({n for row in rows.values() for n in row})
-        body = [(rest, next(iter(row.values())).unit, *(_value(row[n].value) if n in row else "" for n in numbers))
-                for rest, row in rows.items()]
+        body = [(rest, words.unit(next(iter(row.values())).unit),
+                 *(_value(row[n].value) if n in row else "" for n in numbers)) for rest, row in rows.items()]
         found.append(table(f"Parameters by {group}: stiffness k, damping c and place p along each axis, the place from "
                            f"the geometric centre.", ("name", "unit", *(f"{group} {n}" for n in numbers)), body,
                            "ll" + "r" * len(numbers)))

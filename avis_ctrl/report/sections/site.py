@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz
 from avis_ctrl.report.pieces import Paragraph, Section, Table, table
+from avis_ctrl.report.sections.transmissibility import left_out
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.model import ControllerResult, DesignResult
 
 
 def site(result: DesignResult) -> Section:
@@ -20,6 +21,11 @@ def site(result: DesignResult) -> Section:
                                            _compliance(result)))
 
 
+def _settled(result: DesignResult) -> list[ControllerResult]:
+    """The controllers whose nominal loop has a steady motion."""
+    return [c for c in result.controllers if c.stable]
+
+
 def _third_octaves(result: DesignResult) -> Figure:
     first = result.controllers[0].site
     bands = first.third_octave_Hz
@@ -29,12 +35,14 @@ def _third_octaves(result: DesignResult) -> Figure:
         curves.append(Curve(bands, np.where(np.isfinite(limit), 1e6 * limit, np.nan),
                             "VC-A (top) to VC-G" if c.name == "VC-A" else "", STYLES["faint"]))
     curves.append(Curve(bands, 1e6 * first.floor_third_octaves, "floor", STYLES["plain"]))
-    for one in result.controllers:
-        curves.append(Curve(bands, 1e6 * one.site.payload_third_octaves.max(axis=1), one.title, STYLES[one.name]))
-    ratings = "; ".join(f"{c.title} {c.site.rating or 'none'}" for c in result.controllers)
+    for one in _settled(result):
+        curves.append(Curve(bands, 1e6 * one.site.payload_third_octaves.max(axis=1), one.title,
+                            controller_style(one.name)))
+    ratings = "; ".join(f"{c.title} {c.site.rating or 'none'}" for c in _settled(result))
     panel = Panel(hertz(1.0, 100.0), Axis("velocity [µm/s r.m.s.]", "log"), tuple(curves))
     return Figure("third_octaves", "Velocity in third octaves on the site's floor, payload by its worst axis, against "
-                  f"the generic vibration criteria. Criterion met: floor {first.floor_rating or 'none'}; {ratings}.",
+                  f"the generic vibration criteria. Criterion met: floor {first.floor_rating or 'none'}; {ratings}."
+                  + left_out(result),
                   (panel,))
 
 
@@ -42,7 +50,7 @@ def _motion(result: DesignResult) -> Table:
     axes = result.plant.axes
     rows = [(c.title, *(words.number(1e6 * c.site.velocity_rms[a]) for a in axes),
              *(words.number(1e6 * c.site.noise_rms[a]) for a in axes), c.site.rating or "none")
-            for c in result.controllers]
+            for c in _settled(result)]
     header = ("controller", *(words.axis(a) for a in axes), *(f"noise in {words.axis(a)}" for a in axes), "criterion")
     return table("Payload velocity r.m.s. [µm/s], from floor and sensor noise together and from the noise alone.",
                  header, rows, "l" + "r" * 2 * len(axes) + "c")
@@ -51,7 +59,7 @@ def _motion(result: DesignResult) -> Table:
 def _volts(result: DesignResult) -> Table:
     rows = [(c.title, *(f"{words.number(rms)} / {words.number(c.site.volts_peak[name])}"
                         for name, rms in c.site.volts_rms.items()))
-            for c in result.controllers if c.K is not None]
+            for c in _settled(result) if c.K is not None]
     return table("Voltages on the site by channel, r.m.s. / peak [V]. The peak is what a Gaussian signal passes once "
                  f"in ten minutes; the limit is {words.number(result.rig.drive_limit_V)} V.",
                  ("controller", *result.plant.actuators), rows)
@@ -59,9 +67,9 @@ def _volts(result: DesignResult) -> Table:
 
 def _compliance(result: DesignResult) -> Figure:
     curves = []
-    for c in result.controllers:
-        style: Style = STYLES[c.name]
+    for c in _settled(result):
+        style: Style = controller_style(c.name)
         curves.append(Curve(c.transmissibility.omega / (2 * np.pi), 1e6 * c.compliance, c.title, style))
     return Figure("compliance", "Compliance: displacement of the payload against the floor per force on it, largest "
-                  "singular value, floor at rest; nominal plant. Low is stiff.",
+                  "singular value, floor at rest; nominal plant. Low is stiff." + left_out(result),
                   (Panel(hertz(0.1, 200.0), Axis("compliance [µm/N]", "log"), tuple(curves)),))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, decibels, hertz
+from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, controller_style, decibels, hertz
 from avis_ctrl.report.pieces import Section
 from avis_ctrl.study.model import ControllerResult, DesignResult
 
@@ -25,13 +25,19 @@ def asked_dB(result: DesignResult, omega: np.ndarray) -> np.ndarray:
     return np.where(inside, limits.band_dB, limits.peak_dB)
 
 
+def left_out(result: DesignResult) -> str:
+    """Which controllers a figure of the nominal loop cannot show."""
+    unstable = [c.title for c in result.controllers if not c.stable]
+    return f" Left out, its nominal loop being unstable: {words.joined(unstable)}." if unstable else ""
+
+
 def _limit(result: DesignResult) -> Curve:
     omega = 2 * np.pi * np.geomspace(0.1, 200.0, 2000)
     return Curve(omega / (2 * np.pi), asked_dB(result, omega), "asked of the synthesis", STYLES["limit"])
 
 
 def _sigma(c: ControllerResult) -> Curve:
-    return Curve(_hz(c), decibels(c.transmissibility.sigma), c.title, STYLES[c.name])
+    return Curve(_hz(c), decibels(c.transmissibility.sigma), c.title, controller_style(c.name))
 
 
 def _hz(c: ControllerResult) -> np.ndarray:
@@ -47,11 +53,8 @@ def _nominal(result: DesignResult) -> Figure:
     caption = (f"Largest singular value from floor velocity to payload velocity, nominal plant. Without control the "
                f"table peaks at {words.decibel(passive.peak_transmissibility)}, under the mu controller at "
                f"{words.decibel(mu.peak_transmissibility)}.")
-    curves = [_sigma(c) for c in result.controllers]
-    unstable = [c.title for c in result.controllers if not c.stable]
-    if unstable:
-        caption += f" Not stable, so its curve is a frequency response only: {words.joined(unstable)}."
-    return Figure("transmissibility_nominal", caption, (_panel([*curves, _limit(result)], [], ""),))
+    curves = [_sigma(c) for c in result.controllers if c.stable]
+    return Figure("transmissibility_nominal", caption + left_out(result), (_panel([*curves, _limit(result)], [], ""),))
 
 
 def _uncertain(result: DesignResult) -> Figure:
@@ -59,7 +62,7 @@ def _uncertain(result: DesignResult) -> Figure:
     for name in ("mu", "skyhook"):
         c = result.controller(name)
         T = c.transmissibility
-        style = STYLES[name]
+        style = controller_style(name)
         worst = Curve(_hz(c), decibels(T.worst), "upper bound over the whole set", STYLES["plain"])
         band = Band(_hz(c), decibels(T.low), decibels(T.high), f"{c.title}: range over sampled plants", style)
         panels.append(_panel([_sigma(c), worst, _limit(result)], [band], c.title))
@@ -80,9 +83,9 @@ def _spread_words(result: DesignResult) -> str:
 def _by_axis(result: DesignResult) -> Figure:
     panels = []
     for k, axis in enumerate(result.plant.axes):
-        curves = [Curve(_hz(c), decibels(c.transmissibility.nominal[:, k, k]), c.title, STYLES[c.name])
-                  for c in result.controllers]
+        curves = [Curve(_hz(c), decibels(c.transmissibility.nominal[:, k, k]), c.title, controller_style(c.name))
+                  for c in result.controllers if c.stable]
         panels.append(Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", GAIN_DB), tuple(curves), (),
                             words.axis(axis)))
     return Figure("transmissibility_axes", "Each axis alone, nominal plant: payload velocity over floor velocity along "
-                  "the same axis, without the coupling between axes.", tuple(panels))
+                  "the same axis, without the coupling between axes." + left_out(result), tuple(panels))

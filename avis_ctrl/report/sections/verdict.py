@@ -65,14 +65,14 @@ def comparison(result: DesignResult) -> Section:
         ("mu peaks at", lambda c: words.hertz(c.mu.omega)),
         ("stable, nominal", lambda c: Mark("yes", True) if c.stable else Mark("no", False)),
         ("stable for the whole set", _robustly_stable),
-        ("peak transmissibility, nominal", lambda c: words.decibel(c.peak_transmissibility)),
+        ("peak transmissibility, nominal", lambda c: _settled(c, words.decibel(c.peak_transmissibility))),
         ("peak transmissibility, worst case", lambda c: words.decibel(c.worst_peak.upper)),
         (f"worst case over {low:g} to {high:g} Hz", lambda c: words.decibel(c.worst_band.upper)),
-        ("payload velocity r.m.s., worst axis", lambda c: words.micro(max(c.site.velocity_rms.values()), "m/s")),
-        ("of which from sensor noise", lambda c: words.micro(max(c.site.noise_rms.values()), "m/s")),
-        ("vibration criterion met", lambda c: c.site.rating or "none"),
-        ("largest voltage r.m.s.", lambda c: _volts(c.site.volts_rms)),
-        ("largest voltage, once in 10 min", lambda c: _volts(c.site.volts_peak)),
+        ("payload velocity r.m.s., worst axis", lambda c: _settled(c, _micro(c.site.velocity_rms))),
+        ("of which from sensor noise", lambda c: _settled(c, _micro(c.site.noise_rms))),
+        ("vibration criterion met", lambda c: _settled(c, c.site.rating or "none")),
+        ("largest voltage r.m.s.", lambda c: _settled(c, _volts(c.site.volts_rms))),
+        ("largest voltage, once in 10 min", lambda c: _settled(c, _volts(c.site.volts_peak))),
         ("fastest pole", lambda c: f"{words.number(c.fastest_pole_Hz)} Hz" if c.K is not None else "none"),
     ]
     controllers = result.controllers
@@ -91,6 +91,15 @@ def _robustly_stable(c: ControllerResult) -> Cell:
     if not c.stable or bound.lower >= 1:
         return Mark("no", False)
     return Mark("yes", True) if bound.upper < 1 else Mark("not shown", False)
+
+
+def _settled(c: ControllerResult, text: str) -> str:
+    """A figure of the nominal loop, which an unstable loop does not have."""
+    return text if c.stable else "unstable"
+
+
+def _micro(axes: dict[str, float]) -> str:
+    return words.micro(max(axes.values()), "m/s")
 
 
 def _volts(channels: dict[str, float]) -> str:
