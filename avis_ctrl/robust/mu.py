@@ -93,7 +93,7 @@ def mu(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: float = 1e
     tolerance : relative accuracy in upper^2 at which the scalings' optimisation stops.
 
     The lower bound is local: the search may miss the least perturbation, what it returns is verified (smallest
-    singular value of I - M delta below 1e-9 (1 + ||M delta||)). Up to three full complex blocks the two meet.
+    singular value of I - M delta below 1e-9, with M balanced). Up to three full complex blocks the two meet.
 
     Raises
     ------

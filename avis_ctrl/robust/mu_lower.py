@@ -23,6 +23,7 @@ import numpy as np
 
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.mu_lmi import Array, Scalings, dagger, residual
+from avis_ctrl.robust.mu_upper import block_balance, expand, rescaled
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 SINGULAR = 1e-9
@@ -156,11 +157,17 @@ def block_norm(delta: Array, structure: BlockStructure) -> Array:
                             else np.abs(delta[:, w.start, z.start]) for block, w, z in structure.slices()]), axis=0)
 
 
-def singularity(M: Array, delta: Array) -> Array:
-    """Smallest singular value of I - M Delta against 1 + ||M Delta|| (B,): 0 where the loop is singular."""
-    A = M @ delta
-    return (np.linalg.svd(np.eye(A.shape[-1]) - A, compute_uv=False)[..., -1]
-            / (1 + np.linalg.norm(A, ord=2, axis=(-2, -1))))
+def is_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
+    """Whether I - M Delta is singular (B,): smallest singular value below 1e-9, up to the round-off of M Delta.
+
+    Judged on the balanced M, which has the same determinant: a badly scaled M looks singular to any Delta.
+    """
+    if not M.shape[0]:
+        return np.zeros(0, bool)
+    d_z, d_w = expand(structure, block_balance(M[:, None], structure))
+    A = (M * d_z[:, :, None] / d_w[:, None, :]) @ delta
+    least = np.linalg.svd(np.eye(A.shape[-1]) - A, compute_uv=False)[:, -1]
+    return least < SINGULAR + 1e-14 * np.linalg.norm(A, ord=2, axis=(1, 2))
 
 
 def _complex_part(structure: BlockStructure) -> Array:
@@ -246,9 +253,15 @@ def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Sca
     """
     rng = np.random.default_rng(seed)
     batch = M.shape[0]
+    # Scalings of one number a block commute with every Delta: the search runs on the balanced M.
+    d_z, d_w = expand(structure, block_balance(M[:, None], structure))
+    M = M * d_z[:, :, None] / d_w[:, None, :]
+    scalings = rescaled(scalings, 1 / d_z, 1 / d_w, np.ones(batch))
     best = LowerBound(np.zeros(batch), np.zeros((batch, structure.n_w, structure.n_z), complex))
+    # An upper bound that is round-off of M means mu = 0: nothing to search for.
+    above_noise = upper > 1e-10 * np.linalg.norm(M, ord=2, axis=(1, 2))
     for count, iterations, damping in ((3, 20, 0.0), (6, 30, 0.0), (6, 40, 0.5)):
-        live = np.flatnonzero((upper > 0) & (best.beta < enough * upper))
+        live = np.flatnonzero(above_noise & (best.beta < enough * upper))
         if live.size:
             _search(best, M, structure, upper, scalings, live, count, iterations, damping, rng)
     return best
@@ -277,9 +290,10 @@ def _keep(best: LowerBound, live: Array, size: Array, unit: Array, delta: Array,
         candidate = np.where(finite[:, None, None], candidate, 0.0)
         norm = block_norm(candidate, structure)
         good = finite & (norm > 0)
-        good[good] &= singularity(unit[good], candidate[good]) < SINGULAR
+        good[good] &= is_singular(unit[good], candidate[good], structure)
         value = np.where(good, size / np.where(good, norm, 1.0), 0.0)
-        better = value > best.beta[live]
+        # unit is M over its upper bound: what exceeds that is round-off that passed for singular.
+        better = (value > best.beta[live]) & (value <= size * (1 + 1e-6))
         best.beta[live[better]] = value[better]
         best.delta[live[better]] = candidate[better] / size[better, None, None]
 
@@ -308,7 +322,7 @@ def singular_frequency(N: StateSpace, structure: BlockStructure, near: Array, le
         exact = made_singular(M, delta, structure) if np.any(_complex_part(structure)) else delta
         usable = np.flatnonzero(np.all(np.isfinite(exact), axis=(1, 2)))
         usable = usable[block_norm(exact[usable], structure) > 0]
-        usable = usable[singularity(M[usable], exact[usable]) < SINGULAR]
+        usable = usable[is_singular(M[usable], exact[usable], structure)]
         for k, norm in zip(usable, block_norm(exact[usable], structure), strict=True):
             if best is None or 1 / norm > best[0]:
                 best = (float(1 / norm), float(omega[k]), exact[k])

@@ -42,13 +42,13 @@ def block_balance(M: Array, structure: BlockStructure, sweeps: int = 20) -> Arra
     return np.sqrt(d2 / np.exp(np.mean(np.log(d2), axis=1, keepdims=True)))
 
 
-def _expand(structure: BlockStructure, d: Array) -> tuple[Array, Array]:
+def expand(structure: BlockStructure, d: Array) -> tuple[Array, Array]:
     """Per-entry scalings (d_z (B, n_z), d_w (B, n_w)) from one number a block."""
     return (np.repeat(d, [b.cols for b in structure.blocks], axis=1),
             np.repeat(d, [b.rows for b in structure.blocks], axis=1))
 
 
-def _rescaled(scalings: Scalings, d_z: Array, d_w: Array, size: Array) -> Scalings:
+def rescaled(scalings: Scalings, d_z: Array, d_w: Array, size: Array) -> Scalings:
     """Scalings of the original M from those of diag(d_z) M / diag(d_w) / size."""
     return Scalings(d_z[:, :, None] * scalings.X_z * d_z[:, None, :],
                     d_w[:, :, None] * scalings.X_w * d_w[:, None, :],
@@ -72,7 +72,7 @@ def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5,
 
 def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Array) -> UpperBound:
     space = ScalingSpace.of(structure)
-    d_z, d_w = _expand(structure, block_balance(M, structure))
+    d_z, d_w = expand(structure, block_balance(M, structure))
     balanced = M * d_z[:, None, :, None] / d_w[:, None, None, :]
     size = np.max(np.linalg.norm(balanced, ord=2, axis=(2, 3)), axis=1)
     live = size > 0
@@ -86,7 +86,7 @@ def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Ar
     scalings = space.scalings(theta)
     lam = np.where(live, least_level(unit, scalings, space.level), 0.0)
     beta = size * np.sqrt(np.maximum(lam, 0.0))
-    return UpperBound(beta, _rescaled(scalings, d_z, d_w, size))
+    return UpperBound(beta, rescaled(scalings, d_z, d_w, size))
 
 
 def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5) -> UpperBound:
@@ -132,13 +132,13 @@ def _skewed_from(M: Array, structure: BlockStructure, start: Scalings, tolerance
     # Coordinates in which these scalings are near the identity and the first level is 2.
     d = np.stack([np.sqrt(np.trace(X_w[:, w, w], axis1=1, axis2=2).real / (w.stop - w.start))
                   for _, w, _ in structure.slices()], axis=1)
-    d_z, d_w = _expand(structure, d)
+    d_z, d_w = expand(structure, d)
     unit = M * d_z[:, None, :, None] / d_w[:, None, None, :]
-    theta = space.theta(_rescaled(Scalings(X_z, X_w, G), 1 / d_z, 1 / d_w, np.ones(batch)))
+    theta = space.theta(rescaled(Scalings(X_z, X_w, G), 1 / d_z, 1 / d_w, np.ones(batch)))
     first = np.maximum(least_level(unit, space.scalings(theta), space.level), 1e-300)
     size = np.sqrt(first)
     scaled = unit / np.where(space.level, size[:, None], 1.0)[:, None, None, :]
     theta, _ = follow(space, scaled, theta, np.full(batch, 2.0), -1e-8, tolerance)
     scalings = space.scalings(theta)
     beta = size * np.sqrt(np.maximum(least_level(scaled, scalings, space.level), 0.0))
-    return beta, _rescaled(scalings, d_z, d_w, np.ones(batch))
+    return beta, rescaled(scalings, d_z, d_w, np.ones(batch))
