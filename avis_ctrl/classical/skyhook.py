@@ -28,6 +28,10 @@ class Skyhook:
     axes : names; rotations as edge displacements.
     gains : N s/m, one an axis (edge force per edge velocity for rotations).
     tilt_corner_Hz, roll_off_Hz : corners of the high-pass and of the low-pass filter.
+
+    Raises
+    ------
+    InputError : a negative gain, corners that are not positive or not in order.
     """
 
     axes: tuple[str, ...]
@@ -38,6 +42,9 @@ class Skyhook:
     def __post_init__(self) -> None:
         if len(self.axes) != len(self.gains):
             raise InputError(f"{len(self.axes)} axes but {len(self.gains)} gains", field="gains", value=self.gains)
+        if not all(np.isfinite(g) and g >= 0 for g in self.gains):
+            raise InputError("expected gains of at least 0: a negative one feeds the motion", field="gains",
+                             value=self.gains)
         for field in ("tilt_corner_Hz", "roll_off_Hz"):
             value = getattr(self, field)
             if not (np.isfinite(value) and value > 0):
@@ -53,7 +60,9 @@ class Skyhook:
         return cascade(np.zeros(1), [-tilt, -roll], roll)
 
     def loop(self, axis: str) -> StateSpace:
-        """One axis: seen velocity [m/s] -> force [N]."""
+        """One axis: seen velocity [m/s] -> force [N]. Raises InputError for an axis it does not have."""
+        if axis not in self.axes:
+            raise InputError(f"expected one of {list(self.axes)}", field="axis", value=axis)
         return self.filter.scaled(left=-self.gains[self.axes.index(axis)])
 
     def controller(self) -> StateSpace:
