@@ -31,6 +31,7 @@ from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 # An iteration that lowers the best gamma by less than this share has stalled.
 STALL = 0.005
+FLAT = 0.001
 NORM_TOLERANCE = 1e-6
 DONE = "done"
 FOLLOWING = {"D-K": "descent", "descent": "growth", "growth": DONE}
@@ -191,7 +192,7 @@ def _no_further(state: State, options: _Options) -> str:
     if state.phase == DONE:
         return f"converged: neither D-K iteration nor descent on gamma gains {100 * STALL:g} % more"
     if state.phase != "D-K" and not options.polish:
-        return f"D-K iteration stalled: the last step gained less than {100 * STALL:g} %"
+        return f"D-K iteration stalled: a step gained less than {100 * STALL:g} %, or left the scaled loop flat"
     if options.target is not None and state.best and state.best.gamma <= options.target:
         return f"target {options.target:g} reached"
     if len(state.history) >= options.max_iterations:
@@ -255,7 +256,9 @@ def _recorded(state: State, loop: Loop, row: Iteration, points: PointwiseScaling
     """The state after an iteration: the best loop kept, the phase moved on where nothing was gained."""
     gained = np.inf if state.best is None else 1 - loop.mu / state.best.mu
     best = loop if gained > 0 else state.best
-    phase = state.phase if gained > STALL else FOLLOWING[state.phase]
+    # A loop that fitted scalings have made flat has mu at its bound everywhere: no other D lowers it further.
+    flat = row.kind == "D-K" and loop.gamma < (1 + FLAT) * loop.mu
+    phase = state.phase if gained > STALL and not flat else FOLLOWING[state.phase]
     return State(phase, points, loop, best, (*state.history, row))
 
 
