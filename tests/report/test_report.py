@@ -16,7 +16,7 @@ from avis_ctrl.report import render_html, render_pdf
 from avis_ctrl.report.content import document
 from avis_ctrl.report.figures import Figure
 from avis_ctrl.report.pieces import Mark, Table
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.model import Bound, DesignResult
 
 HOSTILE = '</script><script>alert(1)</script> <b>x</b> #panic("y") $ *z* {{ 7*7 }} \\ & "'
 
@@ -178,3 +178,15 @@ def test_comparison_says_who_is_unstable(fabricated: DesignResult) -> None:
     assert rows["stable, nominal"] == Mark("no", False)
     assert rows["largest voltage r.m.s."] == rows["vibration criterion met"] == "unstable"
     assert rows["mu, upper bound"] == rows["peak transmissibility, worst case"] == "unstable"
+
+
+def test_a_study_that_found_little_is_still_reported(fabricated: DesignResult) -> None:
+    none = np.zeros(0)
+    empty = Bound(np.inf, np.nan, np.nan, False, None, (), none, none, none)
+    poor = replace(fabricated, dk_history=(), requirements=(), notes=(), controllers=tuple(
+        replace(c, gamma=np.inf, mu=empty, stability=empty, worst_peak=empty, worst_band=empty, stable=False,
+                peak_transmissibility=np.inf) for c in fabricated.controllers))
+    text = " ".join(Reader(render_html(poor)).text.split())
+    assert "not shown to be stable for every plant" in text and "No iteration was made." in text
+    assert not re.search(r"\b(inf|nan) (dB|Hz|V)\b", text)
+    assert render_pdf(poor).startswith(b"%PDF-")

@@ -22,9 +22,12 @@ def synthesis(result: DesignResult) -> Section:
     marked = Axis("iteration", "linear", (steps[0] - 0.5, steps[-1] + 0.5))
     gamma, mu = np.array([h.gamma for h in history]), np.array([h.mu_upper for h in history])
     both = np.concatenate([gamma, mu])
-    both = both[np.isfinite(both)]
-    top = 1.1 * float(np.max(both, initial=1.0))
-    values = Panel(marked, Axis("gamma, mu", "linear", (0.0, top)), (
+    both = both[np.isfinite(both) & (both > 0)]
+    low, top = float(np.min(both, initial=1.0)), float(np.max(both, initial=1.0))
+    # The first gamma, before any scaling, is often a hundred times the last.
+    shown = Axis("gamma, mu", "log", (0.7 * low, 1.5 * top)) if top > 8 * low else \
+        Axis("gamma, mu", "linear", (0.0, 1.1 * top))
+    values = Panel(marked, shown, (
         Curve(steps, gamma, "gamma of the scaled loop", numbered(1), points=True),
         Curve(steps, mu, "peak of the upper bound of mu", STYLES["mu"], points=True),
         level(steps[0] - 0.5, steps[-1] + 0.5, 1.0, "1")))
