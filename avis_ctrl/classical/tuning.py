@@ -119,7 +119,8 @@ def tune_skyhook(scenarios: Scenarios, axes: tuple[str, ...], search: TuningRang
 
     Parameters
     ----------
-    peak_limit : largest singular value allowed at any frequency (a ratio, not dB).
+    peak_limit : largest singular value allowed at any frequency (a ratio, not dB). Where no tuning keeps it, the
+        excess is weighed ten times as heavily as the transmissibility in the band.
 
     Raises
     ------

@@ -1,0 +1,172 @@
+"""Tuning of skyhook loops on the AVIS plant: its algebra against closed loops, its search against brute force."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avis_ctrl.classical.skyhook import Skyhook
+from avis_ctrl.classical.tuning import Scenarios, TuningRange, _encirclements, _largest_singular_value, tune_skyhook
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.lti import lft_lower
+from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.study.controllers import TUNING_HZ, critical_gains
+from avis_ctrl.study.design_file import read_design
+from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.uncertainty.generalized_plant import sample_lft
+
+DESIGNS = Path(__file__).resolve().parents[2] / "designs"
+OMEGA = 2 * np.pi * TUNING_HZ
+BAND_HZ = (1.0, 10.0)
+
+
+@pytest.fixture(scope="module")
+def plant() -> DesignPlant:
+    return build_plant(read_design(DESIGNS / "avis_z_phix.toml"), load_rig("avis"))
+
+
+@pytest.fixture(scope="module")
+def scenarios(plant) -> Scenarios:
+    return Scenarios.sample(plant.full, plant.floor_velocities, plant.velocities, OMEGA, 4, seed=3)
+
+
+@pytest.fixture(scope="module")
+def critical() -> tuple[float, ...]:
+    return critical_gains(load_rig("avis"), ("z", "phi_x"))
+
+
+def random_skyhook(rng: np.random.Generator, critical: tuple[float, ...], reach: float) -> Skyhook:
+    factors = np.exp(rng.uniform(np.log(0.1), np.log(reach), 2))
+    return Skyhook(("z", "phi_x_edge"), tuple(factors * critical), float(rng.uniform(0.02, 1.0)),
+                   float(rng.uniform(30.0, 400.0)))
+
+
+def diagonal(skyhook: Skyhook, omega: np.ndarray) -> np.ndarray:
+    """(n_omega, n_axes) loop gains."""
+    K = skyhook.controller().frequency_response(omega)
+    return np.einsum("wkk->wk", K)
+
+
+def test_closed_scenario_is_the_closed_loop_of_the_sampled_plant(plant, scenarios, critical, rng):
+    """Real perturbations: close Delta, then K, as state spaces."""
+    motion = plant.full.restricted(plant.floor_velocities, plant.velocities)
+    for _ in range(3):
+        delta = plant.full.blocks.random(rng, real=True)
+        skyhook = random_skyhook(rng, critical, 3.0)
+        found = scenarios.with_delta(delta).channels().closed(diagonal(skyhook, OMEGA))[-1]
+        expected = lft_lower(sample_lft(motion.P, motion.blocks, delta), skyhook.controller())
+        response = expected.frequency_response(OMEGA)
+        np.testing.assert_allclose(found, response, rtol=0, atol=1e-8 * np.abs(response).max())
+
+
+def test_complex_scenarios_close_in_either_order(plant, scenarios, critical, rng):
+    """Complex perturbations, one a frequency: close K as a state space first, then Delta by hand."""
+    skyhook = random_skyhook(rng, critical, 3.0)
+    N = plant.full.restricted(plant.floor_velocities, plant.velocities).closed(skyhook.controller())
+    response, n_w, n_z = N.frequency_response(OMEGA), plant.full.blocks.n_w, plant.full.blocks.n_z
+    found = scenarios.channels().closed(diagonal(skyhook, OMEGA))
+    for k, n in product(range(len(scenarios.deltas)), range(0, OMEGA.size, 7)):
+        delta, M = scenarios.deltas[k, n], response[n]
+        expected = M[n_z:, n_w:] + M[n_z:, :n_w] @ delta @ np.linalg.inv(
+            np.eye(n_z) - M[:n_z, :n_w] @ delta) @ M[:n_z, n_w:]
+        np.testing.assert_allclose(found[k, n], expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+def test_samples_lie_on_the_boundary_of_the_set(plant, scenarios):
+    blocks = plant.full.blocks
+    assert not np.any(scenarios.deltas[0])
+    for sample in scenarios.deltas[1:]:
+        values = [blocks.values(delta) for delta in sample]
+        for place, block in enumerate(blocks.blocks):
+            over_frequency = [value[place] for value in values]
+            if block.kind == "real":
+                assert set(over_frequency) in ({1.0}, {-1.0})  # a parameter is one number
+            else:
+                sizes = [np.linalg.norm(np.atleast_2d(value), 2) for value in over_frequency]
+                np.testing.assert_allclose(sizes, 1.0, rtol=1e-12)
+
+
+def test_largest_singular_value_in_closed_form(rng):
+    T = rng.standard_normal((50, 3, 2, 2)) + 1j * rng.standard_normal((50, 3, 2, 2))
+    T[0] = 0.0
+    T[1, :, 1] = T[1, :, 0]  # rank one
+    np.testing.assert_allclose(_largest_singular_value(T), np.linalg.svd(T, compute_uv=False)[..., 0], rtol=1e-7)
+    other = rng.standard_normal((5, 3, 3))
+    np.testing.assert_allclose(_largest_singular_value(other), np.linalg.svd(other, compute_uv=False)[:, 0], rtol=1e-12)
+
+
+def test_encirclements_tell_stable_from_unstable(plant, scenarios, critical, rng):
+    """Argument principle against eigenvalues, on the frequencies that the search uses.
+
+    Loops with a pole within 2 % of the axis are left out: they turn between two points of the grid, and their
+    resonance is what the limit on the peak refuses.
+    """
+    verdicts = []
+    for _ in range(200):
+        delta = plant.full.blocks.random(rng, real=True)
+        skyhook = random_skyhook(rng, critical, TuningRange(critical).gain_factor[1])
+        channels, K = scenarios.with_delta(delta).channels(), diagonal(skyhook, OMEGA)
+        turns = _encirclements(np.linalg.det(np.eye(2) - channels.yu[-1:] * K[:, None, :]))
+        closed = sample_lft(scenarios.plant.P, plant.full.blocks, delta)
+        poles = lft_lower(closed, skyhook.controller()).poles()
+        if np.min(np.abs(poles.real) / np.abs(poles)) > 0.02:
+            verdicts.append((turns == 0, bool(np.all(poles.real < 0))))
+    assert all(found == true for found, true in verdicts)
+    assert {true for _, true in verdicts} == {True, False}
+    assert len(verdicts) > 150
+
+
+def test_half_turns_count_unstable_poles():
+    """1 - P K = (s - a)(s - b)/(s + 1)^2 by hand."""
+    s = 1j * np.geomspace(1e-4, 1e4, 400)
+    for unstable, roots in ((0, (-2, -3)), (1, (2, -3)), (2, (2, 3)), (2, (1 + 4j, 1 - 4j))):
+        assert _encirclements(((s - roots[0]) * (s - roots[1]) / (s + 1) ** 2)[None]) == unstable
+
+
+@pytest.fixture(scope="module")
+def tuned(scenarios, critical) -> tuple[Skyhook, float]:
+    limit = 10 ** (4 / 20)
+    return tune_skyhook(scenarios, ("z", "phi_x_edge"), TuningRange(critical), BAND_HZ, limit, seed=1), limit
+
+
+def measured(scenarios: Scenarios, skyhook: Skyhook) -> tuple[float, float]:
+    """Largest singular value over all samples: everywhere, and in the band."""
+    sigma = np.linalg.norm(scenarios.channels().closed(diagonal(skyhook, OMEGA)), ord=2, axis=(-2, -1))
+    inside = [BAND_HZ[0] <= f <= BAND_HZ[1] for f in TUNING_HZ]
+    return float(sigma.max()), float(sigma[:, inside].max())
+
+
+def test_tuning_keeps_the_peak_limit_on_its_samples(tuned, scenarios):
+    skyhook, limit = tuned
+    assert measured(scenarios, skyhook)[0] <= limit * (1 + 1e-9)
+    assert scenarios.plant.closed(skyhook.controller()).is_stable()
+
+
+def test_tuning_beats_a_grid(tuned, scenarios, critical):
+    skyhook, limit = tuned
+    best = np.inf
+    for a, b, tilt, roll in product(np.geomspace(0.1, 10.0, 7), np.geomspace(0.1, 10.0, 7), (0.02, 0.15, 1.0),
+                                    (30.0, 110.0, 400.0)):
+        one = Skyhook(("z", "phi_x_edge"), (a * critical[0], b * critical[1]), tilt, roll)
+        if scenarios.plant.closed(one.controller()).is_stable():
+            peak, band = measured(scenarios, one)
+            best = min(best, band if peak <= limit else np.inf)
+    assert np.isfinite(best)
+    assert measured(scenarios, skyhook)[1] < best
+
+
+def test_tuning_stays_in_its_range(tuned, critical):
+    skyhook, _ = tuned
+    search = TuningRange(critical)
+    assert search.tilt_corner_Hz[0] <= skyhook.tilt_corner_Hz <= search.tilt_corner_Hz[1]
+    assert search.roll_off_Hz[0] <= skyhook.roll_off_Hz <= search.roll_off_Hz[1]
+    for gain, unit in zip(skyhook.gains, critical, strict=True):
+        assert search.gain_factor[0] <= gain / unit <= search.gain_factor[1]
+
+
+def test_a_range_of_unstable_gains_is_refused(scenarios, critical):
+    with pytest.raises(ComputationError, match="largest real part"):
+        tune_skyhook(scenarios, ("z", "phi_x_edge"), TuningRange(critical, gain_factor=(300.0, 1000.0)), BAND_HZ, 2.0)
