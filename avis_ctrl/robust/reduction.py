@@ -7,7 +7,7 @@ only if the figure that the caller measures with it (gamma, mu, ...) grows by no
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -103,19 +103,42 @@ def reduce_controller(P: Any, K: StateSpace, measure: Callable[[StateSpace], flo
 
 def split_stable(K: StateSpace) -> tuple[StateSpace, StateSpace]:
     """K = stable + unstable (poles on the stability boundary count as unstable); the direct term stays in the first."""
+    # A margin relative to the fastest pole: a slow pole that round-off could move over is kept, not truncated.
+    margin = 1e-12 * float(np.max(np.abs(K.poles()), initial=0.0))
+    inside = (lambda re, im: np.hypot(re, im) < 1 - 1e-12) if K.dt else (lambda re, im: re < -margin)
+    return _split(K, inside)
+
+
+def residualise_fast(K: StateSpace, limit: float) -> StateSpace:
+    """K with every pole faster than `limit` [rad/s] replaced by what it contributes at rest.
+
+    A controller that runs at a sample rate cannot have them, and one taken close to the optimum often does; K(0) is
+    kept exactly. Raises InputError for sampled K, ComputationError where a fast pole is unstable.
+    """
+    if K.dt:
+        raise InputError("expected a continuous controller", field="K.dt", value=K.dt)
+    slow, fast = _split(K, lambda re, im: np.hypot(re, im) <= limit)
+    if not fast.nstates:
+        return K
+    if not fast.is_stable():
+        raise ComputationError("an unstable pole is too fast to implement",
+                               measured=f"{np.max(np.abs(fast.poles())):.4g} rad/s, limit {limit:.4g} rad/s",
+                               next_step="raise the back-off, or sample faster")
+    return replace(slow, D=slow.D + fast.dcgain())
+
+
+def _split(K: StateSpace, first: Callable[[float, float], bool]) -> tuple[StateSpace, StateSpace]:
+    """K as a sum of the part with the poles that `first` picks (and the direct term), and the rest."""
     n = K.nstates
     if not n:
         return K, StateSpace(K.A, K.B, K.C, 0 * K.D, K.dt, K.inputs, K.outputs)
-    # A margin relative to the fastest pole: a slow pole that round-off could move over is kept, not truncated.
-    margin = 1e-12 * float(np.max(np.abs(K.poles())))
-    inside = (lambda re, im: np.hypot(re, im) < 1 - 1e-12) if K.dt else (lambda re, im: re < -margin)
-    T, U, k = la.schur(K.A, output="real", sort=inside)
+    T, U, k = la.schur(K.A, output="real", sort=first)
     # Solve T11 X - X T22 = -T12, so that the coordinates [I X; 0 I] decouple the two parts.
     X = la.solve_sylvester(T[:k, :k], -T[k:, k:], -T[:k, k:]) if 0 < k < n else np.zeros((k, n - k))
     B, C = U.T @ K.B, K.C @ U
-    stable = StateSpace(T[:k, :k], B[:k] - X @ B[k:], C[:, :k], K.D, K.dt, K.inputs, K.outputs)
-    unstable = StateSpace(T[k:, k:], B[k:], C[:, :k] @ X + C[:, k:], 0 * K.D, K.dt, K.inputs, K.outputs)
-    return stable, unstable
+    chosen = StateSpace(T[:k, :k], B[:k] - X @ B[k:], C[:, :k], K.D, K.dt, K.inputs, K.outputs)
+    rest = StateSpace(T[k:, k:], B[k:], C[:, :k] @ X + C[:, k:], 0 * K.D, K.dt, K.inputs, K.outputs)
+    return chosen, rest
 
 
 def discretise_controller(K: StateSpace, sample_rate_Hz: float,

@@ -6,23 +6,39 @@ was expected; a misspelt key is answered with the nearest one.
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.file_errors import first_complaint
 from avis_ctrl.rigs.floor_spectrum import shipped_spectra
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_file import LIMIT, SHIPPED, load_rig
 from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+
+def _rising(band: list[float]) -> list[float]:
+    if band[0] >= band[1]:
+        raise ValueError("expected the lower end first, the upper one after it")
+    return band
+
+
+def _different(axes: list[str]) -> list[str]:
+    if len(set(axes)) != len(axes):
+        raise ValueError("expected each axis once")
+    return axes
+
+
+Positive = Annotated[float, Field(gt=0, le=LIMIT)]
+NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
 Percent = Annotated[float, Field(gt=0, lt=100)]
-Band = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+Decibel = Annotated[float, Field(ge=-200, le=200)]
+Band = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(_rising)]
 Axis = Literal["x", "y", "z", "phi_x", "phi_y", "phi_z"]
 
 
@@ -43,7 +59,7 @@ class ChainUncertainty(_Section):
 
     low_percent: Percent
     crossover_Hz: Positive
-    high_percent: Annotated[float, Field(gt=100)]
+    high_percent: Annotated[float, Field(gt=100, le=LIMIT)]
 
 
 class UncertaintySection(_Section):
@@ -61,8 +77,10 @@ class UncertaintySection(_Section):
                 names = [name for name in known if fnmatchcase(name, pattern)]
                 field = f"uncertainty.parameters_{'absolute' if absolute else 'percent'}"
                 if not names:
-                    raise InputError(f"the rig has no parameter that matches; it has {', '.join(known)}",
-                                     field=field, value=pattern)
+                    near = difflib.get_close_matches(pattern, known, n=1)
+                    hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
+                    raise InputError(f"the rig {rig.name} has no parameter that matches; {hint}", field=field,
+                                     value=pattern)
                 for name in names:
                     if name in found:
                         raise InputError(f"{name} is listed twice", field=field, value=pattern)
@@ -73,19 +91,18 @@ class UncertaintySection(_Section):
 class TransmissibilitySection(_Section):
     """The bound that synthesis is asked for: peak_dB everywhere, band_dB inside band_Hz."""
 
-    peak_dB: float
-    band_dB: float
+    peak_dB: Decibel
+    band_dB: Decibel
     band_Hz: Band
     transition_octaves: Positive = 0.5
     tolerance_dB: Positive = 0.5
 
-    @model_validator(mode="after")
-    def _ordered(self) -> TransmissibilitySection:
-        if self.band_Hz[0] >= self.band_Hz[1]:
-            raise ValueError(f"band_Hz must rise, got {self.band_Hz}")
-        if self.band_dB >= self.peak_dB:
-            raise ValueError(f"band_dB must lie below peak_dB, got {self.band_dB} and {self.peak_dB}")
-        return self
+    @field_validator("band_dB")
+    @classmethod
+    def _below_peak(cls, band_dB: float, info: ValidationInfo) -> float:
+        if band_dB >= info.data.get("peak_dB", band_dB + 1):
+            raise ValueError(f"expected a bound below peak_dB = {info.data['peak_dB']:g}")
+        return band_dB
 
 
 class EffortSection(_Section):
@@ -93,7 +110,7 @@ class EffortSection(_Section):
 
     floor_velocity_m_per_s: Positive
     bandwidth_Hz: Positive
-    reduction: Annotated[float, Field(gt=1)] = 30.0
+    reduction: Annotated[float, Field(gt=1, le=LIMIT)] = 30.0
 
 
 class ComplianceSection(_Section):
@@ -109,11 +126,12 @@ class FloorSection(_Section):
     velocity_rms_m_per_s: Positive | None = None
     band_Hz: Band = [0.5, 60.0]
 
-    @model_validator(mode="after")
-    def _known(self) -> FloorSection:
-        if self.spectrum not in shipped_spectra():
-            raise ValueError(f"no spectrum {self.spectrum!r}; there are {', '.join(shipped_spectra())}")
-        return self
+    @field_validator("spectrum")
+    @classmethod
+    def _known(cls, spectrum: str) -> str:
+        if spectrum not in shipped_spectra():
+            raise ValueError(f"expected one of {', '.join(shipped_spectra())}")
+        return spectrum
 
 
 class SynthesisSection(_Section):
@@ -122,17 +140,26 @@ class SynthesisSection(_Section):
     backoff_percent: Annotated[float, Field(ge=0, le=50)] = 1.0
     reduction_cost_percent: NotNegative = 1.0
     target_mu: Positive | None = None
+    polish: bool = False
 
 
 class SkyhookSection(_Section):
     tilt_corner_Hz: Band = [0.02, 1.0]
-    roll_off_Hz: Band = [30.0, 400.0]
+    roll_off_Hz: Annotated[Band, Field(validate_default=True)] = [30.0, 400.0]
+
+    @field_validator("roll_off_Hz")
+    @classmethod
+    def _above_tilt(cls, roll_off: list[float], info: ValidationInfo) -> list[float]:
+        tilt = info.data.get("tilt_corner_Hz", [0.0])
+        if roll_off[0] <= tilt[-1]:
+            raise ValueError(f"expected frequencies above tilt_corner_Hz = {tilt}")
+        return roll_off
 
 
 class SimulationSection(_Section):
     duration_s: Annotated[float, Field(ge=10, le=3600)] = 60.0
     random_plants: Annotated[int, Field(ge=0, le=500)] = 20
-    seed: int = 1
+    seed: Annotated[int, Field(ge=0)] = 1
 
 
 Quantity = Literal["mu_upper", "mu_gap_percent", "worst_case_peak_transmissibility_dB",
@@ -146,13 +173,14 @@ class RequirementSection(_Section):
 
     quantity: Quantity
     at_most: float | None = None
-    at_least: float | None = None
+    at_least: Annotated[float | None, Field(validate_default=True)] = None
 
-    @model_validator(mode="after")
-    def _one_limit(self) -> RequirementSection:
-        if (self.at_most is None) == (self.at_least is None):
-            raise ValueError("give exactly one of at_most and at_least")
-        return self
+    @field_validator("at_least")
+    @classmethod
+    def _one_limit(cls, at_least: float | None, info: ValidationInfo) -> float | None:
+        if (info.data.get("at_most", 0.0) is None) == (at_least is None):
+            raise ValueError("expected exactly one of at_most and at_least")
+        return at_least
 
     @property
     def unit(self) -> str:
@@ -164,7 +192,7 @@ class Design(_Section):
 
     title: str
     rig: str
-    keep: Annotated[list[Axis], Field(min_length=1)]
+    keep: Annotated[list[Axis], Field(min_length=1), AfterValidator(_different)]
     loop: LoopSection = LoopSection()
     uncertainty: UncertaintySection = UncertaintySection()
     transmissibility: TransmissibilitySection
@@ -176,12 +204,6 @@ class Design(_Section):
     simulation: SimulationSection = SimulationSection()
     requirement: list[RequirementSection] = []
 
-    @model_validator(mode="after")
-    def _different_axes(self) -> Design:
-        if len(set(self.keep)) != len(self.keep):
-            raise ValueError(f"keep lists an axis twice: {self.keep}")
-        return self
-
 
 def read_design(path: str | Path) -> Design:
     """Read and check a design file.
@@ -192,13 +214,14 @@ def read_design(path: str | Path) -> Design:
     """
     path = Path(path)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        # Editors on Windows begin a file with a byte-order mark.
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError("no such file; expected a design file such as designs/avis_z_phix.toml", file=path) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read as text: {error}", file=path) from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not a TOML file: {error}", file=path) from None
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"expected a TOML file in UTF-8; {' '.join(str(error).split())}", file=path) from None
     return design_from_table(table, path)
 
 
@@ -209,3 +232,25 @@ def design_from_table(table: dict, file: object = None) -> Design:
     except ValidationError as error:
         complaint = first_complaint(error, Design)
         raise (complaint.in_file(file) if file is not None else complaint) from None
+
+
+def read_study(path: str | Path) -> tuple[Design, Rig]:
+    """A design file and the rig it names: a shipped one, or a rig file beside it.
+
+    Raises
+    ------
+    InputError : as `read_design`; a rig that is not there or wrong, an uncertain parameter that it does not have.
+    """
+    path = Path(path)
+    design = read_design(path)
+    beside = path.parent / design.rig
+    if design.rig not in SHIPPED and not beside.is_file():
+        raise InputError(f"expected a rig file beside the design or one of {', '.join(SHIPPED)}", file=path,
+                         field="rig", value=design.rig)
+    rig = load_rig(design.rig if design.rig in SHIPPED else beside)
+    try:
+        for parameter in design.uncertainty.of(rig):
+            parameter.half_range(rig.parameters()[parameter.name].value)
+    except InputError as error:
+        raise error.in_file(path) from None
+    return design, rig

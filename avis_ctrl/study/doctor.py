@@ -56,10 +56,10 @@ def _threads() -> str:
 def _slicot() -> str:
     """A resonance of damping zeta peaks at 1/(2 zeta sqrt(1 - zeta^2))."""
     from avis_ctrl.lti.statespace import tf
-    from avis_ctrl.robust.slycot_adapter import linf_norm
+    from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
 
     zeta = 0.1
-    return _near(linf_norm(tf([1.0], [1.0, 2 * zeta, 1.0])).gain, 1 / (2 * zeta * np.sqrt(1 - zeta ** 2)), 1e-6)
+    return _near(hinf_norm_slicot(tf([1.0], [1.0, 2 * zeta, 1.0])), 1 / (2 * zeta * np.sqrt(1 - zeta ** 2)), 1e-6)
 
 
 def _clarabel() -> str:

@@ -16,7 +16,6 @@ from threadpoolctl import threadpool_limits
 
 import avis_ctrl
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.controllers import (
@@ -27,24 +26,23 @@ from avis_ctrl.study.controllers import (
     passive,
     tuned_skyhook,
 )
-from avis_ctrl.study.design_file import Design, read_design
+from avis_ctrl.study.design_file import Design, read_study
 from avis_ctrl.study.model import ControllerResult, DesignResult
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.requirements import judge
 from avis_ctrl.study.sampling import random_perturbations
-from avis_ctrl.study.simulation import simulate_study
+from avis_ctrl.study.simulation import SimulationCheck, simulate_study
+from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
 SAMPLES = 60
+# A mu controller without a finite worst case sets no limit: the skyhook is then held to +6 dB.
+UNLIMITED_PEAK = 2.0
 
 
 def run_file(path: str | Path, progress: Progress = lambda text: None) -> DesignResult:
     """Run a design file; the rig it names is shipped, or a file beside it."""
-    path = Path(path)
-    design = read_design(path)
-    beside = path.parent / design.rig
-    rig = load_rig(beside if beside.suffix == ".toml" and beside.exists() else design.rig)
-    return run_design(design, rig, progress, source=path)
+    return run_design(*read_study(path), progress, source=Path(path))
 
 
 def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
@@ -60,17 +58,9 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
     with threadpool_limits(1):
         progress("model: rig, uncertainty, weights")
         plant = build_plant(design, rig)
-        reduction = reduction_error(rig, design.keep)
         candidates, made = _synthesise(design, plant, rig, progress)
-        samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
-        results = [_measured(design, plant, c, samples, progress) for c in candidates]
-        by_name = {c.name: c for c in results}
-        progress("skyhook tuned to the same worst-case peak")
-        limit = by_name["mu"].worst_peak.upper
-        skyhook = tuned_skyhook(plant, rig, design, limit if np.isfinite(limit) else 2.0)
-        results.insert(1, _measured(design, plant, skyhook, samples, progress))
-        progress("closed loop of the nonlinear rig")
-        simulation = simulate_study(design, rig, plant, {c.name: c for c in results}["mu"], progress)
+        results, simulation = _measure(design, plant, rig, candidates, progress)
+        reduction = reduction_error(rig, design.keep)
     seconds = time.monotonic() - began
     return DesignResult(design, rig, plant, tuple(results), made.history, judge(design, results), reduction, simulation,
                         provenance(design, source, rig, seconds), seconds, made.notes)
@@ -84,13 +74,38 @@ def _synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress
         progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.4f}, peak mu {row.mu_upper:.4f}, "
                  f"order {row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
     mu, made = mu_optimal(design, plant, rig, shown)
-    return [passive(), classical_skyhook(plant, rig, design), hinf, mu], made
+    progress(mu.notes[-1])
+    return [mu, hinf, classical_skyhook(plant, rig, design), passive()], made
 
 
-def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndarray,
-              progress: Progress) -> ControllerResult:
-    progress(f"bounds of {c.title}")
-    return analyse(design, plant, c.K, c.name, c.title, c.kind, samples, c.notes)
+def _measure(design: Design, plant: DesignPlant, rig: Rig, candidates: list[Candidate],
+             progress: Progress) -> tuple[list[ControllerResult], SimulationCheck]:
+    """Bounds of every controller and the simulation, on two processes: none needs another but the tuned skyhook."""
+    samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
+    with Workers() as workers:
+        jobs = {c.name: workers.submit(_measured, design, plant, c, samples) for c in candidates}
+        mu = jobs["mu"].result()
+        progress("bounds of mu synthesis")
+        jobs["simulation"] = workers.submit(simulate_study, design, rig, plant, mu)
+        jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, mu.worst_peak.upper, samples)
+        found = {}
+        for name, job in jobs.items():
+            found[name] = job.result()
+            if name != "mu":
+                progress(f"simulated {design.simulation.random_plants + 2} nonlinear plants" if name == "simulation"
+                         else f"bounds of {found[name].title}")
+    return [found[name] for name in ("passive", "skyhook_classical", "skyhook", "hinf", "mu")], found["simulation"]
+
+
+def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndarray) -> ControllerResult:
+    with threadpool_limits(1):
+        return analyse(design, plant, c.K, c.name, c.title, c.kind, samples, c.notes)
+
+
+def _tuned(design: Design, plant: DesignPlant, rig: Rig, peak_limit: float, samples: np.ndarray) -> ControllerResult:
+    with threadpool_limits(1):
+        limit = peak_limit if np.isfinite(peak_limit) else UNLIMITED_PEAK
+        return _measured(design, plant, tuned_skyhook(plant, rig, design, limit), samples)
 
 
 def provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from avis_ctrl.classical.skyhook import Skyhook
 from avis_ctrl.lti.statespace import StateSpace, gain
@@ -21,16 +22,13 @@ from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.study.sampling import random_perturbations
 
 
-def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult,
-                   progress: Callable[[str], None]) -> SimulationCheck:
+def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult) -> SimulationCheck:
     """Nominal, worst-case and random plants in closed loop, each judged against the linear prediction."""
     loop = nominal_loop(design, rig, plant, result.K)
     loops = [loop, *perturbed_loops(design, rig, plant, result, loop)]
 
-    def shown(done: int, of: int, name: str) -> None:
-        if done == of or done % 8 == 0:
-            progress(f"simulated {done} of {of} plants, {design.simulation.duration_s:g} s each")
-    return check_designs(loops, design.simulation.duration_s, design.simulation.seed, shown)
+    with threadpool_limits(1):
+        return check_designs(loops, design.simulation.duration_s, design.simulation.seed)
 
 
 def nominal_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None) -> SampledLoop:
