@@ -28,18 +28,18 @@ def design(
     """From a rig to certified controllers, checks and a design report."""
     from rich.console import Console
 
-    from avis_ctrl.study.design_file import read_design
+    from avis_ctrl.study.design_file import read_study
     from avis_ctrl.study.output import open_folder
 
     console = Console(highlight=False)
-    read_design(file)  # before anything is imported or written that takes time
+    design, rig = read_study(file)  # before anything is imported or written that takes time
     folder = open_folder(out)
-    with _progress(console) as progress:
+    with _Progress(console) as progress:
         from avis_ctrl.report import render_html, render_pdf
         from avis_ctrl.study.output import write_study
-        from avis_ctrl.study.runner import run_file
+        from avis_ctrl.study.runner import run_design
 
-        result = run_file(file, progress)
+        result = run_design(design, rig, progress, source=file)
         progress("report")
         files = write_study(result, folder, render_html(result), render_pdf(result))
     _verdict(console, result)
@@ -64,7 +64,7 @@ def doctor() -> None:
         raise typer.Exit(3)
 
 
-class _progress:
+class _Progress:
     """Lines of progress with the time; on a terminal the running step has a spinner."""
 
     def __init__(self, console):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Sequence
 from typing import Any, get_args
 
@@ -31,8 +32,13 @@ def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputErro
         return InputError(_unknown_key(str(last), absent, _known_keys(model, parents)), field=field, value=value)
     if problem["type"] == "missing":
         return InputError("this key is missing", field=field)
-    return InputError(problem["msg"].replace("Input should", "expected to", 1).replace("to be ", "", 1), field=field,
-                      value=problem["input"])
+    value = problem["input"]
+    if problem["type"] in ("model_type", "dict_type", "model_attributes_type"):
+        return InputError("expected a section of keys", field=field, value=value)
+    # pydantic says "Input should be a valid number", "List should have at least 2 items after validation, not 1".
+    words = problem["msg"].removeprefix("Value error, ").replace(" after validation", "")
+    words = re.sub(r"^(Input|List) should (be )?", lambda said: "expected " if said[2] else "expected to ", words)
+    return InputError(words, field=field, value=value)
 
 
 def _dotted(place: Sequence[int | str]) -> str:
