@@ -6,11 +6,16 @@ from avis_ctrl.report.pieces import Bullets, Formula, Heading, Paragraph, Sectio
 from avis_ctrl.study.model import DesignResult
 
 SOURCES = (
-    "P. Beadle, S. Hurlebaus, U. Stoebener, L. Gaul: modelling of the spring-suspended Halcyonics table.",
-    "P. M. Rademakers: modelling and control of the air-mount AVIS, TU Eindhoven, 2005.",
-    "S. Skogestad, I. Postlethwaite: Multivariable Feedback Control, 2nd ed., Wiley, 2005 (weights, chapter 7 and 8).",
+    "B. M. Beadle, S. Hurlebaus, U. Stöbener, L. Gaul: Modeling and Parameter Identification of an Active "
+    "Anti-Vibration System (the Halcyonics table).",
+    "N. G. M. Rademakers: Modelling, Identification and Multivariable Control of an Active Vibration Isolation System, "
+    "report DCT 2005.63, Eindhoven University of Technology, 2005 (the AVIS).",
+    "S. Skogestad, I. Postlethwaite: Multivariable Feedback Control, 2nd ed., Wiley, 2005 (weights, uncertainty, mu).",
     "K. Zhou, J. C. Doyle, K. Glover: Robust and Optimal Control, Prentice Hall, 1996 (H-infinity, mu, D-K iteration).",
     "A. Packard, J. C. Doyle: The complex structured singular value, Automatica 29 (1993) 71-109.",
+    "S. O. Rice: Mathematical Analysis of Random Noise, Bell System Technical Journal 23 (1944) (level crossings).",
+    "P. D. Welch: The use of fast Fourier transform for the estimation of power spectra, IEEE Trans. Audio "
+    "Electroacoust. AU-15 (1967).",
     "IEC 61260-1:2014: Octave-band and fractional-octave-band filters.",
     "C. G. Gordon: Generic criteria for vibration-sensitive equipment, Proc. SPIE 1619 (1991).",
     "H. Amick, M. Gendreau, T. Busch, C. Gordon: Evolving criteria for research facilities, Proc. SPIE 5933 (2005).",
