@@ -15,10 +15,13 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.study.model import ControllerResult, DesignResult
 
 
+FILES = ("plant.json", "report.html", "report.pdf", "result.json")
+
+
 def open_folder(folder: str | Path) -> Path:
     """Create the output folder and make sure, before hours of computing, that it can be written.
 
-    Raises InputError where it is a file, read-only, or below something that is.
+    Raises InputError where it is a file, read-only, below something that is, or holds a folder in place of a file.
     """
     path = Path(folder)
     try:
@@ -28,6 +31,10 @@ def open_folder(folder: str | Path) -> Path:
     except OSError as error:
         raise InputError(f"expected a folder that can be written ({error.strerror or error})", field="--out",
                          value=str(path)) from None
+    for name, is_folder in (("controllers", True), *((name, False) for name in FILES)):
+        if (path / name).exists() and (path / name).is_dir() != is_folder:
+            raise InputError(f"expected a {'folder' if is_folder else 'file'} at {path / name}, or nothing",
+                             field="--out", value=str(path))
     return path
 
 
@@ -44,9 +51,13 @@ def write_whole(path: Path, content: bytes) -> None:
                 return
         _write_renamed(path, content)
     except OSError as error:
-        raise ComputationError(f"{path} was not written; what was there before is untouched",
-                               cause=str(error.strerror or error),
-                               next_step="free some space or choose another --out folder") from None
+        raise _not_written(path, error) from None
+
+
+def _not_written(path: Path, error: OSError) -> ComputationError:
+    return ComputationError(f"{path} was not written; what was there before is untouched",
+                            cause=str(error.strerror or error),
+                            next_step="free some space or choose another --out folder")
 
 
 def _write_nameless(path: Path, content: bytes) -> None:
@@ -129,9 +140,11 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
 
 def write_study(result: DesignResult, folder: Path, html: bytes | None = None, pdf: bytes | None = None) -> list[Path]:
     """All files of a study; result.json last, so that its presence says that the others are complete."""
-    (folder / "controllers").mkdir(exist_ok=True)
-    with contextlib.suppress(FileNotFoundError):
-        (folder / "result.json").unlink()
+    try:
+        (folder / "controllers").mkdir(exist_ok=True)
+        (folder / "result.json").unlink(missing_ok=True)
+    except OSError as error:
+        raise _not_written(folder, error) from None
     written = []
     for c in result.controllers:
         if c.K is not None:
