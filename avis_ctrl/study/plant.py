@@ -224,6 +224,7 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], chain: StateSpace, noi
                                         [f"seen_{axis}_dot"]), "sum")
         diagram.means(f"clean_{axis}_dot", "velocity as the sensors' band shows it", "m/s")
         diagram.means(f"seen_{axis}_dot", "measured velocity", "m/s")
+        diagram.means(f"mixed_noise_{axis}", "noise of the sensors that make this axis, before its filter", "1")
         diagram.means(f"noise_{axis}", "sensor noise that accompanies 1 m/s of floor velocity", "1")
         diagram.means(f"sensor_noise_{axis}", "sensor noise as velocity", "m/s")
     diagram.add("noise mixing", gain(mix, [f"noise_{a}" for a in axes], [f"mixed_noise_{a}" for a in axes]),
