@@ -11,6 +11,8 @@ import typer
 
 from avis_ctrl.errors import AvisError
 
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False,
                   help="Workbench for active vibration isolation tables.")
 
@@ -108,19 +110,18 @@ def _verdict(console, result) -> None:
 def main() -> None:
     """Entry point: errors of ours end in one line and their exit code."""
     try:
-        app(standalone_mode=False)
+        # The parser hands back the code of typer.Exit, and 130 after Ctrl-C.
+        code = app(standalone_mode=False)
     except AvisError as error:
         print(f"avis: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except typer.Exit as stop:
-        sys.exit(stop.exit_code)
-    except typer.Abort:
-        sys.exit(130)
-    except KeyboardInterrupt:
-        print("avis: stopped; nothing half-written is left", file=sys.stderr)
-        sys.exit(130)
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
     except Exception as error:  # usage errors of the command line parser carry their own code
-        if hasattr(error, "exit_code") and hasattr(error, "format_message"):
-            print(f"avis: {error.format_message()}", file=sys.stderr)
-            sys.exit(error.exit_code)
-        raise
+        if not (hasattr(error, "exit_code") and hasattr(error, "format_message")):
+            raise
+        print(f"avis: {error.format_message()}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    if code == INTERRUPTED:
+        print("avis: stopped; nothing half-written is left", file=sys.stderr)
+    sys.exit(code)

@@ -14,7 +14,6 @@ import numpy as np
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.study.model import ControllerResult, DesignResult
 
-
 FILES = ("plant.json", "report.html", "report.pdf", "result.json")
 
 

@@ -1,0 +1,107 @@
+"""The layers of the package: imports point downward only."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "avis_ctrl"
+LEVEL = {"errors": -1, "lti": 0, "rigs": 1, "measurement": 1, "identification": 2, "uncertainty": 2, "robust": 3,
+         "classical": 3, "simulation": 4, "gap": 4, "study": 5, "report": 6, "cli": 7}
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def imports(path: Path) -> Iterator[tuple[str, bool]]:
+    """(dotted name, whether it is imported when the module is) of each import."""
+    package = [PACKAGE.name, *path.relative_to(PACKAGE).parent.parts]
+
+    def walk(node: ast.AST, at_once: bool) -> Iterator[tuple[str, bool]]:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.Import):
+                yield from ((alias.name, at_once) for alias in child.names)
+            elif isinstance(child, ast.ImportFrom):
+                base = [*package[:len(package) - child.level + 1]] if child.level else []
+                module = ".".join([*base, *([child.module] if child.module else [])])
+                yield from ((f"{module}.{alias.name}", at_once) for alias in child.names)
+            else:
+                inside = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+                yield from walk(child, at_once and not inside)
+    yield from walk(ast.parse(path.read_text(encoding="utf-8")), True)
+
+
+def layer(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def test_every_module_belongs_to_a_layer():
+    assert {layer(path) for path in FILES} - {"__init__"} <= set(LEVEL)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_point_downward(path):
+    own = layer(path)
+    if own == "__init__":  # the front door: it names its modules as text and loads them late
+        assert not [name for name, _ in imports(path) if name.startswith("avis_ctrl.")]
+        return
+    for name, _ in imports(path):
+        parts = name.split(".")
+        # `import avis_ctrl` itself is for the version number.
+        if parts[0] == PACKAGE.name and len(parts) > 1 and parts[1] != own:
+            assert LEVEL[parts[1]] < LEVEL[own], f"{path.name} imports {name}"
+
+
+def test_the_walk_sees_an_upward_import(tmp_path, monkeypatch):
+    """The test of the test: an import inside a function counts too."""
+    monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path / "avis_ctrl")
+    path = tmp_path / "avis_ctrl" / "lti" / "bad.py"
+    path.parent.mkdir(parents=True)
+    path.write_text("from ..study import runner\ndef f():\n    import avis_ctrl.cli\n    from . import norms\n")
+    assert list(imports(path)) == [("avis_ctrl.study.runner", True), ("avis_ctrl.cli", False),
+                                   ("avis_ctrl.lti.norms", False)]
+
+
+def users(library: str, at_once: bool = False) -> list[str]:
+    return [str(path.relative_to(PACKAGE)) for path in FILES
+            for name, direct in imports(path) if name.split(".")[0] == library and (direct or not at_once)]
+
+
+def test_slycot_is_imported_in_one_module():
+    """It is GPL-2.0: one adapter."""
+    assert set(users("slycot")) == {"robust/slycot_adapter.py"}
+
+
+@pytest.mark.parametrize("library", ["slycot", "control"])
+def test_slow_libraries_are_imported_late(library):
+    assert users(library, at_once=True) == []
+
+
+@pytest.mark.parametrize("library", ["matplotlib", "plotly", "typst", "jinja2"])
+def test_only_the_report_draws(library):
+    """What computes needs no drawing library."""
+    assert {name.split("/")[0] for name in users(library, at_once=True)} <= {"report"}
+
+
+@pytest.mark.parametrize("library", ["typer", "rich"])
+def test_only_the_command_line_talks(library):
+    assert set(users(library)) == {"cli.py"}
+
+
+def loaded(statement: str) -> set[str]:
+    """Top-level modules in memory after a statement, in a fresh interpreter."""
+    code = f"import sys\n{statement}\nprint(*{{name.split('.')[0] for name in sys.modules}})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_linear_systems_load_without_python_control():
+    assert loaded("import avis_ctrl.lti").isdisjoint({"control", "slycot", "matplotlib", "cvxpy", "numba"})
+
+
+@pytest.mark.parametrize("statement", ["import avis_ctrl", "import avis_ctrl.cli", "import avis_ctrl.errors"])
+def test_the_front_door_loads_no_arrays(statement):
+    assert loaded(statement).isdisjoint({"numpy", "scipy", "control", "pydantic", "matplotlib"})
