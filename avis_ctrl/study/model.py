@@ -115,6 +115,21 @@ class ControllerResult:
         return self.K.nstates if self.K is not None else 0
 
 
+@dataclass(frozen=True, eq=False)
+class SixDofCheck:
+    """The mu controller on all six degrees of freedom, sampled, the other axes under their own loops.
+
+    omega : (n,) rad/s; kept : (n,) largest singular value from the kept axes' floor to them, rotations at the edge;
+    others : (n,) the same from the floor's other coordinates, which the design model does not have.
+    deviation_dB : largest difference of `kept` from the design model inside the design's band.
+    """
+
+    omega: np.ndarray
+    kept: np.ndarray
+    others: np.ndarray
+    deviation_dB: float
+
+
 @dataclass(frozen=True)
 class Requirement:
     """A line of the verdict table."""
@@ -139,6 +154,7 @@ class DesignResult:
     dk_history: tuple[Any, ...]
     requirements: tuple[Requirement, ...]
     reduction: ReductionError
+    six_dof: SixDofCheck
     simulation: Any | None
     provenance: dict[str, Any]
     seconds: float

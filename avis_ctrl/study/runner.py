@@ -31,7 +31,7 @@ from avis_ctrl.study.model import ControllerResult, DesignResult
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.requirements import judge
 from avis_ctrl.study.sampling import random_perturbations
-from avis_ctrl.study.simulation import SimulationCheck, simulate_study
+from avis_ctrl.study.simulation import SimulationCheck, simulate_study, six_dof_check
 from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
@@ -61,9 +61,10 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
         candidates, made = _synthesise(design, plant, rig, progress)
         results, simulation = _measure(design, plant, rig, candidates, progress)
         reduction = reduction_error(rig, design.keep)
+        six_dof = six_dof_check(design, rig, plant, next(c for c in results if c.name == "mu"))
     seconds = time.monotonic() - began
-    return DesignResult(design, rig, plant, tuple(results), made.history, judge(design, results), reduction, simulation,
-                        provenance(design, source, rig, seconds), seconds, made.notes)
+    return DesignResult(design, rig, plant, tuple(results), made.history, judge(design, results), reduction, six_dof,
+                        simulation, provenance(design, source, rig, seconds), seconds, made.notes)
 
 
 def _synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress) -> tuple[list[Candidate], Any]:

@@ -14,10 +14,11 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.robust.mu_realise import realise_delta
 from avis_ctrl.simulation.campaign import SimulationCheck, check_designs
+from avis_ctrl.simulation.prediction import predict_transmissibility_6dof
 from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, accelerometer_bank, geophone_bank
 from avis_ctrl.study.controllers import critical_gains, middle_corners
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.model import ControllerResult
+from avis_ctrl.study.model import ControllerResult, SixDofCheck
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.study.sampling import random_perturbations
 
@@ -40,6 +41,19 @@ def nominal_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | N
     return SampledLoop(rig, K, tuple(design.keep), {name: loops.loop(name) for name in others},
                        sensor_bank(design, rig), floor_by_coordinate(design, rig, plant.floor), name="nominal",
                        amplifier_corner_Hz=design.loop.amplifier_corner_Hz)
+
+
+def six_dof_check(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult) -> SixDofCheck:
+    """Transmissibility of the sampled loop in six degrees of freedom against the design model's."""
+    T2 = result.transmissibility
+    T = predict_transmissibility_6dof(nominal_loop(design, rig, plant, result.K), T2.omega)
+    kept = [COORDINATES.index(name) for name in design.keep]
+    others = [k for k in range(6) if k not in kept]
+    sigma = np.linalg.norm(T[:, kept][:, :, kept], ord=2, axis=(1, 2))
+    low, high = (2 * np.pi * f for f in design.transmissibility.band_Hz)
+    inside = (T2.omega >= low) & (T2.omega <= high)
+    deviation = 20 * np.max(np.abs(np.log10(sigma[inside] / T2.sigma[inside])))
+    return SixDofCheck(T2.omega, sigma, np.linalg.norm(T[:, kept][:, :, others], ord=2, axis=(1, 2)), float(deviation))
 
 
 def sensor_bank(design: Design, rig: Rig) -> SensorBank:

@@ -12,7 +12,15 @@ from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn_state import Iteration
 from avis_ctrl.study.design_file import read_design
-from avis_ctrl.study.model import Bound, ControllerResult, DesignResult, Requirement, SiteResponse, Transmissibility
+from avis_ctrl.study.model import (
+    Bound,
+    ControllerResult,
+    DesignResult,
+    Requirement,
+    SiteResponse,
+    SixDofCheck,
+    Transmissibility,
+)
 from avis_ctrl.study.plant import DesignPlant, build_plant
 
 DESIGN = Path(__file__).parents[2] / "designs" / "avis_z_phix.toml"
@@ -59,5 +67,7 @@ def fabricated() -> DesignResult:
     history = tuple(Iteration(k, 1.0 + 1 / k, 1.0 + 0.9 / k, 10 + k, 0.01, k, 0.2, "K-step") for k in range(1, 4))
     provenance = {"avis_ctrl": "0.1.0", "design_file": "avis_z_phix.toml", "inputs_sha256": "0123456789abcdef" * 4,
                   "seed": 1, "date": "2025-01-02T03:04:05+00:00", "seconds": 12.5}
-    return DesignResult(design, rig, plant, tuple(_controller(name, plant) for name in GAINS), history, requirements,
-                        reduction_error(rig, design.keep), None, provenance, 12.5, ("a remark",))
+    controllers = tuple(_controller(name, plant) for name in GAINS)
+    mu = controllers[-1].transmissibility
+    return DesignResult(design, rig, plant, controllers, history, requirements, reduction_error(rig, design.keep),
+                        SixDofCheck(mu.omega, mu.sigma, 0.1 * mu.sigma, 0.0), None, provenance, 12.5, ("a remark",))
