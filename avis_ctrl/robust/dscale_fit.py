@@ -62,7 +62,6 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
     Raises
     ------
     InputError : shapes that differ, magnitudes or frequencies that are not positive and finite, a negative order.
-    ComputationError : the spectral factorisation fails.
     """
     omega, target, weight = _checked(omega, magnitude, order, weight)
     best, error = _constant_fit(target, weight)
@@ -83,7 +82,11 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
             lower = level
             continue
         p, q = candidate
-        fitted = _spectral_factor(p, q, unit)
+        try:
+            fitted = _spectral_factor(p, q, unit)
+        except ComputationError:
+            # Round-off put a root on the axis: as above.
+            break
         achieved = float(np.max(weight * np.abs(fitted.log_magnitude(omega) - target)))
         if achieved >= error:
             # Feasible on paper but not after factorisation: doubles end here.

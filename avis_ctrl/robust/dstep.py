@@ -80,21 +80,28 @@ def choose_scalings(points: PointwiseScalings, allowed_cost: float = 0.01, max_s
     """Greedy search for the smallest orders whose realised scalings cost less than `allowed_cost` of peak mu.
 
     All orders start at zero; the blocks whose misfit accounts for most of the excess get one more, as long as
-    the scaled plant gains at most `max_states` states. `start` (scalings of the last iteration) is tried too.
+    the scaled plant gains at most `max_states` states. Where that ends short of the allowed cost, the search goes on
+    from `start`, the scalings that the loop was made with: the result never costs more than they do.
     """
-    best = _evaluated(points, _refined(points, _constants(points)))
-    if start is not None:
-        again = _evaluated(points, _refined(points, start))
-        if again.cost <= allowed_cost < best.cost and again.scalings.added_states <= max_states:
-            best = again
+    fresh = _grown(points, _evaluated(points, _refined(points, _constants(points))), allowed_cost, max_states)
+    if start is None or fresh.cost <= allowed_cost:
+        return fresh
+    kept = min(_evaluated(points, start), _evaluated(points, _refined(points, start)), key=lambda step: step.cost)
+    return min(fresh, _grown(points, kept, allowed_cost, max_states), key=lambda step: step.cost)
+
+
+def _grown(points: PointwiseScalings, best: DStep, allowed_cost: float, max_states: int) -> DStep:
+    """Orders raised where the misfit costs most, until the cost is allowed or nothing helps."""
     while best.cost > allowed_cost:
         share = _blame(points, best.scalings)
+        if not np.any(share > 0):
+            break
         candidates = (_raised(points, best, np.flatnonzero(share >= part * np.max(share)), max_states, by)
                       # One more order may not pay where two do: a resonance needs a pair of roots.
                       for part, by in ((0.4, 1), (0.4, 2), (0.999, 1), (0.999, 2)))
         better = next((new for new in candidates if new is not None and new.cost < max(0.9 * best.cost, allowed_cost)),
                       None)
-        if better is None or not np.any(share > 0):
+        if better is None:
             break
         best = better
     return best
