@@ -21,6 +21,8 @@ from avis_ctrl.errors import InputError
 
 Names = tuple[str, ...]
 Selector = str | int | slice | Sequence[str] | Sequence[int] | np.ndarray
+# States that back substitution takes at once: the rest of its work is then one matrix product.
+RESOLVENT_BLOCK = 16
 
 
 def _names(given: Iterable[str] | None, count: int, prefix: str, what: str) -> Names:
@@ -308,7 +310,13 @@ def _resolvent(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) 
     T, U = la.schur(balanced, output="complex")
     rhs = U.conj().T @ (B / scale[:, None])
     left = (C * scale) @ U
-    x = np.zeros((points.size, n, B.shape[1]), complex)
-    for k in range(n - 1, -1, -1):
-        x[:, k] = (rhs[k] + np.einsum("j,pju->pu", T[k, k + 1:], x[:, k + 1:])) / (points - T[k, k])[:, None]
-    return left @ x
+    columns = B.shape[1]
+    x = np.zeros((n, points.size * columns), complex)
+    pivots = np.repeat(points, columns) - np.diag(T)[:, None]
+    right = np.tile(rhs, (1, points.size))
+    for stop in range(n, 0, -RESOLVENT_BLOCK):
+        block = slice(max(stop - RESOLVENT_BLOCK, 0), stop)
+        right[block] += T[block, stop:] @ x[stop:]
+        for k in range(stop - 1, block.start - 1, -1):
+            x[k] = (right[k] + T[k, k + 1:stop] @ x[k + 1:stop]) / pivots[k]
+    return np.moveaxis((left @ x).reshape(-1, points.size, columns), 1, 0)
