@@ -89,7 +89,7 @@ def _eigenpair(A: Array, near: Array, rng: np.random.Generator) -> tuple[Array, 
     """Right and left eigenvectors x, y (B, n) of A for the eigenvalue nearest to `near`, by inverse iteration."""
     batch, n = A.shape[:2]
     shift = near * (1 + 1e-9 * (1 + 0.7j)) + 1e-14 * np.linalg.norm(A, axis=(1, 2))
-    P = np.linalg.inv(A - shift[:, None, None] * np.eye(n) + 1e-300)
+    P = _inverse(A - shift[:, None, None] * np.eye(n))
     P /= np.maximum(np.linalg.norm(P, axis=(1, 2)), 1e-300)[:, None, None]
     P = P @ P
     P /= np.maximum(np.linalg.norm(P, axis=(1, 2)), 1e-300)[:, None, None]
@@ -97,6 +97,16 @@ def _eigenpair(A: Array, near: Array, rng: np.random.Generator) -> tuple[Array, 
     x, y = (P @ start[0][..., None])[..., 0], (dagger(P) @ start[1][..., None])[..., 0]
     return (x / np.maximum(np.linalg.norm(x, axis=1), 1e-300)[:, None],
             y / np.maximum(np.linalg.norm(y, axis=1), 1e-300)[:, None])
+
+
+def _inverse(B: Array) -> Array:
+    """Inverse of each matrix, of its nearest regular neighbour where a pivot vanishes."""
+    try:
+        return np.linalg.inv(B)
+    except np.linalg.LinAlgError:
+        U, sigma, Vh = np.linalg.svd(B)
+        floor = np.maximum(np.finfo(float).eps * sigma[:, :1], 1e-150)
+        return (dagger(Vh) / np.maximum(sigma, floor)[:, None, :]) @ dagger(U)
 
 
 class Linearised(NamedTuple):
