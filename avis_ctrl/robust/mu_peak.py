@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance
 from avis_ctrl.lti.norms import bilinear_to_continuous
+from avis_ctrl.robust.mu_coupled import Coupled, coupled
 from avis_ctrl.robust.mu_cover import Cover, Interval, cover
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_lmi import Array, Scalings
@@ -76,7 +77,8 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
         raise InputError(f"the blocks need {structure.n_z} outputs and {structure.n_w} inputs, N has "
                          f"{system.noutputs} and {system.ninputs}", field="blocks")
     with threadpool_limits(1):
-        return _in_rad_s(N, _mu_peak(system, structure, _continuous_band(N, band), known_upper))
+        part = _prepared(system, structure)
+        return _in_rad_s(system, part, _mu_peak(part.N, part.structure, _continuous_band(system, band), known_upper))
 
 
 def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
@@ -101,11 +103,12 @@ def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
         raise InputError(f"the blocks take {structure.n_z} outputs and {structure.n_w} inputs of N's "
                          f"{system.noutputs} and {system.ninputs}: no performance channel is left", field="blocks")
     with threadpool_limits(1):
-        return _in_rad_s(N, _worst_case_gain(system, structure, _continuous_band(N, band)))
+        part = _prepared(system, structure)
+        return _in_rad_s(system, part, _worst_case_gain(part.N, part.structure, _continuous_band(system, band)))
 
 
 def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> tuple[StateSpace, BlockStructure]:
-    """N as a balanced continuous-time system, and its blocks."""
+    """N as a stable system of this package, and its blocks."""
     N = N if isinstance(N, StateSpace) else StateSpace.from_control(N)
     if not N.is_stable():
         poles = N.poles()
@@ -113,23 +116,30 @@ def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> tuple[S
         raise ComputationError("the bounds of mu need a stable system", measured=f"pole {worst:.6g}",
                                cause="the nominal closed loop is unstable or has a mode that the controller misses",
                                next_step="stabilise N, or remove the mode by lti.minimal if no channel sees it")
-    return balance(bilinear_to_continuous(N) if N.dt else N), BlockStructure.of(blocks)
+    return N, BlockStructure.of(blocks)
+
+
+def _prepared(N: StateSpace, structure: BlockStructure) -> Coupled:
+    """The blocks that matter with a balanced continuous-time system."""
+    part = coupled(N, structure)
+    return replace(part, N=balance(bilinear_to_continuous(part.N) if N.dt else part.N))
 
 
 def _continuous_band(N: StateSpace, band: Interval) -> Interval:
     low, high = float(band[0]), float(band[1])
     if not 0 <= low < high:
         raise InputError("expected 0 <= low < high in rad/s", field="band", value=band)
-    if not getattr(N, "dt", 0.0):
+    if not N.dt:
         return low, high
     nyquist = np.pi / N.dt
     return (2 / N.dt * float(np.tan(low * N.dt / 2)),
             np.inf if high >= nyquist else 2 / N.dt * float(np.tan(high * N.dt / 2)))
 
 
-def _in_rad_s(N: StateSpace, result: MuPeak) -> MuPeak:
-    """Frequencies of the bilinear image of a sampled system turned back into its own."""
-    dt = getattr(N, "dt", 0.0)
+def _in_rad_s(N: StateSpace, part: Coupled, result: MuPeak) -> MuPeak:
+    """Delta of all blocks, and frequencies of the bilinear image of a sampled system turned back into its own."""
+    result = replace(result, delta=part.restored(result.delta))
+    dt = N.dt
     if not dt:
         return result
     return replace(result, omega=2 / dt * float(np.arctan(result.omega * dt / 2)),

@@ -151,6 +151,29 @@ def test_real_perturbation_puts_a_pole_on_the_axis(rng):
         assert np.max(np.linalg.eigvals(perturbed).real) < 0
 
 
+@pytest.mark.parametrize("dead", ["z", "w"])
+def test_blocks_without_a_loop_change_nothing(rng, dead):
+    """A lag beside N whose z (or w) is linked to nothing leaves both peaks as they are."""
+    N = flexible(rng, 4, 4, modes=3, damping=0.05).scaled(left=0.05)
+    lag = tf([3], [1, 2])
+    inside = append(N.renamed(list("abcd"), list("pqrs")), lag.renamed(["lag_in"], ["lag_out"]))
+    right, left = np.eye(5), np.eye(5)
+    # One end of the lag is taken off; the other end of that channel acts on N (or sees it) all the same.
+    if dead == "z":
+        right[4, 4], right[0, 4] = 0.0, 1.0
+    else:
+        left[4, 4], left[4, 0] = 0.0, 1.0
+    whole = inside.scaled(left=left, right=right).select([0, 4, 1, 2, 3], [0, 4, 1, 2, 3])
+    assert whole.nstates == N.nstates + 1
+    for function, blocks, small in ((mu_peak, [R(), C(), F(3)], [R(), F(3)]),
+                                    (worst_case_gain, [R(), C()], [R()])):
+        found, expected = function(whole, blocks), function(N, small)
+        assert found.guaranteed and found.upper == pytest.approx(expected.upper, rel=1e-3)
+        assert found.lower == pytest.approx(expected.lower, rel=1e-3)
+        assert found.delta.shape[0] == BlockStructure.of(blocks).n_w
+        assert not np.any(found.delta[1]) and not np.any(found.delta[:, 1])
+
+
 # -- the guarantee, bands, clocks ---------------------------------------------------------------------------
 
 def test_upper_bound_holds_between_the_points(rng):
