@@ -1,0 +1,262 @@
+"""A study's files follow the contract, and their figures are reproduced from the files alone."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+from avis_ctrl.lti import StateSpace
+from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot, mu_upper_slicot
+from avis_ctrl.study.analysis import analyse
+from avis_ctrl.study.controllers import classical_skyhook, passive
+from avis_ctrl.study.design_file import Design, design_from_table, read_study
+from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.output import write_study
+from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.study.runner import provenance, run_design
+from avis_ctrl.study.sampling import random_perturbations
+from avis_ctrl.uncertainty.blocks import BlockStructure, RealScalar
+
+DESIGNS = Path(__file__).resolve().parents[2] / "designs"
+FLOOR_HZ = np.geomspace(0.1, 100.0, 40)
+
+PLANT_KEYS = {"format", "version", "A", "B", "C", "D", "dt", "inputs", "outputs", "nmeas", "ncon", "blocks",
+              "performance"}
+CONTROLLER_KEYS = {"format", "version", "name", "A", "B", "C", "D", "dt", "inputs", "outputs", "input_units",
+                   "output_units"}
+RESULT_KEYS = {"format", "version", "plant", "controllers", "dk_history", "requirements", "simulation", "seconds"}
+ROW_KEYS = {"name", "kind", "file", "order", "gamma", "mu_upper", "mu_lower", "mu_peak_Hz", "stable",
+            "peak_transmissibility_dB", "worst_case_peak_transmissibility_dB"}
+
+
+def read(path: Path) -> dict[str, Any]:
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{path.name} holds {constant}, which JSON does not have")
+    return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+
+
+def system(stored: dict[str, Any]) -> Any:
+    """python-control's state space of a stored system."""
+    n = np.size(stored["A"], 0)
+    return control.ss(np.reshape(stored["A"], (n, n)), np.reshape(stored["B"], (n, len(stored["inputs"]))),
+                      np.reshape(stored["C"], (len(stored["outputs"]), n)), stored["D"])
+
+
+def check_plant(plant: dict[str, Any]) -> None:
+    assert set(plant) == PLANT_KEYS
+    assert (plant["format"], plant["version"], plant["dt"]) == ("avis-plant", 1, 0.0)
+    D = np.array(plant["D"])
+    assert D.shape == (len(plant["outputs"]), len(plant["inputs"]))
+    rows, cols = (sum(block[key] for block in plant["blocks"]) for key in ("rows", "cols"))
+    for block in plant["blocks"]:
+        assert set(block) == {"kind", "rows", "cols", "name"}
+        assert block["kind"] == "full" or block["rows"] == block["cols"]
+    assert D.shape == (cols + plant["performance"]["cols"] + plant["nmeas"],
+                       rows + plant["performance"]["rows"] + plant["ncon"])
+    # Order (w_delta, w, u) and (z_delta, z, y); u and y last.
+    assert all(name.startswith("w:") for name in plant["inputs"][:rows])
+    assert all(name.startswith("z:") for name in plant["outputs"][:cols])
+    assert all(name.startswith("command_") for name in plant["inputs"][-plant["ncon"]:])
+    assert all(name.startswith("seen_") for name in plant["outputs"][-plant["nmeas"]:])
+    names = [name[2:].partition("[")[0] for name in plant["inputs"][:rows]]
+    assert names == [block["name"] for block in plant["blocks"] for _ in range(block["rows"])]
+
+
+def check_controller(stored: dict[str, Any], plant: dict[str, Any], row: dict[str, Any]) -> None:
+    assert set(stored) == CONTROLLER_KEYS
+    assert (stored["format"], stored["version"], stored["name"]) == ("avis-controller", 1, row["name"])
+    assert stored["dt"] == 0.0
+    assert stored["inputs"] == plant["outputs"][-plant["nmeas"]:]
+    assert stored["outputs"] == plant["inputs"][-plant["ncon"]:]
+    assert stored["input_units"] == ["m/s"] * plant["nmeas"]
+    assert stored["output_units"] == ["N"] * plant["ncon"]
+    assert np.shape(stored["A"])[0] == row["order"]
+
+
+def closed_loop(plant: dict[str, Any], controller: dict[str, Any] | None) -> Any:
+    """F_l(P, K) by python-control."""
+    P = system(plant)
+    n_u, n_y = plant["ncon"], plant["nmeas"]
+    if controller is None:
+        return P[:P.noutputs - n_y, :P.ninputs - n_u]
+    return P.lft(system(controller), n_u, n_y)
+
+
+def check_figures(plant: dict[str, Any], controller: dict[str, Any] | None, row: dict[str, Any]) -> None:
+    """gamma by SLICOT's norm; mu by SLICOT's upper bound on a grid and at the reported peak."""
+    N = closed_loop(plant, controller)
+    rows, cols = (sum(block[key] for block in plant["blocks"]) for key in ("rows", "cols"))
+    stable = bool(np.all(N.poles().real < 0))
+    assert row["stable"] == stable
+    if not stable:
+        return
+    nominal = N[cols:, rows:]
+    assert row["gamma"] == pytest.approx(hinf_norm_slicot(StateSpace(nominal.A, nominal.B, nominal.C, nominal.D)),
+                                         rel=1e-5)
+    if row["mu_upper"] is None:  # the set holds an unstable plant
+        return
+    structure = BlockStructure.from_dicts(plant["blocks"]).with_performance(plant["performance"]["rows"],
+                                                                            plant["performance"]["cols"])
+    assert row["mu_lower"] <= row["mu_upper"] * (1 + 1e-9)
+    for f in [*FLOOR_HZ, row["mu_peak_Hz"]]:
+        M = N(2j * np.pi * f)
+        assert mu_upper_slicot(M, structure.blocks) <= row["mu_upper"] * (1 + 2e-3), f
+    assert mu_upper_slicot(N(2j * np.pi * row["mu_peak_Hz"]), structure.blocks) >= row["mu_lower"] * (1 - 1e-6)
+
+
+def check_folder(folder: Path) -> dict[str, Any]:
+    """Everything that the contract says of a folder of results."""
+    result, plant = read(folder / "result.json"), read(folder / "plant.json")
+    assert set(result) >= RESULT_KEYS
+    assert (result["format"], result["version"], result["plant"]) == ("avis-design", 1, "plant.json")
+    check_plant(plant)
+    for row in result["controllers"]:
+        assert set(row) == ROW_KEYS
+        assert row["kind"] in ("mu", "hinf", "skyhook", "passive")
+        assert (row["file"] is None) == (row["kind"] == "passive")
+        stored = None
+        if row["file"] is not None:
+            assert row["file"] == f"controllers/{row['name']}.json"
+            check_controller(stored := read(folder / row["file"]), plant, row)
+        check_figures(plant, stored, row)
+    for row in result["dk_history"]:
+        assert set(row) == {"iteration", "gamma", "mu_upper", "order", "d_fit_error", "seconds"}
+    for row in result["requirements"]:
+        assert set(row) == {"name", "limit", "value", "unit", "met"}
+    return result
+
+
+def small_design(**changes: Any) -> Design:
+    """z alone, mass and one stiffness uncertain: bounds in a second."""
+    table = {"title": "small", "rig": "avis", "keep": ["z"],
+             "uncertainty": {"parameters_percent": {"mass": 10.0, "isolator1.k_z": 15.0}},
+             "transmissibility": {"peak_dB": 6.0, "band_dB": -3.0, "band_Hz": [2.0, 6.0]},
+             "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0}}
+    return design_from_table(table | changes)
+
+
+@pytest.fixture(scope="module")
+def small() -> tuple[Design, DesignPlant]:
+    design = small_design()
+    return design, build_plant(design, load_rig("avis"))
+
+
+def partial_result(**given: Any) -> DesignResult:
+    """A result with the parts that are not written to JSON left empty."""
+    return DesignResult(**{field.name: given.get(field.name) for field in fields(DesignResult)})
+
+
+def test_files_of_a_small_study_follow_the_contract(small, tmp_path):
+    design, plant = small
+    rig = load_rig("avis")
+    samples = random_perturbations(plant, 5, 1)
+    controllers = [analyse(design, plant, c.K, c.name, c.title, c.kind, samples)
+                   for c in (passive(), classical_skyhook(plant, rig, design))]
+    result = partial_result(design=design, rig=rig, plant=plant, controllers=tuple(controllers), dk_history=(),
+                            requirements=(), provenance=provenance(design, None, rig, 1.0), seconds=1.0, notes=())
+    written = write_study(result, tmp_path, b"<html>", b"%PDF")
+    assert written[-1] == tmp_path / "result.json"
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()} == {
+        "result.json", "plant.json", "controllers/skyhook_classical.json", "report.html", "report.pdf"}
+    stored = check_folder(tmp_path)
+    assert [row["name"] for row in stored["controllers"]] == ["passive", "skyhook_classical"]
+    passive_row, skyhook_row = stored["controllers"]
+    assert passive_row["peak_transmissibility_dB"] > 20 > skyhook_row["peak_transmissibility_dB"]
+    # Samples lie inside the worst case, the worst case at or above the nominal.
+    for row, c in zip(stored["controllers"], controllers, strict=True):
+        assert row["worst_case_peak_transmissibility_dB"] >= row["peak_transmissibility_dB"] - 1e-6
+        assert 20 * np.log10(c.transmissibility.high.max()) <= row["worst_case_peak_transmissibility_dB"] + 1e-6
+
+
+def test_a_failed_rewrite_takes_the_old_result_away(small, tmp_path, monkeypatch):
+    """result.json says that all else is complete: it goes first and comes last."""
+    from avis_ctrl.errors import ComputationError
+    from avis_ctrl.study import output
+
+    design, plant = small
+    rig = load_rig("avis")
+    result = partial_result(design=design, rig=rig, plant=plant, controllers=(), dk_history=(), requirements=(),
+                            provenance={}, seconds=1.0)
+    write_study(result, tmp_path)
+    assert (tmp_path / "result.json").exists()
+
+    def full(path: Path, value: dict) -> None:
+        raise ComputationError("disk full")
+    monkeypatch.setattr(output, "write_json", full)
+    with pytest.raises(ComputationError):
+        write_study(result, tmp_path)
+    assert not (tmp_path / "result.json").exists()
+
+
+def test_uncertain_parameters_come_in_the_order_of_the_blocks(small):
+    _, plant = small
+    assert plant.synthesis.blocks == BlockStructure.of([RealScalar(1, "mass"), RealScalar(1, "isolator1.k_z")])
+    assert plant.synthesis.w == ("floor_z_dot", "noise_z")
+    assert plant.synthesis.z == ("e_z", "effort_z")
+
+
+def test_transmissibility_of_the_plant_is_that_of_the_rig(small):
+    """Passive, nominal: v over v_f of m, c, k by hand."""
+    _, plant = small
+    rig = load_rig("avis")
+    equations = rig.equations_of_motion()
+    m, c, k = equations.M[2, 2], equations.C[2, 2], equations.K[2, 2]
+    s = 2j * np.pi * FLOOR_HZ
+    passive_loop = plant.full.closed(None).select("z_dot", "floor_z_dot").frequency_response(2 * np.pi * FLOOR_HZ)
+    np.testing.assert_allclose(passive_loop[:, 0, 0], (c * s + k) / (m * s ** 2 + c * s + k), rtol=1e-9)
+
+
+def test_compliance_bound_joins_the_weights():
+    design = small_design(compliance={"limit_m_per_N": 1e-5})
+    plant = build_plant(design, load_rig("avis"))
+    assert plant.synthesis.w == ("floor_z_dot", "noise_z", "force_z")
+    assert plant.synthesis.z == ("e_z", "effort_z", "compliance_z")
+    # compliance_z over force_z at rest: 1/k over the bound.
+    k = load_rig("avis").equations_of_motion().K[2, 2]
+    loop = plant.synthesis.closed(None).select("compliance_z", "force_z")
+    assert abs(loop(1e-4j)[0, 0]) == pytest.approx(1 / k / 1e-5, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["avis_z_phix", "halcyonics_z_phix"])
+def test_shipped_designs_build(name):
+    design, rig = read_study(DESIGNS / f"{name}.toml")
+    plant = build_plant(design, rig)
+    check_plant(plant.synthesis.as_dict())
+    assert plant.axes == ("z", "phi_x_edge")
+    assert plant.synthesis.P.is_stable()
+    # Voltages that push one axis push no other: decoding what allocation does is the identity on the axes.
+    equations = rig.equations_of_motion()
+    used = [equations.actuators.index(name) for name in plant.actuators]
+    lever = np.diag([1.0, 1.0 / rig.edge_m])
+    np.testing.assert_allclose(lever @ equations.T[2:4][:, used] @ plant.allocation, np.eye(2), atol=1e-12)
+    others = np.delete(equations.T, [2, 3], axis=0)[:, used] @ plant.allocation
+    assert np.max(np.abs(others)) < 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["avis_z_phix", "halcyonics_z_phix"])
+def test_whole_study_of_a_shipped_design(name, tmp_path):
+    """Few iterations, plants and seconds; the figures are reproduced from the files alone."""
+    design, rig = read_study(DESIGNS / f"{name}.toml")
+    short = design.model_copy(update={
+        "synthesis": design.synthesis.model_copy(update={"max_iterations": 3}),
+        "simulation": design.simulation.model_copy(update={"duration_s": 20.0, "random_plants": 2})})
+    said: list[str] = []
+    result = run_design(short, rig, said.append)
+    from avis_ctrl.report import render_html, render_pdf
+
+    files = write_study(result, tmp_path, render_html(result), render_pdf(result))
+    stored = check_folder(tmp_path)
+    assert {row["name"] for row in stored["controllers"]} >= {"passive", "skyhook", "hinf", "mu"}
+    assert len(stored["dk_history"]) >= 1
+    assert len(stored["requirements"]) == len(design.requirement)
+    assert all(path.stat().st_size > 0 for path in files)
+    assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert any("D-K iteration" in line for line in said)
