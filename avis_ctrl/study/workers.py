@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from typing import Any
@@ -21,8 +22,10 @@ class Workers:
     def __enter__(self) -> Workers:
         # A forked child has the compiled code and the libraries already.
         method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-        self._pool = (ProcessPoolExecutor(self._count, multiprocessing.get_context(method)) if self._count > 1
-                      else None)
+        # Ctrl-C ends the children at once and silently; this process says that it was stopped.
+        self._pool = (ProcessPoolExecutor(self._count, multiprocessing.get_context(method), signal.signal,
+                                          (signal.SIGINT, signal.SIG_DFL)) if self._count > 1 else None)
+        self._others = set(multiprocessing.active_children())
         return self
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
@@ -32,10 +35,15 @@ class Workers:
         done: Future = Future()
         try:
             done.set_result(function(*arguments))
-        except BaseException as error:
+        except Exception as error:
             done.set_exception(error)
         return done
 
     def __exit__(self, kind: Any, value: Any, trace: Any) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=kind is None, cancel_futures=True)
+        if self._pool is None:
+            return
+        if kind is not None:
+            # Nobody waits for the answers any more; without this the interpreter would, before it ends.
+            for child in set(multiprocessing.active_children()) - self._others:
+                child.terminate()
+        self._pool.shutdown(cancel_futures=True)
