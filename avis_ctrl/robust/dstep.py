@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.optimize as so
 
+from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.dscale_fit import fit_magnitude
 from avis_ctrl.robust.dscale_matrix import fit_hermitian
 from avis_ctrl.robust.gamma_descent import free_parameters, parameter_box, parameters, with_parameters
@@ -20,12 +21,16 @@ from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.scalings import MAX_ORDER, MatrixScaling, ScalarScaling, Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-FIT_TOLERANCE = 3e-3
-MATRIX_FIT_TOLERANCE = 1e-2
+# A fit is refined together with the others afterwards: closer than this its own optimum is not worth looking for.
+FIT_TOLERANCE = 2e-2
+MATRIX_FIT_TOLERANCE = 2e-2
 # Gain of a linear program below which refining a fit is not worth another: a tenth of what a fit may cost.
 REFINEMENT = 1e-3
 # Below this share of the peak a loop has room for any misfit; from here up its own mu is the yardstick.
 PROFILE_FLOOR = 0.8
+# Points of the check between the grid's, and the excess there that sends its peaks back into the grid.
+CHECKED_POINTS = 400
+BETWEEN = 1.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +70,16 @@ class PointwiseScalings:
                 X[k] = part
         return PointwiseScalings(omega, M, structure, mu, log_d, X)
 
+    def extended(self, omega: np.ndarray, M: np.ndarray) -> PointwiseScalings:
+        """With more frequencies of the same loop."""
+        more = PointwiseScalings.of(omega, M, self.structure)
+        order = np.argsort(np.concatenate([self.omega, omega]))
+
+        def both(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+            return np.concatenate([one, two])[order]
+        return PointwiseScalings(both(self.omega, omega), both(self.M, M), self.structure, both(self.mu, more.mu),
+                                 both(self.log_d, more.log_d), {k: both(X, more.X[k]) for k, X in self.X.items()})
+
 
 @dataclass(frozen=True)
 class DStep:
@@ -73,6 +88,46 @@ class DStep:
     scalings: Scalings
     peak: float
     cost: float
+
+
+def d_step(points: PointwiseScalings, loop: StateSpace, start: Scalings, allowed_cost: float = 0.01,
+           max_states: int = 60) -> DStep:
+    """Scalings of the loop N(s) chosen on the grid and measured between its points: peaks there are added to it.
+
+    The peak measured of the scaled loop is at most that with `start`, the scalings that the loop was made with.
+    """
+    dense = np.geomspace(points.omega[0], points.omega[-1], CHECKED_POINTS)
+    response = loop.frequency_response(dense)
+    first = _measured(points, loop, dense, response, start)[0]
+    step = choose_scalings(points, allowed_cost, max_states, start)
+    for _ in range(4):
+        measured, omega, M = _measured(points, loop, dense, response, step.scalings)
+        if not omega.size:
+            return measured
+        points = points.extended(omega, M)
+        again = min((_evaluated(points, scalings) for scalings in (step.scalings, _refined(points, step.scalings))),
+                    key=lambda found: found.cost)
+        step = _grown(points, again, allowed_cost, max_states)
+    measured = _measured(points, loop, dense, response, step.scalings)[0]
+    return min(measured, first, key=lambda found: found.peak)
+
+
+def _measured(points: PointwiseScalings, loop: StateSpace, dense: np.ndarray, response: np.ndarray,
+              scalings: Scalings) -> tuple[DStep, np.ndarray, np.ndarray]:
+    """The step with its peak between the grid's points too, and where (and with which M) it exceeds theirs."""
+    step = _evaluated(points, scalings)
+    # Lightly damped roots make the narrowest peaks that scalings can add.
+    roots = np.abs(np.concatenate([np.r_[part.zeros, part.poles] for part in scalings.parts
+                                   if isinstance(part, ScalarScaling)]))
+    omega = np.concatenate([dense, roots])
+    order = np.argsort(omega)
+    M = np.concatenate([response, loop.frequency_response(roots)])[order]
+    omega = omega[order]
+    sigma = _sigma(omega, M, scalings)
+    top = (sigma[1:-1] >= sigma[:-2]) & (sigma[1:-1] > sigma[2:]) & (sigma[1:-1] > BETWEEN * step.peak)
+    at = np.flatnonzero(top) + 1
+    at = at[np.argsort(sigma[at])[::-1][:4]]
+    return DStep(scalings, max(step.peak, float(np.max(sigma))), step.cost), omega[at], M[at]
 
 
 def choose_scalings(points: PointwiseScalings, allowed_cost: float = 0.01, max_states: int = 60,
@@ -115,8 +170,12 @@ def band_of(omega: np.ndarray) -> tuple[float, float]:
 
 def peak_of(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
     """sigma_max(D N D^-1) (n_omega,) with the realised scalings."""
-    left, right = scalings.response(points.omega)
-    return np.linalg.norm(left @ points.M @ right, ord=2, axis=(1, 2))
+    return _sigma(points.omega, points.M, scalings)
+
+
+def _sigma(omega: np.ndarray, M: np.ndarray, scalings: Scalings) -> np.ndarray:
+    left, right = scalings.response(omega)
+    return np.linalg.norm(left @ M @ right, ord=2, axis=(1, 2))
 
 
 def _evaluated(points: PointwiseScalings, scalings: Scalings) -> DStep:
@@ -223,7 +282,7 @@ def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 8) -> S
 def _linearised(points: PointwiseScalings, scalings: Scalings, kept: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """Logarithms of the largest singular values near the peak (n,), and their slopes in theta (n, n_theta)."""
     left, right = scalings.response(points.omega)
-    U, s, Vh = np.linalg.svd(left @ points.M @ right)
+    U, s, Vh = np.linalg.svd(left @ points.M @ right, full_matrices=False)
     kept = min(kept, s.shape[1])
     log_s = np.log(np.maximum(s[:, :kept], 1e-300))
     log_ref = np.log(points.yardstick)

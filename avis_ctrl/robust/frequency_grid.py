@@ -6,7 +6,7 @@ import numpy as np
 
 from avis_ctrl.lti import StateSpace
 
-POINTS_PER_DECADE = 8
+POINTS_PER_DECADE = 5
 MAX_POINTS = 140
 
 

@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
-from avis_ctrl.robust.dstep import DStep, PointwiseScalings, band_of, choose_scalings
-from avis_ctrl.robust.frequency_grid import frequency_grid, merged, refined_grid
+from avis_ctrl.robust.dstep import PointwiseScalings, band_of, choose_scalings, d_step
+from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
 from avis_ctrl.robust.gamma_descent import descend, grown
 from avis_ctrl.robust.hinf_plant import as_plant
 from avis_ctrl.robust.hinfsyn import Synthesis, hinfsyn
@@ -215,7 +215,8 @@ def _proposed(problem: _Problem, state: State, options: _Options) -> _Proposal |
     if state.last is None or state.best is None or state.points is None:
         return _Proposal(Scalings.identity(problem.structure), 0.0, "H-infinity")
     if state.phase == "D-K":
-        step = _d_step(problem, state.last, state.points, options)
+        step = d_step(state.points, lft_lower(problem.P, state.last.K), state.last.scalings,
+                      max_states=options.max_added_states)
         return _Proposal(step.scalings, step.cost, "D-K")
     band = band_of(state.points.omega)
     start = min(state.last, state.best, key=lambda loop: loop.gamma).scalings
@@ -231,18 +232,6 @@ def _proposed(problem: _Problem, state: State, options: _Options) -> _Proposal |
     except ComputationError:
         return None
     return _Proposal(descent.scalings, 0.0, state.phase)
-
-
-def _d_step(problem: _Problem, last: Loop, points: PointwiseScalings, options: _Options) -> DStep:
-    """Scalings chosen on the grid and measured on the axis: a peak between the points is added to them."""
-    closed = lft_lower(problem.P, last.K)
-    for _ in range(3):
-        step = choose_scalings(points, max_states=options.max_added_states, start=last.scalings)
-        worst = hinf_norm(step.scalings.scale(closed), 1e-3)
-        if worst.gain <= 1.02 * step.peak or not 0 < worst.omega < np.inf:
-            break
-        points = analysed(problem.P, last.K, problem.structure, merged(points.omega, np.array([worst.omega])))
-    return step
 
 
 def _next_grid(state: State, closed_loop: StateSpace) -> np.ndarray:
