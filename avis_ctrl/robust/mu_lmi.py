@@ -7,8 +7,7 @@ For w = Delta z, z = M w with ||Delta|| <= 1/beta no loop exists if scalings tha
 (Fan, Tits and Doyle, IEEE TAC 36, 1991). X_z and X_w carry the same numbers on both sides of a block, G
 lives on real blocks. The least lambda is a generalized eigenvalue problem, solved here by following the
 analytic centres of {F > 0, X > 0} as lambda falls (Boyd and El Ghaoui, Linear Algebra and its
-Applications 188/189, 1993), with a tangent step in lambda between the Newton steps. All derivatives come
-from one Gram matrix:  F = V K(theta) V^H,  V = [I  M^H],  d2(-log det F) = tr(T K_k T K_l),  T = V^H inv(F) V.
+Applications 188/189, 1993), with a tangent step in lambda between the Newton steps (compiled, see `mu_kernel`).
 
 Several matrices may share one set of scalings (axis 1 of M): their bound then holds for all of them.
 """
@@ -20,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from avis_ctrl.robust.mu_kernel import Entries, centres
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Array = np.ndarray
@@ -42,13 +42,11 @@ class LinearForm:
         self.row = np.array([e[0] for e in order], int)
         self.col = np.array([e[1] for e in order], int)
         self.value = np.array([e[2] for e in order], complex)
+        self.parameter = np.array([e[3] for e in order], int)
         self.incidence = np.zeros((parameters, len(order)))
         self.incidence[[e[3] for e in order], np.arange(len(order))] = 1.0
         self._dense = np.zeros((parameters, size * size), complex)
         self._dense[[e[3] for e in order], self.row * size + self.col] = self.value
-        # tr(T K_k T K_l) = sum of K_k[a, b] T[b, c] K_l[c, d] T[d, a]
-        self._to_next = self.row[None, :] + size * self.col[:, None]
-        self._to_first = self.row[:, None] + size * self.col[None, :]
 
     def matrix(self, theta: Array) -> Array:
         """K(theta), shape (B, size, size)."""
@@ -59,13 +57,9 @@ class LinearForm:
         flat = T.reshape(T.shape[0], -1)
         return (flat[:, self.col * self.size + self.row] * (self.value * weight)).real @ self.incidence.T
 
-    def hessian(self, T: Array, weight: Array | None = None) -> Array:
-        """tr(T K_k T K_l), shape (B, p, p), summed over axis 1 of T (B, n_shared, size, size)."""
-        flat = T.reshape(*T.shape[:2], -1)
-        product = np.sum(flat[:, :, self._to_next] * flat[:, :, self._to_first], axis=1)
-        value = np.broadcast_to(self.value, (T.shape[0], self.value.size)) if weight is None else self.value * weight
-        product = (value[:, :, None] * product * value[:, None, :]).real
-        return self.incidence @ product @ self.incidence.T
+    def entries(self, on_level: Array) -> Entries:
+        """The entries as the compiled code takes them; `on_level` marks those that lambda multiplies."""
+        return Entries(self.row, self.col, self.value, self.parameter, on_level, self.size)
 
 
 @dataclass(frozen=True)
@@ -173,35 +167,6 @@ def least_level(M: Array, scalings: Scalings, level: Array) -> Array:
     return np.where(feasible, lam, np.inf) if r.size else lam
 
 
-@dataclass
-class _Point:
-    """Derivatives of the barrier at (theta, lambda) for a batch."""
-
-    gradient: Array
-    hessian: Array
-    slope: Array  # d gradient / d lambda
-
-    def part(self, which: Array) -> _Point:
-        return _Point(self.gradient[which], self.hessian[which], self.slope[which])
-
-
-def _barrier(space: ScalingSpace, M: Array, theta: Array, lam: Array) -> _Point:
-    batch, shared, _, n_w = M.shape
-    scalings = space.scalings(theta)
-    S = np.linalg.inv(residual(M, scalings, lam, space.level))
-    V = np.concatenate([np.broadcast_to(np.eye(n_w), (batch, shared, n_w, n_w)), dagger(M)], axis=-1)
-    SV = S @ V
-    T = dagger(V) @ SV
-    weight = np.where(space.is_level, lam[:, None], 1.0)
-    Xi = np.linalg.inv(space.core.matrix(theta))
-    gradient = space.trace - space.form.gradient(T.sum(axis=1), weight) - space.core.gradient(Xi)
-    hessian = space.form.hessian(T, weight) + space.core.hessian(Xi[:, None])
-    Xp = scalings.X_w * space.level
-    T_slope = (dagger(SV) @ Xp[:, None] @ SV).sum(axis=1)
-    slope = space.form.gradient(T_slope, weight) - space.form.gradient(T.sum(axis=1), space.is_level.astype(float))
-    return _Point(gradient, hessian, slope)
-
-
 def _inside(space: ScalingSpace, M: Array, theta: Array, lam: Array) -> Array:
     """Whether F > 0 and X > 0, for each problem."""
     F = np.linalg.eigvalsh(residual(M, space.scalings(theta), lam, space.level))
@@ -224,32 +189,11 @@ def _step_to_boundary(space: ScalingSpace, M: Array, theta: Array, lam: Array, d
     return 1.0 / np.maximum(rate, 1e-300)
 
 
-def _newton(space: ScalingSpace, hessian: Array, gradient: Array) -> Array:
-    """-inv(hessian) gradient with unit-diagonal scaling; ridges of round-off size where it is singular.
-
-    A G that multiplies a real entry of M has no effect and no curvature: its ridge is measured against the
-    largest curvature, so that round-off does not drive it away.
-    """
-    diagonal = np.diagonal(hessian, axis1=1, axis2=2)
-    ridge = np.where(space.is_g, 1e-11 * np.max(diagonal, axis=1, keepdims=True), 0.0)
-    d = 1.0 / np.sqrt(np.maximum(diagonal + ridge, 1e-300))
-    eye = np.eye(d.shape[1])
-    scaled = hessian * d[:, :, None] * d[:, None, :] + (1e-13 + ridge * d ** 2)[:, :, None] * eye
-    return -d * np.linalg.solve(scaled, (d * gradient)[..., None])[..., 0]
-
-
 def _centre(space: ScalingSpace, M: Array, theta: Array, lam: Array, accuracy: float = 0.3,
-            steps: int = 40) -> tuple[Array, _Point]:
-    """Damped Newton steps towards the analytic centre at fixed lambda."""
-    for _ in range(steps):
-        point = _barrier(space, M, theta, lam)
-        step = _newton(space, point.hessian, point.gradient)
-        decrement = np.sqrt(np.maximum(-np.sum(step * point.gradient, axis=1), 0.0))
-        if np.all(decrement < accuracy):
-            break
-        length = np.where(decrement < 0.4, 1.0, 1.0 / (1.0 + decrement))
-        theta = theta + length[:, None] * step
-    return theta, point
+            steps: int = 40) -> tuple[Array, Array]:
+    """Analytic centres at fixed lambda and the directions in which they move with lambda."""
+    return centres(np.ascontiguousarray(M, complex), theta, lam, space.form.entries(space.is_level),
+                   space.core.entries(np.zeros(space.core.row.size, bool)), space.trace, space.is_g, accuracy, steps)
 
 
 def follow(space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array | float = 0.0, tolerance: float = 1e-5,
@@ -264,17 +208,16 @@ def follow(space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array 
     active = np.arange(M.shape[0])
     for _ in range(iterations):
         Ma, la, end = M[active], lam[active], floor[active]
-        th, point = _centre(space, Ma, theta[active], la)
-        sound = np.all(np.isfinite(th), axis=1) & np.all(np.isfinite(point.slope), axis=1)
+        th, direction = _centre(space, Ma, theta[active], la)
+        sound = np.all(np.isfinite(th), axis=1) & np.all(np.isfinite(direction), axis=1)
         sound[sound] &= _inside(space, Ma[sound], th[sound], la[sound])
         if not np.all(sound):
             # Round-off ended the path here; the last verified point stands.
-            active, Ma, la, end, th, point = (active[sound], Ma[sound], la[sound], end[sound], th[sound],
-                                              point.part(sound))
+            active, Ma, la, end, th, direction = (active[sound], Ma[sound], la[sound], end[sound], th[sound],
+                                                  direction[sound])
             if not active.size:
                 break
         theta[active] = th
-        direction = _newton(space, point.hessian, point.slope)
         reach = _step_to_boundary(space, Ma, th, la, direction)
         fall = np.minimum(0.9 * reach, la - end)
         for _ in range(30):
