@@ -67,11 +67,11 @@ def doctor() -> None:
 
 
 class _Progress:
-    """Lines of progress with the time; on a terminal the running step has a spinner."""
+    """A line with the time at each step; on a terminal a spinner below says that work goes on."""
 
     def __init__(self, console):
-        self.console, self.began, self.step = console, time.monotonic(), None
-        self.status = console.status("starting") if console.is_terminal else None
+        self.console, self.began = console, time.monotonic()
+        self.status = console.status("working") if console.is_terminal else None
 
     def __enter__(self):
         if self.status:
@@ -79,19 +79,9 @@ class _Progress:
         return self
 
     def __call__(self, text: str) -> None:
-        self._finish()
-        self.step = text
-        if self.status:
-            self.status.update(text)
-
-    def _finish(self) -> None:
-        if self.step:
-            self.console.print(f"[dim]{time.monotonic() - self.began:6.1f} s[/]  {self.step}", soft_wrap=True)
-        self.step = None
+        self.console.print(f"[dim]{time.monotonic() - self.began:6.1f} s[/]  {text}", soft_wrap=True)
 
     def __exit__(self, kind, value, trace) -> None:
-        if kind is None:
-            self._finish()
         if self.status:
             self.status.stop()
 
@@ -105,6 +95,8 @@ def _verdict(console, result) -> None:
         asked = "yes" if r.comparison == "is" else f"{r.comparison} {r.limit:.4g}{unit}"
         table.add_row(r.name, asked, f"{r.value:.4g}{unit}", "[green]met[/]" if r.met else "[red]not met[/]")
     console.print(table)
+    for note in result.notes:
+        console.print(note)
 
 
 def main() -> None:

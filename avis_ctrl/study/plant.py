@@ -21,6 +21,7 @@ from avis_ctrl.rigs.converter import Converter, white_density
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel, shipped_spectrum
 from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.study.design_file import ChainUncertainty, Design
 from avis_ctrl.uncertainty.blocks import ComplexFull
 from avis_ctrl.uncertainty.generalized_plant import Diagram, GeneralizedPlant
@@ -105,6 +106,9 @@ def build_plant(design: Design, rig: Rig) -> DesignPlant:
     low, high = design.floor.band_Hz
     reference = floor.rms(low, high) / np.sqrt(high - low)
     _sensor_side(diagram, axes, chain, noise, decoding, reference)
+    # What each sensor sees of the kept axes, rotations at the edge.
+    rows = decoder.matrix[:, [COORDINATES.index(name) for name in design.keep]] / lever
+    _sensor_errors(diagram, design.uncertainty.sensor_chains, axes, decoder.sensors, rows, decoding, weights)
     _performance(diagram, design, rig, axes, matrix[used], weights)
     w = [*(f"floor_{a}_dot" for a in axes), *(f"noise_{a}" for a in axes), *(f"force_{a}" for a in axes)]
     weighted = [*(f"e_{a}" for a in axes), *(f"effort_{a}" for a in axes)]
@@ -220,8 +224,8 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], chain: StateSpace, noi
     for axis in axes:
         diagram.add(f"sensor chain {axis}", chain.renamed([f"{axis}_dot"], [f"clean_{axis}_dot"]), "sensor")
         diagram.add(f"noise {axis}", noise.renamed([f"mixed_noise_{axis}"], [f"sensor_noise_{axis}"]), "weight")
-        diagram.add(f"sum {axis}", gain([[1.0, 1.0]], [f"clean_{axis}_dot", f"sensor_noise_{axis}"],
-                                        [f"seen_{axis}_dot"]), "sum")
+        diagram.add(f"sum {axis}", gain([[1.0, 1.0, 1.0]], [f"clean_{axis}_dot", f"sensor_noise_{axis}",
+                                                            f"chain_error_{axis}"], [f"seen_{axis}_dot"]), "sum")
         diagram.means(f"clean_{axis}_dot", "velocity as the sensors' band shows it", "m/s")
         diagram.means(f"seen_{axis}_dot", "measured velocity", "m/s")
         diagram.means(f"mixed_noise_{axis}", "noise of the sensors that make this axis, before its filter", "1")
@@ -229,6 +233,24 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], chain: StateSpace, noi
         diagram.means(f"sensor_noise_{axis}", "sensor noise as velocity", "m/s")
     diagram.add("noise mixing", gain(mix, [f"noise_{a}" for a in axes], [f"mixed_noise_{a}" for a in axes]),
                 "allocation")
+
+
+def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty | None, axes: tuple[str, ...],
+                   sensors: tuple[str, ...], rows: np.ndarray, decoding: np.ndarray, weights: dict[str, Weight]) -> None:
+    """What the neglected dynamics of each sensor chain add to the decoded velocities: decoding (W Delta) rows."""
+    used = [k for k in range(len(sensors)) if np.any(np.abs(rows[k]) > 1e-9) and np.any(np.abs(decoding[:, k]) > 1e-9)]
+    errors = [f"chain_error_{a}" for a in axes]
+    if uncertainty is None or not used:
+        diagram.add("sensor errors", gain(np.zeros((len(axes), 0)), [], errors), "sum")
+        return
+    weight = NeglectedDynamics(uncertainty.low_percent / 100, uncertainty.crossover_Hz, uncertainty.high_percent / 100)
+    weights["sensor chain *"] = weight
+    labels = [f"sensor chain {sensors[k]}" for k in used]
+    for k, label in zip(used, labels, strict=True):
+        diagram.add(f"at {sensors[k]}", gain([rows[k]], [f"clean_{a}_dot" for a in axes], [f"{sensors[k]}_dot"]), "sum")
+        diagram.add(f"W {label}", weight.system(f"{sensors[k]}_dot", f"z:{label}"), "weight")
+        diagram.uncertain(ComplexFull(1, 1, label), [f"w:{label}"], [f"z:{label}"])
+    diagram.add("sensor errors", gain(decoding[:, used], [f"w:{label}" for label in labels], errors), "allocation")
 
 
 def _performance(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, ...], allocation: np.ndarray,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 import avis_ctrl
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
+from avis_ctrl.robust.musyn import MuSynthesis
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.controllers import (
     Candidate,
@@ -27,6 +28,7 @@ from avis_ctrl.study.controllers import (
     tuned_skyhook,
 )
 from avis_ctrl.study.design_file import Design, read_study
+from avis_ctrl.study.limits import best_found
 from avis_ctrl.study.model import ControllerResult, DesignResult
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.requirements import judge
@@ -55,46 +57,62 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
     source : design file, hashed into the provenance.
     """
     began = time.monotonic()
+    progress("model: rig, uncertainty, weights")
+    plant = build_plant(design, rig)
+    candidates, synthesis = synthesise(design, plant, rig, progress)
+    controllers, simulation = compare(design, plant, rig, candidates, progress)
+    return conclude(design, plant, rig, synthesis, controllers, simulation, time.monotonic() - began, source)
+
+
+def synthesise(design: Design, plant: DesignPlant, rig: Rig,
+               progress: Progress = lambda text: None) -> tuple[list[Candidate], MuSynthesis]:
+    """The controllers that need no other: mu, nominal H-infinity, classical skyhook, none; and the D-K iteration."""
     with threadpool_limits(1):
-        progress("model: rig, uncertainty, weights")
-        plant = build_plant(design, rig)
-        candidates, made = _synthesise(design, plant, rig, progress)
-        results, simulation = _measure(design, plant, rig, candidates, progress)
+        progress("H-infinity synthesis of the nominal plant")
+        hinf = nominal_hinf(design, plant, rig)
+
+        def shown(row: Any) -> None:
+            progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.4f}, peak mu {row.mu_upper:.4f}, "
+                     f"order {row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
+        mu, made = mu_optimal(design, plant, rig, shown)
+        progress(mu.notes[-1])
+        return [mu, hinf, classical_skyhook(plant, rig, design), passive()], made
+
+
+def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesis,
+             controllers: Sequence[ControllerResult], simulation: SimulationCheck, seconds: float,
+             source: Path | None = None) -> DesignResult:
+    """The verdict, with what the reduction to the kept axes leaves out, and the provenance."""
+    with threadpool_limits(1):
         reduction = reduction_error(rig, design.keep)
-        six_dof = six_dof_check(design, rig, plant, next(c for c in results if c.name == "mu"))
-    seconds = time.monotonic() - began
-    return DesignResult(design, rig, plant, tuple(results), made.history, judge(design, results), reduction, six_dof,
-                        simulation, provenance(design, source, rig, seconds), seconds, made.notes)
+        mu = next(c for c in controllers if c.name == "mu")
+        six_dof = six_dof_check(design, rig, plant, mu)
+        notes = (best_found(plant, mu.K, mu.mu),) if mu.K is not None and mu.mu.upper >= 1 else ()
+    return DesignResult(design, rig, plant, tuple(controllers), synthesis.history, judge(design, controllers),
+                        reduction, six_dof, simulation, provenance(design, source, rig, seconds), seconds, notes)
 
 
-def _synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress) -> tuple[list[Candidate], Any]:
-    progress("H-infinity synthesis of the nominal plant")
-    hinf = nominal_hinf(design, plant, rig)
+def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[Candidate],
+            progress: Progress = lambda text: None) -> tuple[list[ControllerResult], SimulationCheck]:
+    """Bounds of every controller, a skyhook tuned to the worst-case peak of mu, and the simulation of mu.
 
-    def shown(row: Any) -> None:
-        progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.4f}, peak mu {row.mu_upper:.4f}, "
-                 f"order {row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
-    mu, made = mu_optimal(design, plant, rig, shown)
-    progress(mu.notes[-1])
-    return [mu, hinf, classical_skyhook(plant, rig, design), passive()], made
-
-
-def _measure(design: Design, plant: DesignPlant, rig: Rig, candidates: list[Candidate],
-             progress: Progress) -> tuple[list[ControllerResult], SimulationCheck]:
-    """Bounds of every controller and the simulation, on two processes: none needs another but the tuned skyhook."""
+    On two processes: none needs another but the last two, which need the bounds of mu.
+    """
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     with Workers() as workers:
         jobs = {c.name: workers.submit(_measured, design, plant, c, samples) for c in candidates}
+        progress("bounds of every controller over the whole uncertainty set, closed loop of the nonlinear rig")
         mu = jobs["mu"].result()
-        progress("bounds of mu synthesis")
+        progress("  done: bounds of mu synthesis")
         jobs["simulation"] = workers.submit(simulate_study, design, rig, plant, mu)
         jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, mu.worst_peak.upper, samples)
         found = {}
-        for name, job in jobs.items():
+        for job in as_completed(jobs.values()):
+            name = next(name for name, one in jobs.items() if one is job)
             found[name] = job.result()
             if name != "mu":
-                progress(f"simulated {design.simulation.random_plants + 2} nonlinear plants" if name == "simulation"
-                         else f"bounds of {found[name].title}")
+                progress(f"  done: {design.simulation.random_plants + 2} nonlinear plants" if name == "simulation"
+                         else f"  done: bounds of {found[name].title}")
     return [found[name] for name in ("passive", "skyhook_classical", "skyhook", "hinf", "mu")], found["simulation"]
 
 
