@@ -6,6 +6,7 @@ import hashlib
 import platform
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import as_completed
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
