@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.lti.connect import summing_junction
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.rigs.actuator import pade_delay
@@ -105,10 +106,12 @@ def build_plant(design: Design, rig: Rig) -> DesignPlant:
     floor = floor_spectrum(design, rig)
     low, high = design.floor.band_Hz
     reference = floor.rms(low, high) / np.sqrt(high - low)
-    _sensor_side(diagram, axes, chain, noise, decoding, reference)
-    # What each sensor sees of the kept axes, rotations at the edge.
-    rows = decoder.matrix[:, [COORDINATES.index(name) for name in design.keep]] / lever
-    _sensor_errors(diagram, design.uncertainty.sensor_chains, axes, decoder.sensors, rows, decoding, weights)
+    errors = design.uncertainty.sensor_chains
+    _sensor_side(diagram, axes, chain, noise, decoding, reference, errors is not None)
+    if errors is not None:
+        # What each sensor sees of the kept axes, rotations at the edge.
+        rows = decoder.matrix[:, [COORDINATES.index(name) for name in design.keep]] / lever
+        _sensor_errors(diagram, errors, axes, decoder.sensors, rows, decoding, weights)
     _performance(diagram, design, rig, axes, matrix[used], weights)
     w = [*(f"floor_{a}_dot" for a in axes), *(f"noise_{a}" for a in axes), *(f"force_{a}" for a in axes)]
     weighted = [*(f"e_{a}" for a in axes), *(f"effort_{a}" for a in axes)]
@@ -215,7 +218,7 @@ def sensor_chain(design: Design, rig: Rig) -> tuple[StateSpace, StateSpace]:
 
 
 def _sensor_side(diagram: Diagram, axes: tuple[str, ...], chain: StateSpace, noise: StateSpace,
-                 decoding: np.ndarray, reference: float) -> None:
+                 decoding: np.ndarray, reference: float, uncertain: bool) -> None:
     """Sensor chains of the logical axes (alike, so that decoding and chain commute) and their noise.
 
     One unit of noise is what accompanies 1 m/s of floor velocity: sensor density over floor density.
@@ -224,8 +227,8 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], chain: StateSpace, noi
     for axis in axes:
         diagram.add(f"sensor chain {axis}", chain.renamed([f"{axis}_dot"], [f"clean_{axis}_dot"]), "sensor")
         diagram.add(f"noise {axis}", noise.renamed([f"mixed_noise_{axis}"], [f"sensor_noise_{axis}"]), "weight")
-        diagram.add(f"sum {axis}", gain([[1.0, 1.0, 1.0]], [f"clean_{axis}_dot", f"sensor_noise_{axis}",
-                                                            f"chain_error_{axis}"], [f"seen_{axis}_dot"]), "sum")
+        terms = [f"clean_{axis}_dot", f"sensor_noise_{axis}", *([f"chain_error_{axis}"] if uncertain else [])]
+        diagram.add(f"sum {axis}", summing_junction(f"seen_{axis}_dot", terms), "sum")
         diagram.means(f"clean_{axis}_dot", "velocity as the sensors' band shows it", "m/s")
         diagram.means(f"seen_{axis}_dot", "measured velocity", "m/s")
         diagram.means(f"mixed_noise_{axis}", "noise of the sensors that make this axis, before its filter", "1")
@@ -235,14 +238,10 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], chain: StateSpace, noi
                 "allocation")
 
 
-def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty | None, axes: tuple[str, ...],
-                   sensors: tuple[str, ...], rows: np.ndarray, decoding: np.ndarray, weights: dict[str, Weight]) -> None:
+def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty, axes: tuple[str, ...], sensors: tuple[str, ...],
+                   rows: np.ndarray, decoding: np.ndarray, weights: dict[str, Weight]) -> None:
     """What the neglected dynamics of each sensor chain add to the decoded velocities: decoding (W Delta) rows."""
     used = [k for k in range(len(sensors)) if np.any(np.abs(rows[k]) > 1e-9) and np.any(np.abs(decoding[:, k]) > 1e-9)]
-    errors = [f"chain_error_{a}" for a in axes]
-    if uncertainty is None or not used:
-        diagram.add("sensor errors", gain(np.zeros((len(axes), 0)), [], errors), "sum")
-        return
     weight = NeglectedDynamics(uncertainty.low_percent / 100, uncertainty.crossover_Hz, uncertainty.high_percent / 100)
     weights["sensor chain *"] = weight
     labels = [f"sensor chain {sensors[k]}" for k in used]
@@ -250,7 +249,10 @@ def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty | None, axes:
         diagram.add(f"at {sensors[k]}", gain([rows[k]], [f"clean_{a}_dot" for a in axes], [f"{sensors[k]}_dot"]), "sum")
         diagram.add(f"W {label}", weight.system(f"{sensors[k]}_dot", f"z:{label}"), "weight")
         diagram.uncertain(ComplexFull(1, 1, label), [f"w:{label}"], [f"z:{label}"])
-    diagram.add("sensor errors", gain(decoding[:, used], [f"w:{label}" for label in labels], errors), "allocation")
+    diagram.add("decoding of errors", gain(decoding[:, used], [f"w:{label}" for label in labels],
+                                           [f"chain_error_{a}" for a in axes]), "allocation")
+    for axis in axes:
+        diagram.means(f"chain_error_{axis}", "what neglected sensor dynamics add to the velocity", "m/s")
 
 
 def _performance(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, ...], allocation: np.ndarray,

@@ -99,7 +99,8 @@ def with_delta(rig: Rig, plant: DesignPlant, nominal: SampledLoop, name: str, de
               if block.kind != "real"}
     actuators = rig.equations_of_motion().actuators
     drives = [_chain(plant, chains, "actuator chain", one, omega) for one in actuators]
-    return nominal.with_plant(name, changed, drives)
+    sensors = [_chain(plant, chains, "sensor chain", one, omega) for one in plant.sensors]
+    return nominal.with_plant(name, changed, drives, sensors)
 
 
 def _chain(plant: DesignPlant, chains: dict, kind: str, name: str, omega: float) -> StateSpace | None:

@@ -22,7 +22,9 @@ from avis_ctrl.study.output import write_study
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.runner import provenance, run_design
 from avis_ctrl.study.sampling import random_perturbations
+from avis_ctrl.study.simulation import nominal_loop, with_delta
 from avis_ctrl.uncertainty.blocks import BlockStructure, RealScalar
+from avis_ctrl.uncertainty.generalized_plant import sample_lft
 
 DESIGNS = Path(__file__).resolve().parents[2] / "designs"
 FLOOR_HZ = np.geomspace(0.1, 100.0, 40)
@@ -222,6 +224,48 @@ def test_compliance_bound_joins_the_weights():
     k = load_rig("avis").equations_of_motion().K[2, 2]
     loop = plant.synthesis.closed(None).select("compliance_z", "force_z")
     assert abs(loop(1e-4j)[0, 0]) == pytest.approx(1 / k / 1e-5, rel=1e-6)
+
+
+@pytest.mark.parametrize("rig_name", ["avis", "halcyonics_loaded"])
+def test_sensor_chains_err_where_they_stand(rig_name):
+    """A real Delta of one sensor's chain: seen = (I + decoding W delta rows) clean, two axes, by hand."""
+    chains = {"low_percent": 10.0, "crossover_Hz": 60.0, "high_percent": 400.0}
+    floor = {"velocity_rms_m_per_s": 2e-6}
+    design = small_design(rig=rig_name, keep=["z", "phi_x"], uncertainty={"sensor_chains": chains}, floor=floor)
+    rig = load_rig(rig_name)
+    plant = build_plant(design, rig)
+    blocks = plant.full.blocks
+    assert len(blocks.blocks) >= 3
+    assert all(block.name.startswith("sensor chain ") for block in blocks.blocks)
+    omega = 2 * np.pi * FLOOR_HZ
+    names, rows = rig.sensor_rows()
+    W = plant.weights["sensor chain *"].system("u", "y").frequency_response(omega)[:, 0, 0]
+    nominal = plant.full.nominal().P.select([f"seen_{a}_dot" for a in plant.axes], plant.floor_velocities)
+    clean = nominal.frequency_response(omega)
+    for place, block in enumerate(blocks.blocks):
+        values = [0.0] * len(blocks.blocks)
+        values[place] = 0.7
+        k = names.index(block.name.removeprefix("sensor chain "))
+        row = rows[k, 2:4] / np.array([1.0, rig.edge_m])
+        sampled = sample_lft(plant.full.P, blocks, blocks.assemble(values))
+        seen = sampled.select([f"seen_{a}_dot" for a in plant.axes], plant.floor_velocities).frequency_response(omega)
+        expected = clean + 0.7 * W[:, None, None] * (plant.decoding[:, k, None] * row) @ clean
+        np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+def test_simulated_plants_have_their_sensor_chains():
+    design = small_design(uncertainty={"sensor_chains": {"low_percent": 10.0, "crossover_Hz": 60.0,
+                                                         "high_percent": 400.0}})
+    rig = load_rig("avis")
+    plant = build_plant(design, rig)
+    nominal = nominal_loop(design, rig, plant, None)
+    blocks = plant.synthesis.blocks
+    changed = with_delta(rig, plant, nominal, "random", blocks.assemble([0.5j] * len(blocks.blocks)), 60.0)
+    chained = {block.name.removeprefix("sensor chain ") for block in blocks.blocks}
+    for name, before, after in zip(plant.sensors, nominal.sensors.chains, changed.sensors.chains, strict=True):
+        # 1 + W delta at the frequency that the phase belongs to.
+        W = plant.weights["sensor chain *"].system("u", "y")(60j)[0, 0] if name in chained else 0.0
+        assert after(60j)[0, 0] == pytest.approx((1 + 0.5j * W) * before(60j)[0, 0], rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["avis_z_phix", "halcyonics_z_phix"])
