@@ -112,7 +112,8 @@ def main() -> None:
     except Exception as error:  # usage errors of the command line parser carry their own code
         if not (hasattr(error, "exit_code") and hasattr(error, "format_message")):
             raise
-        print(f"avis: {error.format_message()}", file=sys.stderr)
+        if message := error.format_message():  # without a command the help has said it
+            print(f"avis: {message}", file=sys.stderr)
         sys.exit(error.exit_code)
     if code == INTERRUPTED:
         print("avis: stopped; nothing half-written is left", file=sys.stderr)

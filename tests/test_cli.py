@@ -69,6 +69,13 @@ def test_wrong_usage_is_one_line_and_code_2(arguments, words, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_without_a_command_the_help_answers():
+    done = avis()
+    assert done.returncode == 2
+    assert "design" in done.stdout
+    assert done.stderr == ""
+
+
 def test_a_folder_that_cannot_be_written_is_code_2(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     done = avis("design", str(DESIGNS / "avis_z_phix.toml"), "--out", str(tmp_path / "file" / "out"))
