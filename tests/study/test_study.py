@@ -13,6 +13,7 @@ import pytest
 
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.robust.mu_oracle import mu_upper_by_bisection
 from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot, mu_upper_slicot
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.controllers import classical_skyhook, passive
@@ -92,7 +93,10 @@ def closed_loop(plant: dict[str, Any], controller: dict[str, Any] | None) -> Any
 
 
 def check_figures(plant: dict[str, Any], controller: dict[str, Any] | None, row: dict[str, Any]) -> None:
-    """gamma by SLICOT's norm; mu by SLICOT's upper bound on a grid and at the reported peak."""
+    """gamma by SLICOT's norm; mu by SLICOT's upper bound on a grid and at the reported peak.
+
+    SLICOT does not treat repeated scalars: there the upper bound is the LMI, at fewer frequencies.
+    """
     N = closed_loop(plant, controller)
     rows, cols = (sum(block[key] for block in plant["blocks"]) for key in ("rows", "cols"))
     stable = bool(np.all(N.poles().real < 0))
@@ -107,10 +111,12 @@ def check_figures(plant: dict[str, Any], controller: dict[str, Any] | None, row:
     structure = BlockStructure.from_dicts(plant["blocks"]).with_performance(plant["performance"]["rows"],
                                                                             plant["performance"]["cols"])
     assert row["mu_lower"] <= row["mu_upper"] * (1 + 1e-9)
-    for f in [*FLOOR_HZ, row["mu_peak_Hz"]]:
-        M = N(2j * np.pi * f)
-        assert mu_upper_slicot(M, structure.blocks) <= row["mu_upper"] * (1 + 2e-3), f
-    assert mu_upper_slicot(N(2j * np.pi * row["mu_peak_Hz"]), structure.blocks) >= row["mu_lower"] * (1 - 1e-6)
+    repeated = any(block.repeated for block in structure.blocks)
+    upper = mu_upper_by_bisection if repeated else mu_upper_slicot
+    for f in FLOOR_HZ[::10] if repeated else FLOOR_HZ:
+        assert upper(N(2j * np.pi * f), structure.blocks) <= row["mu_upper"] * (1 + 2e-3), f
+    at_peak = upper(N(2j * np.pi * row["mu_peak_Hz"]), structure.blocks)
+    assert row["mu_lower"] * (1 - 1e-4) <= at_peak <= row["mu_upper"] * (1 + 2e-3)
 
 
 def check_folder(folder: Path) -> dict[str, Any]:
