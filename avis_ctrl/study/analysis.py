@@ -5,6 +5,8 @@ Each figure is computed on the closed loop of the returned controller, never tak
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from avis_ctrl.lti.norms import hinf_norm
@@ -59,21 +61,24 @@ def bound(plant: DesignPlant, blocks: BlockStructure, found: MuPeak) -> Bound:
 
 
 def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> tuple[str, ...]:
-    """A perturbation in physical units: parameters by value, chains by size and phase."""
+    """A perturbation in physical units: parameters by value, chains by size and phase; alike ones together."""
     part = delta[:blocks.n_w, :blocks.n_z]
     real = {p.name: p for p in plant.rig.parameters}
-    words = []
+    by_words: dict[str, list[str]] = {}
     for value, block in zip(blocks.values(part), blocks.blocks, strict=True):
         if block.name in real:
             parameter = real[block.name]
-            words.append(parameter.describe(float(np.real(value)), plant.rig.nominal[block.name],
-                                            plant.rig.units[block.name]))
+            words = parameter.describe(float(np.real(value)), plant.rig.nominal[block.name],
+                                       plant.rig.units[block.name]).removeprefix(block.name)
         else:
             number = complex(np.asarray(value).ravel()[0]) if np.size(value) == 1 else None
             size = abs(number) if number is not None else float(np.linalg.norm(np.asarray(value), 2))
             phase = f" at {np.degrees(np.angle(number)):+.0f} deg" if number is not None else ""
-            words.append(f"{block.name}: {100 * size:.0f} % of its bound{phase}")
-    return tuple(words)
+            words = f": {100 * size:.0f} % of its bound{phase}"
+        # "isolator1.k_z" and "isolator2.k_z" are of one family.
+        by_words.setdefault(re.sub(r"\d+", "*", block.name) + words, []).append(block.name + words)
+    return tuple(f"{family} ({len(names)} of them)" if len(names) > 1 else names[0]
+                 for family, names in by_words.items())
 
 
 def transmissibility(motion: StateSpace, blocks: BlockStructure, samples: np.ndarray, omega: np.ndarray,

@@ -39,8 +39,6 @@ from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
 SAMPLES = 60
-# A mu controller without a finite worst case sets no limit: the skyhook is then held to +6 dB.
-UNLIMITED_PEAK = 2.0
 
 
 def run_file(path: str | Path, progress: Progress = lambda text: None) -> DesignResult:
@@ -106,7 +104,7 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
         mu = jobs["mu"].result()
         progress("  done: bounds of mu synthesis")
         jobs["simulation"] = workers.submit(simulate_study, design, rig, plant, mu)
-        jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, mu.worst_peak.upper, samples)
+        jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, skyhook_limit(design, mu), samples)
         found = {}
         for job in as_completed(jobs.values()):
             name = next(name for name, one in jobs.items() if one is job)
@@ -124,8 +122,15 @@ def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndar
 
 def _tuned(design: Design, plant: DesignPlant, rig: Rig, peak_limit: float, samples: np.ndarray) -> ControllerResult:
     with threadpool_limits(1):
-        limit = peak_limit if np.isfinite(peak_limit) else UNLIMITED_PEAK
-        return _measured(design, plant, tuned_skyhook(plant, rig, design, limit), samples)
+        return _measured(design, plant, tuned_skyhook(plant, rig, design, peak_limit), samples)
+
+
+def skyhook_limit(design: Design, mu: ControllerResult) -> float:
+    """Worst-case peak that the skyhook may have: what the design asks of its rival, or the rival's own if larger."""
+    asked = [10 ** (one.at_most / 20) for one in design.requirement
+             if one.quantity == "worst_case_peak_transmissibility_dB" and one.at_most is not None]
+    known = [limit for limit in (*asked, mu.worst_peak.upper) if np.isfinite(limit)]
+    return max(known, default=10 ** (design.transmissibility.peak_dB / 20))
 
 
 def provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:
