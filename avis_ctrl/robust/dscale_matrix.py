@@ -55,8 +55,7 @@ def fit_hermitian(omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndar
     """Log-Chebyshev fit of X (n_omega, n, n) at omega [rad/s] by D^H D, D of n * degree states.
 
     weight (n_omega,) in 0..1; the bisection ends where error and bound are within the tolerance.
-    Raises InputError for shapes that differ or an X that is not Hermitian positive definite, ComputationError
-    where the spectral factorisation fails.
+    Raises InputError for shapes that differ or an X that is not Hermitian positive definite.
     """
     omega, X, weight = _checked(omega, X, degree, weight)
     C = la.cholesky(np.mean(X.real, axis=0))
@@ -75,7 +74,11 @@ def fit_hermitian(omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndar
         if found is None:
             lower = level
             continue
-        candidate = _with_right_factor(_spectral_factor(*found, problem.e, unit), C)
+        try:
+            candidate = _with_right_factor(_spectral_factor(*found, problem.e, unit), C)
+        except (ComputationError, InputError):
+            # Round-off left the factorisation without a stable factor: what was found so far stands.
+            break
         achieved = _error(candidate, omega, X, weight)
         if achieved >= error:
             break

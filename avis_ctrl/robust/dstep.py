@@ -8,7 +8,7 @@ the peak over frequency of the loop scaled by the realised D(s).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.optimize as so
@@ -47,6 +47,7 @@ class PointwiseScalings:
     mu: np.ndarray
     log_d: np.ndarray
     X: dict[int, np.ndarray]
+    floor: float = PROFILE_FLOOR
 
     @property
     def peak(self) -> float:
@@ -55,7 +56,7 @@ class PointwiseScalings:
     @property
     def yardstick(self) -> np.ndarray:
         """What the loop scaled by realised D(s) is compared with (n_omega,): mu, or a share of its peak."""
-        return np.maximum(self.mu, PROFILE_FLOOR * self.peak)
+        return np.maximum(self.mu, self.floor * self.peak)
 
     @staticmethod
     def of(omega: np.ndarray, M: np.ndarray, structure: BlockStructure, tolerance: float = 2e-3) -> PointwiseScalings:
@@ -77,8 +78,8 @@ class PointwiseScalings:
 
         def both(one: np.ndarray, two: np.ndarray) -> np.ndarray:
             return np.concatenate([one, two])[order]
-        return PointwiseScalings(both(self.omega, omega), both(self.M, M), self.structure, both(self.mu, more.mu),
-                                 both(self.log_d, more.log_d), {k: both(X, more.X[k]) for k, X in self.X.items()})
+        return replace(self, omega=both(self.omega, omega), M=both(self.M, M), mu=both(self.mu, more.mu),
+                       log_d=both(self.log_d, more.log_d), X={k: both(X, more.X[k]) for k, X in self.X.items()})
 
 
 @dataclass(frozen=True)
@@ -94,27 +95,40 @@ def d_step(points: PointwiseScalings, loop: StateSpace, start: Scalings, allowed
            max_states: int = 60) -> DStep:
     """Scalings of the loop N(s) chosen on the grid and measured between its points: peaks there are added to it.
 
-    The peak measured of the scaled loop is at most that with `start`, the scalings that the loop was made with.
+    Measured so, the result never costs more than `start`, the scalings that the loop was made with.
     """
+    step = choose_scalings(points, allowed_cost, max_states, start)
+    return _settled(points, loop, step, start, allowed_cost, max_states)
+
+
+def tightened(points: PointwiseScalings, loop: StateSpace, start: Scalings, allowed_cost: float,
+              max_states: int) -> DStep:
+    """Scalings from `start` that lower the peak of the scaled loop N(s) itself, whatever they do below it."""
+    points = replace(points, floor=1.0)
+    step = _continued(points, start, allowed_cost, max_states)
+    return _settled(points, loop, step, start, allowed_cost, max_states)
+
+
+def _settled(points: PointwiseScalings, loop: StateSpace, step: DStep, start: Scalings, allowed_cost: float,
+             max_states: int) -> DStep:
+    """The step corrected until nothing peaks between the grid's points, or `start` where that costs less."""
     dense = np.geomspace(points.omega[0], points.omega[-1], CHECKED_POINTS)
     response = loop.frequency_response(dense)
     first = _measured(points, loop, dense, response, start)[0]
-    step = choose_scalings(points, allowed_cost, max_states, start)
     for _ in range(4):
         measured, omega, M = _measured(points, loop, dense, response, step.scalings)
         if not omega.size:
-            return measured
+            break
         points = points.extended(omega, M)
-        again = min((_evaluated(points, scalings) for scalings in (step.scalings, _refined(points, step.scalings))),
-                    key=lambda found: found.cost)
-        step = _grown(points, again, allowed_cost, max_states)
-    measured = _measured(points, loop, dense, response, step.scalings)[0]
-    return min(measured, first, key=lambda found: found.peak)
+        step = _continued(points, step.scalings, allowed_cost, max_states)
+    else:
+        measured = _measured(points, loop, dense, response, step.scalings)[0]
+    return min(measured, first, key=lambda found: found.cost)
 
 
 def _measured(points: PointwiseScalings, loop: StateSpace, dense: np.ndarray, response: np.ndarray,
               scalings: Scalings) -> tuple[DStep, np.ndarray, np.ndarray]:
-    """The step with its peak between the grid's points too, and where (and with which M) it exceeds theirs."""
+    """The step with peak and cost between the grid's points too, and where (and with which M) it exceeds theirs."""
     step = _evaluated(points, scalings)
     # Lightly damped roots make the narrowest peaks that scalings can add.
     roots = np.abs(np.concatenate([np.r_[part.zeros, part.poles] for part in scalings.parts
@@ -127,7 +141,9 @@ def _measured(points: PointwiseScalings, loop: StateSpace, dense: np.ndarray, re
     top = (sigma[1:-1] >= sigma[:-2]) & (sigma[1:-1] > sigma[2:]) & (sigma[1:-1] > BETWEEN * step.peak)
     at = np.flatnonzero(top) + 1
     at = at[np.argsort(sigma[at])[::-1][:4]]
-    return DStep(scalings, max(step.peak, float(np.max(sigma))), step.cost), omega[at], M[at]
+    yardstick = np.interp(np.log(omega), np.log(points.omega), points.yardstick)
+    cost = max(step.cost, float(np.max(sigma / yardstick)) - 1)
+    return DStep(scalings, max(step.peak, float(np.max(sigma))), cost), omega[at], M[at]
 
 
 def choose_scalings(points: PointwiseScalings, allowed_cost: float = 0.01, max_states: int = 60,
@@ -141,8 +157,13 @@ def choose_scalings(points: PointwiseScalings, allowed_cost: float = 0.01, max_s
     fresh = _grown(points, _evaluated(points, _refined(points, _constants(points))), allowed_cost, max_states)
     if start is None or fresh.cost <= allowed_cost:
         return fresh
+    return min(fresh, _continued(points, start, allowed_cost, max_states), key=lambda step: step.cost)
+
+
+def _continued(points: PointwiseScalings, start: Scalings, allowed_cost: float, max_states: int) -> DStep:
+    """Given scalings refined where that helps, and grown from there."""
     kept = min(_evaluated(points, start), _evaluated(points, _refined(points, start)), key=lambda step: step.cost)
-    return min(fresh, _grown(points, kept, allowed_cost, max_states), key=lambda step: step.cost)
+    return _grown(points, kept, allowed_cost, max_states)
 
 
 def _grown(points: PointwiseScalings, best: DStep, allowed_cost: float, max_states: int) -> DStep:
@@ -255,7 +276,7 @@ def _blame(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
     return share
 
 
-def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 8) -> Scalings:
+def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 5) -> Scalings:
     """Sequential linear programs in a trust region on max over frequency of log sigma_max(D N D^-1)."""
     if not free_parameters(scalings):
         return scalings

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
-from avis_ctrl.robust.dstep import PointwiseScalings, band_of, choose_scalings, d_step
+from avis_ctrl.robust.dstep import PointwiseScalings, band_of, d_step, tightened
 from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
 from avis_ctrl.robust.gamma_descent import descend, grown
 from avis_ctrl.robust.hinf_plant import as_plant
@@ -32,6 +32,8 @@ from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 # An iteration that lowers the best gamma by less than this share has stalled.
 STALL = 0.005
 FLAT = 0.001
+# What the certificate may leave above mu of the final loop.
+TIGHT = 0.003
 NORM_TOLERANCE = 1e-6
 DONE = "done"
 FOLLOWING = {"D-K": "descent", "descent": "growth", "growth": DONE}
@@ -254,18 +256,18 @@ def _recorded(state: State, loop: Loop, row: Iteration, points: PointwiseScaling
 def _certificate(problem: _Problem, best: Loop) -> tuple[Scalings, float]:
     """Realised scalings that bound mu of a loop at every frequency, and the bound.
 
-    Those that K was made with, or better ones where they leave more than a stall's worth above mu on the grid.
+    Those that K was made with, or others of the least peak where they leave more than `TIGHT` above mu on the grid.
     """
     closed = lft_lower(problem.P, best.K)
 
     def bound(scalings: Scalings) -> float:
         return hinf_norm(scalings.scale(closed), NORM_TOLERANCE).gain * (1 + NORM_TOLERANCE)
-    gamma = bound(best.scalings)
-    if gamma < (1 + STALL) * best.mu:
-        return best.scalings, gamma
-    points = analysed(problem.P, best.K, problem.structure, frequency_grid(closed))
-    fresh = choose_scalings(points, max_states=10 * problem.P.nstates, start=best.scalings).scalings
-    return min(((best.scalings, gamma), (fresh, bound(fresh))), key=lambda pair: pair[1])
+    candidates = [(best.scalings, bound(best.scalings))]
+    if candidates[0][1] > (1 + TIGHT) * best.mu:
+        points = analysed(problem.P, best.K, problem.structure, frequency_grid(closed))
+        tighter = tightened(points, closed, best.scalings, TIGHT, 10 * problem.P.nstates).scalings
+        candidates.append((tighter, bound(tighter)))
+    return min(candidates, key=lambda pair: pair[1])
 
 
 def _result(problem: _Problem, uncertainty: BlockStructure, state: State, status: str,
