@@ -49,7 +49,7 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
         bound(plant, blocks, mu_peak(performance, all_blocks)),
         bound(plant, blocks, mu_peak(performance.select(slice(n_z), slice(n_w)), blocks)),
         worst_peak, worst_band, transmissibility(motion, blocks, samples, omega, worst_peak),
-        _compliance(plant, full, omega), site_response(plant, full),
+        _compliance(plant, full, omega), site_response(plant, full, K is not None),
         hinf_norm(motion.select(slice(n_z, None), slice(n_w, None))).gain, fastest, notes)
 
 
@@ -108,7 +108,7 @@ def _compliance(plant: DesignPlant, full: StateSpace, omega: np.ndarray) -> np.n
     return np.linalg.norm(full.select(moved, forces).frequency_response(omega), ord=2, axis=(1, 2))
 
 
-def site_response(plant: DesignPlant, full: StateSpace) -> SiteResponse:
+def site_response(plant: DesignPlant, full: StateSpace, controlled: bool) -> SiteResponse:
     """Spectra of payload velocity and of volts under the site's floor motion and the sensors' noise."""
     frequency = np.geomspace(plant.floor.low_Hz, 250.0, 2000)
     omega = 2 * np.pi * frequency
@@ -119,10 +119,12 @@ def site_response(plant: DesignPlant, full: StateSpace) -> SiteResponse:
     # Directions of the floor and the sensors are independent of each other.
     by_floor = np.linalg.norm(from_floor, axis=2) * floor[:, None]
     by_noise = np.linalg.norm(from_noise, axis=2) * plant.floor_density
+    if not controlled:
+        # No volts and no sensor noise in the motion: exactly, not to round-off.
+        by_floor[:, len(plant.axes):], by_noise[:] = 0.0, 0.0
     density = np.hypot(by_floor, by_noise)
 
     def rms(asd: np.ndarray) -> float:
-        # Without a controller there are no volts and no sensor noise in the motion.
         return band_rms(frequency, asd, frequency[0], frequency[-1]) if np.any(asd) else 0.0
     n = len(plant.axes)
     bands = third_octave_midbands(1.0, 80.0)
