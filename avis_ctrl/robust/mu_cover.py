@@ -30,7 +30,9 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Interval = tuple[float, float]
 NARROW = 1e-6
-POINTS = 4
+# So many gaps at one level mean that mu is flat there: a level a little higher needs far fewer intervals.
+PATIENCE = 250
+WIDENINGS = 5
 
 
 def midpoint(low: float, high: float) -> float:
@@ -102,29 +104,42 @@ def proved_intervals(N: StateSpace, scalings: Scalings, inside: Interval) -> lis
 
 @dataclass
 class Cover:
-    """What came out: the level reached, the gaps that are left, and where the level had to be raised."""
+    """What came out: the level reached, the gaps that are left, and where the level had to be raised.
+
+    looked : gaps looked at since the level was last raised for their number; widened : how often that was done.
+    """
 
     level: float
     gaps: list[Interval] = field(default_factory=list)
     raised_at: list[float] = field(default_factory=list)
     intervals: int = 0
+    looked: int = 0
+    widened: int = 0
 
 
 def cover(N: StateSpace, structure: BlockStructure, scaled: Callable[[StateSpace, float], StateSpace],
           bound: Callable[[Array], Array], level: float, band: Interval, samples: Array, *, slack: float,
-          rounds: int = 60, most: int = 4000) -> Cover:
+          rounds: int = 60, most: int = 1500) -> Cover:
     """Prove the level on a whole band, raising it where a gap's own bound asks for it.
 
     scaled(N, level) is the system whose mu must stay at or below 1 for the level to hold; bound(M) gives the level
     that scalings shared along axis 1 of M (B, n_shared, n_z, n_w) prove. `samples` are frequencies worth a look.
+    A level is raised by the share `slack` more than asked; where it still needs too many intervals, by twice, four
+    times .. `slack`. What `rounds` rounds or `most` gaps leave unproved stays in `gaps`.
     """
     state = Cover(level)
     samples = np.unique(samples[(samples >= band[0]) & (samples <= band[1])])
     edges = np.unique(np.concatenate([[band[0]], samples, [band[1]]]))
     state.gaps = list(pairwise(edges.tolist()))
+    total = 0
     for _ in range(rounds):
-        if not state.gaps or state.intervals > most or not np.isfinite(state.level):
+        total += len(state.gaps)
+        state.looked += len(state.gaps)
+        if not state.gaps or total > most or not np.isfinite(state.level):
             break
+        if state.looked > PATIENCE and state.widened < WIDENINGS:
+            state.level *= 1 + slack * 2.0 ** state.widened
+            state.looked, state.widened = 0, state.widened + 1
         _one_round(N, structure, scaled, bound, state, slack)
     return state
 
@@ -140,7 +155,7 @@ def _one_round(N: StateSpace, structure: BlockStructure, scaled: Callable[[State
     gaps, state.gaps = state.gaps, []
     omega = np.array([_points(*gap) for gap in gaps])
     M = unit.frequency_response(omega.ravel()).reshape(*omega.shape, unit.noutputs, unit.ninputs)
-    shared = upper_bound(M, structure, 1e-4, 1.0)
+    shared = upper_bound(M, structure, max(slack / 5, 1e-4), 1.0)
     open_gaps = []
     for k, gap in enumerate(gaps):
         if shared.beta[k] >= 1.0:
@@ -178,7 +193,7 @@ def _is_narrow(gap: Interval) -> bool:
 
 
 def _without(gap: Interval, parts: list[Interval]) -> list[Interval]:
-    """What the parts leave of a gap; halves where they took nothing of it."""
+    """What the parts leave of a gap; what is left almost whole is halved, lest it lose but slivers."""
     left, at = [], gap[0]
     for low, high in parts:
         if low > at:
@@ -186,7 +201,9 @@ def _without(gap: Interval, parts: list[Interval]) -> list[Interval]:
         at = high
     if gap[1] > at:
         left.append((at, gap[1]))
-    if left == [gap]:
-        middle = midpoint(*gap)
-        return [(gap[0], middle), (middle, gap[1])]
-    return left
+    middle = midpoint(*gap)
+    halved: list[Interval] = []
+    for low, high in left:
+        almost = low < midpoint(gap[0], middle) and high > midpoint(middle, gap[1])
+        halved += [(low, middle), (middle, high)] if almost else [(low, high)]
+    return halved

@@ -2,7 +2,8 @@
 
 For V = [I  M^H], K(theta) = sum_k theta_k K_k given by its entries, F = V K V^H and T = V^H inv(F) V
 
-    d(-log det F) = -tr(T K_k),   d2(-log det F) = tr(T K_k T K_l) = sum over entries of v_i v_j T[c_i, r_j] T[c_j, r_i].
+    d(-log det F) = -tr(T K_k),
+    d2(-log det F) = tr(T K_k T K_l) = sum over the entries of v_i v_j T[c_i, r_j] T[c_j, r_i].
 
 Matrices are small and each problem needs its own number of steps: plain loops are several times faster than stacks.
 """

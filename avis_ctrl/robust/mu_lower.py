@@ -175,7 +175,11 @@ def is_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
     if not M.shape[0]:
         return np.zeros(0, bool)
     d_z, d_w = expand(structure, block_balance(M[:, None], structure))
-    A = (M * d_z[:, :, None] / d_w[:, None, :]) @ delta
+    return _balanced_is_singular(M * d_z[:, :, None] / d_w[:, None, :], delta)
+
+
+def _balanced_is_singular(M: Array, delta: Array) -> Array:
+    A = M @ delta
     least = np.linalg.svd(np.eye(A.shape[-1]) - A, compute_uv=False)[:, -1]
     return least < SINGULAR + 1e-14 * np.linalg.norm(A, ord=2, axis=(1, 2))
 
@@ -300,7 +304,7 @@ def _keep(best: LowerBound, live: Array, size: Array, unit: Array, delta: Array,
         candidate = np.where(finite[:, None, None], candidate, 0.0)
         norm = block_norm(candidate, structure)
         good = finite & (norm > 0)
-        good[good] &= is_singular(unit[good], candidate[good], structure)
+        good[good] &= _balanced_is_singular(unit[good], candidate[good])
         value = np.where(good, size / np.where(good, norm, 1.0), 0.0)
         # unit is M over its upper bound: what exceeds that is round-off that passed for singular.
         better = (value > best.beta[live]) & (value <= size * (1 + 1e-6))

@@ -57,7 +57,7 @@ class MuPeak:
 
 
 def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
-            band: Interval = ALL_FREQUENCIES, known_upper: float | None = None) -> MuPeak:
+            band: Interval = ALL_FREQUENCIES, known_upper: float | None = None, slack: float = SLACK) -> MuPeak:
     """Supremum of mu(N(j omega)) over a band, by default all frequencies including 0 and infinity.
 
     Parameters
@@ -66,49 +66,56 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     band : (low, high) in rad/s; the Nyquist frequency replaces infinity for sampled systems.
     known_upper : a bound that the caller has proved for the whole band, such as the measured norm of the loop scaled
         by a realised D(s); where it is within 0.5 % of the peak found, it is taken for the upper bound as it is.
+    slack : share by which the level to be proved lies above the highest value found; a larger one needs fewer
+        intervals. Where mu is flat over frequency the proof takes more than this share (see `mu_cover`).
 
     Raises
     ------
-    InputError : blocks that do not fit N, an empty band.
+    InputError : blocks that do not fit N, an empty band, a slack outside 1e-5 to 0.1.
     ComputationError : N has a pole that is not stable (named): mu says nothing about such a loop.
     """
-    system, structure = _checked(N, blocks)
+    system, structure = _checked(N, blocks, slack)
     if (system.noutputs, system.ninputs) != (structure.n_z, structure.n_w):
         raise InputError(f"the blocks need {structure.n_z} outputs and {structure.n_w} inputs, N has "
                          f"{system.noutputs} and {system.ninputs}", field="blocks")
     with threadpool_limits(1):
         part = _prepared(system, structure)
-        return _in_rad_s(system, part, _mu_peak(part.N, part.structure, _continuous_band(system, band), known_upper))
+        found = _mu_peak(part.N, part.structure, _continuous_band(system, band), slack, known_upper)
+        return _in_rad_s(system, part, found)
 
 
 def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
-                    band: Interval = ALL_FREQUENCIES) -> MuPeak:
+                    band: Interval = ALL_FREQUENCIES, slack: float = SLACK) -> MuPeak:
     """Largest gain from the inputs d to the outputs e of N over all perturbations of norm at most 1.
 
     Parameters
     ----------
     N : stable system; the first sum(cols) outputs and sum(rows) inputs belong to the blocks, the rest are e and d.
     band : (low, high) in rad/s. The gain is that in the band; robust stability is asked at all frequencies.
+    slack : as for mu_peak.
 
     upper is inf where robust stability is not proved; lower is inf where `delta` (norm at most 1) destabilises.
 
     Raises
     ------
-    InputError : blocks that leave no performance channel, an empty band.
+    InputError : blocks that leave no performance channel, an empty band, a slack outside 1e-5 to 0.1.
     ComputationError : N has a pole that is not stable (named).
     """
-    system, structure = _checked(N, blocks)
+    system, structure = _checked(N, blocks, slack)
     n_d, n_e = system.ninputs - structure.n_w, system.noutputs - structure.n_z
     if n_d < 1 or n_e < 1:
         raise InputError(f"the blocks take {structure.n_z} outputs and {structure.n_w} inputs of N's "
                          f"{system.noutputs} and {system.ninputs}: no performance channel is left", field="blocks")
     with threadpool_limits(1):
         part = _prepared(system, structure)
-        return _in_rad_s(system, part, _worst_case_gain(part.N, part.structure, _continuous_band(system, band)))
+        return _in_rad_s(system, part, _worst_case_gain(part.N, part.structure, _continuous_band(system, band), slack))
 
 
-def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> tuple[StateSpace, BlockStructure]:
+def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block],
+             slack: float) -> tuple[StateSpace, BlockStructure]:
     """N as a stable system of this package, and its blocks."""
+    if not 1e-5 <= slack <= 0.1:
+        raise InputError("expected 1e-5 to 0.1", field="slack", value=slack)
     N = N if isinstance(N, StateSpace) else StateSpace.from_control(N)
     if not N.is_stable():
         poles = N.poles()
@@ -152,9 +159,10 @@ class _Scan:
 
     omega: Array
     bound: UpperBound
+    slack: float
 
     @staticmethod
-    def of(N: StateSpace, band: Interval, bound: Callable[[Array], UpperBound]) -> _Scan:
+    def of(N: StateSpace, band: Interval, bound: Callable[[Array], UpperBound], slack: float) -> _Scan:
         seen: list[tuple[Array, UpperBound]] = []
 
         def value(omega: Array) -> Array:
@@ -162,11 +170,12 @@ class _Scan:
             seen.append((omega, found))
             return found.beta
         first = first_frequencies(N, band)
-        refine_maxima(value, first, value(first))
+        refine_maxima(value, first, value(first), tolerance=_tolerance(slack))
         omega = np.concatenate([w for w, _ in seen])
         order = np.argsort(omega)
         scalings = Scalings(*(np.concatenate(s)[order] for s in zip(*(u.scalings for _, u in seen), strict=True)))
-        return _Scan(omega[order], UpperBound(np.concatenate([u.beta for _, u in seen])[order], scalings))
+        return _Scan(omega[order], UpperBound(np.concatenate([u.beta for _, u in seen])[order], scalings),
+                     slack)
 
     @property
     def peak(self) -> Array:
@@ -176,17 +185,24 @@ class _Scan:
     @property
     def level(self) -> float:
         # A level of zero proves nothing: a small positive one lets an identically vanishing mu be covered.
-        return max(float(np.max(self.bound.beta)) * (1 + SLACK), 1e-9)
+        return max(float(np.max(self.bound.beta)) * (1 + self.slack), 1e-9)
 
 
-def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, known_upper: float | None = None) -> MuPeak:
-    scan = _Scan.of(N, band, lambda M: upper_bound(M, structure, 1e-4))
+def _tolerance(slack: float) -> float:
+    """Accuracy of lambda = beta^2 that goes with a slack of beta."""
+    return max(slack / 5, 1e-4)
+
+
+def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: float,
+             known_upper: float | None = None) -> MuPeak:
+    accuracy = _tolerance(slack)
+    scan = _Scan.of(N, band, lambda M: upper_bound(M, structure, accuracy), slack)
     lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9)
     if known_upper is not None and known_upper <= (1 + KNOWN_SLACK) * scan.level:
         done = Cover(known_upper)
     else:
         done = cover(N, structure, lambda system, level: system.scaled(left=1 / level),
-                     lambda M: upper_bound(M, structure, 1e-4).beta, scan.level, band, scan.peak, slack=SLACK)
+                     lambda M: upper_bound(M, structure, accuracy).beta, scan.level, band, scan.peak, slack=slack)
     best, at, delta = _best_singular(N, structure, scan.omega, scan.bound, lower, done, band)
     if best == 0.0:
         at = float(scan.peak[0])
@@ -213,7 +229,8 @@ def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found
     return (best, at, delta) if best > 0 else (0.0, at, None)
 
 
-def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval) -> MuPeak:
+def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, slack: float) -> MuPeak:
+    accuracy = _tolerance(slack)
     n_z, n_w = structure.n_z, structure.n_w
     n_e = N.noutputs - n_z
     whole = structure.with_performance(N.ninputs - n_w, n_e)
@@ -221,18 +238,18 @@ def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval) -
     def scaled(system: StateSpace, level: float) -> StateSpace:
         return system.scaled(left=np.r_[np.ones(n_z), np.full(n_e, 1 / level)])
 
-    scan = _Scan.of(N, band, lambda M: skewed_upper_bound(M, whole, 1e-4))
+    scan = _Scan.of(N, band, lambda M: skewed_upper_bound(M, whole, accuracy), slack)
     M = N.frequency_response(scan.omega)
     done = None
     if np.all(np.isfinite(scan.bound.beta)) and _robustly_stable(N.select(range(n_z), range(n_w)), structure, band):
-        done = cover(N, whole, scaled, lambda m: skewed_upper_bound(m, whole, 1e-4).beta, scan.level, band, scan.peak,
-                     slack=SLACK)
+        done = cover(N, whole, scaled, lambda m: skewed_upper_bound(m, whole, accuracy).beta, scan.level, band,
+                     scan.peak, slack=slack)
     if done is not None and np.isfinite(done.level):
         lower = worst_gain(M, structure)
         k = int(np.argmax(lower.gain))
         return MuPeak(done.level, float(lower.gain[k]), float(scan.omega[k]), lower.delta[k], not done.gaps,
                       _in_words(done, band), scan.omega, scan.bound.beta, lower.gain)
-    robust = _mu_peak(N.select(range(n_z), range(n_w)), structure, ALL_FREQUENCIES)
+    robust = _mu_peak(N.select(range(n_z), range(n_w)), structure, ALL_FREQUENCIES, slack)
     words = f"robust stability is not proved: mu of the blocks is between {robust.lower:.6g} and {robust.upper:.6g}"
     # Only perturbations that provably keep the loop stable have a gain.
     radius = min(1.0, (1 - 1e-9) / robust.upper) if robust.guaranteed else 0.0
@@ -252,7 +269,7 @@ def _robustly_stable(N: StateSpace, structure: BlockStructure, band: Interval) -
         return True
     done = cover(N, structure, lambda system, level: system.scaled(left=1 / level),
                  lambda M: upper_bound(M, structure, 1e-4).beta, 1.0 - 1e-6, ALL_FREQUENCIES,
-                 first_frequencies(N, ALL_FREQUENCIES, 0), slack=SLACK)
+                 first_frequencies(N, ALL_FREQUENCIES, 0), slack=0.0)
     return not done.gaps and done.level < 1.0
 
 

@@ -6,8 +6,10 @@ import pytest
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, append, discretise, gain, hinf_norm, lft_upper, tf
 from avis_ctrl.robust.mu import mu_upper
+from avis_ctrl.robust.mu_cover import cover
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.robust.mu_realise import realise_delta
+from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
 
 C, R, F = ComplexScalar, RealScalar, ComplexFull
@@ -172,6 +174,48 @@ def test_blocks_without_a_loop_change_nothing(rng, dead):
         assert found.lower == pytest.approx(expected.lower, rel=1e-3)
         assert found.delta.shape[0] == BlockStructure.of(blocks).n_w
         assert not np.any(found.delta[1]) and not np.any(found.delta[:, 1])
+
+
+def test_flat_peak_of_a_passive_oscillator():
+    """Two masses, dampers and springs in a chain, each uncertain by 30 %: sup mu is 0.3.
+
+    As long as all are positive the energy decays and the chain is stable; at 1/0.3 a stiffness vanishes, or every
+    damping does, at any frequency the masses and springs may be given: mu is 0.3 over a whole range, not at a peak.
+    """
+    m, c, k, share = [1.0, 0.7], [4.0, 6.0], [30.0, 90.0], 0.3
+    L = np.array([[1.0, 0.0], [-1.0, 1.0]])
+    mass, M_inv = np.diag(m), np.diag(1 / np.array(m))
+    A = np.block([[np.zeros((2, 2)), np.eye(2)], [-M_inv @ L.T @ np.diag(k) @ L, -M_inv @ L.T @ np.diag(c) @ L]])
+    # m x'' + L^T w_c + L^T w_k + w_m + .. = 0 with w = delta z, z_m = 0.3 m x'', z_c = 0.3 c L x', z_k = 0.3 k L x.
+    B = np.vstack([np.zeros((2, 6)), -M_inv @ np.hstack([np.eye(2), L.T, L.T])])
+    C_ = share * np.vstack([mass @ A[2:], np.hstack([np.zeros((2, 2)), np.diag(c) @ L]),
+                            np.hstack([np.diag(k) @ L, np.zeros((2, 2))])])
+    D = share * np.vstack([mass @ B[2:], np.zeros((4, 6))])
+    found = mu_peak(StateSpace(A, B, C_, D), [R()] * 6, slack=5e-3)
+    assert found.guaranteed and found.lower == pytest.approx(share, rel=1e-5)
+    assert share <= found.upper <= 1.1 * share
+
+
+def test_a_proof_that_takes_too_long_is_given_up_and_says_so(rng):
+    """Narrow resonances and no room for rounds: the bound is not called proved and the gaps are named."""
+    N = flexible(rng, 3, 3, modes=10)
+    structure = BlockStructure.of([R(), R(), R()])
+    bound = mu_upper(N.frequency_response(np.abs(N.poles())), structure).upper
+    done = cover(N, structure, lambda system, level: system.scaled(left=1 / level),
+                 lambda M: upper_bound(M, structure, 1e-4).beta, 0.5 * float(np.max(bound)), (0.0, np.inf),
+                 np.abs(N.poles()), slack=5e-4, rounds=2)
+    assert done.gaps and all(low < high for low, high in done.gaps)
+    found = mu_peak(N, structure)
+    assert found.guaranteed and found.lower <= found.upper
+
+
+def test_larger_slack_stays_above(rng):
+    N = flexible(rng, 4, 4)
+    fine, coarse = (mu_peak(N, [R(), C(), F(2)], slack=slack) for slack in (5e-4, 1e-2))
+    assert coarse.guaranteed and fine.lower <= fine.upper <= coarse.upper * (1 + 1e-4)
+    assert coarse.upper <= 1.03 * fine.upper
+    with pytest.raises(InputError, match="slack"):
+        mu_peak(N, [R(), C(), F(2)], slack=0.0)
 
 
 # -- the guarantee, bands, clocks ---------------------------------------------------------------------------
