@@ -260,10 +260,11 @@ class LowerBound(NamedTuple):
 
 
 def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Scalings, *, enough: float = 0.99,
-                seed: int = 0) -> LowerBound:
+                stages: int = 3, seed: int = 0) -> LowerBound:
     """Best verified perturbation for each M (B, n_z, n_w), from starts at the null vectors of the upper bound.
 
-    Where three starts do not reach `enough` times the upper bound, more are made, with shorter steps too.
+    Where three starts do not reach `enough` times the upper bound, more are made in further `stages`, with shorter
+    steps too.
     """
     rng = np.random.default_rng(seed)
     batch = M.shape[0]
@@ -274,7 +275,7 @@ def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Sca
     best = LowerBound(np.zeros(batch), np.zeros((batch, structure.n_w, structure.n_z), complex))
     # An upper bound that is round-off of M means mu = 0: nothing to search for.
     above_noise = upper > 1e-10 * np.linalg.norm(M, ord=2, axis=(1, 2))
-    for count, iterations, damping in ((3, 20, 0.0), (6, 30, 0.0), (6, 40, 0.5)):
+    for count, iterations, damping in ((3, 20, 0.0), (6, 30, 0.0), (6, 40, 0.5))[:stages]:
         live = np.flatnonzero(above_noise & (best.beta < enough * upper))
         if live.size:
             _search(best, M, structure, upper, scalings, live, count, iterations, damping, rng)

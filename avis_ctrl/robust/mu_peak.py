@@ -197,7 +197,8 @@ def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: fl
              known_upper: float | None = None) -> MuPeak:
     accuracy = _tolerance(slack)
     scan = _Scan.of(N, band, lambda M: upper_bound(M, structure, accuracy), slack)
-    lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9)
+    # One stage draws the curve; the search goes on at the peaks only.
+    lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9, stages=1)
     if known_upper is not None and known_upper <= (1 + KNOWN_SLACK) * scan.level:
         done = Cover(known_upper)
     else:
