@@ -26,6 +26,7 @@ REDUCTION_HZ = np.geomspace(0.05, 300.0, 25)
 TUNING_HZ = np.concatenate([np.geomspace(0.1, 100.0, 50), [150.0, 250.0, 400.0]])
 TUNING_SAMPLES = 12
 TUNING_ROUNDS = 4
+TUNING_SLACK = 5e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +102,7 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
     limit = peak_limit
     for round_number in range(TUNING_ROUNDS):
         loops = tune_skyhook(scenarios, plant.axes, search, band, limit, seed=design.simulation.seed + round_number)
-        found = worst_case_gain(motion.closed(loops.controller()), motion.blocks)
+        found = worst_case_gain(motion.closed(loops.controller()), motion.blocks, slack=TUNING_SLACK)
         if found.upper <= peak_limit:
             break
         if found.delta is not None:
