@@ -33,7 +33,7 @@ uncertainty = UncertaintySection(
 )
 
 asked = TransmissibilitySection(
-    peak_dB=3.5, band_dB=-6.0, band_Hz=[4.0, 16.0], transition_octaves=0.8, tolerance_dB=1.0
+    peak_dB=3.5, band_dB=-8.0, band_Hz=[4.0, 16.0], transition_octaves=0.8, tolerance_dB=1.0
 )
 
 design = Design(
