@@ -26,8 +26,9 @@ FIT_TOLERANCE = 2e-2
 MATRIX_FIT_TOLERANCE = 2e-2
 # Gain of a linear program below which refining a fit is not worth another: a tenth of what a fit may cost.
 REFINEMENT = 1e-3
-# Below this share of the peak a loop has room for any misfit; from here up its own mu is the yardstick.
-PROFILE_FLOOR = 0.8
+# Below this share of the peak a loop has room for any misfit; from here up its own mu is the yardstick. Steps that
+# gain much need little of the profile, the last ones live off it.
+BROAD_FLOOR, DETAILED_FLOOR = 0.8, 0.3
 # Points of the check between the grid's, and the excess there that sends its peaks back into the grid.
 CHECKED_POINTS = 400
 BETWEEN = 1.02
@@ -47,7 +48,7 @@ class PointwiseScalings:
     mu: np.ndarray
     log_d: np.ndarray
     X: dict[int, np.ndarray]
-    floor: float = PROFILE_FLOOR
+    floor: float = BROAD_FLOOR
 
     @property
     def peak(self) -> float:

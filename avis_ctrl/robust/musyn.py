@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
-from avis_ctrl.robust.dstep import PointwiseScalings, band_of, d_step, tightened
+from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, band_of, d_step, tightened
 from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
 from avis_ctrl.robust.gamma_descent import descend, grown
 from avis_ctrl.robust.hinf_plant import as_plant
@@ -32,6 +32,8 @@ from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 # An iteration that lowers the best gamma by less than this share has stalled.
 STALL = 0.005
 FLAT = 0.001
+# A step that lowers mu by more than this share is followed by another of its kind.
+FAST = 0.25
 # What the certificate may leave above mu of the final loop.
 TIGHT = 0.003
 NORM_TOLERANCE = 1e-6
@@ -217,7 +219,8 @@ def _proposed(problem: _Problem, state: State, options: _Options) -> _Proposal |
     if state.last is None or state.best is None or state.points is None:
         return _Proposal(Scalings.identity(problem.structure), 0.0, "H-infinity")
     if state.phase == "D-K":
-        step = d_step(state.points, lft_lower(problem.P, state.last.K), state.last.scalings,
+        points = replace(state.points, floor=BROAD_FLOOR if _falls_fast(state) else DETAILED_FLOOR)
+        step = d_step(points, lft_lower(problem.P, state.last.K), state.last.scalings,
                       max_states=options.max_added_states)
         return _Proposal(step.scalings, step.cost, "D-K")
     band = band_of(state.points.omega)
@@ -234,6 +237,11 @@ def _proposed(problem: _Problem, state: State, options: _Options) -> _Proposal |
     except ComputationError:
         return None
     return _Proposal(descent.scalings, 0.0, state.phase)
+
+
+def _falls_fast(state: State) -> bool:
+    """Whether the last step lowered mu by more than `FAST`, or none was taken yet."""
+    return len(state.history) < 2 or state.history[-1].mu_upper < (1 - FAST) * state.history[-2].mu_upper
 
 
 def _next_grid(state: State, closed_loop: StateSpace) -> np.ndarray:
