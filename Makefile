@@ -10,6 +10,8 @@ export OMP_NUM_THREADS = 1
 $(BIN)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
+	@echo "Compiling the numerical kernels once, and checking that all works here"
+	$(BIN)/avis doctor
 	touch $@
 
 lint: $(BIN)/.installed

@@ -98,8 +98,8 @@ class TuningRange:
 
     critical: tuple[float, ...]
     gain_factor: tuple[float, float] = (0.05, 20.0)
-    tilt_corner_Hz: tuple[float, float] = (0.02, 1.0)
-    roll_off_Hz: tuple[float, float] = (30.0, 400.0)
+    tilt_corner_Hz: tuple[float, float] = (0.005, 1.0)
+    roll_off_Hz: tuple[float, float] = (5.0, 400.0)
 
     def bounds(self) -> list[tuple[float, float]]:
         """Bounds of the logarithms searched over."""

@@ -144,8 +144,8 @@ class SynthesisSection(_Section):
 
 
 class SkyhookSection(_Section):
-    tilt_corner_Hz: Band = [0.02, 1.0]
-    roll_off_Hz: Annotated[Band, Field(validate_default=True)] = [30.0, 400.0]
+    tilt_corner_Hz: Band = [0.005, 1.0]
+    roll_off_Hz: Annotated[Band, Field(validate_default=True)] = [5.0, 400.0]
 
     @field_validator("roll_off_Hz")
     @classmethod

@@ -11,6 +11,8 @@ from importlib import metadata
 
 import numpy as np
 
+from avis_ctrl.lti.statespace import gain
+
 LIBRARIES = ("numpy", "scipy", "control", "slycot", "cvxpy", "clarabel", "matplotlib", "plotly", "typst", "numba")
 
 
@@ -28,7 +30,8 @@ def examine() -> list[Check]:
     checks = [Check("python", platform.python_version(), True)]
     checks += [_attempt(name, partial(metadata.version, name)) for name in LIBRARIES]
     checks += [_attempt("processors and BLAS threads", _threads), _attempt("SLICOT H-infinity norm", _slicot),
-               _attempt("clarabel solves an LMI", _clarabel), _attempt("numba compiles", _numba),
+               _attempt("clarabel solves an LMI", _clarabel), _attempt("mu bounds (compiled)", _mu),
+               _attempt("nonlinear simulation (compiled)", _simulation),
                _attempt("typst compiles a PDF", _typst), _attempt("own H-infinity synthesis", _synthesis)]
     return checks
 
@@ -72,10 +75,28 @@ def _clarabel() -> str:
     return _near(float(np.asarray(t.value)), float(np.max(np.linalg.eigvalsh(A))), 1e-6)
 
 
-def _numba() -> str:
-    from numba import njit
+def _mu() -> str:
+    """mu of a rank-one matrix with scalar blocks is the sum of its diagonal's magnitudes; compiles the kernel."""
+    from avis_ctrl.robust.mu import mu
+    from avis_ctrl.uncertainty.blocks import ComplexScalar
 
-    return _near(float(njit(lambda x: x * x)(3.0)), 9.0, 0.0)
+    M = np.outer([1.0, 2.0, 3.0], [1.0, -1.0j, 0.5])
+    return _near(float(mu(M, [ComplexScalar()] * 3).upper), 4.5, 1e-4)
+
+
+def _simulation() -> str:
+    """A table at rest on a still floor stays there; compiles the kernel."""
+    from avis_ctrl.rigs.rig_file import load_rig
+    from avis_ctrl.simulation.loop import simulate
+    from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, geophone_bank
+
+    rig = load_rig("avis")
+    bank = geophone_bank(rig)
+    silent = SensorBank("velocity", bank.chains, bank.gain_V, np.zeros(len(bank.chains)), bank.converter)
+    record = simulate(SampledLoop(rig, gain(np.zeros((1, 1))), ("z",), {}, silent, {}), 0.1, settle_s=0.0)
+    if np.any(record.q):
+        raise ArithmeticError(f"it moved by {np.max(np.abs(record.q)):.3g} m")
+    return f"{record.time.size} samples at rest"
 
 
 def _typst() -> str:
@@ -89,7 +110,7 @@ def _typst() -> str:
 
 def _synthesis() -> str:
     """min ||W S|| = |W(z)| for a plant zero z in the right half plane (Skogestad and Postlethwaite, section 5.7)."""
-    from avis_ctrl.lti import connect, gain, summing_junction, tf
+    from avis_ctrl.lti import connect, summing_junction, tf
     from avis_ctrl.robust.hinfsyn import hinfsyn
 
     weight, z = tf([1.0, 2.0], [2.0, 0.02]), 1.0

@@ -16,7 +16,7 @@ from avis_ctrl.robust.mu_realise import realise_delta
 from avis_ctrl.simulation.campaign import SimulationCheck, check_designs
 from avis_ctrl.simulation.prediction import predict_transmissibility_6dof
 from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, accelerometer_bank, geophone_bank
-from avis_ctrl.study.controllers import critical_gains, middle_corners
+from avis_ctrl.study.controllers import CUSTOMARY_CORNERS_HZ, critical_gains
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.model import ControllerResult, SixDofCheck
 from avis_ctrl.study.plant import DesignPlant
@@ -37,7 +37,7 @@ def nominal_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | N
     if K is None:
         K = gain(np.zeros((len(design.keep), len(design.keep))))
     others = tuple(name for name in COORDINATES if name not in design.keep)
-    loops = Skyhook(others, critical_gains(rig, others), *middle_corners(design))
+    loops = Skyhook(others, critical_gains(rig, others), *CUSTOMARY_CORNERS_HZ)
     return SampledLoop(rig, K, tuple(design.keep), {name: loops.loop(name) for name in others},
                        sensor_bank(design, rig), floor_by_coordinate(design, rig, plant.floor), name="nominal",
                        amplifier_corner_Hz=design.loop.amplifier_corner_Hz)

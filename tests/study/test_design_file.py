@@ -104,7 +104,7 @@ def test_numbers_outside_their_range_are_named(place, value, field):
     ("transmissibility/band_Hz", [1.0, 2.0, 3.0], "transmissibility.band_Hz = [1.0, 2.0, 3.0]"),
     ("floor/band_Hz", [60.0, 0.5], "floor.band_Hz = [60.0, 0.5]"),
     ("skyhook/roll_off_Hz", [400.0, 30.0], "skyhook.roll_off_Hz = [400.0, 30.0]"),
-    ("skyhook/tilt_corner_Hz", [0.5, 100.0], "skyhook.roll_off_Hz = [30.0, 400.0]"),
+    ("skyhook/tilt_corner_Hz", [0.5, 100.0], "skyhook.roll_off_Hz = [5.0, 400.0]"),
     ("transmissibility/band_dB", 5.0, "transmissibility.band_dB = 5.0"),
 ])
 def test_bands_rise(place, value, field):
