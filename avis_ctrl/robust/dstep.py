@@ -28,7 +28,7 @@ MATRIX_FIT_TOLERANCE = 2e-2
 REFINEMENT = 1e-3
 # Below this share of the peak a loop has room for any misfit; from here up its own mu is the yardstick. Steps that
 # gain much need little of the profile, the last ones live off it.
-BROAD_FLOOR, DETAILED_FLOOR = 0.8, 0.3
+BROAD_FLOOR, DETAILED_FLOOR = 0.5, 0.3
 # Points of the check between the grid's, and the excess there that sends its peaks back into the grid.
 CHECKED_POINTS = 400
 BETWEEN = 1.02
