@@ -50,7 +50,10 @@ def assert_bounds_proved(M, blocks, found):
 
 @pytest.mark.parametrize("blocks, printed", [([F(2)], 3.162), ([C(), C()], 3.000)])
 def test_skogestad_postlethwaite_example_8_5(blocks, printed):
-    """Multivariable Feedback Control (1996), example 8.5: M = [2 2; -1 -1]."""
+    """Multivariable Feedback Control (1996), example 8.5: M = [2 2; -1 -1].
+
+    Both are exact to the printed digits by hand: sqrt(10), the norm of a matrix of rank one, and 2 + 1, its diagonal.
+    """
     found = mu([[2, 2], [-1, -1]], blocks)
     assert found.upper == pytest.approx(printed, abs=5e-4)
     assert found.lower == pytest.approx(printed, abs=5e-4)

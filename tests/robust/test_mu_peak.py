@@ -4,7 +4,19 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import StateSpace, append, discretise, gain, hinf_norm, lft_upper, tf
+from avis_ctrl.lti import (
+    StateSpace,
+    append,
+    connect,
+    discretise,
+    gain,
+    hinf_norm,
+    lft_lower,
+    lft_upper,
+    summing_junction,
+    tf,
+)
+from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu import mu_upper
 from avis_ctrl.robust.mu_cover import cover
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
@@ -38,6 +50,20 @@ def distillation():
     I, O = np.eye(2), np.zeros((2, 2))
     return append(*parts).scaled(left=np.block([[I, I, O, O], [O, O, I, I]]),
                                  right=np.block([[I, O], [O, I], [I, O], [O, I]]))
+
+
+def distillation_plant():
+    """The same without its controller: inputs w_delta, w, u; outputs z_delta, z, y = -(G (u + w_delta) + w)."""
+    G = StateSpace(-np.eye(2) / 75, np.eye(2), np.array([[87.8, -86.4], [108.2, -109.6]]) / 75, np.zeros((2, 2)), 0.0,
+                   ["a1", "a2"], ["g1", "g2"])
+    parts = [G]
+    for k in "12":
+        parts += [tf([1.0, 0.2], [0.5, 1.0], [f"u{k}"], [f"z_delta{k}"]), tf([0.5, 0.05], [1.0, 1e-6], [f"e{k}"],
+                     [f"z{k}"]),
+                  summing_junction(f"a{k}", [f"u{k}", f"w_delta{k}"]), summing_junction(f"e{k}", [f"g{k}", f"w{k}"]),
+                  summing_junction(f"y{k}", [f"-e{k}"])]
+    return connect(parts, ["w_delta1", "w_delta2", "w1", "w2", "u1", "u2"],
+                   ["z_delta1", "z_delta2", "z1", "z2", "y1", "y2"])
 
 
 def flexible(rng, n_w, n_z, modes=6, damping=1e-3):
@@ -84,8 +110,16 @@ def test_spinning_satellite_complex(blocks):
     assert found.lower == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.parametrize("channels, blocks, printed", [(2, [C(), C()], 0.5242), (4, [C(), C(), F(2)], 5.7726)])
+def test_distillation_on_the_grid_of_the_book(channels, blocks, printed):
+    """Skogestad and Postlethwaite's own Fig8_15.m: 0.5242 (robust stability) and 5.7726 (robust performance), the
+    largest upper bounds at 61 points from 1e-3 to 1e3 rad/s."""
+    grid = distillation().select(range(channels), range(channels)).frequency_response(np.logspace(-3, 3, 61))
+    assert np.max(mu_upper(grid, blocks).upper) == pytest.approx(printed, abs=5e-5)
+
+
 def test_distillation_robust_stability_and_performance():
-    """Printed peaks: RS 0.53, RP 5.77 (section 8.11.3, figure 8.15; read off a grid, hence 0.5 %)."""
+    """Between those points the peaks are a little higher; 0.53 and 5.77 from the text of section 8.11.3 alone."""
     N = distillation()
     stability = mu_peak(N.select(slice(2), slice(2)), [C(), C()])
     performance = mu_peak(N, [C(), C(), F(2)])
@@ -95,14 +129,48 @@ def test_distillation_robust_stability_and_performance():
 
 
 def test_distillation_worst_case_gain():
-    """Printed peak of the skewed mu: 44.93 (section 8.11.3, remark on worst-case performance; off a grid)."""
+    """Peak of the skewed mu: 44.92 by muperf in Skogestad and Postlethwaite's Fig8_15.m (off a grid, hence 0.5 %)."""
     N = distillation()
     found = worst_case_gain(N, [C(), C()])
-    assert found.guaranteed and found.upper == pytest.approx(44.93, rel=5e-3)
-    assert found.lower == pytest.approx(44.93, rel=5e-3)
+    assert found.guaranteed and found.upper == pytest.approx(44.92, rel=5e-3)
+    assert found.lower == pytest.approx(44.92, rel=5e-3)
     # The scaled system has mu 1 exactly at the worst-case gain (definition of the skewed mu).
     skewed = mu_peak(N.scaled(left=[1, 1, 1 / found.upper, 1 / found.upper]), [C(), C(), F(2)])
     assert skewed.upper == pytest.approx(1.0, rel=2e-3)
+
+
+@pytest.mark.parametrize("num, den, printed", [
+    ([1.0], [1.0], 1.1798),
+    (2 * np.poly([-1000, -0.25, -0.054]) / 1000, np.polymul([1, 1.34, 0.67 ** 2 + 0.56 ** 2], [1, 0.013]), 0.9740)])
+def test_distillation_under_the_controllers_of_the_book(num, den, printed):
+    """H-infinity optimal for D = I (first D-K step) and for Lundstroem's D: peak mu 1.1798 and 0.9740 in Skogestad and
+    Postlethwaite's own Sec8_124.m (section 8.12.4; off a grid of 61 points, searches to 0.1 %)."""
+    P, d, inverse, one = distillation_plant(), tf(num, den), tf(den, num), tf([1.0], [1.0])
+    left = append(*(x.renamed([f"i{k}"], [f"o{k}"]) for k, x in enumerate([d, d, one, one, one, one])))
+    right = append(*(x.renamed([f"i{k}"], [f"o{k}"]) for k, x in enumerate([inverse, inverse, one, one, one, one])))
+    K = hinfsyn(left.renamed(P.outputs, P.outputs) @ P @ right.renamed(P.inputs, P.inputs), 2, 2,
+                backoff=1e-4, tolerance=1e-4).K
+    found = mu_peak(lft_lower(P, K), [C(), C(), F(2)])
+    assert found.guaranteed and found.lower == pytest.approx(printed, rel=1e-3)
+    assert found.upper == pytest.approx(printed, rel=2e-3)
+
+
+def test_two_carts_with_uncertain_masses_and_spring():
+    """MathWorks, Robust Control Toolbox, "Robust Stability and Worst-Case Gain of Uncertain System": m1 = m2 = k = 1
+    +- 20 %, C = 100 ((s + 1)/(0.001 s + 1))^3 on the second cart's position: margin at most 2.8864 (lower bounds from
+    2.8803 to 2.8834 in different releases), at 575.0339 rad/s, with k = 1.5773 and m1 = m2 = 0.4227."""
+    s = 0.2
+    # m1 x1'' = u - f - w1, m2 x2'' = f - w2, f = x1 - x2 + w_k; z = s (x1'', x2'', x1 - x2).
+    carts = StateSpace([[0, 1, 0, 0], [-1, 0, 1, 0], [0, 0, 0, 1], [1, 0, -1, 0]],
+                       [[0, 0, 0, 0], [-1, 0, -1, 1], [0, 0, 0, 0], [0, -1, 1, 0]],
+                       [[-s, 0, s, 0], [s, 0, -s, 0], [s, 0, -s, 0], [0, 0, 1, 0]],
+                       [[-s, 0, -s, s], [0, -s, s, 0], [0, 0, 0, 0], [0, 0, 0, 0]], 0.0,
+                       ["w1", "w2", "w_k", "u"], ["z1", "z2", "z_k", "x2"])
+    controller = tf(-100 * np.poly([-1, -1, -1]), np.poly([-1000, -1000, -1000]) / 1e9, ["x2"], ["u"])
+    found = mu_peak(connect([carts, controller], ["w1", "w2", "w_k"], ["z1", "z2", "z_k"]), [R(), R(), R()])
+    assert 1 / found.lower == pytest.approx(2.8864, abs=5e-5) and found.omega == pytest.approx(575.0339, abs=5e-5)
+    assert 1 + s * np.diag(found.delta).real == pytest.approx([0.4227, 0.4227, 1.5773], abs=5e-5)
+    assert found.guaranteed and 2.8834 <= 1 / found.upper <= 1 / found.lower
 
 
 def test_mass_spring_damper_with_uncertain_damping():
