@@ -19,7 +19,7 @@ UNIT = ([1.0], [1.0])
 
 
 def bound(w_B, M=1.5, A=1e-4):
-    """Skogestad and Postlethwaite eq. 2.105: the weight (s/M + w_B)/(s + w_B A)."""
+    """Skogestad and Postlethwaite's performance weight (s/M + w_B)/(s + w_B A), in all their files used here."""
     return [1 / M, w_B], [1, w_B * A]
 
 
