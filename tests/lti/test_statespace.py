@@ -100,3 +100,15 @@ def test_wrong_names_and_clocks():
     with pytest.raises(InputError, match="different sample times"):
         append(sampled, StateSpace([[-0.5]], [[1]], [[1]], [[0]], 0.0, ["c"], ["d"]))
     assert append(sampled, gain([[2.0]], ["c"], ["d"])).dt == 0.1
+
+
+def test_slow_states_are_not_lost_beside_fast_ones(rng):
+    """A = -G R G with R well conditioned and G over nine decades: the response at rest is C inv(G) inv(R) inv(G) B."""
+    n = 8
+    G = np.diag(np.geomspace(1e-4, 1e5, n))
+    R = np.eye(n) + 0.2 * rng.uniform(-1, 1, (n, n))
+    B, C = G @ rng.standard_normal((n, 2)), rng.standard_normal((2, n)) @ G
+    exact = C @ np.linalg.inv(G) @ np.linalg.solve(R, np.linalg.solve(G, B))
+    omega = np.concatenate([[0.0], np.geomspace(1e-14, 1e12, 60)])
+    response = StateSpace(-G @ R @ G, B, C, np.zeros((2, 2))).frequency_response(omega)
+    np.testing.assert_allclose(response[:3].real, np.broadcast_to(exact, (3, 2, 2)), rtol=1e-6, atol=1e-6)
