@@ -8,6 +8,7 @@ export OMP_NUM_THREADS = 1
 .PHONY: test test-slow demo lint bench clean
 
 $(BIN)/.installed: pyproject.toml constraints.txt
+	@echo "Installing into .venv: a minute or two"
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
 	@echo "Compiling the numerical kernels once, and checking that all works here"

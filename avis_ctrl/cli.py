@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -9,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from avis_ctrl import __version__
 from avis_ctrl.errors import AvisError
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
@@ -17,9 +20,19 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_
                   help="Workbench for active vibration isolation tables.")
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"avis_ctrl {__version__}")
+        raise typer.Exit()
+
+
 @app.callback()
-def _commands() -> None:
-    """Workbench for active vibration isolation tables."""
+def _commands(version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True,
+                                                    help="print the version")] = False) -> None:
+    """Workbench for active vibration isolation tables.
+
+    Exit codes: 0 done (read the verdict), 2 the input is wrong, 3 a computation failed.
+    """
 
 
 @app.command()
@@ -27,7 +40,10 @@ def design(
     file: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="what to design; start from designs/*.toml")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for controllers and report")],
 ) -> None:
-    """From a rig to certified controllers, checks and a design report."""
+    """From a rig to certified controllers, checks and a design report.
+
+    Writes report.html, report.pdf, controllers/NAME.json, plant.json and result.json into DIR.
+    """
     from rich.console import Console
 
     from avis_ctrl.study.design_file import read_study
@@ -101,6 +117,9 @@ def _verdict(console, result) -> None:
 
 def main() -> None:
     """Entry point: errors of ours end in one line and their exit code."""
+    # Before numpy is loaded: several BLAS threads round differently from one, and are slower on small matrices.
+    os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", MKL_NUM_THREADS="1")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         # The parser hands back the code of typer.Exit, and 130 after Ctrl-C.
         code = app(standalone_mode=False)

@@ -220,8 +220,12 @@ def _proposed(problem: _Problem, state: State, options: _Options) -> _Proposal |
         return _Proposal(Scalings.identity(problem.structure), 0.0, "H-infinity")
     if state.phase == "D-K":
         points = replace(state.points, floor=BROAD_FLOOR if _falls_fast(state) else DETAILED_FLOOR)
-        step = d_step(points, lft_lower(problem.P, state.last.K), state.last.scalings,
-                      max_states=options.max_added_states)
+        try:
+            step = d_step(points, lft_lower(problem.P, state.last.K), state.last.scalings,
+                          max_states=options.max_added_states)
+        except np.linalg.LinAlgError:
+            # A loop that no decomposition takes (entries beyond all scale) ends the D-K phase, not the synthesis.
+            return None
         return _Proposal(step.scalings, step.cost, "D-K")
     band = band_of(state.points.omega)
     start = min(state.last, state.best, key=lambda loop: loop.gamma).scalings

@@ -157,7 +157,7 @@ class SkyhookSection(_Section):
 
 
 class SimulationSection(_Section):
-    duration_s: Annotated[float, Field(ge=10, le=3600)] = 60.0
+    duration_s: Annotated[float, Field(ge=15, le=3600)] = 60.0
     random_plants: Annotated[int, Field(ge=0, le=500)] = 20
     seed: Annotated[int, Field(ge=0)] = 1
 

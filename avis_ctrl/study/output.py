@@ -17,6 +17,9 @@ from avis_ctrl.study.model import ControllerResult, DesignResult
 FILES = ("plant.json", "report.html", "report.pdf", "result.json")
 
 
+FILES = ("result.json", "report.html", "report.pdf", "plant.json")
+
+
 def open_folder(folder: str | Path) -> Path:
     """Create the output folder and make sure, before hours of computing, that it can be written.
 
@@ -141,7 +144,9 @@ def write_study(result: DesignResult, folder: Path, html: bytes | None = None, p
     """All files of a study; result.json last, so that its presence says that the others are complete."""
     try:
         (folder / "controllers").mkdir(exist_ok=True)
-        (folder / "result.json").unlink(missing_ok=True)
+        # Of an earlier study nothing stays: an old report beside new controllers would lie.
+        for old in (*(folder / name for name in FILES), *(folder / "controllers").glob("*.json")):
+            old.unlink(missing_ok=True)
     except OSError as error:
         raise _not_written(folder, error) from None
     written = []

@@ -5,11 +5,26 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from typing import Any
 
 MOST = 2
+WATCH_S = 1.0
+
+
+def _as_worker(parent: int) -> None:
+    """Ctrl-C and SIGTERM end a worker at once and silently (the parent speaks); so does the parent's own death."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH_S)
+        os._exit(1)
+    threading.Thread(target=watch, daemon=True).start()
 
 
 class Workers:
@@ -22,9 +37,8 @@ class Workers:
     def __enter__(self) -> Workers:
         # A forked child has the compiled code and the libraries already.
         method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-        # Ctrl-C ends the children at once and silently; this process says that it was stopped.
-        self._pool = (ProcessPoolExecutor(self._count, multiprocessing.get_context(method), signal.signal,
-                                          (signal.SIGINT, signal.SIG_DFL)) if self._count > 1 else None)
+        self._pool = (ProcessPoolExecutor(self._count, multiprocessing.get_context(method), _as_worker, (os.getpid(),))
+                      if self._count > 1 else None)
         self._others = set(multiprocessing.active_children())
         return self
 

@@ -249,7 +249,8 @@ def _realise(lft: _StaticLft, coordinates: tuple[str, ...], actuators: Sequence[
     C = np.vstack([lft.R @ S_x, S_x[2 * n:3 * n], velocity_x, S_x[:n], sense @ velocity_x, sense @ S_x[:n]])
     D = np.vstack([z_e, S_e[2 * n:3 * n], velocity_e, S_e[:n], sense @ velocity_e, sense @ S_e[:n]])
 
-    tags = [f"{name}[{c}]" if copies > 1 else name
+    # python-control forbids dots in signal names.
+    tags = [name.replace(".", "_") + (f"[{c}]" if copies > 1 else "")
             for name, copies in zip(parameters, lft.copies, strict=True) for c in range(copies)]
     inputs = [*(f"w:{tag}" for tag in tags), *actuators, *(f"floor_{name}_dot" for name in coordinates),
               *(f"force_{name}" for name in coordinates)]

@@ -15,7 +15,8 @@ def provenance(result: DesignResult) -> Section:
     rows = [(NAMES.get(key, key), words.number(value) if isinstance(value, float) else str(value))
             for key, value in result.provenance.items() if value is not None]
     return Section("Provenance", "provenance", (
-        table("With the same version, inputs and seed the same figures come out.", ("what", "value"), rows, "ll"),))
+        table("With the same inputs, seed, library versions and processor the same figures come out; elsewhere "
+              "round-off may lead the D-K iteration another way.", ("what", "value"), rows, "ll"),))
 
 
 def stamp(result: DesignResult) -> str:
