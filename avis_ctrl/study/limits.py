@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.robust.mu import mu_upper
-from avis_ctrl.study.model import Bound
+from avis_ctrl.robust.musyn_state import Iteration
+from avis_ctrl.study.model import ControllerResult
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 WORTH_NAMING = 0.02
+STILL_FALLING = 0.05
 
 
 def without_each(plant: DesignPlant, K: StateSpace, omega: float) -> list[tuple[str, float]]:
@@ -42,10 +46,23 @@ def _mu(M: np.ndarray, blocks: BlockStructure) -> float:
     return float(mu_upper(M, blocks).upper)
 
 
-def best_found(plant: DesignPlant, K: StateSpace, mu: Bound) -> str:
-    """One sentence for a design whose mu stays above 1: what was reached, and what stands in the way."""
-    worth = (1 - WORTH_NAMING) * mu.upper
-    relief = [f"{name} ({value:.2f} without it)" for name, value in without_each(plant, K, mu.omega) if value < worth]
-    return (f"The specification is not met for all plants of the set: the best mu found is {mu.upper:.3g}, at "
-            f"{mu.omega / (2 * np.pi):.3g} Hz. What holds it up there: {', '.join(relief[:4]) or 'all together'}. "
-            f"With uncertainties {mu.upper:.3g} times smaller and bounds {mu.upper:.3g} times wider it is met.")
+def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[ControllerResult],
+               history: Sequence[Iteration]) -> str:
+    """What was reached by a design whose mu stays above 1, what stands in the way, and what to try.
+
+    It is no proof that nothing better exists: the synthesis may have ended early, and says so here.
+    """
+    if mu.K is None:
+        return ""
+    worth = (1 - WORTH_NAMING) * mu.mu.upper
+    relief = [f"{name} ({value:.2f} without it)" for name, value in without_each(plant, mu.K, mu.mu.omega)
+              if value < worth]
+    text = (f"The specification is not met for all plants of the set: mu of the mu controller is {mu.mu.upper:.3g}, at "
+            f"{mu.mu.omega / (2 * np.pi):.3g} Hz. What holds it up there: {', '.join(relief[:4]) or 'all together'}. "
+            f"With uncertainties {mu.mu.upper:.3g} times smaller and bounds {mu.mu.upper:.3g} times wider it is met.")
+    if len(history) > 1 and history[-1].mu_upper < (1 - STILL_FALLING) * history[-2].mu_upper:
+        text += " The D-K iteration ended while mu was still falling: raise synthesis.max_iterations or time_limit_s."
+    if better := [c for c in others if c.mu.upper < mu.mu.upper]:
+        best = min(better, key=lambda c: c.mu.upper)
+        text += f" The controller {best.title!r} has a smaller mu, {best.mu.upper:.3g}: the iteration ended too early."
+    return text

@@ -56,7 +56,7 @@ def _figure(name: str, result: DesignResult, pick: Pick, label: str, what: str, 
     curves.append(level(0.01, 1000.0, 1.0, "1", STYLES["limit"]))
     finite = [float(np.max(c.y[np.isfinite(c.y)], initial=1.0)) for c in curves]
     top = min(max(finite) * 1.3, 30.0)
-    panel = Panel(hertz(0.1, 500.0), Axis(label, "log", (0.05, top)), tuple(curves))
+    panel = Panel(hertz(0.01, 500.0), Axis(label, "log", (0.05, top)), tuple(curves))
     return Figure(name, f"Upper bounds (thick) and lower bounds (thin, dotted) of {what}. {meaning}", (panel,))
 
 
@@ -83,5 +83,7 @@ def _worst(result: DesignResult) -> Table:
                               ("peak transmissibility", c.worst_peak, True)):
             value = words.decibel(b.lower) if gain else words.bound(b.lower, 4)
             rows.append((f"{c.title}: {what}", value, words.hertz(b.omega), "; ".join(b.words) or "none was found"))
-    return table("The worst plants that were found, in physical words. Each reaches the lower bound named beside it.",
+    return table("The worst plants that were found, in physical words. Each reaches the lower bound named beside it. "
+                 "Those of mu are scaled until they reach the limit, to 1/mu of the set: where mu is below 1 they lie "
+                 "outside it. Those of transmissibility lie inside.",
                  ("what it makes worst", "reaches", "at", "perturbation"), rows, "lrrl")
