@@ -33,7 +33,7 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
 
     Parameters
     ----------
-    samples : (n_samples, n_w, n_z) real perturbations for the band of sampled transmissibility.
+    samples : (n_samples, n_w, n_z) perturbations, held over frequency, for the band of sampled transmissibility.
     """
     performance = plant.synthesis.closed(K)
     motion = plant.full.restricted([*plant.floor_velocities], [*plant.velocities]).closed(K)
@@ -51,7 +51,7 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
         name, title, kind, K, full.is_stable(), hinf_norm(nominal).gain,
         bound(plant, blocks, mu_peak(performance, all_blocks, slack=SLACK)),
         bound(plant, blocks, mu_peak(performance.select(slice(n_z), slice(n_w)), blocks, slack=SLACK)),
-        worst_peak, worst_band, transmissibility(motion, blocks, samples, omega, worst_peak),
+        worst_peak, worst_band, transmissibility(motion, blocks, samples, omega),
         _compliance(plant, full, omega), site_response(plant, full, K is not None),
         hinf_norm(motion.select(slice(n_z, None), slice(n_w, None))).gain, fastest, notes)
 
@@ -84,9 +84,9 @@ def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> t
                  for family, names in by_words.items())
 
 
-def transmissibility(motion: StateSpace, blocks: BlockStructure, samples: np.ndarray, omega: np.ndarray,
-                     worst: Bound) -> Transmissibility:
-    """Nominal, sampled and worst-case transmissibility of a closed loop with inputs (w_delta, floor)."""
+def transmissibility(motion: StateSpace, blocks: BlockStructure, samples: np.ndarray,
+                     omega: np.ndarray) -> Transmissibility:
+    """Nominal and sampled transmissibility of a closed loop with inputs (w_delta, floor)."""
     response = motion.frequency_response(omega)
     n_w, n_z = blocks.n_w, blocks.n_z
     nominal = response[:, n_z:, n_w:]
@@ -97,13 +97,7 @@ def transmissibility(motion: StateSpace, blocks: BlockStructure, samples: np.nda
         sampled.append(np.linalg.norm(T, ord=2, axis=(1, 2)))
     sigma = np.linalg.norm(nominal, ord=2, axis=(1, 2))
     band = np.array([sigma, *sampled])
-    known = np.isfinite(worst.frequencies) & (worst.frequencies > 0)
-    if np.any(known):
-        curve = np.exp(np.interp(np.log(omega), np.log(worst.frequencies[known]),
-                                 np.log(np.maximum(worst.upper_curve[known], 1e-12)), left=np.nan, right=np.nan))
-    else:
-        curve = np.full(omega.size, np.nan)
-    return Transmissibility(omega, nominal, sigma, band.min(axis=0), band.max(axis=0), curve)
+    return Transmissibility(omega, nominal, sigma, band.min(axis=0), band.max(axis=0))
 
 
 def _compliance(plant: DesignPlant, full: StateSpace, omega: np.ndarray) -> np.ndarray:

@@ -47,7 +47,6 @@ class Transmissibility:
 
     nominal : (n, n_axes, n_axes) complex; sigma : (n,) its largest singular value.
     low, high : (n,) smallest and largest sigma over the sampled plants.
-    worst : (n,) upper bound of sigma over the whole set (nan where it was not computed).
     """
 
     omega: np.ndarray
@@ -55,7 +54,6 @@ class Transmissibility:
     sigma: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    worst: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

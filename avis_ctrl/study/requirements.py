@@ -16,6 +16,16 @@ def decibel(value: float) -> float:
     return 20.0 * float(np.log10(value)) if value > 0 else -np.inf
 
 
+def _advantage(skyhook: ControllerResult, mu: ControllerResult) -> float:
+    """Lower bound of the skyhook's worst case over the upper bound of mu's [dB]; nan, never met, without a rival.
+
+    A skyhook that some plant of the set destabilises is no baseline: its infinite gain would flatter any controller.
+    """
+    if not np.isfinite(skyhook.worst_peak.upper):
+        return np.nan
+    return decibel(skyhook.worst_band.lower) - decibel(mu.worst_band.upper)
+
+
 def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requirement, ...]:
     """One line a requirement of the design file, in its order."""
     by_name = {c.name: c for c in controllers}
@@ -39,7 +49,7 @@ def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requ
             "passive peak transmissibility, nominal", lambda: decibel(passive.peak_transmissibility), ""),
         "advantage_over_skyhook_dB": (
             f"worst case {band} below the best skyhook's",
-            lambda: decibel(skyhook.worst_band.lower) - decibel(mu.worst_band.upper),
+            lambda: _advantage(skyhook, mu),
             f"skyhook reaches {decibel(skyhook.worst_band.lower):+.1f} dB at a worst-case peak of "
             f"{decibel(skyhook.worst_peak.lower):+.1f} dB"),
         "fastest_controller_pole_Hz": ("fastest pole of the mu controller", lambda: mu.fastest_pole_Hz, ""),

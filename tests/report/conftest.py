@@ -53,7 +53,7 @@ def _controller(name: str, plant: DesignPlant) -> ControllerResult:
     fastest = 0.0 if K is None else 60.0
     return ControllerResult(name, TITLES.get(name, name), KINDS.get(name, name), K, name != "skyhook_classical", 1.1,
                             bound, bound, bound, bound,
-                            Transmissibility(omega, T, sigma, 0.8 * sigma, 1.2 * sigma, 1.4 * sigma), 1e-5 * sigma,
+                            Transmissibility(omega, T, sigma, 0.8 * sigma, 1.2 * sigma), 1e-5 * sigma,
                             site, float(sigma.max()), fastest)
 
 

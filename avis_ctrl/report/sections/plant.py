@@ -9,7 +9,7 @@ from avis_ctrl.report.block_diagram import block_diagram
 from avis_ctrl.report.families import EXTERNAL, Families
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, decibels, hertz, level, numbered
 from avis_ctrl.report.pieces import Bullets, Drawing, Heading, Paragraph, Piece, Section, Table, table
-from avis_ctrl.report.sections.transmissibility import asked_dB
+from avis_ctrl.report.sections.transmissibility import asked_dB, upper_bound
 from avis_ctrl.study.model import ControllerResult, DesignResult
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
@@ -88,9 +88,10 @@ def _transmissibility_weight(result: DesignResult) -> Figure:
     curves = (Curve(f, asked_dB(result, omega), "asked", STYLES["limit"]),
               Curve(f, decibels(limit), "1/|W_T|, the filter", STYLES["filter"]),
               Curve(f, decibels(mu.transmissibility.sigma), "mu synthesis, nominal", STYLES["mu"]),
-              Curve(f, decibels(mu.transmissibility.worst), "mu synthesis, upper bound over the set", STYLES["plain"]))
+              upper_bound(mu, "mu synthesis, upper bound over the set"))
     return Figure("weight_transmissibility", "The transmissibility bound as asked, as the rational filter realises it, "
-                  "and what the loop achieves. The loop meets the bound where its curves lie below the filter's.",
+                  "and what the loop achieves. The loop meets the bound where its curves lie below the filter's; the "
+                  "bound over the set was computed at the marked frequencies.",
                   (Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", (-60.0, 20.0)), curves),))
 
 

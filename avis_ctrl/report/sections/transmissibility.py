@@ -41,6 +41,14 @@ def _sigma(c: ControllerResult) -> Curve:
     return Curve(_hz(c), decibels(c.transmissibility.sigma), c.title, controller_style(c.name))
 
 
+def upper_bound(c: ControllerResult, label: str) -> Curve:
+    """Worst-case transmissibility where its bound was computed, marked: between the points it may lie higher."""
+    b = c.worst_peak
+    order = np.argsort(b.frequencies)
+    return Curve(b.frequencies[order] / (2 * np.pi), decibels(b.upper_curve[order]), label, STYLES["plain"],
+                 points=True)
+
+
 def _hz(c: ControllerResult) -> np.ndarray:
     return c.transmissibility.omega / (2 * np.pi)
 
@@ -64,7 +72,7 @@ def _uncertain(result: DesignResult) -> Figure:
         c = result.controller(name)
         T = c.transmissibility
         style = controller_style(name)
-        worst = Curve(_hz(c), decibels(T.worst), "upper bound over the whole set", STYLES["plain"])
+        worst = upper_bound(c, "upper bound over the whole set")
         band = Band(_hz(c), decibels(T.low), decibels(T.high), f"{c.title}: range over sampled plants", style)
         panels.append(_panel([_sigma(c), worst, _limit(result)], [band], c.title))
     return Figure("transmissibility_uncertain", _spread_words(result), tuple(panels))
@@ -77,8 +85,8 @@ def _spread_words(result: DesignResult) -> str:
         parts.append(f"{c.title}: sampled plants peak at {words.decibel(float(np.max(c.transmissibility.high)))}, the "
                      f"bound at {words.decibel(c.worst_peak.upper)}")
     return ("Largest singular value over the uncertainty set: nominal (line), range over the sampled plants (area), "
-            f"and the upper bound that no plant of the set exceeds. {'; '.join(parts)}. A bound that is missing "
-            "at some frequency was not computed there.")
+            f"and the upper bound that no plant of the set exceeds at the marked frequencies; the lines between them "
+            f"guide the eye, only the peak is proved there too. {'; '.join(parts)}.")
 
 
 def _by_axis(result: DesignResult) -> Figure:

@@ -1,0 +1,160 @@
+"""What the verdict is made of: the delay and the noise in the plant, the site's motion, worst cases, the comparison."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.study.analysis import analyse
+from avis_ctrl.study.controllers import classical_skyhook, passive
+from avis_ctrl.study.design_file import Design, RequirementSection, read_study
+from avis_ctrl.study.model import ControllerResult
+from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.study.requirements import judge
+from avis_ctrl.study.runner import skyhook_limit
+from avis_ctrl.study.sampling import random_perturbations
+
+DESIGNS = Path(__file__).resolve().parents[2] / "designs"
+
+
+@pytest.fixture(scope="module")
+def shipped() -> tuple[Design, DesignPlant]:
+    design, rig = read_study(DESIGNS / "avis_z_phix.toml")
+    return design, build_plant(design, rig)
+
+
+@pytest.fixture(scope="module")
+def one_axis() -> tuple[Design, DesignPlant]:
+    """z alone; mass and the damping of one isolator uncertain, no chains."""
+    design, rig = read_study(DESIGNS / "avis_z_phix.toml")
+    uncertainty = design.uncertainty.model_copy(update={
+        "parameters_percent": {"mass": 10.0, "isolator1.k_z": 15.0}, "actuator_chains": None})
+    design = design.model_copy(update={"keep": ["z"], "uncertainty": uncertainty})
+    return design, build_plant(design, rig)
+
+
+@pytest.fixture(scope="module")
+def measured(one_axis) -> dict[str, ControllerResult]:
+    design, plant = one_axis
+    samples = random_perturbations(plant, 3, 1)
+    return {c.name: analyse(design, plant, c.K, c.name, c.title, c.kind, samples)
+            for c in (passive(), classical_skyhook(plant, load_rig("avis"), design))}
+
+
+def test_a_command_waits_for_the_delay_and_half_a_sample(shipped):
+    """exp(-s (1 ms + 0.5 ms)) and the amplifier's lag, written out, between command and volts."""
+    _, plant = shipped
+    omega = 2 * np.pi * np.geomspace(1.0, 60.0, 20)
+    volts = plant.full.nominal().P.select(plant.volts, ["command_z"]).frequency_response(omega)[:, :, 0]
+    late = np.exp(-1.5e-3j * omega) / (1 + 1j * omega / (2 * np.pi * 300.0))
+    np.testing.assert_allclose(volts, late[:, None] * plant.allocation[:, 0], rtol=1e-4)
+
+
+def test_rotation_is_seen_as_edge_velocity(shipped):
+    """Floor and payload at one velocity far below resonance: each axis reads its own, through the geophones' corner."""
+    _, plant = shipped
+    assert plant.decoding.shape == (2, 6)
+    # A unit edge velocity moves the vertical geophones by +-1 m/s, all at the edge's lever p_y = 0.375 m.
+    _, rows = load_rig("avis").sensor_rows()
+    edge = rows[:, 3] / 0.375
+    np.testing.assert_allclose(plant.decoding @ edge, [0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(plant.decoding @ rows[:, 2], [1.0, 0.0], atol=1e-12)
+
+
+def test_sensor_noise_is_that_of_the_rig_file(shipped):
+    """1 mV r.m.s. and the rounding of 14 bits over 20 V, white to 500 Hz, over 3125 V s/m, through the decoding."""
+    _, plant = shipped
+    density = np.hypot(1e-3, 20 / 2 ** 14 / np.sqrt(12)) * np.sqrt(2 / 1000) / 3125
+    inputs = [f"noise_{a}" for a in plant.axes]
+    # Far above all loops' band nothing but the noise path is left: take it without the rig by u = 0.
+    G = plant.full.nominal().P.select([f"seen_{a}_dot" for a in plant.axes], inputs)(2j * np.pi * 20.0)
+    G = G * plant.floor_density
+    np.testing.assert_allclose(G @ G.conj().T, density ** 2 * plant.decoding @ plant.decoding.T, rtol=1e-9)
+
+
+def test_site_motion_is_the_spectrum_through_the_table(one_axis, measured):
+    """Passive: m, c, k by hand times the floor's density, integrated on an even, fine grid."""
+    _, plant = one_axis
+    equations = load_rig("avis").equations_of_motion()
+    m, c, k = equations.M[2, 2], equations.C[2, 2], equations.K[2, 2]
+    f = np.arange(plant.floor.low_Hz, 250.0, 2e-3)
+    s = 2j * np.pi * f
+    density = np.abs((c * s + k) / (m * s ** 2 + c * s + k)) * plant.floor.asd(f, "velocity")
+    site = measured["passive"].site
+    assert site.velocity_rms["z"] == pytest.approx(np.sqrt(np.trapezoid(density ** 2, f)), rel=5e-3)
+    assert site.noise_rms["z"] == 0.0
+    for number in (3, 10):  # third octaves about 2 and 10 Hz: edges 10^(+-1/20)
+        mid = site.third_octave_Hz[number]
+        inside = (f >= mid * 10 ** -0.05) & (f < mid * 10 ** 0.05)
+        assert site.payload_third_octaves[number, 0] == pytest.approx(
+            np.sqrt(np.trapezoid(density[inside] ** 2, f[inside])), rel=2e-2)
+
+
+def test_noise_reaches_the_payload_through_the_loop(one_axis, measured):
+    """Noise of the sensors times loop gain over return difference, from the parts of the plant."""
+    _, plant = one_axis
+    f = np.geomspace(plant.floor.low_Hz, 250.0, 6000)
+    omega = 2 * np.pi * f
+    K = measured["skyhook_classical"].K.frequency_response(omega)[:, 0, 0]
+    P = plant.full.nominal().P
+    G = P.select("z_dot", "command_z").frequency_response(omega)[:, 0, 0]
+    seen = P.select("seen_z_dot", "command_z").frequency_response(omega)[:, 0, 0]
+    density = np.hypot(1e-3, 20 / 2 ** 14 / np.sqrt(12)) * np.sqrt(2 / 1000) / 3125 * np.linalg.norm(plant.decoding)
+    moved = np.abs(G * K / (1 - seen * K)) * density
+    assert measured["skyhook_classical"].site.noise_rms["z"] == pytest.approx(
+        np.sqrt(np.trapezoid(moved ** 2, f)), rel=5e-3)
+
+
+def test_worst_case_in_the_band_is_that_of_the_worst_rebuilt_rig(one_axis, measured):
+    """Every corner of mass and stiffness, m, c, k by hand: the bound is reached, and never exceeded."""
+    design, _ = one_axis
+    low, high = design.transmissibility.band_Hz
+    s = 2j * np.pi * np.geomspace(low, high, 20000)
+    nominal = load_rig("avis").equations_of_motion()
+    c, k1, gains = nominal.C[2, 2], 45.0e3, []
+    for dm, dk in product(np.linspace(-0.1, 0.1, 9), (-0.15, 0.15)):
+        m, k = nominal.M[2, 2] * (1 + dm), nominal.K[2, 2] + dk * k1
+        gains.append(np.max(np.abs((c * s + k) / (m * s ** 2 + c * s + k))))
+    found = measured["passive"].worst_band
+    assert max(gains) <= found.upper
+    assert max(gains) == pytest.approx(found.upper, rel=1e-2)
+
+
+def with_bounds(c: ControllerResult, name: str, lower: float, upper: float) -> ControllerResult:
+    bound = replace(c.worst_band, lower=lower, upper=upper)
+    return replace(c, name=name, worst_band=bound, worst_peak=bound)
+
+
+def asking(design: Design, **limits: float) -> Design:
+    return design.model_copy(update={"requirement": [RequirementSection(quantity=quantity, **{
+        "at_least" if quantity.startswith("advantage") else "at_most": value}) for quantity, value in limits.items()]})
+
+
+def test_advantage_counts_the_bounds_against_the_controller(one_axis, measured):
+    """What the skyhook surely reaches over what mu surely stays below: 20 log10(4 / 2)."""
+    design, _ = one_axis
+    controllers = [measured["passive"], with_bounds(measured["passive"], "skyhook", 4.0, 8.0),
+                   with_bounds(measured["passive"], "mu", 1.0, 2.0)]
+    line, = judge(asking(design, advantage_over_skyhook_dB=6.0), controllers)
+    assert (line.value, line.met) == (pytest.approx(20 * np.log10(2.0)), True)
+
+
+def test_a_skyhook_that_may_be_unstable_is_no_rival(one_axis, measured):
+    design, _ = one_axis
+    controllers = [measured["passive"], with_bounds(measured["passive"], "skyhook", np.inf, np.inf),
+                   with_bounds(measured["passive"], "mu", 1.0, 2.0)]
+    line, = judge(asking(design, advantage_over_skyhook_dB=6.0), controllers)
+    assert np.isnan(line.value)
+    assert not line.met
+
+
+@pytest.mark.parametrize(("asked_dB", "own", "limit"), [(6.0, 1.5, 10 ** 0.3), (6.0, 3.0, 3.0)])
+def test_the_skyhook_may_peak_as_high_as_asked_or_as_its_rival(one_axis, measured, asked_dB, own, limit):
+    design, _ = one_axis
+    mu = with_bounds(measured["passive"], "mu", own, own)
+    assert skyhook_limit(asking(design, worst_case_peak_transmissibility_dB=asked_dB), mu) == pytest.approx(limit)
