@@ -6,6 +6,7 @@ Each figure is computed on the closed loop of the returned controller, never tak
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -52,7 +53,7 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
         bound(plant, blocks, mu_peak(performance, all_blocks, slack=SLACK)),
         bound(plant, blocks, mu_peak(performance.select(slice(n_z), slice(n_w)), blocks, slack=SLACK)),
         worst_peak, worst_band, transmissibility(motion, blocks, samples, omega),
-        _compliance(plant, full, omega), site_response(plant, full, K is not None),
+        _compliance(plant, full, omega), site_response(plant, full, K is not None, design.floor.band_Hz),
         hinf_norm(motion.select(slice(n_z, None), slice(n_w, None))).gain, fastest, notes)
 
 
@@ -67,7 +68,7 @@ def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> t
     """A perturbation in physical units: parameters by value, chains by size and phase; alike ones together."""
     part = delta[:blocks.n_w, :blocks.n_z]
     real = {p.name: p for p in plant.rig.parameters}
-    by_words: dict[str, list[str]] = {}
+    told: list[tuple[str, str]] = []
     for value, block in zip(blocks.values(part), blocks.blocks, strict=True):
         if block.name in real:
             parameter = real[block.name]
@@ -78,10 +79,20 @@ def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> t
             size = abs(number) if number is not None else float(np.linalg.norm(np.asarray(value), 2))
             phase = f" at {np.degrees(np.angle(number)):+.0f} deg" if number is not None else ""
             words = f": {100 * size:.0f} % of its bound{phase}"
-        # "isolator1.k_z" and "isolator2.k_z" are of one family.
-        by_words.setdefault(re.sub(r"\d+", "*", block.name) + words, []).append(block.name + words)
-    return tuple(f"{family} ({len(names)} of them)" if len(names) > 1 else names[0]
-                 for family, names in by_words.items())
+        told.append((block.name, words))
+    return _by_family(told)
+
+
+def _by_family(told: list[tuple[str, str]]) -> tuple[str, ...]:
+    """(name, words) with names that differ in their number only written once where the words are the same for all."""
+    families: dict[str, list[tuple[str, str]]] = {}
+    for name, words in told:
+        families.setdefault(re.sub(r"\d+", "*", name), []).append((name, words))
+    lines: list[str] = []
+    for family, members in families.items():
+        alike = len(members) > 1 and len({words for _, words in members}) == 1
+        lines += [f"every {family}{members[0][1]}"] if alike else [name + words for name, words in members]
+    return tuple(lines)
 
 
 def transmissibility(motion: StateSpace, blocks: BlockStructure, samples: np.ndarray,
@@ -105,7 +116,7 @@ def _compliance(plant: DesignPlant, full: StateSpace, omega: np.ndarray) -> np.n
     return np.linalg.norm(full.select(moved, forces).frequency_response(omega), ord=2, axis=(1, 2))
 
 
-def site_response(plant: DesignPlant, full: StateSpace, controlled: bool) -> SiteResponse:
+def site_response(plant: DesignPlant, full: StateSpace, controlled: bool, band_Hz: Sequence[float]) -> SiteResponse:
     """Spectra of payload velocity and of volts under the site's floor motion and the sensors' noise."""
     frequency = np.geomspace(plant.floor.low_Hz, 250.0, 2000)
     omega = 2 * np.pi * frequency
@@ -121,15 +132,15 @@ def site_response(plant: DesignPlant, full: StateSpace, controlled: bool) -> Sit
         by_floor[:, len(plant.axes):], by_noise[:] = 0.0, 0.0
     density = np.hypot(by_floor, by_noise)
 
-    def rms(asd: np.ndarray) -> float:
-        return band_rms(frequency, asd, frequency[0], frequency[-1]) if np.any(asd) else 0.0
+    def rms(asd: np.ndarray, low: float = frequency[0], high: float = frequency[-1]) -> float:
+        return band_rms(frequency, asd, low, high) if np.any(asd) else 0.0
     n = len(plant.axes)
     bands = third_octave_midbands(1.0, 80.0)
     payload = np.stack([third_octave_rms(frequency, density[:, k], bands)[1] for k in range(n)], axis=1)
     on_floor = third_octave_rms(frequency, floor, bands)[1]
     volts = {name: rms(density[:, n + k]) for k, name in enumerate(plant.actuators)}
     return SiteResponse(
-        {axis: rms(density[:, k]) for k, axis in enumerate(plant.axes)},
-        {axis: rms(by_noise[:, k]) for k, axis in enumerate(plant.axes)},
+        {axis: rms(density[:, k], *band_Hz) for k, axis in enumerate(plant.axes)},
+        {axis: rms(by_noise[:, k], *band_Hz) for k, axis in enumerate(plant.axes)},
         bands, on_floor, payload, rating(bands, payload.max(axis=1)).criterion, rating(bands, on_floor).criterion,
         volts, {name: PEAK_FACTOR * value for name, value in volts.items()})

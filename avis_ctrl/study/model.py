@@ -60,7 +60,8 @@ class Transmissibility:
 class SiteResponse:
     """What the loop makes of the site's floor motion and of the sensors' noise (nominal plant).
 
-    velocity_rms, noise_rms : payload velocity by axis [m/s], from floor and noise, and from noise alone.
+    velocity_rms, noise_rms : payload velocity by axis [m/s] in the design's floor band, from floor and noise, and
+        from noise alone.
     third_octave_Hz, floor_third_octaves, payload_third_octaves : bands [Hz] and r.m.s. velocities [m/s];
         payload (n_bands, n_axes).
     rating, floor_rating : generic vibration criterion met by the worst axis and by the floor (None: not even VC-A).

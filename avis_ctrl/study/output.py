@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.study.model import ControllerResult, DesignResult
+from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
 
 FILES = ("plant.json", "report.html", "report.pdf", "result.json")
 
@@ -127,7 +127,20 @@ def result_dict(result: DesignResult) -> dict[str, Any]:
         "requirements": [{"name": r.name, "limit": r.limit, "value": r.value, "unit": r.unit, "met": r.met}
                          for r in result.requirements],
         "simulation": result.simulation.as_dict() if result.simulation is not None else {},
-        "seconds": result.seconds, "provenance": result.provenance}
+        "seconds": result.seconds, "provenance": result.provenance,
+        "worst_cases": {c.name: {"mu": _worst_case(result, c.mu), "peak": _worst_case(result, c.worst_peak),
+                                 "band": _worst_case(result, c.worst_band)} for c in result.controllers}}
+
+
+def _worst_case(result: DesignResult, bound: Bound) -> dict[str, Any] | None:
+    """A perturbation block by block, so that it can be rebuilt: numbers as [real, imaginary]."""
+    if bound.delta is None:
+        return None
+    blocks = result.plant.synthesis.blocks
+    values = blocks.values(bound.delta[:blocks.n_w, :blocks.n_z])
+    return {"lower": bound.lower, "upper": bound.upper, "frequency_Hz": bound.omega / (2 * np.pi),
+            "delta": {block.name: [[np.real(v), np.imag(v)] for v in np.ravel(value)]
+                      for block, value in zip(blocks.blocks, values, strict=True)}}
 
 
 def _controller_row(c: ControllerResult) -> dict[str, Any]:

@@ -52,7 +52,9 @@ def _motion(result: DesignResult) -> Table:
              *(words.number(1e6 * c.site.noise_rms[a]) for a in axes), c.site.rating or "none")
             for c in _settled(result)]
     header = ("controller", *(words.axis(a) for a in axes), *(f"noise in {words.axis(a)}" for a in axes), "criterion")
-    return table("Payload velocity r.m.s. [µm/s], from floor and sensor noise together and from the noise alone.",
+    low, high = result.design.floor.band_Hz
+    return table(f"Payload velocity r.m.s. [µm/s] from {low:g} to {high:g} Hz, from floor and sensor noise together "
+                 "and from the noise alone.",
                  header, rows, "l" + "r" * 2 * len(axes) + "c")
 
 

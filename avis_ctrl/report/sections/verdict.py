@@ -57,6 +57,7 @@ def _achieved(result: DesignResult) -> str:
 def comparison(result: DesignResult) -> Section:
     """All controllers in one table."""
     low, high = result.design.transmissibility.band_Hz
+    start, stop = result.design.floor.band_Hz
     rows: list[tuple[str, Callable[[ControllerResult], Cell]]] = [
         ("order", lambda c: str(c.order)),
         ("gamma, nominal weighted loop", lambda c: words.bound(c.gamma)),
@@ -68,7 +69,8 @@ def comparison(result: DesignResult) -> Section:
         ("peak transmissibility, nominal", lambda c: _settled(c, words.decibel(c.peak_transmissibility))),
         ("peak transmissibility, worst case", lambda c: words.decibel(c.worst_peak.upper)),
         (f"worst case over {low:g} to {high:g} Hz", lambda c: words.decibel(c.worst_band.upper)),
-        ("payload velocity r.m.s., worst axis", lambda c: _settled(c, _micro(c.site.velocity_rms))),
+        (f"payload velocity r.m.s., {start:g} to {stop:g} Hz, worst axis",
+         lambda c: _settled(c, _micro(c.site.velocity_rms))),
         ("of which from sensor noise", lambda c: _settled(c, _micro(c.site.noise_rms))),
         ("vibration criterion met", lambda c: _settled(c, c.site.rating or "none")),
         ("largest voltage r.m.s.", lambda c: _settled(c, _volts(c.site.volts_rms))),
