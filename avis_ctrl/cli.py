@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from avis_ctrl import __version__
+import avis_ctrl
 from avis_ctrl.errors import AvisError
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
@@ -22,7 +22,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_
 
 def _version(asked: bool) -> None:
     if asked:
-        print(f"avis_ctrl {__version__}")
+        print(f"avis_ctrl {avis_ctrl.__version__}")
         raise typer.Exit()
 
 
