@@ -28,7 +28,7 @@ CUSTOMARY_CORNERS_HZ = (0.1, 100.0)
 TUNING_HZ = np.concatenate([np.geomspace(0.1, 5.0, 20), np.geomspace(5.5, 200.0, 44), [300.0, 400.0]])
 TUNING_SAMPLES = 16
 TUNING_ROUNDS = 6
-TUNING_SLACK = 5e-3
+TUNING_SLACK = 2e-2
 
 
 @dataclass(frozen=True, eq=False)
