@@ -23,7 +23,7 @@ test: lint
 	$(BIN)/pytest -n 2 -m "not slow"
 
 test-slow: lint
-	$(BIN)/pytest -n 2
+	AVIS_EXPLORE=1 $(BIN)/pytest -n 2
 
 demo: $(BIN)/.installed
 	$(BIN)/avis design designs/avis_z_phix.toml --out reports/avis_z_phix

@@ -28,7 +28,11 @@ LIMIT = 1e12
 Number = Annotated[float, Field(ge=-LIMIT, le=LIMIT)]
 Positive = Annotated[float, Field(gt=0, le=LIMIT)]
 NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
+# No table is larger: far points leave no digits for the inertia beside m r^2.
+Length = Annotated[float, Field(ge=-100.0, le=100.0)]
+PositiveLength = Annotated[float, Field(gt=0, le=100.0)]
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Point = Annotated[list[Length], Field(min_length=3, max_length=3)]
 PositiveVector = Annotated[list[Positive], Field(min_length=3, max_length=3)]
 DampingVector = Annotated[list[NotNegative], Field(min_length=3, max_length=3)]
 Axis = Literal["x", "y", "z"]
@@ -45,14 +49,14 @@ class AvisPayload(_Section):
     mass_kg: Positive
     inertia_kgm2: PositiveVector
     inertia_offdiagonal_kgm2: Vector = [0.0, 0.0, 0.0]
-    centre_of_mass_m: Vector
+    centre_of_mass_m: Point
 
 
 class IsolatorSection(_Section):
-    position_m: Vector
+    position_m: Point
     stiffness_N_per_m: PositiveVector
     damping_Ns_per_m: DampingVector
-    chassis_point_m: Vector | None = None
+    chassis_point_m: Point | None = None
 
 
 class MotorSection(_Section):
@@ -100,11 +104,11 @@ class AvisFile(_Section):
 class PlateSection(_Section):
     mass_kg: Positive
     inertia_kgm2: PositiveVector
-    L1_m: Positive
-    L2_m: Positive
-    L3_m: Positive
-    L4_plus_L5_m: Positive
-    L6_m: Number
+    L1_m: PositiveLength
+    L2_m: PositiveLength
+    L3_m: PositiveLength
+    L4_plus_L5_m: PositiveLength
+    L6_m: Length
 
 
 class SuspensionSection(_Section):
@@ -139,9 +143,9 @@ class AccelerometerSection(_Section):
 
 class LoadSection(_Section):
     mass_kg: Positive
-    L7_m: Number
-    L8_m: Number
-    L9_m: Number
+    L7_m: Length
+    L8_m: Length
+    L9_m: Length
     Ixx_total_kgm2: Positive
     Iyy_total_kgm2: Positive
     Izz_total_kgm2: Positive
@@ -203,8 +207,17 @@ def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcy
     else:
         raise InputError("expected the sections of a rig: [[isolator]] (air mounts) or [suspension] (springs)",
                          field="top level", value=sorted(content))
+    _check_mass(rig)
     _check_support(rig)
     return rig
+
+
+def _check_mass(rig: AvisTable | Halcyonics) -> None:
+    """Every motion of the payload has inertia, also in the arithmetic at hand."""
+    M = rig.equations_of_motion().M
+    if not (np.all(np.isfinite(M)) and np.linalg.eigvalsh(M)[0] > 0):
+        raise InputError("expected mass, inertia and centre of mass that make a positive definite mass matrix",
+                         field="payload")
 
 
 def _check_support(rig: AvisTable | Halcyonics) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import avis_ctrl.rigs.rig_file as rig_file
@@ -154,6 +154,7 @@ hostile = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.tex
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.sampled_from(PLACES), hostile, st.booleans(), st.text(max_size=4))
+@example(("avis", ("payload", "centre_of_mass_m", 0)), 1621907, False, "")  # m r^2 had left no digits for J
 def test_any_entry_replaced_by_anything_gives_a_sound_rig_or_one_line(where, value, rename, key):
     name, place = where
     content = copy.deepcopy(CONTENT[name])
