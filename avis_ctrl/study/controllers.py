@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.classical.skyhook import Skyhook, critical_damping
 from avis_ctrl.classical.tuning import Scenarios, TuningRange, tune_skyhook
+from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.robust.hinfsyn import hinfsyn
@@ -99,7 +100,13 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
     motion = plant.full.restricted(plant.floor_velocities, plant.velocities)
     limit = peak_limit
     for round_number in range(TUNING_ROUNDS):
-        loops = tune_skyhook(scenarios, plant.axes, search, band, limit, seed=design.simulation.seed + round_number)
+        try:
+            loops = tune_skyhook(scenarios, plant.axes, search, band, limit, seed=design.simulation.seed + round_number)
+        except ComputationError as error:
+            # Many axes make a search of many dimensions; the study goes on with loops that anyone would try first.
+            classical = classical_skyhook(plant, rig, design)
+            return replace(classical, name="skyhook", title="skyhook, tuned",
+                           notes=(f"critical damping in its place: {error}", *classical.notes))
         found = worst_case_gain(motion.closed(loops.controller()), motion.blocks, slack=TUNING_SLACK)
         if found.upper <= peak_limit:
             break
