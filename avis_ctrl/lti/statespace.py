@@ -127,7 +127,7 @@ class StateSpace:
         omega = np.atleast_1d(np.asarray(omega, dtype=float))
         response = np.broadcast_to(self.D.astype(complex), (omega.size, *self.D.shape)).copy()
         finite = np.isfinite(omega)
-        if self.nstates and np.any(finite):
+        if self.nstates and np.any(finite) and response.size:
             points = np.exp(1j * omega[finite] * self.dt) if self.dt else 1j * omega[finite]
             response[finite] += _resolvent(self.A, self.B, self.C, points)
         return response
