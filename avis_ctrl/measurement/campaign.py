@@ -1,0 +1,238 @@
+"""A measurement campaign: several records of one rig, in memory or on disk.
+
+A record on disk is loaded whole or in pieces, so that one of many gigabytes never has to fit in memory.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+
+Excitation = Literal["multisine", "noise", "rest", "floor"]
+EXCITATIONS: tuple[str, ...] = get_args(Excitation)
+FLOOR_NAMES = ("vx", "vy", "vz")
+
+
+@dataclass(frozen=True)
+class RecordHeader:
+    """What a record says of itself (contract: campaign file).
+
+    Attributes
+    ----------
+    name : such as "00".
+    sample_rate_Hz : of every channel.
+    samples : number of samples.
+    u_names, y_names, floor_names : channels; floor_names is empty where the floor was not measured.
+    u_unit, y_unit, floor_unit : units, "V" for commanded voltages; "V", "m/s", "m/s^2" or "m" for y.
+    excitation : "multisine" (periodic, from rest), "noise", "rest" (u = 0) or "floor" (u = 0, floor shaken).
+    level_V : r.m.s. of the driven voltages, by which records at different levels are told apart.
+    start_s : time of the first sample, on the campaign's clock.
+    period_s : of a periodic record, otherwise None.
+
+    Raises
+    ------
+    InputError : values that contradict each other.
+    """
+
+    name: str
+    sample_rate_Hz: float
+    samples: int
+    u_names: tuple[str, ...]
+    y_names: tuple[str, ...]
+    excitation: str
+    level_V: float = 0.0
+    start_s: float = 0.0
+    period_s: float | None = None
+    u_unit: str = "V"
+    y_unit: str = "V"
+    floor_names: tuple[str, ...] = ()
+    floor_unit: str = "m/s"
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.sample_rate_Hz) and self.sample_rate_Hz > 0):
+            raise InputError("expected a positive sample rate in Hz", field=f"record {self.name}: sample_rate_Hz",
+                             value=self.sample_rate_Hz)
+        if self.samples < 2:
+            raise InputError("expected at least two samples", field=f"record {self.name}", value=self.samples)
+        if self.excitation not in EXCITATIONS:
+            raise InputError(f"expected one of {', '.join(EXCITATIONS)}", field=f"record {self.name}: excitation",
+                             value=self.excitation)
+        for field in ("u_names", "y_names", "floor_names"):
+            names = getattr(self, field)
+            if len(set(names)) != len(names):
+                raise InputError("expected different channel names", field=f"record {self.name}: {field}", value=names)
+        if self.period_s is not None:
+            self._check_period(self.period_s)
+
+    def _check_period(self, period_s: float) -> None:
+        field = f"record {self.name}: period_s"
+        if not (np.isfinite(period_s) and period_s > 0):
+            raise InputError("expected a positive period in s", field=field, value=period_s)
+        count = period_s * self.sample_rate_Hz
+        if abs(count - round(count)) > 1e-6 * count or round(count) < 2:
+            raise InputError(f"expected a whole number of samples; at {self.sample_rate_Hz:g} Hz it is {count:.6g}",
+                             field=field, value=period_s)
+
+    @property
+    def duration_s(self) -> float:
+        return self.samples / self.sample_rate_Hz
+
+    @property
+    def period_samples(self) -> int | None:
+        """Samples in a period; None where the record is not periodic."""
+        return None if self.period_s is None else round(self.period_s * self.sample_rate_Hz)
+
+    @property
+    def periods(self) -> int:
+        """Whole periods; 0 where the record is not periodic."""
+        return self.samples // self.period_samples if self.period_samples else 0
+
+
+class RecordSource(ABC):
+    """A record, wherever it lies."""
+
+    header: RecordHeader
+
+    @abstractmethod
+    def load(self, start: int = 0, stop: int | None = None) -> Record:
+        """Samples start .. stop (end of the record by default) in memory.
+
+        Raises
+        ------
+        InputError : samples that are not finite numbers, a file that ends early.
+        """
+
+    def pieces(self, longest: int) -> Iterator[Record]:
+        """The record in consecutive pieces of at most `longest` samples; periodic ones are cut between periods."""
+        step = longest
+        if period := self.header.period_samples:
+            if period > longest:
+                raise InputError(f"expected periods of at most {longest} samples, to be read in pieces",
+                                 field=f"record {self.header.name}: period_s", value=self.header.period_s)
+            step = longest // period * period
+        for start in range(0, self.header.samples, step):
+            if self.header.samples - start >= 2:
+                yield self.load(start, min(start + step, self.header.samples))
+
+
+@dataclass(frozen=True, eq=False)
+class Record(RecordSource):
+    """A record in memory.
+
+    u : (samples, n_u) commanded volts, held between samples; y : (samples, n_y); floor : (samples, 3) m/s or None.
+    """
+
+    header: RecordHeader
+    u: np.ndarray
+    y: np.ndarray
+    floor: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        h = self.header
+        columns = {"u": h.u_names, "y": h.y_names} | ({} if self.floor is None else {"floor": h.floor_names})
+        for field, names in columns.items():
+            array = np.asarray(getattr(self, field), float)
+            if array.shape != (h.samples, len(names)):
+                raise InputError(f"expected shape {(h.samples, len(names))}: {h.samples} samples of {len(names)} "
+                                 "channels", field=f"record {h.name}: {field}", value=array.shape)
+            if not np.all(np.isfinite(array)):
+                row, column = np.argwhere(~np.isfinite(array))[0]
+                raise InputError(f"expected finite numbers; {np.count_nonzero(~np.isfinite(array))} are not, the first "
+                                 f"at sample {row} of channel {names[column]}", field=f"record {h.name}: {field}",
+                                 value=float(array[row, column]))
+            object.__setattr__(self, field, array)
+        if self.floor is None and h.floor_names:
+            raise InputError("floor channels are named but there are no floor samples", field=f"record {h.name}: floor")
+
+    @property
+    def time(self) -> np.ndarray:
+        """(samples,) s on the campaign's clock."""
+        return self.header.start_s + np.arange(self.header.samples) / self.header.sample_rate_Hz
+
+    def load(self, start: int = 0, stop: int | None = None) -> Record:
+        stop = self.header.samples if stop is None else stop
+        if (start, stop) == (0, self.header.samples):
+            return self
+        header = replace(self.header, samples=stop - start,
+                         start_s=self.header.start_s + start / self.header.sample_rate_Hz)
+        return Record(header, self.u[start:stop], self.y[start:stop],
+                      None if self.floor is None else self.floor[start:stop])
+
+
+@dataclass(frozen=True, eq=False)
+class Campaign:
+    """Records of one rig.
+
+    rig : name of the rig; records : in order; source : file that they came from; notes : what the reader had to
+    assume or repair, one sentence each.
+
+    Raises
+    ------
+    InputError : no record, records of different channels, units or sample rates.
+    """
+
+    rig: str
+    records: tuple[RecordSource, ...]
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.records:
+            raise InputError("expected at least one record", field="records")
+        first = self.records[0].header
+        for record in self.records[1:]:
+            for field in ("sample_rate_Hz", "u_names", "y_names", "u_unit", "y_unit"):
+                if getattr(record.header, field) != getattr(first, field):
+                    raise InputError(f"expected {getattr(first, field)!r} as in record {first.name}",
+                                     field=f"record {record.header.name}: {field}",
+                                     value=getattr(record.header, field))
+
+    @property
+    def sample_rate_Hz(self) -> float:
+        return self.records[0].header.sample_rate_Hz
+
+    @property
+    def u_names(self) -> tuple[str, ...]:
+        return self.records[0].header.u_names
+
+    @property
+    def y_names(self) -> tuple[str, ...]:
+        return self.records[0].header.y_names
+
+    @property
+    def y_unit(self) -> str:
+        return self.records[0].header.y_unit
+
+    def named(self, name: str) -> RecordSource:
+        """The record of that name."""
+        for record in self.records:
+            if record.header.name == name:
+                return record
+        raise InputError(f"expected one of {[r.header.name for r in self.records]}", field="record", value=name)
+
+    def only(self, names: tuple[str, ...]) -> Campaign:
+        """Some of the records."""
+        return replace(self, records=tuple(self.named(name) for name in names))
+
+
+def digest(campaign: Campaign, longest: int = 1 << 20) -> str:
+    """SHA-256 of all headers and samples, for provenance: independent of the file format they came in."""
+    total = hashlib.sha256(campaign.rig.encode())
+    for record in campaign.records:
+        total.update(repr(record.header).encode())
+        for start in range(0, record.header.samples, longest):
+            stop = min(start + longest, record.header.samples)
+            if stop - start < 2:
+                start -= 1
+            piece = record.load(start, stop)
+            for array in (piece.u, piece.y, piece.floor):
+                if array is not None:
+                    total.update(np.ascontiguousarray(array).tobytes())
+    return total.hexdigest()
