@@ -15,7 +15,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 
-Excitation = Literal["multisine", "noise", "rest", "floor"]
+Excitation = Literal["multisine", "noise", "rest", "floor", "sine"]
 EXCITATIONS: tuple[str, ...] = get_args(Excitation)
 FLOOR_NAMES = ("vx", "vy", "vz")
 
@@ -31,7 +31,8 @@ class RecordHeader:
     samples : number of samples.
     u_names, y_names, floor_names : channels; floor_names is empty where the floor was not measured.
     u_unit, y_unit, floor_unit : units, "V" for commanded voltages; "V", "m/s", "m/s^2" or "m" for y.
-    excitation : "multisine" (periodic, from rest), "noise", "rest" (u = 0) or "floor" (u = 0, floor shaken).
+    excitation : "multisine" (periodic, from rest), "noise", "rest" (u = 0), "floor" (u = 0, floor shaken),
+        or "sine" (one frequency; not of the contract, for stepped-sine calibrations).
     level_V : r.m.s. of the driven voltages, by which records at different levels are told apart.
     start_s : time of the first sample, on the campaign's clock.
     period_s : of a periodic record, otherwise None.

@@ -29,13 +29,15 @@ class FrequencyResponse:
     distortion : the part of `noise` that repeats: stochastic nonlinear distortion, where separated; may be indefinite
         by chance where there is none.
     coherence : (n, n_y) multiple coherence where it was computed.
+    entry_variance : (n, n_y, n_u) E|error|^2 of each entry, for files that know no more (coherence, or variances);
+        entries then count as independent, and `noise` and `gram` are None.
     method : how it was estimated, in words.
     """
 
     frequency_Hz: np.ndarray
     value: np.ndarray
-    noise: np.ndarray
-    gram: np.ndarray
+    noise: np.ndarray | None
+    gram: np.ndarray | None
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     input_unit: str = "V"
@@ -44,12 +46,13 @@ class FrequencyResponse:
     measurement_noise: np.ndarray | None = None
     distortion: np.ndarray | None = None
     coherence: np.ndarray | None = None
+    entry_variance: np.ndarray | None = None
     method: str = ""
 
     def __post_init__(self) -> None:
         n, n_y, n_u = len(self.frequency_Hz), len(self.outputs), len(self.inputs)
         shapes = {"value": (n, n_y, n_u), "noise": (n, n_y, n_y), "gram": (n, n_u, n_u),
-                  "measurement_noise": (n, n_y, n_y), "distortion": (n, n_y, n_y), "coherence": (n, n_y)}
+                  "measurement_noise": (n, n_y, n_y), "distortion": (n, n_y, n_y), "coherence": (n, n_y), "entry_variance": (n, n_y, n_u)}
         for field, shape in shapes.items():
             array = getattr(self, field)
             if array is None:
@@ -58,6 +61,9 @@ class FrequencyResponse:
             if array.shape != shape or not np.all(np.isfinite(array)):
                 raise InputError(f"expected finite numbers of shape {shape}", field=field, value=array.shape)
             object.__setattr__(self, field, array)
+        if (self.noise is None or self.gram is None) == (self.entry_variance is None):
+            raise InputError("expected the noise covariance with the inputs' Gram matrix, or variances of the entries",
+                             field="noise, gram, entry_variance")
         frequency = np.asarray(self.frequency_Hz, float)
         if not np.all(np.diff(frequency) > 0):
             raise InputError("expected increasing frequencies", field="frequency_Hz")
@@ -70,8 +76,10 @@ class FrequencyResponse:
 
     def variance(self, part: str = "noise") -> np.ndarray:
         """(n, n_y, n_u) variance E|error|^2 of each entry from `noise`, `measurement_noise` or `distortion`."""
+        if part == "noise" and self.entry_variance is not None:
+            return self.entry_variance
         covariance = getattr(self, part)
-        if covariance is None:
+        if covariance is None or self.gram is None:
             raise InputError("this estimate did not separate noise and distortion", field=part)
         inverse = np.linalg.inv(self.gram)
         rows = np.real(np.einsum("nii->ni", covariance))
@@ -91,6 +99,7 @@ class FrequencyResponse:
         """Some of the lines, by mask or index."""
         def cut(array: np.ndarray | None) -> np.ndarray | None:
             return None if array is None else array[keep]
-        return FrequencyResponse(self.frequency_Hz[keep], self.value[keep], self.noise[keep], self.gram[keep],
+        return FrequencyResponse(self.frequency_Hz[keep], self.value[keep], cut(self.noise), cut(self.gram),
                                  self.inputs, self.outputs, self.input_unit, self.output_unit, self.dof,
-                                 cut(self.measurement_noise), cut(self.distortion), cut(self.coherence), self.method)
+                                 cut(self.measurement_noise), cut(self.distortion), cut(self.coherence),
+                                 cut(self.entry_variance), self.method)
