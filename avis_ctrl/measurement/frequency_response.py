@@ -52,7 +52,8 @@ class FrequencyResponse:
     def __post_init__(self) -> None:
         n, n_y, n_u = len(self.frequency_Hz), len(self.outputs), len(self.inputs)
         shapes = {"value": (n, n_y, n_u), "noise": (n, n_y, n_y), "gram": (n, n_u, n_u),
-                  "measurement_noise": (n, n_y, n_y), "distortion": (n, n_y, n_y), "coherence": (n, n_y), "entry_variance": (n, n_y, n_u)}
+                  "measurement_noise": (n, n_y, n_y), "distortion": (n, n_y, n_y), "coherence": (n, n_y),
+                  "entry_variance": (n, n_y, n_u)}
         for field, shape in shapes.items():
             array = getattr(self, field)
             if array is None:
