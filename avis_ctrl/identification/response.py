@@ -1,0 +1,307 @@
+"""Frequency response of a rig as its records see it, with its derivative by every parameter.
+
+    y = s(w) R (jw)^p { inv(D) F  [u; v_floor; transient] + aliases inv(M) T u },    D = K + jw C - w^2 M
+    F = [ T h(w) a(w),  (K_f + jw C_f) E / jw,  I, jw I ]
+
+R picks the motion along each sensor, s is its chain (geophone with compensation, preamplifier), p the derivative that it
+senses, h hold and delay, a the amplifiers, E the three translations of the floor. The last two blocks of F carry the
+transient of a record that does not start and end alike: whatever momentum and displacement it starts with acts as an
+impulse and a step (real vectors, unknown, found along with the parameters).
+
+Derivatives are analytic: d inv(D)F = inv(D) (dF - dD inv(D) F), with dM, dC, dK, dT of the rig's matrices. These are
+polynomials of at most second degree in each parameter, for which a central difference is exact at any step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.sampling import Motion, aliases, hold
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.converter import Converter
+from avis_ctrl.rigs.geophone import Accelerometer, CompensationFilter, Geophone, SensorChain
+from avis_ctrl.rigs.rig import Parameter, Rig
+
+FLOOR = ("vx", "vy", "vz")
+MOTION_OF_UNIT: dict[str, Motion] = {"m": "displacement", "m/s": "velocity", "m/s^2": "acceleration"}
+_POWER: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
+_MATRICES = ("M", "C", "K", "C_floor", "K_floor", "T")
+N_Q = 6
+
+
+@dataclass(frozen=True, eq=False)
+class SensorModel:
+    """Sensors of a rig: names, what motion each chain takes in, and the chain (unit sensitivity), as a common system.
+
+    chain is None for an ideal sensor. sensitivity : (n_y,) unit of y per unit of motion, in the passband.
+    transient_poles : polynomial coefficients (ascending) of the chain's denominator, [1] without a chain.
+    """
+
+    names: tuple[str, ...]
+    motion: Motion
+    chain: StateSpace | None
+    sensitivity: np.ndarray
+    unit: str
+    sensitivity_unit: str
+    transient_poles: tuple[float, ...] = (1.0,)
+
+
+def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) -> SensorModel:
+    """The rig's sensors as its file describes them ("V"), or ideal ones in m, m/s, m/s^2.
+
+    Raises
+    ------
+    InputError : a unit that is none of these, a rig without sensors, names that it does not have.
+    """
+    known, _ = rig.sensor_rows()
+    chosen = tuple(names) if names is not None else known
+    if missing := [name for name in chosen if name not in known]:
+        raise InputError(f"the sensors of the rig {rig.name} are {', '.join(known)}", field="y names", value=missing)
+    index = [known.index(name) for name in chosen]
+    if unit in MOTION_OF_UNIT:
+        return SensorModel(chosen, MOTION_OF_UNIT[unit], None, np.ones(len(chosen)), unit, f"{unit} per {unit}")
+    if unit != "V":
+        raise InputError(f"expected V, {', '.join(MOTION_OF_UNIT)}", field="unit of y", value=unit)
+    if rig.geophones is not None and rig.acquisition is not None:
+        g, a = rig.geophones, rig.acquisition
+        corners = CompensationFilter(g.suspension_Hz, g.suspension_damping, g.compensated_Hz, g.compensated_damping)
+        converter = Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz)
+        chain = SensorChain(Geophone(g.suspension_Hz, g.suspension_damping, 1.0), corners, 1.0, converter)
+        gain = np.array(g.sensitivity_Vs_per_m)[index] * g.preamplifier_gain
+        poles = np.real(np.poly(corners.poles()))[::-1]
+        return SensorModel(chosen, "velocity", chain.system(), gain, "V", "V s/m", tuple(poles))
+    if rig.accelerometers is not None:
+        acc = rig.accelerometers
+        system = Accelerometer(1.0, acc.low_corner_Hz, 0.0).system()
+        return SensorModel(chosen, "acceleration", system, np.full(len(chosen), acc.sensitivity_Vs2_per_m), "V",
+                           "V s^2/m", (2 * np.pi * acc.low_corner_Hz, 1.0))
+    raise InputError("the rig file describes no sensors", field="geophones, accelerometers")
+
+
+class Matrices(NamedTuple):
+    """Equations of motion and sensor rows; for derivatives with a leading axis of parameters."""
+
+    M: np.ndarray
+    C: np.ndarray
+    K: np.ndarray
+    C_floor: np.ndarray
+    K_floor: np.ndarray
+    T: np.ndarray
+    R: np.ndarray
+
+
+class Driven(NamedTuple):
+    """Y (n, n_y, m) for inputs U, and dY (n_p, n, n_y, m) by the parameters in the model's order."""
+
+    Y: np.ndarray
+    dY: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseModel:
+    """y of a rig by frequency, as a function of its physical parameters.
+
+    Parameters
+    ----------
+    rig : structure, and the values of what is not free.
+    names : free parameters: of `rig.parameters()`, "sensor.NAME" (its sensitivity), "loop_delay_s".
+    sensors : as `sensor_model`. actuators : inputs that records drive, by default all.
+    period_s, delay_s : hold and loop delay; period_s = 0 for responses measured against the voltage itself.
+    amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
+
+    Raises
+    ------
+    InputError : names that the rig does not have.
+    """
+
+    rig: Rig
+    names: tuple[str, ...]
+    sensors: SensorModel
+    actuators: tuple[str, ...]
+    period_s: float
+    delay_s: float
+    amplifier_corner_Hz: float | None = None
+
+    def __post_init__(self) -> None:
+        known = self.all_parameters()
+        if unknown := [name for name in self.names if name not in known]:
+            raise InputError(f"the rig {self.rig.name} has no such parameter; it has {', '.join(known)}",
+                             field="parameters", value=unknown)
+        available = self.rig.equations_of_motion().actuators
+        if missing := [name for name in self.actuators if name not in available]:
+            raise InputError(f"the actuators of the rig {self.rig.name} are {', '.join(available)}", field="u names",
+                             value=missing)
+
+    @staticmethod
+    def of(rig: Rig, names: Sequence[str], unit: str = "V", sensors: Sequence[str] | None = None,
+           actuators: Sequence[str] | None = None, sampled: bool = True,
+           amplifier_corner_Hz: float | None = None) -> ResponseModel:
+        """The model of a rig with its own clock and delay."""
+        driven = tuple(actuators) if actuators is not None else rig.equations_of_motion().actuators
+        return ResponseModel(rig, tuple(names), sensor_model(rig, unit, sensors), driven,
+                             1 / rig.sample_rate_Hz if sampled else 0.0, rig.loop_delay_s if sampled else 0.0,
+                             amplifier_corner_Hz)
+
+    def all_parameters(self) -> dict[str, Parameter]:
+        """Every parameter that could be free."""
+        found = dict(self.rig.parameters())
+        for name, value in zip(self.sensors.names, self.sensors.sensitivity, strict=True):
+            found[f"sensor.{name}"] = Parameter(float(value), self.sensors.sensitivity_unit, f"sensitivity of {name}")
+        found["loop_delay_s"] = Parameter(self.delay_s, "s", "delay from the sample to the actuator voltage")
+        return found
+
+    @property
+    def values(self) -> np.ndarray:
+        """(n_p,) present values of the free parameters."""
+        known = self.all_parameters()
+        return np.array([known[name].value for name in self.names])
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        known = self.all_parameters()
+        return tuple(known[name].unit for name in self.names)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Actuators, then the floor's velocities."""
+        return (*self.actuators, *FLOOR)
+
+    def at(self, theta: Sequence[float] | np.ndarray) -> ResponseModel:
+        """The model with its free parameters at theta (n_p,). Raises InputError where no rig has them."""
+        values = dict(zip(self.names, np.asarray(theta, float).tolist(), strict=True))
+        sensitivity = np.array([values.get(f"sensor.{name}", old) for name, old
+                                in zip(self.sensors.names, self.sensors.sensitivity, strict=True)])
+        delay = values.get("loop_delay_s", self.delay_s)
+        if not 0 <= delay < 1:
+            raise InputError("expected a delay from 0 to 1 s", field="loop_delay_s", value=delay)
+        of_rig = {name: value for name, value in values.items() if name in self.rig.parameters()}
+        return replace(self, rig=self.rig.with_parameters(of_rig), delay_s=delay,
+                       sensors=replace(self.sensors, sensitivity=sensitivity))
+
+    def matrices(self) -> Matrices:
+        """Of the rig as it is, the actuators and sensors of the model."""
+        eom = self.rig.equations_of_motion()
+        known, rows = self.rig.sensor_rows()
+        R = rows[[known.index(name) for name in self.sensors.names]]
+        T = eom.T[:, [eom.actuators.index(name) for name in self.actuators]]
+        return Matrices(eom.M, eom.C, eom.K, eom.C_floor, eom.K_floor, T, R)
+
+    def derivative_matrices(self) -> Matrices:
+        """By each free parameter, (n_p, ...) each; zero for those that are not the rig's."""
+        known = self.rig.parameters()
+        shapes = [(len(self.names), *matrix.shape) for matrix in self.matrices()]
+        found = Matrices(*(np.zeros(shape) for shape in shapes))
+        for j, name in enumerate(self.names):
+            if name in known:
+                value = known[name].value
+                # Exact at any step for polynomials of second degree: a tenth loses no digits.
+                step = 0.1 * abs(value) or 1e-3
+                up, down = (replace(self, rig=self.rig.with_parameters({name: value + sign * step})).matrices()
+                            for sign in (1, -1))
+                for all_of, high, low in zip(found, up, down, strict=True):
+                    all_of[j] = (high - low) / (2 * step)
+        return found
+
+    def response(self, omega: np.ndarray) -> np.ndarray:
+        """G, (n, n_y, n_u + 3): from commanded volts and floor velocity [m/s] to y; omega > 0 [rad/s]."""
+        n, n_in = len(omega), len(self.inputs)
+        return self.driven(omega, np.broadcast_to(np.eye(n_in, dtype=complex), (n, n_in, n_in)), derivative=False).Y
+
+    def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
+        """y for spectra of the inputs, and its derivative by the free parameters.
+
+        U : (n, n_u + 3, m), or (n, n_u + 3 + 12, m) with impulse and step of the transient last.
+        """
+        omega = np.asarray(omega, float)
+        s, mat = 1j * omega[:, None, None], self.matrices()
+        n_u, transient = len(self.actuators), U.shape[1] > len(self.inputs)
+        a, alias = self._drive(omega)
+        volts, floor = U[:, :n_u], U[:, n_u:n_u + 3]
+        D = mat.K + s * mat.C + s ** 2 * mat.M
+        force = mat.T @ (a * volts) + (mat.K_floor[:, :3] / s + mat.C_floor[:, :3]) @ floor
+        if transient:
+            force = force + U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
+        inverse = np.linalg.inv(D)
+        q = inverse @ force
+        out = self._chain(omega) * s ** _POWER[self.sensors.motion]
+        folded = alias * volts * self._passband()
+        S = self.sensors.sensitivity[:, None]
+        Minv = np.linalg.inv(mat.M)
+        # Aliases pass the chain far above its corners.
+        seen = out * (mat.R @ q) + mat.R @ Minv @ mat.T @ folded
+        if not derivative:
+            return Driven(S * seen, np.empty(0))
+        return Driven(S * seen, self._derivative(omega, volts, floor, q, inverse, out, folded, seen, mat, Minv, a))
+
+    def _derivative(self, omega, volts, floor, q, inverse, out, folded, seen, mat, Minv, a) -> np.ndarray:
+        s, d = 1j * omega[:, None, None], self.derivative_matrices()
+        S = self.sensors.sensitivity[:, None]
+        left = S * out * (mat.R @ inverse)
+        folded_q = Minv @ mat.T @ folded
+        dY = np.zeros((len(self.names), *seen.shape), complex)
+        driven = a * volts
+        for j, name in enumerate(self.names):
+            if name.startswith("sensor."):
+                k = self.sensors.names.index(name.removeprefix("sensor."))
+                dY[j, :, k] = seen[:, k]
+            elif name == "loop_delay_s":
+                dY[j] = self._delay_derivative(omega, volts, mat, inverse, out, Minv)
+            else:
+                dY[j] = left @ _force_derivative(d, j, s, q, driven, floor)
+                folding = _nonzero(d.T[j], lambda X: X @ folded) - _nonzero(d.M[j], lambda X: X @ folded_q)
+                if np.ndim(folding):
+                    dY[j] += S * (mat.R @ Minv @ folding)
+                if np.any(d.R[j]):
+                    dY[j] += S * (out * (d.R[j] @ q) + d.R[j] @ folded_q)
+        return dY
+
+    def _delay_derivative(self, omega, volts, mat, inverse, out, Minv) -> np.ndarray:
+        """Of the continuous term exactly; aliases by a difference, for they are small, with a kink at whole samples."""
+        s, step = 1j * omega[:, None, None], 1e-4 * (self.period_s or 1e-3)
+        a, _ = self._drive(omega)
+        earlier, later = max(self.delay_s - step, 0.0), self.delay_s + step
+        slope = (replace(self, delay_s=later)._drive(omega)[1]
+                 - replace(self, delay_s=earlier)._drive(omega)[1]) / (later - earlier) * self._passband()
+        moved = out * (mat.R @ inverse @ mat.T @ (-s * a * volts)) + mat.R @ Minv @ mat.T @ (slope * volts)
+        return self.sensors.sensitivity[:, None] * moved
+
+    def _drive(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Voltage commanded to force divided by T, and the aliases, (n, 1, 1) each."""
+        if self.period_s:
+            a = hold(omega, self.period_s, self.delay_s)
+            folded = aliases(omega, self.period_s, self.delay_s, self.sensors.motion, self.amplifier_corner_Hz)
+        else:
+            a, folded = np.exp(-1j * omega * self.delay_s), np.zeros(len(omega), complex)
+        if self.amplifier_corner_Hz:
+            a = a / (1 + 1j * omega / (2 * np.pi * self.amplifier_corner_Hz))
+        return a[:, None, None], folded[:, None, None]
+
+    def _chain(self, omega: np.ndarray) -> np.ndarray:
+        """(n, 1, 1) the sensors' chain of unit sensitivity."""
+        chain = self.sensors.chain
+        return np.ones((len(omega), 1, 1)) if chain is None else chain.frequency_response(omega)
+
+    def _passband(self) -> float:
+        """The chain far above its corners."""
+        return 1.0 if self.sensors.chain is None else float(self.sensors.chain.D[0, 0])
+
+
+def _force_derivative(d: Matrices, j: int, s, q, driven, floor) -> np.ndarray | float:
+    """dF U - dD q of parameter j; matrices that it does not enter are passed over."""
+    total: np.ndarray | float = 0.0
+    total = total + _nonzero(d.T[j], lambda X: X @ driven)
+    total = total + _nonzero(d.K_floor[j], lambda X: X[:, :3] @ (floor / s))
+    total = total + _nonzero(d.C_floor[j], lambda X: X[:, :3] @ floor)
+    total = total - _nonzero(d.K[j], lambda X: X @ q)
+    total = total - _nonzero(d.C[j], lambda X: X @ (s * q))
+    total = total - _nonzero(d.M[j], lambda X: X @ (s ** 2 * q))
+    return total if np.ndim(total) else np.zeros_like(q)
+
+
+def _nonzero(matrix: np.ndarray, product) -> np.ndarray | float:
+    return product(matrix) if np.any(matrix) else 0.0
