@@ -1,0 +1,79 @@
+"""Phases of a multisine that keep its crest factor low.
+
+The peak is the limit of the p-norm. Guillaume, Schoukens, Pintelon and Kollar (IEEE Trans. Instrum. Meas. 40 (1991),
+pp. 982-989) minimise it for p = 4, 8, 16 .. in turn, each from the answer before. So does this module; their
+Gauss-Newton step is replaced by L-BFGS with the gradient by FFT, because their Jacobian of samples by lines is dense.
+
+Only the samples count: a zero-order hold makes no voltage between them. What a filter behind the hold makes of the
+signal may peak higher.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import minimize
+
+# Exponents of the norm, and steps spent on each.
+EXPONENTS = (4, 8, 16, 32, 64, 128, 256)
+STEPS = 60
+
+
+def crest_factor(u: np.ndarray) -> np.ndarray:
+    """Peak over r.m.s. along the samples, u (..., samples); 0 where the signal is zero."""
+    peak, rms = np.max(np.abs(u), axis=-1), np.sqrt(np.mean(np.square(u), axis=-1))
+    return np.divide(peak, rms, out=np.zeros_like(peak), where=rms > 0)
+
+
+def synthesise(lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray, samples: int) -> np.ndarray:
+    """sum of amplitude cos(2 pi k n / samples + phase) over the lines k, (..., samples) for phase (..., n_lines)."""
+    spectrum = np.zeros((*np.shape(phase)[:-1], samples // 2 + 1), complex)
+    spectrum[..., lines] = 0.5 * samples * amplitude * np.exp(1j * np.asarray(phase))
+    return np.fft.irfft(spectrum, samples)
+
+
+def schroeder_phases(amplitude: np.ndarray) -> np.ndarray:
+    """Phases of Schroeder (IEEE Trans. Inf. Theory 16 (1970), eq. 11) for these line amplitudes, (n_lines,).
+
+    For equal amplitudes -pi k (k - 1) / n; the crest factor is then near 1.7.
+    """
+    power = np.square(amplitude) / np.sum(np.square(amplitude))
+    return -2 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(power)[:-1])])
+
+
+def low_crest_phases(lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray, samples: int,
+                     rotations: np.ndarray | None = None) -> np.ndarray:
+    """Phases near a local minimum of the peak, started from `phase`, (n_lines,).
+
+    rotations : constants [rad] added to all phases in turn; the highest peak of the signals so made is minimised, so
+        that orthogonal experiments, which rotate each input's spectrum, share one set of phases. One signal by default.
+
+    Never worse than the start: the best of the p-norms' answers by peak, the start included.
+    """
+    turns = np.exp(1j * (np.zeros(1) if rotations is None else np.asarray(rotations)))[:, None]
+    best, lowest = phase, np.inf
+
+    def signals(phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        lines_now = amplitude * np.exp(1j * phi) * turns
+        spectrum = np.zeros((len(turns), samples // 2 + 1), complex)
+        spectrum[:, lines] = 0.5 * samples * lines_now
+        return lines_now, np.fft.irfft(spectrum, samples)
+
+    def log_norm(phi: np.ndarray, p: int) -> tuple[float, np.ndarray]:
+        """log of the p-norm over all samples and rotations, and its gradient."""
+        lines_now, u = signals(phi)
+        peak = np.max(np.abs(u))
+        ratio = u / peak
+        power = np.abs(ratio) ** (p - 1)
+        total = np.sum(power * np.abs(ratio))
+        slope = power * np.sign(ratio) / (total * peak)
+        # d u_n / d phi_k = Re(j A_k exp(j phi_k) exp(2 pi j k n / N))
+        gradient = np.real(1j * lines_now * np.conj(np.fft.rfft(slope)[:, lines])).sum(axis=0)
+        return float(np.log(peak) + np.log(total / u.size) / p), gradient
+
+    for p in (0, *EXPONENTS):
+        if p:
+            phase = minimize(log_norm, phase, args=(p,), jac=True, method="L-BFGS-B", options={"maxiter": STEPS}).x
+        peak = float(np.max(np.abs(signals(phase)[1])))
+        if peak < lowest:
+            best, lowest = phase, peak
+    return best

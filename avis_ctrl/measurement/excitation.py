@@ -1,0 +1,350 @@
+"""Signals to drive a rig with: random-phase multisines for several inputs, and band-limited noise.
+
+A multisine is a sum of cosines at whole multiples of 1/period. Over whole periods it does not leak, and what is
+measured at the lines that it leaves out is noise or nonlinear distortion (Pintelon and Schoukens, System
+Identification, 2nd ed., 2012, chapters 4 and 5). Several inputs are told apart in one of two ways:
+
+orthogonal : n_u experiments with U(k) = diag(A(k) exp(j phi(k))) T, T an orthogonal matrix with entries of modulus one
+    (Dobrowiecki and Schoukens, Automatica 43 (2007), pp. 38-46): every input drives every line with its own amplitude
+    in every experiment. T is Hadamard's where n_u is a power of two, and the DFT's otherwise.
+zippered : one experiment, the lines dealt out to the inputs in turn; each realisation deals them one place further, so
+    that n_u realisations give every line to every input once.
+
+Crest factor. T fixes only how the spectra of one input relate between experiments; the phases phi of each input are
+free, and orthogonality does not depend on them. With Hadamard's T an input repeats itself up to sign, so that one
+optimisation serves all experiments at no loss. With the DFT's T it is turned by a constant phase from one to the next,
+and the highest peak of all turns is minimised: about 1.55 to 1.6 for flat spectra, where one signal alone reaches 1.4.
+
+The optimised signals are no longer Gaussian in distribution: the best linear approximation of a nonlinear rig, which
+depends on the distribution, is then that for signals of this kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, get_args
+
+import numpy as np
+from scipy.linalg import dft, hadamard
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.crest_factor import crest_factor, low_crest_phases, synthesise
+
+Lines = Literal["full", "odd", "odd_detection"]
+Scheme = Literal["orthogonal", "zippered"]
+# Relative amplitude of the lines: at frequencies [Hz], or one number a line.
+Shape = Callable[[np.ndarray], np.ndarray] | Sequence[float] | np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitationSignals:
+    """Voltages to play.
+
+    Attributes
+    ----------
+    kind : "multisine" (one period each, to be repeated) or "noise".
+    u : (records, samples, n_u) V, held between samples.
+    period_s : of a multisine, otherwise None.
+    line_Hz : (n_lines,) excited lines, over all inputs; empty for noise.
+    detection_Hz : lines of the grid inside the band that were left out at random.
+    limit_V : largest voltage allowed.
+    crest_before : (records, n_u) crest factor with the phases first drawn.
+    settings : everything that the signals were made from, seed included; plain values.
+    """
+
+    kind: str
+    inputs: tuple[str, ...]
+    sample_rate_Hz: float
+    u: np.ndarray
+    period_s: float | None
+    line_Hz: np.ndarray
+    detection_Hz: np.ndarray
+    limit_V: float
+    crest_before: np.ndarray
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def rms_V(self) -> np.ndarray:
+        """(records, n_u)"""
+        return np.sqrt(np.mean(self.u ** 2, axis=1))
+
+    @property
+    def peak_V(self) -> np.ndarray:
+        """(records, n_u)"""
+        return np.max(np.abs(self.u), axis=1)
+
+    @property
+    def crest(self) -> np.ndarray:
+        """(records, n_u) peak over r.m.s. as designed."""
+        return crest_factor(np.moveaxis(self.u, 1, -1))
+
+    def scaled_to(self, rms_V: float) -> ExcitationSignals:
+        """The same signals at another level: the r.m.s. of every input.
+
+        Raises
+        ------
+        InputError : a level that needs more than limit_V; it names the largest possible.
+        """
+        _positive(rms_V, "rms_V")
+        largest = largest_rms(self.crest, self.limit_V)
+        if rms_V > largest * (1 + 1e-12):
+            raise InputError(f"expected at most {largest:.6g} V r.m.s.: with a crest factor of "
+                             f"{self.limit_V / largest:.3f} more would exceed the limit of {self.limit_V:g} V",
+                             field="rms_V", value=rms_V)
+        return _replaced(self, self.u * np.divide(rms_V, self.rms_V[:, None, :]), rms_V)
+
+    def scaled_to_limit(self) -> ExcitationSignals:
+        """The same signals at the largest common r.m.s. that limit_V allows."""
+        return self.scaled_to(largest_rms(self.crest, self.limit_V))
+
+
+def _replaced(signals: ExcitationSignals, u: np.ndarray, rms_V: float) -> ExcitationSignals:
+    values = {one.name: getattr(signals, one.name) for one in fields(signals)}
+    # Round-off must not put the peak beyond the limit.
+    u = np.clip(u, -signals.limit_V, signals.limit_V)
+    return ExcitationSignals(**(values | {"u": u, "settings": signals.settings | {"rms_V": float(rms_V)}}))
+
+
+def largest_rms(crest: np.ndarray, limit_V: float) -> float:
+    """The common r.m.s. at which the highest peak reaches the limit."""
+    return float(limit_V / np.max(crest))
+
+
+@dataclass(frozen=True)
+class MultisineSettings:
+    """What a multisine is asked to be.
+
+    Attributes
+    ----------
+    inputs : names of the drives, in order.
+    sample_rate_Hz, period_s : their product a whole number of samples.
+    band_Hz : lowest and highest frequency, ends included; the highest below half the sample rate.
+    limit_V : largest voltage.
+    rms_V : r.m.s. of every input; None for as much as the limit allows.
+    lines : "full" every line, "odd" odd ones only, "odd_detection" odd ones of which in each group of consecutive ones
+        one at random is left out.
+    spacing : the lines are multiples (odd multiples) of spacing/period; the lines between show noise.
+    group : odd lines in a group, of which one is left out.
+    scheme : how the inputs are told apart, see above.
+    realisations : independent draws of the phases; the lines are the same in all.
+    shape : relative amplitude, a function of Hz, or one number for each line that is excited; flat when None.
+    compensate_hold : divide the amplitudes by the sinc of the zero-order hold, so that the held voltage, not its
+        samples, has the shape asked.
+    low_crest : minimise the crest factor; False keeps the phases drawn.
+    seed : of all that is random.
+
+    Raises
+    ------
+    InputError : a value out of its range, a band without lines.
+    """
+
+    inputs: tuple[str, ...]
+    sample_rate_Hz: float
+    period_s: float
+    band_Hz: tuple[float, float]
+    limit_V: float
+    rms_V: float | None = None
+    lines: Lines = "full"
+    spacing: int = 1
+    group: int = 4
+    scheme: Scheme = "orthogonal"
+    realisations: int = 1
+    shape: Shape | None = None
+    compensate_hold: bool = False
+    low_crest: bool = True
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        for name in ("sample_rate_Hz", "period_s", "limit_V"):
+            _positive(getattr(self, name), name)
+        if self.rms_V is not None:
+            _positive(self.rms_V, "rms_V")
+        samples = self.period_s * self.sample_rate_Hz
+        if abs(samples - round(samples)) > 1e-6 * samples or round(samples) < 4:
+            raise InputError(f"expected a whole number of samples, at least 4; at {self.sample_rate_Hz:g} Hz it is "
+                             f"{samples:.6g}", field="period_s", value=self.period_s)
+        _check_band(self.band_Hz, self.sample_rate_Hz)
+        for name, known in (("lines", get_args(Lines)), ("scheme", get_args(Scheme))):
+            if getattr(self, name) not in known:
+                raise InputError(f"expected one of {', '.join(known)}", field=name, value=getattr(self, name))
+        for name, least in (("spacing", 1), ("group", 2), ("realisations", 1), ("seed", 0)):
+            _whole(getattr(self, name), name, least)
+
+    @property
+    def samples(self) -> int:
+        """In a period."""
+        return round(self.period_s * self.sample_rate_Hz)
+
+    def grid(self) -> np.ndarray:
+        """(n,) numbers of the lines inside the band, those of detection included."""
+        low, high = (frequency * self.period_s for frequency in self.band_Hz)
+        k = np.arange(int(np.ceil(low * (1 - 1e-9))), int(np.floor(high * (1 + 1e-9))) + 1)
+        k = k[(k > 0) & (k % self.spacing == 0) & (2 * k < self.samples)]
+        return k if self.lines == "full" else k[(k // self.spacing) % 2 == 1]
+
+
+def multisine(settings: MultisineSettings) -> ExcitationSignals:
+    """The signals asked for: n_u records a realisation when orthogonal, one when zippered.
+
+    Raises
+    ------
+    InputError : a band that leaves an input without lines, a shape that does not fit or is not positive, a level
+        beyond the limit.
+    """
+    rng, n_u, N = np.random.default_rng(settings.seed), len(settings.inputs), settings.samples
+    lines, detection = choose_lines(settings, rng)
+    shape = _shape(settings, lines)
+    amplitude = shape / np.sinc(lines / N) if settings.compensate_hold else shape
+    plain = _plain(settings) | {"shape": None if settings.shape is None else shape.tolist()}
+    T = orthogonal_matrix(n_u) if settings.scheme == "orthogonal" else np.ones((1, 1))
+    u, before = [], []
+    for r in range(settings.realisations):
+        record, drawn = np.zeros((len(T), N, n_u)), np.zeros((len(T), N, n_u))
+        for i in range(n_u):
+            own = slice(None) if settings.scheme == "orthogonal" else slice((i + r) % n_u, None, n_u)
+            turns = np.angle(T[:, i]) if settings.scheme == "orthogonal" else np.zeros(1)
+            record[:, :, i], drawn[:, :, i] = _one_input(lines[own], amplitude[own], turns, N, settings.low_crest, rng)
+        u.append(record)
+        before.append(drawn)
+    return _finished(ExcitationSignals(
+        "multisine", settings.inputs, settings.sample_rate_Hz, np.concatenate(u), settings.period_s,
+        lines / settings.period_s, detection / settings.period_s, settings.limit_V,
+        crest_factor(np.moveaxis(np.concatenate(before), 1, -1)), plain), settings.rms_V)
+
+
+def _one_input(lines: np.ndarray, amplitude: np.ndarray, turns: np.ndarray, samples: int, low_crest: bool,
+               rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """(experiments, samples) of one input of unit r.m.s., with low crest factor, and as first drawn."""
+    amplitude = amplitude / np.sqrt(np.sum(amplitude ** 2) / 2)
+    drawn = rng.uniform(0, 2 * np.pi, lines.size)
+    # Half a turn is a change of sign, which changes no peak.
+    different = np.unique(np.round(turns % np.pi, 9) % np.round(np.pi, 9))
+    phase = low_crest_phases(lines, amplitude, drawn, samples, different) if low_crest else drawn
+    return (synthesise(lines, amplitude, phase + turns[:, None], samples),
+            synthesise(lines, amplitude, drawn + turns[:, None], samples))
+
+
+def choose_lines(settings: MultisineSettings, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the excited lines and of the detection lines, ascending."""
+    grid = settings.grid()
+    left_out = np.zeros(grid.size, bool)
+    if settings.lines == "odd_detection":
+        # A last group that is not full keeps all its lines.
+        starts = np.arange(0, grid.size - settings.group + 1, settings.group)
+        left_out[starts + rng.integers(settings.group, size=starts.size)] = True
+    lines = grid[~left_out]
+    least = len(settings.inputs) if settings.scheme == "zippered" else 1
+    if lines.size < least:
+        raise InputError(f"expected a band with at least {least} lines {settings.spacing / settings.period_s:g} Hz "
+                         f"apart ({settings.lines}); it has {lines.size}", field="band_Hz", value=settings.band_Hz)
+    return lines, grid[left_out]
+
+
+def orthogonal_matrix(n: int) -> np.ndarray:
+    """(n, n), T T^H = n I, entries of modulus one: Hadamard's for a power of two, otherwise the DFT's."""
+    return hadamard(n).astype(float) if n & (n - 1) == 0 else dft(n)
+
+
+def _shape(settings: MultisineSettings, lines: np.ndarray) -> np.ndarray:
+    """(n_lines,) relative amplitudes."""
+    shape = np.ones(lines.size) if settings.shape is None else settings.shape
+    amplitude = np.asarray(shape(lines / settings.period_s) if callable(shape) else shape, float)
+    if amplitude.shape != lines.shape or not (np.all(np.isfinite(amplitude)) and np.all(amplitude > 0)):
+        raise InputError(f"expected {lines.size} finite, positive amplitudes, one for each excited line", field="shape",
+                         value=f"array of shape {amplitude.shape}")
+    return amplitude
+
+
+@dataclass(frozen=True)
+class NoiseSettings:
+    """Gaussian noise, flat inside band_Hz and nothing outside it; as in `MultisineSettings`.
+
+    records : independent ones; duration_s : of each.
+    """
+
+    inputs: tuple[str, ...]
+    sample_rate_Hz: float
+    duration_s: float
+    band_Hz: tuple[float, float]
+    limit_V: float
+    rms_V: float | None = None
+    records: int = 1
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        for name in ("sample_rate_Hz", "duration_s", "limit_V"):
+            _positive(getattr(self, name), name)
+        if self.rms_V is not None:
+            _positive(self.rms_V, "rms_V")
+        _check_band(self.band_Hz, self.sample_rate_Hz)
+        _whole(self.records, "records", 1)
+        _whole(self.seed, "seed", 0)
+
+
+def noise(settings: NoiseSettings) -> ExcitationSignals:
+    """Independent noise in every input and record, made by its Fourier lines, so that its band has sharp ends.
+
+    Raises
+    ------
+    InputError : a record too short to have a line inside the band, a level beyond the limit (noise peaks at 4 to 5
+        times its r.m.s.).
+    """
+    rng, N = np.random.default_rng(settings.seed), round(settings.duration_s * settings.sample_rate_Hz)
+    if N < 4:
+        raise InputError("expected at least 4 samples", field="duration_s", value=settings.duration_s)
+    u = np.array([band_limited(N, settings.sample_rate_Hz, settings.band_Hz, len(settings.inputs), rng)
+                  for _ in range(settings.records)])
+    u = u / np.sqrt(np.mean(u ** 2, axis=1, keepdims=True))
+    return _finished(ExcitationSignals("noise", settings.inputs, settings.sample_rate_Hz, u, None, np.zeros(0),
+                                       np.zeros(0), settings.limit_V, crest_factor(np.moveaxis(u, 1, -1)),
+                                       _plain(settings)), settings.rms_V)
+
+
+def band_limited(samples: int, sample_rate_Hz: float, band_Hz: tuple[float, float], channels: int,
+                 rng: np.random.Generator) -> np.ndarray:
+    """(samples, channels) independent Gaussian noise of unit variance, flat inside the band, zero outside it."""
+    frequency = np.fft.rfftfreq(samples, 1 / sample_rate_Hz)
+    inside = (frequency >= band_Hz[0] * (1 - 1e-9)) & (frequency <= band_Hz[1] * (1 + 1e-9)) & (frequency > 0)
+    inside &= 2 * np.arange(frequency.size) < samples
+    if not np.any(inside):
+        raise InputError(f"expected a band with a multiple of 1/duration = {sample_rate_Hz / samples:.4g} Hz inside",
+                         field="band_Hz", value=band_Hz)
+    spectrum = np.zeros((frequency.size, channels), complex)
+    draw = rng.standard_normal((2, np.count_nonzero(inside), channels))
+    spectrum[inside] = (draw[0] + 1j * draw[1]) * samples / (2 * np.sqrt(np.count_nonzero(inside)))
+    return np.fft.irfft(spectrum, samples, axis=0)
+
+
+def _finished(signals: ExcitationSignals, rms_V: float | None) -> ExcitationSignals:
+    return signals.scaled_to_limit() if rms_V is None else signals.scaled_to(rms_V)
+
+
+def _plain(settings: MultisineSettings | NoiseSettings) -> dict[str, Any]:
+    """Settings as numbers, strings and lists, for files; a shape is left to the caller."""
+    values = {one.name: getattr(settings, one.name) for one in fields(settings)}
+    return values | {"inputs": list(settings.inputs), "band_Hz": [float(f) for f in settings.band_Hz]}
+
+
+def _check_inputs(inputs: tuple[str, ...]) -> None:
+    if not inputs or len(set(inputs)) != len(inputs):
+        raise InputError("expected different names of at least one drive", field="inputs", value=inputs)
+
+
+def _check_band(band_Hz: tuple[float, float], sample_rate_Hz: float) -> None:
+    if len(band_Hz) != 2 or not (np.all(np.isfinite(band_Hz)) and 0 < band_Hz[0] <= band_Hz[1] < sample_rate_Hz / 2):
+        raise InputError(f"expected two frequencies above 0 and below half the sample rate ({sample_rate_Hz / 2:g} "
+                         "Hz), the lower one first", field="band_Hz", value=tuple(band_Hz))
+
+
+def _positive(value: float, name: str) -> None:
+    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if not (number and np.isfinite(value) and value > 0):
+        raise InputError("expected a finite number greater than zero", field=name, value=value)
+
+
+def _whole(value: int, name: str, least: int) -> None:
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
+        raise InputError(f"expected a whole number, {least} or more", field=name, value=value)

@@ -1,0 +1,82 @@
+"""Signals to play on a rig as files: HDF5, CSV or MATLAB .mat (v5). Every file carries seed and settings."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+from scipy.io import savemat
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.excitation import ExcitationSignals
+
+SUFFIXES = (".h5", ".hdf5", ".csv", ".mat")
+# A variable of a .mat file of version 5 holds less than 2^31 bytes.
+MAT5_BYTES = 2 ** 31
+
+
+def write_signals(signals: ExcitationSignals, path: str | Path, periods: int = 1, rig: str = "") -> None:
+    """Write all records; a multisine is repeated `periods` times.
+
+    .h5, .hdf5 : as a campaign without y: /records/NN/u with the campaign's attributes; at the top format =
+        "avis-excitation", version = 1, seed, and settings as JSON.
+    .csv : lines "# key = value" of settings, a header record,time_s,DRIVE.., and one line a sample.
+    .mat : u (samples, drives, records), names, sample_rate_Hz, period_s, level_V, seed, settings (JSON).
+
+    Raises
+    ------
+    InputError : another suffix, a number of periods below one (or other than one for noise), a file that cannot be
+        written, too many samples for .mat.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"expected a file name that ends in {', '.join(SUFFIXES)}", file=path)
+    if not isinstance(periods, (int, np.integer)) or periods < 1 or (periods > 1 and signals.period_s is None):
+        raise InputError("expected a whole number, 1 or more (noise is not periodic: 1)", field="periods",
+                         value=periods)
+    u = np.tile(signals.u, (1, int(periods), 1))
+    writer = {".csv": _write_csv, ".mat": _write_mat}.get(path.suffix.lower(), _write_hdf5)
+    try:
+        writer(signals, u, path, rig)
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror or error}", file=path) from None
+
+
+def _write_hdf5(signals: ExcitationSignals, u: np.ndarray, path: Path, rig: str) -> None:
+    with h5py.File(path, "w") as file:
+        file.attrs.update({"format": "avis-excitation", "version": 1, "rig": rig,
+                           "seed": signals.settings.get("seed", 0), "settings": json.dumps(signals.settings)})
+        for k, (record, level) in enumerate(zip(u, signals.rms_V, strict=True)):
+            group = file.create_group(f"records/{k:02d}")
+            group.attrs.update({"sample_rate_Hz": signals.sample_rate_Hz, "excitation": signals.kind,
+                                "level_V": float(np.sqrt(np.mean(level ** 2))),
+                                "start_s": k * len(record) / signals.sample_rate_Hz})
+            if signals.period_s is not None:
+                group.attrs["period_s"] = signals.period_s
+            volts = group.create_dataset("u", data=record)
+            volts.attrs.update({"names": list(signals.inputs), "unit": "V"})
+
+
+def _write_csv(signals: ExcitationSignals, u: np.ndarray, path: Path, rig: str) -> None:
+    settings = {"rig": rig, "excitation": signals.kind, "period_s": signals.period_s, **signals.settings}
+    time = np.arange(u.shape[1]) / signals.sample_rate_Hz
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"# {key} = {json.dumps(value)}\n" for key, value in settings.items())
+        file.write(",".join(["record", "time_s", *signals.inputs]) + "\n")
+        for k, record in enumerate(u):
+            rows = zip(time.tolist(), record.tolist(), strict=True)
+            file.writelines(f"{k},{t!r},{','.join(map(repr, row))}\n" for t, row in rows)
+
+
+def _write_mat(signals: ExcitationSignals, u: np.ndarray, path: Path, rig: str) -> None:
+    if u.nbytes >= MAT5_BYTES:
+        raise InputError(f"expected less than {MAT5_BYTES / 2 ** 30:g} GiB in a .mat file; write .h5 instead",
+                         file=path, field="u", value=f"{u.nbytes / 2 ** 30:.1f} GiB")
+    content = {"u": np.moveaxis(u, 0, -1), "names": np.array(signals.inputs, object), "rig": rig,
+               "sample_rate_Hz": signals.sample_rate_Hz,
+               "period_s": np.nan if signals.period_s is None else signals.period_s, "excitation": signals.kind,
+               "level_V": signals.rms_V, "seed": signals.settings.get("seed", 0),
+               "settings": json.dumps(signals.settings)}
+    savemat(path, content, do_compression=True, appendmat=False)
