@@ -325,6 +325,7 @@ def _finished(signals: ExcitationSignals, rms_V: float | None) -> ExcitationSign
 def _plain(settings: MultisineSettings | NoiseSettings) -> dict[str, Any]:
     """Settings as numbers, strings and lists, for files; a shape is left to the caller."""
     values = {one.name: getattr(settings, one.name) for one in fields(settings)}
+    values = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
     return values | {"inputs": list(settings.inputs), "band_Hz": [float(f) for f in settings.band_Hz]}
 
 

@@ -59,6 +59,8 @@ def digital_controller(loop: SampledLoop) -> StateSpace:
     """Sensor volts to demanded drive volts, sampled: what the processor computes, limits aside."""
     rig, bank, T = loop.rig, loop.sensors, loop.period_s
     names = (*loop.axes, *loop.loops)
+    if not names:  # nothing is controlled, and nothing need be told apart by the sensors
+        return gain(np.zeros((loop.n_drives, len(bank.chains))), dt=T)
     arms = lever_arms(rig)[[COORDINATES.index(name) for name in names]]
     decoding = arms[:, None] * sensor_axes(rig, names).decoding / bank.gain_V
     # A force F at the edge is a moment of arm times F.

@@ -114,14 +114,14 @@ def _sense_and_control(arrays, work, noise, adc, sensed_row):
 
 
 @njit(cache=True)
-def _demand(work, step, limit_V, demanded_row):
-    """Puts the limited voltages on their way; without delay they act at once."""
+def _demand(work, step, drive, limit_V, demanded_row):
+    """Puts the limited voltages, the controller's and `drive` (n_u,), on their way; without delay they act at once."""
     n_u, delay = work.u.shape[0], work.line.shape[0] - 1
     n_c = work.controlled.shape[0] - n_u
     slot = (step + delay) % (delay + 1)
     for i in range(n_u):
-        demanded_row[i] = work.controlled[n_c + i]
-        work.line[slot, i] = min(max(work.controlled[n_c + i], -limit_V), limit_V)
+        demanded_row[i] = work.controlled[n_c + i] + drive[i]
+        work.line[slot, i] = min(max(demanded_row[i], -limit_V), limit_V)
         if delay == 0:
             work.u[i] = work.line[slot, i]
 
@@ -150,10 +150,10 @@ def _gone(x, far):
 
 
 @njit(cache=True)
-def run(arrays, work, floor, noise, substeps, nonlinear, acceleration, adc, limit_V, far, records):
+def run(arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, adc, limit_V, far, records):
     """Steps through the control periods; returns how many were completed when the table left its range, or all.
 
-    floor : (n + 1, 6) floor velocity at the samples; noise : (n, n_s) V.
+    floor : (n + 1, 6) floor velocity at the samples; noise : (n, n_s) V; drive : (n, n_u) V on top of the controller's.
     substeps : steps a period. nonlinear : the table's; acceleration : what the sensors see, which needs N first.
     adc : (lsb, lower, upper) V, lsb = 0 for none. far : (m, rad) beyond which the table has diverged.
     """
@@ -169,7 +169,7 @@ def run(arrays, work, floor, noise, substeps, nonlinear, acceleration, adc, limi
                 _excess(arrays, work)
             if j == 0:
                 _sense_and_control(arrays, work, noise[k], adc, records.sensed[k])
-                _demand(work, step, limit_V, records.demanded[k])
+                _demand(work, step, drive[k], limit_V, records.demanded[k])
                 _put(records.volts[k], 0, work.u)
                 _put(records.q[k], 0, work.x[:6])
                 _put(records.q_dot[k], 0, work.x[6:12])

@@ -73,7 +73,7 @@ def floor_velocity(loop: SampledLoop, samples: int, rng: np.random.Generator) ->
 
 def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int, ...] = 1, *, settle_s: float = 10.0,
              nonlinear: bool = True, extra_substeps: int = 1, floor: np.ndarray | None = None,
-             initial: np.ndarray | None = None) -> SimulationRecord:
+             initial: np.ndarray | None = None, drive: np.ndarray | None = None) -> SimulationRecord:
     """Run the loop and keep the last `duration_s`.
 
     Parameters
@@ -84,6 +84,8 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
     extra_substeps : divides each step further, to see what the step costs.
     floor : (n + 1, 6) floor velocities in place of a realisation, n samples in all.
     initial : (12,) q and q' at the start.
+    drive : (n, n_u) volts added to what the controller demands, before the limit; n samples in all, those of
+        `settle_s` included. Zero by default.
 
     Raises
     ------
@@ -98,6 +100,9 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
     if floor.shape != (samples + 1, 6):
         raise InputError(f"expected floor velocities of shape {(samples + 1, 6)}", field="floor", value=floor.shape)
     n_s, n_u = len(loop.sensors.chains), loop.n_drives
+    drive = np.zeros((samples, n_u)) if drive is None else np.ascontiguousarray(drive, float)
+    if drive.shape != (samples, n_u) or not np.all(np.isfinite(drive)):
+        raise InputError(f"expected finite voltages of shape {(samples, n_u)}", field="drive", value=drive.shape)
     noise = rng.standard_normal((samples, n_s)) * loop.sensors.noise_rms_V
     state = np.zeros(linear_part(loop).nstates)
     if initial is not None:
@@ -107,7 +112,7 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
     records = kernel.Records(*(np.empty((samples, width)) for width in (6, 6, n_u, n_u, n_s)))
     arrays = step_arrays(loop, extra_substeps)
     work = kernel.workspace(arrays, state, loop.delay_substeps * extra_substeps)
-    done = kernel.run(arrays, work, floor, noise, loop.substeps * extra_substeps, nonlinear,
+    done = kernel.run(arrays, work, floor, noise, drive, loop.substeps * extra_substeps, nonlinear,
                       loop.sensors.quantity == "acceleration", adc, loop.limit_V, STOPS, records)
     kept = slice(min(settle, done - 1), done)
     q, q_dot, volts, demanded, sensed = (record[kept].copy() for record in records)
