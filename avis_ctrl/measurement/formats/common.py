@@ -1,0 +1,256 @@
+"""What all readers of measurement files share: tolerant fields, units, and one clear line for every damage."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, RecordHeader
+
+STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3
+# Label -> (SI unit, factor to it).
+UNITS: dict[str, tuple[str, float]] = {
+    "V": ("V", 1.0), "Volt": ("V", 1.0), "Volts": ("V", 1.0), "mV": ("V", 1e-3), "uV": ("V", 1e-6), "kV": ("V", 1e3),
+    "m": ("m", 1.0), "cm": ("m", 1e-2), "mm": ("m", 1e-3), "um": ("m", 1e-6), "nm": ("m", 1e-9), "in": ("m", 0.0254),
+    "m/s": ("m/s", 1.0), "cm/s": ("m/s", 1e-2), "mm/s": ("m/s", 1e-3), "um/s": ("m/s", 1e-6), "nm/s": ("m/s", 1e-9),
+    "in/s": ("m/s", 0.0254),
+    "m/s^2": ("m/s^2", 1.0), "cm/s^2": ("m/s^2", 1e-2), "mm/s^2": ("m/s^2", 1e-3), "um/s^2": ("m/s^2", 1e-6),
+    "g": ("m/s^2", STANDARD_GRAVITY), "gn": ("m/s^2", STANDARD_GRAVITY), "in/s^2": ("m/s^2", 0.0254),
+    "N": ("N", 1.0), "mN": ("N", 1e-3), "kN": ("N", 1e3), "lbf": ("N", 4.4482216152605),
+}
+INPUT_UNITS, OUTPUT_UNITS, FLOOR_UNITS = ("V", "N"), ("V", "m/s", "m/s^2", "m"), ("m/s",)
+ALLOWED = {"u": INPUT_UNITS, "y": OUTPUT_UNITS, "floor": FLOOR_UNITS}
+
+# What a library may raise over a damaged file; anything else is our own mistake and must be seen.
+DAMAGE = (OSError, EOFError, KeyError, IndexError, AttributeError, ValueError, TypeError, RuntimeError, OverflowError,
+          NotImplementedError, AssertionError, UnicodeError, struct.error, zlib.error)
+
+
+def short(error: BaseException) -> str:
+    """First line of a library's message, cut to a readable length."""
+    lines = str(error).strip().splitlines()
+    text = lines[0] if lines else type(error).__name__
+    return text if len(text) <= 140 else text[:137] + "..."
+
+
+@contextmanager
+def reading(path: object, what: str = "the file") -> Iterator[None]:
+    """Every failure inside as one InputError that names the file."""
+    try:
+        yield
+    except InputError as error:
+        if error.file is not None:
+            raise
+        raise error.in_file(path) from None
+    except MemoryError:
+        raise InputError("the sizes it states do not fit in memory; damaged, or to be read in smaller pieces",
+                         file=path) from None
+    except DAMAGE as error:
+        raise InputError(f"{what} cannot be read; damaged or cut short? ({short(error)})", file=path) from error
+
+
+def existing_file(path: str | Path) -> Path:
+    """The path, if something readable lies there.
+
+    Raises
+    ------
+    InputError : no such file, a directory, an empty file, no permission.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir():
+            raise InputError("expected a file, found a directory", file=path)
+        with path.open("rb") as stream:
+            if not stream.read(1):
+                raise InputError("the file is empty (0 bytes)", file=path)
+    except FileNotFoundError:
+        raise InputError("no such file", file=path) from None
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"cannot be opened ({short(error)})", file=path) from None
+    return path
+
+
+def _single(value: Any) -> Any:
+    """A value that files store as a scalar, a 0-d array or an array of one."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        array = np.asarray(value)
+        return array.reshape(-1)[0].item() if array.size == 1 and array.dtype.names is None else value
+    if isinstance(value, (list, tuple)) and len(value) == 1:
+        return _single(value[0])
+    return value
+
+
+def brief(value: Any) -> Any:
+    """The value as a message may show it."""
+    if isinstance(value, np.ndarray):
+        return f"array of shape {value.shape}, {value.dtype}"
+    return value if len(repr(value)) <= 80 else repr(value)[:77] + "..."
+
+
+def as_number(value: Any, field: str) -> float:
+    """A finite real number from whatever holds one."""
+    single = _single(value)
+    if isinstance(single, bool) or not isinstance(single, (int, float)):
+        raise InputError("expected one number", field=field, value=brief(single))
+    try:
+        number = float(single)
+    except OverflowError:
+        number = np.inf
+    if not np.isfinite(number):
+        raise InputError("expected a finite number", field=field, value=number)
+    return number
+
+
+def as_text(value: Any, field: str) -> str:
+    """A text from str or bytes, bare or in an array of one."""
+    single = _single(value)
+    if isinstance(single, bytes):
+        single = single.decode("utf-8", "replace")
+    if not isinstance(single, str):
+        raise InputError("expected a text", field=field, value=brief(single))
+    return single.strip().rstrip("\0").strip()
+
+
+def as_names(value: Any, field: str, count: int | None = None) -> tuple[str, ...]:
+    """Channel names from an array or list of str or bytes, or one text (separated by commas for several).
+
+    count : number of channels, where known.
+    """
+    if isinstance(value, np.ndarray):
+        value = value.reshape(-1).tolist()
+    if isinstance(value, (list, tuple)):
+        names = tuple(as_text(item, field) for item in value)
+    else:
+        text = as_text(value, field)
+        names = (text,) if count == 1 else tuple(part.strip() for part in text.split(","))
+    if not all(names):
+        raise InputError("expected no empty name", field=field, value=names)
+    if count is not None and len(names) != count:
+        raise InputError(f"expected {count} names, one per channel; there are {len(names)}", field=field,
+                         value=brief(names))
+    if len(set(names)) != len(names):
+        raise InputError("expected different names", field=field, value=brief(names))
+    return names
+
+
+class Unit(NamedTuple):
+    """SI unit and the factor that takes stored numbers to it."""
+
+    si: str
+    factor: float
+
+
+def unit_of(label: str, field: str, allowed: Sequence[str] | None = None) -> Unit:
+    """SI unit and factor of a unit's label; the spellings m/s^2, m/s2, m/s**2, m/s/s are one.
+
+    Raises
+    ------
+    InputError : an unknown unit, or one not allowed for this quantity.
+    """
+    text = label.strip().strip("[]()").replace(" ", "").replace("\u00b2", "^2").replace("**", "^")
+    text = text.replace("\u00b5", "u").replace("\u03bc", "u").replace("sec", "s").replace("m/s/s", "m/s^2")
+    text = text[:-1] + "^2" if text.endswith("s2") else text
+    known = UNITS.get(text)
+    if known is None or (allowed is not None and known[0] not in allowed):
+        raise InputError(f"expected a unit of {', '.join(allowed or OUTPUT_UNITS)} (also mV, mm/s, g, ...)",
+                         field=field, value=label)
+    return Unit(*known)
+
+
+def units_of(value: Any, role: str, where: str, count: int) -> tuple[str, tuple[float, ...]]:
+    """One SI unit and the factor of each of `count` channels, from one label or one per channel."""
+    field = f"{where}: {role} unit"
+    array = np.asarray(value, object).reshape(-1) if isinstance(value, (np.ndarray, list, tuple)) else [value]
+    if len(array) not in (1, count):
+        raise InputError(f"expected one unit, or one for each of {count} channels", field=field, value=brief(value))
+    units = [unit_of(as_text(item, field), field, ALLOWED[role]) for item in array]
+    if len({unit.si for unit in units}) > 1:
+        raise InputError("expected one physical quantity for all channels", field=field,
+                         value=[unit.si for unit in units])
+    factors = tuple(unit.factor for unit in units)
+    return units[0].si, factors * count if len(factors) == 1 else factors
+
+
+def require(fields: Mapping[str, Any], name: str, where: str, expected: str) -> Any:
+    """A field that has to be there."""
+    if name not in fields or fields[name] is None:
+        raise InputError(f"missing; expected {expected}", field=f"{where}: {name}")
+    return fields[name]
+
+
+def header_from(fields: Mapping[str, Any], name: str, samples: int, channels: Mapping[str, tuple[str, ...]],
+                units: Mapping[str, str]) -> RecordHeader:
+    """The header of a record from the contract's attributes.
+
+    fields : sample_rate_Hz, excitation, level_V, start_s and, where periodic, period_s; channels : names of u, y and
+    floor; units : their SI units.
+
+    Raises
+    ------
+    InputError : an attribute that is missing, of another type, or out of range.
+    """
+    where = f"record {name}"
+    rate = as_number(require(fields, "sample_rate_Hz", where, "the sample rate in Hz"), f"{where}: sample_rate_Hz")
+    excitation = as_text(require(fields, "excitation", where, f"one of {', '.join(EXCITATIONS)}"),
+                         f"{where}: excitation")
+    level = as_number(require(fields, "level_V", where, "the r.m.s. of the driven voltages"), f"{where}: level_V")
+    start = as_number(require(fields, "start_s", where, "the time of the first sample in s"), f"{where}: start_s")
+    if level < 0:
+        raise InputError("expected 0 or more", field=f"{where}: level_V", value=level)
+    if channels.get("floor", FLOOR_NAMES) != FLOOR_NAMES:
+        raise InputError(f"expected the three velocities {', '.join(FLOOR_NAMES)}", field=f"{where}: floor names",
+                         value=channels["floor"])
+    return RecordHeader(name, rate, samples, channels["u"], channels["y"], excitation, level, start,
+                        _period(fields.get("period_s"), excitation, where), units["u"], units["y"],
+                        channels.get("floor", ()), units.get("floor", "m/s"))
+
+
+def _period(value: Any, excitation: str, where: str) -> float | None:
+    """Period of a record; struct arrays state an empty or NaN one where there is none."""
+    if isinstance(value, np.ndarray) and value.size == 0:
+        value = None
+    single = _single(value)
+    if isinstance(single, float) and np.isnan(single):
+        single = None
+    if single is None:
+        if excitation == "multisine":
+            raise InputError("missing; expected the period in s of a multisine", field=f"{where}: period_s")
+        return None
+    return as_number(single, f"{where}: period_s")
+
+
+def numbers(array: Any, field: str) -> np.ndarray:
+    """A real array as float64.
+
+    Raises
+    ------
+    InputError : text, objects, complex numbers or booleans.
+    """
+    array = np.asarray(array)
+    if array.dtype.kind not in "fiu":
+        raise InputError("expected real numbers", field=field, value=f"array of {kind_of(array.dtype)}")
+    return array.astype(float)
+
+
+def kind_of(dtype: np.dtype) -> str:
+    """What an array holds, in words."""
+    words = {"O": "objects", "S": "bytes", "U": "text", "c": "complex numbers", "b": "booleans", "V": "structures"}
+    return words.get(dtype.kind, str(dtype))
+
+
+def require_finite(array: np.ndarray, names: Sequence[str], field: str, start: int = 0) -> None:
+    """Refuse NaN and Inf, saying where: sample number counted from the start of the record."""
+    good = np.isfinite(array)
+    if not good.all():
+        row, column = np.argwhere(~good)[0]
+        raise InputError(f"expected finite numbers; {np.count_nonzero(~good)} are not, the first at sample "
+                         f"{start + row} of channel {names[column]}", field=field, value=float(array[row, column]))

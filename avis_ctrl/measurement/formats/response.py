@@ -1,0 +1,112 @@
+"""Frequency responses as other instruments hand them over: entries with coherence, variance, or a stated deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.formats.common import kind_of
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+
+SINGLE_PRECISION = 2.0 ** -24
+ROUNDING = 1e-5  # a coherence that far above 1 is one that was printed
+
+
+def coherence_variance(value: np.ndarray, coherence: np.ndarray, averages: float) -> np.ndarray:
+    """E|error|^2 of H1 estimates of one input at a time, from ordinary coherence and the number of averages.
+
+    Bendat and Piersol (Random Data, 4th ed., 2010, chapter 9) give the normalised random error of the gain,
+    sqrt(1 - c) / sqrt(2 c n_d), and the same in radians of the phase; gain and phase errors are at right angles, so
+    E|error|^2 is the sum of both squares, |G|^2 (1 - c) / (c n_d). Their c is the true coherence. The sample coherence
+    states the residual after one coefficient was fitted to n_d averages, so that n_d - 1 in the place of n_d makes the
+    estimate unbiased. Averages that overlap count as fewer than they are.
+
+    value, coherence : of the same shape, 0 < coherence <= 1; a coherence of 1 counts as 1 - 2^-24, its resolution in
+    single precision; averages : of independent blocks, at least 2.
+    """
+    lost = np.maximum(1.0 - coherence, SINGLE_PRECISION)
+    return np.abs(value) ** 2 * lost / (coherence * (averages - 1.0))
+
+
+def response_from(frequency_Hz: np.ndarray, value: np.ndarray, inputs: Sequence[str], outputs: Sequence[str], *,
+                  variance: np.ndarray | None = None, coherence: np.ndarray | None = None,
+                  averages: float | None = None, relative_standard_deviation: float | None = None,
+                  input_unit: str = "V", output_unit: str = "V", method: str = "") -> FrequencyResponse:
+    """A frequency response whose entries count as independent.
+
+    frequency_Hz : (n,); value : (n, n_y, n_u) complex; variance : (n, n_y, n_u) E|error|^2; coherence : (n, n_y, n_u)
+    ordinary coherence with its number of averages; relative_standard_deviation : sqrt(E|error|^2) / |G| that the
+    caller vouches for, used only where the file has neither. Lines where some coherence is 0 are left out, and
+    `method` says so: the response is not determined there.
+
+    Raises
+    ------
+    InputError : nothing known of the errors, a coherence outside 0 .. 1, fewer than 2 averages, wrong shapes.
+    """
+    frequency_Hz, value = _plain(frequency_Hz, "frequency_Hz", "fiu"), _plain(value, "value", "fiuc").astype(complex)
+    shape = (len(frequency_Hz), len(outputs), len(inputs)) if frequency_Hz.ndim == 1 else None
+    if value.shape != shape:
+        raise InputError(f"expected shape {shape}: lines, outputs, inputs", field="value", value=value.shape)
+    keep = np.ones(len(frequency_Hz), bool)
+    if variance is not None:
+        variance = _plain(variance, "variance", "fiu")
+        if variance.shape != shape or not np.all(variance >= 0):
+            raise InputError(f"expected shape {shape} and no negative or missing value", field="variance",
+                             value=variance.shape)
+    elif coherence is not None:
+        coherence = _coherence(coherence, value.shape, averages)
+        keep = np.all(coherence > 0, axis=(1, 2))
+        if not keep.any():
+            raise InputError("0 for some entry at every line; expected some above 0", field="coherence")
+        variance = np.zeros(value.shape)
+        assert averages is not None  # _coherence has asked for it
+        variance[keep] = coherence_variance(value[keep], coherence[keep], averages)
+        method = f"{method}; variance from coherence, {averages:g} averages".lstrip("; ")
+    elif relative_standard_deviation is not None:
+        if not (np.isfinite(relative_standard_deviation) and relative_standard_deviation > 0):
+            raise InputError("expected a positive number", field="relative_standard_deviation",
+                             value=relative_standard_deviation)
+        variance = (relative_standard_deviation * np.abs(value)) ** 2
+        method = f"{method}; stated relative standard deviation {relative_standard_deviation:g}".lstrip("; ")
+    else:
+        raise InputError("neither variance nor coherence is there; pass relative_standard_deviation (such as 0.05) to "
+                         "state the errors yourself", field="uncertainty of the frequency response")
+    if not keep.all():
+        lost = frequency_Hz[~keep]
+        method += f"; {len(lost)} lines of coherence 0 left out, the first at {lost[0]:g} Hz"
+    return FrequencyResponse(frequency_Hz[keep], value[keep], None, None, tuple(inputs), tuple(outputs), input_unit,
+                             output_unit, entry_variance=variance[keep], method=method)
+
+
+def _plain(array: np.ndarray, field: str, kinds: str) -> np.ndarray:
+    array = np.asarray(array)
+    if array.dtype.kind not in kinds:
+        raise InputError("expected numbers", field=field, value=f"array of {kind_of(array.dtype)}")
+    if not np.all(np.isfinite(array)):
+        raise InputError(f"expected finite numbers; {np.count_nonzero(~np.isfinite(array))} are not, the first at line "
+                         f"{np.argwhere(~np.isfinite(array))[0][0]}", field=field)
+    return array
+
+
+def _coherence(coherence: np.ndarray, shape: tuple[int, ...], averages: float | None) -> np.ndarray:
+    coherence = _plain(coherence, "coherence", "fiu").astype(float)
+    if coherence.shape == shape[:2] and shape[2] == 1:
+        coherence = coherence[:, :, None]
+    if coherence.shape == shape[:2]:
+        raise InputError(f"multiple coherence of {shape[2]} inputs does not tell the errors of single entries; "
+                         "expected the ordinary coherence of each entry, or variance", field="coherence",
+                         value=coherence.shape)
+    if coherence.shape != shape:
+        raise InputError(f"expected shape {shape}", field="coherence", value=coherence.shape)
+    if np.any(coherence < 0) or np.any(coherence > 1 + ROUNDING):
+        worst = coherence.flat[np.argmax(np.abs(coherence - 0.5))]
+        raise InputError("expected values from 0 to 1", field="coherence", value=float(worst))
+    if averages is None:
+        raise InputError("missing; coherence tells the errors only together with the number of averages",
+                         field="averages")
+    if not (np.isfinite(averages) and averages >= 2):
+        raise InputError("expected 2 or more; of one average the coherence is 1 whatever the errors", field="averages",
+                         value=averages)
+    return np.minimum(coherence, 1.0)

@@ -1,0 +1,64 @@
+"""From time stamps to a sample rate, with everything that is wrong with them said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+
+SILENT, JITTER, GAP = 1e-3, 0.1, 1.5  # of a sample: printed digits; noted; missing samples
+
+
+def sample_rate_from(time_s: np.ndarray, place: Callable[[int], str] = "sample {}".format,
+                     field: str = "t") -> tuple[float, float, str]:
+    """Sample rate [Hz], time of the first sample [s], and a note ("" where the stamps are even).
+
+    The clock is the straight line through the first and the last stamp. Stamps that lie within a tenth of a sample of
+    it count as even, with a note beyond a thousandth. The rate is rounded as far as the stamps leave it open.
+
+    time_s : (n,) s; place : names a sample in messages, such as "line 17".
+
+    Raises
+    ------
+    InputError : fewer than two stamps; stamps that are not finite, stand still or go backwards, with a gap, or uneven:
+        where the first is and how many there are.
+    """
+    time_s = np.asarray(time_s, float)
+    if time_s.ndim != 1 or len(time_s) < 2:
+        raise InputError("expected at least two time stamps", field=field, value=time_s.shape)
+    if not np.all(np.isfinite(time_s)):
+        bad = np.flatnonzero(~np.isfinite(time_s))
+        raise InputError(f"expected finite time stamps; {len(bad)} are not, the first at {place(int(bad[0]))}",
+                         field=field)
+    step = np.diff(time_s)
+    if np.any(step <= 0):
+        bad = np.flatnonzero(step <= 0)
+        first = int(bad[0]) + 1
+        raise InputError(f"expected increasing time stamps; {len(bad)} stand still or go backwards, the first at "
+                         f"{place(first)}: {time_s[first]:.9g} s after {time_s[first - 1]:.9g} s", field=field)
+    usual = float(np.median(step))
+    if np.any(step > GAP * usual):
+        bad = np.flatnonzero(step > GAP * usual)
+        first = int(bad[0]) + 1
+        raise InputError(f"expected even time stamps; {len(bad)} gaps, the first before {place(first)}: "
+                         f"{step[first - 1]:.6g} s instead of {usual:.6g} s", field=field)
+    mean = (time_s[-1] - time_s[0]) / (len(time_s) - 1)
+    off = np.abs(time_s - time_s[0] - mean * np.arange(len(time_s))) / mean
+    worst = int(np.argmax(off))
+    if off[worst] > JITTER:
+        raise InputError(f"expected even time stamps; {np.count_nonzero(off > JITTER)} are more than {JITTER:g} of a "
+                         f"sample off, the worst at {place(worst)} by {off[worst]:.3g} samples of {mean:.6g} s",
+                         field=field)
+    note = f"time stamps are uneven by up to {off[worst]:.2g} of a sample; taken as even" if off[worst] > SILENT else ""
+    return _rounded(1 / mean, (2 * float(off[worst]) + 1e-9) / (len(time_s) - 1)), float(time_s[0]), note
+
+
+def _rounded(rate: float, uncertainty: float) -> float:
+    """The shortest decimal number within the relative uncertainty."""
+    for digits in range(2, 16):
+        short = float(f"{rate:.{digits}g}")
+        if abs(short - rate) <= uncertainty * rate:
+            return short
+    return rate
