@@ -3,7 +3,7 @@
     y = s(w) R (jw)^p { inv(D) F  [u; v_floor; transient] + aliases inv(M) T u },    D = K + jw C - w^2 M
     F = [ T h(w) a(w),  (K_f + jw C_f) E / jw,  I, jw I ]
 
-R picks the motion along each sensor, s is its chain (geophone with compensation, preamplifier), p the derivative that it
+R picks the motion along each sensor, s is its chain (geophone, compensation, preamplifier), p the derivative that it
 senses, h hold and delay, a the amplifiers, E the three translations of the floor. The last two blocks of F carry the
 transient of a record that does not start and end alike: whatever momentum and displacement it starts with acts as an
 impulse and a step (real vectors, unknown, found along with the parameters).

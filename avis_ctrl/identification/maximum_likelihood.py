@@ -1,0 +1,321 @@
+"""Maximum likelihood in the frequency domain for a rig's physical parameters.
+
+With circular complex Gaussian noise of covariance C_k on line k (Pintelon and Schoukens 2012, section 9.11), minus
+twice the log-likelihood is, up to a constant, the chi-square
+
+    chi2(theta) = 2 sum_k e_k^H inv(C_k) e_k + sum_j (theta_j - prior_j)^2 / sigma_j^2
+    e_k = Y_k - G_k(theta) U_k - t_k
+
+with t_k the transient of a record, linear in real unknowns x, which are projected out (variable projection of Golub
+and Pereyra 1973; the Jacobian contains the derivative of t_k at the best x, so that the step is that of the joint
+problem).
+Levenberg-Marquardt steps in relative parameters; the information matrix is J^T J at the end, its inverse the
+Cramer-Rao bound. Directions that the data do not determine keep their starting value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.identification.information import Information
+from avis_ctrl.identification.response import N_Q, ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock, transient_columns
+
+Prior = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """What a block leaves: e (n, n_y, m), the same whitened (unit variance E|e|^2), and the transient (n, n_y, m)."""
+
+    block: SpectralBlock
+    error: np.ndarray
+    white: np.ndarray
+    transient: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class LikelihoodFit:
+    """The most likely parameters.
+
+    Attributes
+    ----------
+    model : at the estimate.
+    information : of the estimate, with the Cramer-Rao bound.
+    chi2, dof : sum of squares of what should be standard normal numbers, and how many are free.
+    iterations, converged : of the best start. history : chi2 after each of its steps.
+    residuals : one a block.
+    starts : chi2 reached from each start, infinite where it failed.
+    priors : used, by name.
+    """
+
+    model: ResponseModel
+    information: Information
+    chi2: float
+    dof: int
+    iterations: int
+    converged: bool
+    history: tuple[float, ...]
+    residuals: tuple[Residual, ...]
+    starts: tuple[float, ...]
+    priors: Mapping[str, Prior] = field(default_factory=dict)
+
+    @property
+    def values(self) -> np.ndarray:
+        return self.model.values
+
+    @property
+    def chi2_per_dof(self) -> float:
+        return self.chi2 / self.dof
+
+
+@dataclass(frozen=True, eq=False)
+class _Quadratic:
+    """chi2 and its expansion: g = -J^T e, H = J^T J in relative parameters."""
+
+    chi2: float
+    gradient: np.ndarray
+    H: np.ndarray
+    residuals: tuple[Residual, ...] = ()
+
+
+def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior] | None = None,
+        starts: int = 1, spread: float = 0.1, seed: int = 1, max_iterations: int = 60,
+        progress: Callable[[str], None] | None = None) -> LikelihoodFit:
+    """The most likely parameters of `model.names`, from its present values.
+
+    Parameters
+    ----------
+    blocks : data with the covariance of their noise.
+    priors : (mean, standard deviation) of parameters, in their units.
+    starts : how many starting points; the first is the model itself, the others are `spread` (relative) about it.
+
+    Raises
+    ------
+    InputError : no parameters, blocks without noise, priors of unknown parameters.
+    ComputationError : no start came to a finite chi-square.
+    """
+    priors = dict(priors or {})
+    _check(model, blocks, priors, starts)
+    rng = np.random.default_rng(seed)
+    whiteners = [_whitener(block) for block in blocks]
+    reached: list[tuple[float, _Descent | None]] = []
+    for k in range(starts):
+        begin = model if k == 0 else _moved(model, spread, rng)
+        if begin is not None:
+            descent = _Descent(begin, blocks, whiteners, priors, model.values)
+            descent.run(max_iterations)
+            reached.append((descent.now.chi2, descent))
+        else:
+            reached.append((np.inf, None))
+        if progress:
+            progress(f"start {k + 1} of {starts}: chi-square {reached[-1][0]:.6g}")
+    chi2, best = min(reached, key=lambda pair: pair[0])
+    if best is None or not np.isfinite(chi2):
+        raise ComputationError("no start of the fit came to a finite chi-square", measured=f"{chi2}",
+                               cause="data that are zero or far from this rig",
+                               next_step="look at the gates, and start nearer")
+    last = best.evaluate(best.model, residuals=True)
+    scale = _scale(model.values)
+    unknown = sum(_unknowns(block, model) for block in blocks)
+    dof = sum(block.numbers for block in blocks) - unknown - len(model.names)
+    information = Information(model.names, best.model.values, model.units, last.H / np.outer(scale, scale), scale)
+    return LikelihoodFit(best.model, information, last.chi2, dof, best.iterations, best.converged,
+                         tuple(best.history), last.residuals, tuple(value for value, _ in reached), priors)
+
+
+class _Descent:
+    """One Levenberg-Marquardt run."""
+
+    def __init__(self, model: ResponseModel, blocks, whiteners, priors, scale_values):
+        self.model, self.blocks, self.whiteners, self.priors = model, blocks, whiteners, priors
+        self.scale = _scale(scale_values)
+        self.now = self.evaluate(model)
+        self.history = [self.now.chi2]
+        self.iterations, self.converged = 0, False
+
+    def evaluate(self, model: ResponseModel, derivative: bool = True, residuals: bool = False) -> _Quadratic:
+        """chi2 at a model, with its expansion if asked for."""
+        n_p = len(model.names)
+        chi2, g, H, kept = 0.0, np.zeros(n_p), np.zeros((n_p, n_p)), []
+        for block, L in zip(self.blocks, self.whiteners, strict=True):
+            e, J, residual = _block_residual(model, block, L, derivative)
+            chi2 += float(e @ e)
+            if derivative:
+                J *= self.scale[:, None]
+                g -= J @ e
+                H += J @ J.T
+            if residuals:
+                kept.append(residual)
+        for name, (mean, sigma) in self.priors.items():
+            j = model.names.index(name)
+            miss, slope = (mean - model.values[j]) / sigma, self.scale[j] / sigma
+            chi2 += miss ** 2
+            g[j] -= slope * miss
+            H[j, j] += slope ** 2
+        return _Quadratic(chi2, g, H, tuple(kept))
+
+    def run(self, max_iterations: int) -> None:
+        damping = 1e-3
+        while self.iterations < max_iterations and not self.converged:
+            step, promised = self._step(damping)
+            if promised < 1e-6 * max(1.0, 1e-3 * self.now.chi2 / len(self.model.names)) + 1e-12 * self.now.chi2:
+                self.converged = True
+                break
+            trial = self._try(step)
+            if trial is not None and trial[1] < self.now.chi2:
+                gain = (self.now.chi2 - trial[1]) / promised
+                self.model, self.iterations = trial[0], self.iterations + 1
+                self.now = self.evaluate(self.model)
+                self.history.append(self.now.chi2)
+                damping = max(damping * (0.1 if gain > 0.5 else 1.0), 1e-12)
+            else:
+                damping *= 10
+                if damping > 1e8:
+                    # No smaller chi-square in any direction: the end of what arithmetic resolves.
+                    self.converged = promised < 1e-3
+                    break
+
+    def _step(self, damping: float) -> tuple[np.ndarray, float]:
+        """Relative step, and the decrease of chi2 that the expansion promises for it.
+
+        The diagonal is scaled away before the eigenvalues tell what is determined.
+        """
+        H, g = self.now.H, self.now.gradient
+        size = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(H / np.outer(size, size))
+        along = vectors.T @ (g / size)
+        known = values > 1e-11 * values[-1]
+        y = np.where(known, -along / np.where(known, values + damping, 1.0), 0.0)
+        step = vectors @ y / size
+        # No parameter by more than half of itself at once.
+        largest = np.max(np.abs(step))
+        if largest > 0.5:
+            y, step = y * (0.5 / largest), step * (0.5 / largest)
+        return step, float(-(2 * along @ y + y @ (values * y)))
+
+    def _try(self, step: np.ndarray) -> tuple[ResponseModel, float] | None:
+        try:
+            model = self.model.at(self.model.values + step * self.scale)
+        except InputError:
+            return None  # no rig has these parameters: a shorter step
+        if not _physical(model):
+            return None
+        chi2 = self.evaluate(model, derivative=False).chi2
+        return (model, chi2) if np.isfinite(chi2) else None
+
+
+def _physical(model: ResponseModel) -> bool:
+    """Stiffness, damping and sensitivities keep the sign that they have on a rig."""
+    return all(value > 0 for name, value in zip(model.names, model.values, strict=True) if positive(name))
+
+
+def positive(name: str) -> bool:
+    """Whether physics asks for a positive value: masses, stiffness, damping, force constants, sensitivities."""
+    last = name.rpartition(".")[2]
+    inertia = ("mass", "load.mass", "J1", "J2", "J3", "Ixx", "Iyy", "Izz")
+    if name.startswith(("sensor.", "actuator.")) or name in inertia:
+        return True
+    return last.startswith(("k_", "c_")) or (len(last) == 2 and last[0] in "de" and last[1].isdigit())
+
+
+def _block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, derivative: bool
+                    ) -> tuple[np.ndarray, np.ndarray, Residual]:
+    """Real residual e (N,) of unit variance, its negative Jacobian J (n_p, N), both free of the transient."""
+    U = block.U
+    if not block.transient:
+        found = model.driven(block.omega, U, derivative)
+        error = block.Y - found.Y
+        white = _whitened(L, error)
+        J = _real(_whitened(L, found.dY)) if derivative else np.empty(0)
+        return _real(white[None])[0], J, Residual(block, error, white / np.sqrt(2), np.zeros_like(error))
+    columns, norms = transient_columns(block, model)
+    plain = block.Y - model.driven(block.omega, U, False).Y
+    T = _real(np.moveaxis(_whitened(L, columns), -1, 0))
+    Q, R = np.linalg.qr(T.T)
+    e = _real(_whitened(L, plain)[None])[0]
+    x = np.linalg.lstsq(R, Q.T @ e, rcond=1e-12)[0]
+    transient = (columns @ x)[:, :, None]
+    white = _whitened(L, plain - transient)
+    e = _real(white[None])[0]
+    J = np.empty(0)
+    if derivative:
+        n_b = 2 * N_Q
+        body = np.broadcast_to((x[:n_b] / norms[:n_b])[None, :, None], (len(block.omega), n_b, 1))
+        J = _real(_whitened(L, model.driven(block.omega, np.concatenate([U, body], axis=1)).dY))
+        J = J - (J @ Q) @ Q.T
+    return e, J, Residual(block, plain - transient, white / np.sqrt(2), transient)
+
+
+def _whitener(block: SpectralBlock) -> np.ndarray:
+    """(n, 1 or m, n_y, n_y) sqrt(2) inv(chol(C)), with the correction for a covariance that was itself estimated.
+
+    The inverse of a Wishart matrix of n_y outputs and dof degrees of freedom is too large by dof/(dof - n_y).
+    """
+    if block.noise is None:
+        raise InputError("expected the covariance of its noise", field=f"block {block.name}")
+    n_y = block.noise.shape[-1]
+    if block.dof <= n_y:
+        raise InputError(f"expected more than {n_y} degrees of freedom in the noise covariance",
+                         field=f"block {block.name}", value=block.dof)
+    try:
+        factor = np.linalg.cholesky(block.noise)
+    except np.linalg.LinAlgError:
+        raise InputError("expected a positive definite noise covariance on every line; a channel without noise, or two "
+                         "channels that repeat each other, leave it singular", field=f"block {block.name}") from None
+    correction = 1.0 if np.isinf(block.dof) else (block.dof - n_y) / block.dof
+    return np.sqrt(2 * correction) * np.linalg.inv(factor)
+
+
+def _whitened(L: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """L (n, 1 or m, n_y, n_y) applied to (..., n, n_y, m)."""
+    if L.shape[1] == 1:
+        return L[:, 0] @ error
+    return np.moveaxis((L @ np.moveaxis(error, -1, -2)[..., None])[..., 0], -1, -2)
+
+
+def _real(white: np.ndarray) -> np.ndarray:
+    """(p, ...) complex to (p, N) real."""
+    flat = white.reshape(len(white), -1)
+    return np.concatenate([flat.real, flat.imag], axis=1)
+
+
+def _scale(values: np.ndarray) -> np.ndarray:
+    """What one relative unit of a parameter is: its size, or 0.1 (m, kg m^2, ..) for one that is zero."""
+    return np.where(values == 0, 0.1, np.abs(values))
+
+
+def _unknowns(block: SpectralBlock, model: ResponseModel) -> int:
+    return len(transient_columns(block.lines(np.arange(1)), model)[1]) if block.transient else 0
+
+
+def _moved(model: ResponseModel, spread: float, rng: np.random.Generator) -> ResponseModel | None:
+    """Another start: each parameter a random factor away; None where no rig has the draw."""
+    for _ in range(20):
+        try:
+            moved = model.at(model.values + _scale(model.values) * spread * rng.uniform(-1, 1, len(model.names)))
+        except InputError:
+            continue
+        if _physical(moved):
+            return moved
+    return None
+
+
+def _check(model: ResponseModel, blocks, priors, starts: int) -> None:
+    if not model.names:
+        raise InputError("expected at least one free parameter", field="parameters")
+    if not blocks:
+        raise InputError("expected at least one record or response to fit", field="blocks")
+    if starts < 1:
+        raise InputError("expected at least one start", field="starts", value=starts)
+    for name, (mean, sigma) in priors.items():
+        if name not in model.names:
+            raise InputError(f"expected a free parameter out of {', '.join(model.names)}", field="priors", value=name)
+        if not (np.isfinite(mean) and np.isfinite(sigma) and sigma > 0):
+            raise InputError("expected a finite mean and a positive standard deviation", field=f"prior of {name}",
+                             value=(mean, sigma))
+

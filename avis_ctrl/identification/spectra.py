@@ -1,0 +1,160 @@
+"""Data for the fit: spectra of records, or frequency responses, in one form.
+
+A block holds Y = G U + noise on lines omega for m experiments, with the covariance of the noise. A record is one
+experiment (its own spectra, with the transient of its ends unknown); a measured frequency response of n_u inputs is
+n_u experiments: any W with W W^H = S, its Gram matrix, makes the columns of Y = G W independent with the noise
+covariance of one experiment (Pintelon and Schoukens, System Identification, 2nd ed., 2012, section 2.7).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.fft
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.response import FLOOR, N_Q, ResponseModel
+from avis_ctrl.measurement.campaign import Record
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralBlock:
+    """Y = G U + noise.
+
+    Attributes
+    ----------
+    name : record or response that it comes from.
+    omega : (n,) rad/s, positive.
+    U : (n, n_in, m) inputs in the order of the model's (actuators, floor).
+    Y : (n, n_y, m) outputs in the order of the model's sensors.
+    noise : (n, 1 or m, n_y, n_y) covariance E[e e^H] of the noise of an experiment; None until it is known.
+    dof : complex degrees of freedom that `noise` was estimated with; infinite when it is exact.
+    transient : the ends of a record leave a transient in it, which the fit takes out (m = 1).
+    kind : records of one kind share their noise.
+    """
+
+    name: str
+    omega: np.ndarray
+    U: np.ndarray
+    Y: np.ndarray
+    noise: np.ndarray | None = None
+    dof: float = np.inf
+    transient: bool = False
+    kind: str = ""
+
+    def __post_init__(self) -> None:
+        n, m = len(self.omega), self.U.shape[-1]
+        if self.U.shape[0] != n or self.Y.shape[0] != n or self.Y.shape[2] != m or n == 0:
+            raise InputError(f"expected U (n, n_in, m) and Y (n, n_y, m) on {n} lines",
+                             field=f"block {self.name}", value=(self.U.shape, self.Y.shape))
+        if self.transient and m != 1:
+            raise InputError("expected one experiment where a transient is to be found", field=f"block {self.name}")
+
+    @property
+    def numbers(self) -> int:
+        """Real numbers in Y."""
+        return 2 * self.Y.size
+
+    def with_noise(self, noise: np.ndarray, dof: float = np.inf) -> SpectralBlock:
+        """With the covariance of the noise, (n, n_y, n_y) or (n, m, n_y, n_y)."""
+        n_y = self.Y.shape[1]
+        return replace(self, noise=noise.reshape(len(self.omega), -1, n_y, n_y), dof=dof)
+
+    def lines(self, keep: np.ndarray) -> SpectralBlock:
+        """Some of the lines."""
+        return replace(self, omega=self.omega[keep], U=self.U[keep], Y=self.Y[keep],
+                       noise=None if self.noise is None else self.noise[keep])
+
+
+def record_block(record: Record, model: ResponseModel, band_Hz: tuple[float, float]) -> SpectralBlock:
+    """Spectra of a whole record on its DFT lines in a band, scaled by 1/sqrt(samples): white noise keeps its variance.
+
+    Raises
+    ------
+    InputError : a channel that the model does not have, a band without lines, a rate that is not the model's.
+    """
+    h = record.header
+    if model.period_s and abs(h.sample_rate_Hz * model.period_s - 1) > 1e-6:
+        raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
+                         field=f"record {h.name}: sample_rate_Hz")
+    frequency = scipy.fft.rfftfreq(h.samples, 1 / h.sample_rate_Hz)
+    keep = (frequency >= band_Hz[0]) & (frequency <= band_Hz[1]) & (frequency > 0)
+    if not np.any(keep):
+        raise InputError(f"expected a band with lines; record {h.name} resolves {frequency[1]:.3g} Hz up to "
+                         f"{frequency[-1]:.4g} Hz", field="band_Hz", value=band_Hz)
+
+    def spectrum(samples: np.ndarray) -> np.ndarray:
+        return scipy.fft.rfft(samples - samples.mean(0), axis=0)[keep] / np.sqrt(h.samples)
+
+    U = np.zeros((int(keep.sum()), len(model.inputs)), complex)
+    _place(U, h.u_names, model.actuators, spectrum(record.u), f"record {h.name}: u names")
+    if record.floor is not None:
+        _place(U, h.floor_names, FLOOR, spectrum(record.floor), f"record {h.name}: floor names", len(model.actuators))
+    if missing := [name for name in model.sensors.names if name not in h.y_names]:
+        raise InputError(f"the record has {', '.join(h.y_names)}", field=f"record {h.name}: y names", value=missing)
+    Y = spectrum(record.y)[:, [h.y_names.index(name) for name in model.sensors.names]]
+    kind = "floor measured" if record.floor is not None else "floor not measured"
+    return SpectralBlock(h.name, 2 * np.pi * frequency[keep], U[:, :, None], Y[:, :, None], transient=True, kind=kind)
+
+
+def response_block(measured: FrequencyResponse, model: ResponseModel, name: str = "frequency response"
+                   ) -> SpectralBlock:
+    """A measured frequency response, weighted by its covariance.
+
+    Raises
+    ------
+    InputError : channels or units that are not the model's, a Gram matrix that is not positive definite.
+    """
+    if measured.output_unit != model.sensors.unit:
+        raise InputError(f"expected {model.sensors.unit}", field="unit of the response's outputs",
+                         value=measured.output_unit)
+    n, n_in = len(measured.frequency_Hz), len(measured.inputs)
+    if missing := [one for one in model.sensors.names if one not in measured.outputs]:
+        raise InputError(f"the response has {', '.join(measured.outputs)}", field="outputs", value=missing)
+    rows = [measured.outputs.index(one) for one in model.sensors.names]
+    if measured.entry_variance is None:
+        assert measured.gram is not None and measured.noise is not None
+        try:
+            W = np.linalg.cholesky(measured.gram)
+        except np.linalg.LinAlgError:
+            raise InputError("expected inputs that excite every column on every line", field="gram") from None
+        noise = measured.noise[:, None][:, :, rows][:, :, :, rows]
+    else:
+        W = np.broadcast_to(np.eye(n_in, dtype=complex), (n, n_in, n_in))
+        variance = measured.entry_variance[:, rows].swapaxes(1, 2)
+        noise = variance[..., None] * np.eye(len(rows))
+    U = np.zeros((n, len(model.inputs), n_in), complex)
+    _place(U, measured.inputs, model.inputs, W, "inputs")
+    return SpectralBlock(name, measured.omega, U, measured.value[:, rows] @ W, noise, measured.dof, kind=name)
+
+
+def _place(into: np.ndarray, names: Sequence[str], known: Sequence[str], values: np.ndarray, field: str,
+           offset: int = 0) -> None:
+    """Rows of the inputs by name."""
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(f"the model's inputs are {', '.join(known)}", field=field, value=unknown)
+    for k, name in enumerate(names):
+        into[:, offset + list(known).index(name)] = values[:, k]
+
+
+def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.ndarray, np.ndarray]:
+    """(n, n_y, n_t) columns, for real coefficients, of what the ends of a record leave in its spectra; (n_t,) norms.
+
+    Impulse and step on the body (12), the two states of each sensor's chain, and a constant and a slope in frequency
+    for each sensor, which hold the aliases of the others. The columns have unit norm; each was divided by its own.
+    """
+    n, n_y, n_in = len(block.omega), block.Y.shape[1], len(model.inputs)
+    s = 1j * block.omega
+    U = np.zeros((n, n_in + 2 * N_Q, 2 * N_Q), complex)
+    U[:, n_in:] = np.eye(2 * N_Q)
+    body = model.driven(block.omega, U, derivative=False).Y
+    poles = np.asarray(model.sensors.transient_poles)
+    shapes = [np.ones(n), s] if len(poles) == 1 else [
+        *(s ** k / np.polyval(poles[::-1], s) for k in range(len(poles) - 1)), np.ones(n), s]
+    chains = np.stack(shapes, -1)[:, None, :, None] * np.eye(n_y)[:, None, :]
+    columns = np.concatenate([body, chains.reshape(n, n_y, -1)], axis=2)
+    norms = np.linalg.norm(columns, axis=(0, 1))
+    return columns / norms, norms
