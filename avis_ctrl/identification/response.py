@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -183,6 +184,7 @@ class ResponseModel:
         return replace(self, rig=self.rig.with_parameters(of_rig), delay_s=delay,
                        sensors=replace(self.sensors, sensitivity=sensitivity))
 
+    @cached_property
     def matrices(self) -> Matrices:
         """Of the rig as it is, the actuators and sensors of the model."""
         eom = self.rig.equations_of_motion()
@@ -191,17 +193,18 @@ class ResponseModel:
         T = eom.T[:, [eom.actuators.index(name) for name in self.actuators]]
         return Matrices(eom.M, eom.C, eom.K, eom.C_floor, eom.K_floor, T, R)
 
+    @cached_property
     def derivative_matrices(self) -> Matrices:
         """By each free parameter, (n_p, ...) each; zero for those that are not the rig's."""
         known = self.rig.parameters()
-        shapes = [(len(self.names), *matrix.shape) for matrix in self.matrices()]
+        shapes = [(len(self.names), *matrix.shape) for matrix in self.matrices]
         found = Matrices(*(np.zeros(shape) for shape in shapes))
         for j, name in enumerate(self.names):
             if name in known:
                 value = known[name].value
                 # Exact at any step for polynomials of second degree: a tenth loses no digits.
                 step = 0.1 * abs(value) or 1e-3
-                up, down = (replace(self, rig=self.rig.with_parameters({name: value + sign * step})).matrices()
+                up, down = (replace(self, rig=self.rig.with_parameters({name: value + sign * step})).matrices
                             for sign in (1, -1))
                 for all_of, high, low in zip(found, up, down, strict=True):
                     all_of[j] = (high - low) / (2 * step)
@@ -218,7 +221,7 @@ class ResponseModel:
         U : (n, n_u + 3, m), or (n, n_u + 3 + 12, m) with impulse and step of the transient last.
         """
         omega = np.asarray(omega, float)
-        s, mat = 1j * omega[:, None, None], self.matrices()
+        s, mat = 1j * omega[:, None, None], self.matrices
         n_u, transient = len(self.actuators), U.shape[1] > len(self.inputs)
         a, alias = self._drive(omega)
         volts, floor = U[:, :n_u], U[:, n_u:n_u + 3]
@@ -239,7 +242,7 @@ class ResponseModel:
         return Driven(S * seen, self._derivative(omega, volts, floor, q, inverse, out, folded, seen, mat, Minv, a))
 
     def _derivative(self, omega, volts, floor, q, inverse, out, folded, seen, mat, Minv, a) -> np.ndarray:
-        s, d = 1j * omega[:, None, None], self.derivative_matrices()
+        s, d = 1j * omega[:, None, None], self.derivative_matrices
         S = self.sensors.sensitivity[:, None]
         left = S * out * (mat.R @ inverse)
         folded_q = Minv @ mat.T @ folded
