@@ -1,0 +1,311 @@
+"""Local models of a frequency response: polynomials or rational functions of frequency around each line.
+
+Around the frequency f, with d = (line - f) / scale and for each record r,
+
+    Y_r(d) = G(d) U_r(d) + T_r(d) + V_r(d),     G(d) = sum_s G_s d^s,     T_r(d) = sum_s t_rs d^s
+
+(local polynomial method: Pintelon, Schoukens, Vandersteen and Barbe, Mech. Syst. Signal Process. 24, 2010; Pintelon
+and Schoukens, System Identification, 2nd ed., 2012, section 7.2), or with a denominator of its own for each output,
+a_i(d) Y_i = b_i(d) U + t_i(d) + V_i, a_i(0) = 1 (local rational method: McKelvey and Guerin, SYSID 2012). T_r is the
+transient, leakage included. Both are linear least squares.
+
+The records share G but not T_r. T_r is removed by projecting on the orthogonal complement of the polynomials over the
+window, a fixed matrix; what remains is compressed to a triangular factor per line, updated record by record. Records
+of any number and length therefore need the memory of one factor per line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
+
+# Lines whose least-squares problems are factored at once, which bounds the work arrays.
+BATCH = 192
+# Relative size of an input's own part (not explained by the others) below which it counts as dependent.
+RANK_TOLERANCE = 1e-8
+# Amplitude relative to the band's r.m.s. below which an input counts as silent.
+SILENT = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class LocalEstimate:
+    """Local estimates on lines; the covariance is that of measurement.frequency_response.FrequencyResponse.
+
+    frequency_Hz : (n,); value : (n, n_y, n_u); noise : (n, n_y, n_y) covariance of V on one line of one record;
+    gram : (n, n_u, n_u) Gram matrix of the inputs' part that neither slopes nor transients explain;
+    dof : complex degrees of freedom of `noise`; transient : (n_records, n, n_y) or None.
+    """
+
+    frequency_Hz: np.ndarray
+    value: np.ndarray
+    noise: np.ndarray
+    gram: np.ndarray
+    dof: int
+    half_width: int
+    transient: np.ndarray | None = None
+
+
+def degrees_of_freedom(records: int, n_u: int, order: int, half_width: int, rational: bool = False) -> int:
+    """Equations less unknowns of one line: records share G, each has its own transient."""
+    return records * (2 * half_width - order) - (order + 1) * n_u - (order if rational else 0)
+
+
+def least_half_width(records: int, n_u: int, n_y: int, order: int, rational: bool = False, spacing: int = 1) -> int:
+    """Smallest half width [lines] that leaves 2 n_y + 4 degrees of freedom: below n_y the covariance is singular, and
+    its inverse is large on average by dof / (dof - n_y).
+
+    spacing : lines from one excited line to the next (periods of a periodic record); each window then also holds
+    order + 1 excited lines and as many as G has unknowns over all records.
+    """
+    half_width = order + 1
+    while degrees_of_freedom(records, n_u, order, half_width, rational) < 2 * n_y + 4:
+        half_width += 1
+    excited = max(order + 1, -(-(order + 1) * n_u // records) + 1) if n_u else 0
+    return half_width if spacing == 1 else max(half_width, -(-spacing * excited // 2))
+
+
+class LocalFit:
+    """Accumulates the least-squares problems of all lines, record by record.
+
+    Parameters
+    ----------
+    frequency_Hz : (n,) frequencies of the estimates; they need not lie on lines of any record.
+    n_u, n_y : numbers of inputs and outputs; n_u may be 0 (noise only).
+    order : degree of the polynomials, 0 to 6.
+    half_width : the window has 2 half_width + 1 lines; near the ends of the lines given it is shifted inwards.
+    scale_Hz : unit of d, about half the window.
+    rational : local rational method.
+
+    Raises
+    ------
+    InputError : an order or a width outside its range.
+    """
+
+    def __init__(self, frequency_Hz: np.ndarray, n_u: int, n_y: int, order: int, half_width: int, scale_Hz: float,
+                 rational: bool = False):
+        if not 0 <= order <= 6:
+            raise InputError("expected an order from 0 to 6", field="order", value=order)
+        if 2 * half_width <= order:
+            raise InputError(f"expected more than {order / 2:g} lines for polynomials of order {order}",
+                             field="half_width", value=half_width)
+        self.frequency_Hz = np.asarray(frequency_Hz, float)
+        self.n_u, self.n_y, self.order, self.half_width, self.rational = n_u, n_y, order, half_width, rational
+        self.scale_Hz, self._step_Hz = scale_Hz, scale_Hz / half_width
+        # Columns: [Y d^R .. Y d] where rational, [U d^R .. U d], U, Y: what G(f) needs stands in the last corner.
+        self._lead = order * (n_u + (n_y if rational else 0))
+        self._size = self._lead + n_u + n_y
+        self._factor = np.zeros((self.frequency_Hz.size, self._size, self._size), complex)
+        self._unit: tuple[np.ndarray, np.ndarray] | None = None
+        self.records = 0
+        # Orthonormal complement of the transient's polynomials over a window.
+        span = np.vander(np.linspace(-1, 1, 2 * half_width + 1), order + 1)
+        self._free = np.linalg.qr(span, mode="complete")[0][:, order + 1:].T
+
+    @property
+    def dof(self) -> int:
+        return degrees_of_freedom(self.records, self.n_u, self.order, self.half_width, self.rational)
+
+    def window(self, line_Hz: np.ndarray, keep: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Indices (b, m) of the lines around some of the frequencies, and d (b, m) there."""
+        width, step = 2 * self.half_width + 1, line_Hz[1] - line_Hz[0]
+        centre = np.rint((self.frequency_Hz[keep] - line_Hz[0]) / step).astype(int)
+        start = np.clip(centre - self.half_width, 0, line_Hz.size - width)
+        index = start[:, None] + np.arange(width)
+        return index, (line_Hz[index] - self.frequency_Hz[keep][:, None]) / self.scale_Hz
+
+    def add(self, U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray) -> None:
+        """Take in records of the same length.
+
+        Parameters
+        ----------
+        U, Y : (n_records, n_lines, n_u) and (n_records, n_lines, n_y) spectra over sqrt(samples).
+        line_Hz : (n_lines,) consecutive lines.
+
+        Raises
+        ------
+        InputError : fewer lines than a window, shapes that do not fit.
+        """
+        self._check(U, Y, line_Hz)
+        if self._unit is None:
+            self._unit = _scale(U), _scale(Y)
+        U, Y = U / self._unit[0], Y / self._unit[1]
+        for start in range(0, self.frequency_Hz.size, BATCH):
+            keep = slice(start, min(start + BATCH, self.frequency_Hz.size))
+            index, d = self.window(line_Hz, keep)
+            rows = self._free @ self._columns(U[:, index], Y[:, index], d)
+            rows = np.moveaxis(rows, 0, 1).reshape(index.shape[0], -1, self._size)
+            if self.records:
+                rows = np.concatenate([self._factor[keep], rows], axis=1)
+            factor = _triangle(rows)
+            self._factor[keep, :factor.shape[1]] = factor
+        self.records += U.shape[0]
+        self._step_Hz = line_Hz[1] - line_Hz[0]
+
+    def _columns(self, U: np.ndarray, Y: np.ndarray, d: np.ndarray) -> np.ndarray:
+        powers = [d[:, :, None] ** s for s in range(self.order, 0, -1)]
+        lead = [Y * p for p in powers] if self.rational else []
+        return np.concatenate([*lead, *(U * p for p in powers), U, Y], axis=-1)
+
+    def _check(self, U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray) -> None:
+        shape = (U.shape[0], line_Hz.size)
+        if U.shape != (*shape, self.n_u) or Y.shape != (*shape, self.n_y):
+            raise InputError(f"expected {shape} records and lines with {self.n_u} inputs and {self.n_y} outputs",
+                             field="U, Y", value=(U.shape, Y.shape))
+        if line_Hz.size < 2 * self.half_width + 1:
+            raise InputError(f"expected at least {2 * self.half_width + 1} lines, the window of the local model: a "
+                             "longer record, a wider band or fewer inputs", field="lines in the band",
+                             value=line_Hz.size)
+
+    def estimate(self, names: tuple[str, ...] | None = None) -> LocalEstimate:
+        """G, C and S on all lines.
+
+        Raises
+        ------
+        InputError : no degrees of freedom left.
+        ComputationError : inputs that cannot be told apart, by name.
+        """
+        if self.dof < 1 or self._unit is None:
+            raise InputError(f"expected a wider window or more records: {self.dof} degrees of freedom are left on "
+                             f"each line with {self.n_u} inputs, order {self.order}, {self.records} records",
+                             field="half_width", value=self.half_width)
+        names = tuple(f"u{j}" for j in range(self.n_u)) if names is None else names
+        self._check_rank(names)
+        value, noise, gram = self._rational() if self.rational else self._polynomial()
+        unit_u, unit_y = self._unit
+        return LocalEstimate(self.frequency_Hz, value * unit_y[:, None] / unit_u,
+                             noise * unit_y[:, None] * unit_y, gram * unit_u[:, None] * unit_u, self.dof,
+                             self.half_width)
+
+    def _corner(self) -> tuple[np.ndarray, np.ndarray]:
+        """Triangular factor of the inputs' own part (n, n_u, n_u) and the outputs along it (n, n_u, n_y)."""
+        lead, first = self._lead, self._lead + self.n_u
+        if self.rational:  # the outputs' slopes come first, and each output has only its own: leave them out
+            part = _triangle(self._factor[:, :, self.order * self.n_y:])
+            lead, first = self.order * self.n_u, (self.order + 1) * self.n_u
+            return part[:, lead:first, lead:first], part[:, lead:first, first:]
+        return self._factor[:, lead:first, lead:first], self._factor[:, lead:first, first:]
+
+    def _polynomial(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        own, along = self._corner()
+        value = np.swapaxes(np.linalg.solve(own, along), 1, 2)
+        residual = self._factor[:, self._lead + self.n_u:, self._lead + self.n_u:]
+        return value, _covariance(residual) / self.dof, _covariance(own)
+
+    def _rational(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Output by output. The Gram matrix is the one whose inverse is the outputs' mean: each denominator costs a
+        little of what is known of its own numerator.
+
+        The equation's error is a(d) V. Where the response is smooth the least squares chooses a denominator that makes
+        this small rather than one that means something (1 - 5/3 d^2 for white noise, 4/9 of its power), so the
+        residual is divided by the mean of |a|^2 over the window to give the covariance of V.
+        """
+        n, n_u, n_y, order = self.frequency_Hz.size, self.n_u, self.n_y, self.order
+        value, residuals = np.empty((n, n_y, n_u), complex), []
+        inverse = np.zeros((n, n_u, n_u), complex)
+        d = np.arange(-self.half_width, self.half_width + 1) * self._step_Hz / self.scale_Hz
+        powers = d ** np.arange(order, 0, -1)[:, None]
+        for i in range(n_y):
+            # The order of the columns keeps U last among the unknowns, as in the polynomial method.
+            slopes = [s * n_y + i for s in range(order)]
+            columns = [*slopes, *range(order * n_y, self._lead + n_u), self._lead + n_u + i]
+            q, r = np.linalg.qr(self._factor[:, :, columns])
+            unknowns = np.linalg.solve(r[:, :-1, :-1], r[:, :-1, -1:])[:, :, 0]
+            value[:, i] = unknowns[:, unknowns.shape[1] - n_u:]
+            shrink = np.sqrt(np.mean(np.abs(1 - unknowns[:, :order] @ powers) ** 2, axis=1))
+            residuals.append(q[:, :, -1] * r[:, -1:, -1] / shrink[:, None])
+            root = np.linalg.inv(r[:, -1 - n_u:-1, -1 - n_u:-1])
+            inverse += root @ np.swapaxes(root.conj(), 1, 2) / n_y
+        gram = np.swapaxes(np.linalg.inv(inverse), 1, 2)
+        return value, _covariance(np.stack(residuals, axis=-1)) / self.dof, gram
+
+    def _check_rank(self, names: tuple[str, ...]) -> None:
+        if not self.n_u:
+            return
+        own, _ = self._corner()
+        raw = np.linalg.norm(self._factor[:, :, self._lead:self._lead + self.n_u], axis=1)
+        size = np.maximum(raw, SILENT * np.sqrt(self.records * (2 * self.half_width - self.order)))
+        weakest = np.linalg.svd(own / size[:, None, :], compute_uv=False)[:, -1]
+        bad = np.flatnonzero(weakest < RANK_TOLERANCE)
+        if bad.size == 0:
+            return
+        null = np.linalg.svd(own[bad[0]] / size[bad[0]])[2][-1]
+        which = ", ".join(name for name, part in zip(names, np.abs(null), strict=True) if part > 0.03)
+        f = self.frequency_Hz[bad]
+        raise ComputationError(
+            f"the responses to {which} cannot be told apart or are not excited",
+            measured=f"{bad.size} of {self.frequency_Hz.size} lines from {f[0]:.6g} to {f[-1]:.6g} Hz, relative size "
+                     f"of their own part {weakest[bad].min():.1e}",
+            cause="inputs that are silent there, or driven by the same signal, or too few excited lines in a window "
+                  f"of {2 * self.half_width + 1}",
+            next_step="keep to the excited band, leave out the inputs that no record excites, take in records that "
+                      "drive them differently, or widen the window")
+
+
+def _scale(x: np.ndarray) -> np.ndarray:
+    """Root mean square of each channel, 1 where it is silent."""
+    rms = np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 1)))
+    return np.where(rms > 0, rms, 1.0)
+
+
+def _triangle(rows: np.ndarray) -> np.ndarray:
+    """Triangular factors of stacked matrices."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def _covariance(rows: np.ndarray) -> np.ndarray:
+    """sum e e^H over stacked rows e^T: (n, m, k) to (n, k, k)."""
+    return np.swapaxes(rows, 1, 2) @ rows.conj()
+
+
+def local_model(U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray, frequency_Hz: np.ndarray | None = None,
+                order: int = 2, half_width: int | None = None, rational: bool = False,
+                transient: bool = False) -> LocalEstimate:
+    """Local polynomial (or rational) estimate from spectra of whole records of one length.
+
+    Parameters
+    ----------
+    U, Y : (n_records, n_lines, n_u) and (n_records, n_lines, n_y) transforms over sqrt(samples) on consecutive lines.
+    line_Hz : (n_lines,) their frequencies.
+    frequency_Hz : where to estimate; the lines by default.
+    order : degree of the polynomials (2 to 4 is usual).
+    half_width : the window has 2 half_width + 1 lines; by default `least_half_width`.
+    rational : local rational method, a denominator for each output.
+    transient : also return the transients (polynomial method only).
+
+    Raises
+    ------
+    InputError : too few lines or degrees of freedom.
+    ComputationError : inputs that cannot be told apart.
+    """
+    n_u, n_y = U.shape[2], Y.shape[2]
+    if half_width is None:
+        half_width = least_half_width(U.shape[0], n_u, n_y, order, rational)
+    step = line_Hz[1] - line_Hz[0]
+    where = line_Hz if frequency_Hz is None else np.asarray(frequency_Hz, float)
+    fit = LocalFit(where, n_u, n_y, order, half_width, half_width * step, rational)
+    fit.add(U, Y, line_Hz)
+    found = fit.estimate()
+    if not transient:
+        return found
+    return replace(found, transient=_transient(fit, U, Y, line_Hz))
+
+
+def _transient(fit: LocalFit, U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray) -> np.ndarray:
+    """(n_records, n, n_y): polynomials through what the inputs leave unexplained."""
+    if fit.rational or fit._unit is None:
+        raise InputError("expected the polynomial method", field="transient", value=True)
+    unit_u, unit_y = fit._unit
+    known = fit._lead + fit.n_u
+    slopes = np.linalg.solve(fit._factor[:, :known, :known], fit._factor[:, :known, known:])
+    result = np.empty((U.shape[0], fit.frequency_Hz.size, fit.n_y), complex)
+    for start in range(0, fit.frequency_Hz.size, BATCH):
+        keep = slice(start, min(start + BATCH, fit.frequency_Hz.size))
+        index, d = fit.window(line_Hz, keep)
+        columns = fit._columns(U[:, index] / unit_u, Y[:, index] / unit_y, d)
+        left = columns[..., known:] - columns[..., :known] @ slopes[keep]
+        basis = d[:, :, None] ** np.arange(fit.order + 1)
+        result[:, keep] = (np.linalg.pinv(basis)[:, :1] @ left)[:, :, 0]
+    return result * unit_y

@@ -1,0 +1,265 @@
+"""Frequency responses and noise covariances of campaigns by local models, for any excitation.
+
+Every record, or piece of a long one, has its own transient; G is shared (measurement.local_fit). Nothing is assumed
+periodic, so records of noise, multisines from rest and floor motion can be pooled; with a periodic excitation
+measurement.best_linear separates nonlinear distortion as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.campaign import Campaign, RecordSource
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.local_fit import LocalFit, least_half_width
+from avis_ctrl.measurement.spectra import (
+    Band,
+    Channels,
+    channels,
+    checked_band,
+    equal_pieces,
+    lines,
+    taking_part,
+    transform,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseCovariance:
+    """Covariance of the outputs' noise on one line of a transform over sqrt(samples).
+
+    frequency_Hz : (n,); covariance : (n, n_y, n_y) Hermitian, positive definite; dof : (n,) complex degrees of
+    freedom; sample_rate_Hz : a one-sided power spectral density is 2 covariance / sample_rate_Hz.
+    """
+
+    frequency_Hz: np.ndarray
+    covariance: np.ndarray
+    dof: np.ndarray
+    outputs: tuple[str, ...]
+    sample_rate_Hz: float
+
+    @property
+    def density(self) -> np.ndarray:
+        """(n, n_y, n_y) one-sided cross power spectral density, squared unit of y per Hz."""
+        return 2 * self.covariance / self.sample_rate_Hz
+
+
+# Spectra held at once: records are taken in together up to this size, which saves factorisations.
+TOGETHER_BYTES = 1 << 26
+
+
+class _Spectra(NamedTuple):
+    """Spectra of records or pieces of one length, (n_records, lines, n_u) and (n_records, lines, n_y)."""
+
+    U: np.ndarray
+    Y: np.ndarray
+    line_Hz: np.ndarray
+
+
+def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
+                     order: int = 2, half_width: int | None = None, inputs: Sequence[str] | None = None,
+                     floor: bool | None = None, longest_piece: int | None = None) -> FrequencyResponse:
+    """Local polynomial estimate, all records pooled (Pintelon and Schoukens 2012, section 7.2).
+
+    The bias grows with the half width and the curvature of G: (half width / record length)^(order + 1). Nonlinear
+    distortion counts as noise. Memory is one triangular factor per frequency and one piece of a record.
+
+    Parameters
+    ----------
+    band_Hz : lines to use, without line 0 (sensor offsets); all by default.
+    frequency_Hz : where to estimate; by default every line of the shortest piece.
+    order : of the polynomials, 2 to 4 is usual.
+    half_width : window of 2 half_width + 1 lines; by default the smallest that leaves 2 n_y + 4 degrees of freedom.
+    inputs : names of actuators; by default those that some record drives in the band.
+    floor : the floor's velocity as additional inputs; by default where every record measured it. Records with u = 0
+        take part only then.
+    longest_piece : samples; longer records are read and used in pieces, each with its own transient.
+
+    Raises
+    ------
+    InputError : bands, names, windows or records that do not allow an estimate.
+    ComputationError : inputs that cannot be told apart.
+    """
+    return _local_response(campaign, False, band_Hz, frequency_Hz, order, half_width, inputs, floor, longest_piece)
+
+
+def local_rational(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
+                   order: int = 2, half_width: int | None = None, inputs: Sequence[str] | None = None,
+                   floor: bool | None = None, longest_piece: int | None = None) -> FrequencyResponse:
+    """Local rational estimate with one denominator per output (McKelvey and Guerin 2012): for sharp resonances.
+
+    Parameters and errors as in `local_polynomial`. It is a linear least squares with noise among its regressors: meant
+    for signal-to-noise ratios above some 20 dB; below that the polynomial method is the better one.
+    """
+    return _local_response(campaign, True, band_Hz, frequency_Hz, order, half_width, inputs, floor, longest_piece)
+
+
+def _local_response(campaign: Campaign, rational: bool, band_Hz: Band | None, frequency_Hz: np.ndarray | None,
+                    order: int, half_width: int | None, inputs: Sequence[str] | None, floor: bool | None,
+                    longest: int | None) -> FrequencyResponse:
+    records = taking_part(campaign, floor)
+    used = channels(campaign, records, inputs, floor)
+    band = checked_band(band_Hz, campaign.sample_rate_Hz)
+    plan = _Plan.of(campaign, records, longest)
+    driven = range(len(used.inputs)) if inputs is not None else _driven(records, used, band, plan)
+    names = tuple(used.inputs[j] for j in driven)
+    if not names:
+        raise InputError("expected at least one input that is not zero in the band", field="inputs", value=used.inputs)
+    n_y = len(used.outputs)
+    width = half_width or least_half_width(plan.count, len(names), n_y, order, rational, plan.spacing)
+    where = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
+    fit = LocalFit(where, len(names), n_y, order, width, width * campaign.sample_rate_Hz / plan.shortest, rational)
+    for part in _spectra(records, used, list(driven), band, width, plan):
+        fit.add(*part)
+    found = fit.estimate(names)
+    kind = "rational" if rational else "polynomial"
+    left_out = [name for name in used.inputs if name not in names] if inputs is None else []
+    method = (f"local {kind} method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces"
+              + (f"; not excited and left out: {', '.join(left_out)}" if left_out else ""))
+    return FrequencyResponse(found.frequency_Hz, found.value, found.noise, found.gram, names, used.outputs,
+                             used.input_unit, used.output_unit, float(found.dof), method=method)
+
+
+def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz: float | None = None,
+                     band_Hz: Band | None = None, order: int = 2, half_width: int | None = None,
+                     floor: bool | None = None, longest_piece: int | None = None) -> NoiseCovariance:
+    """Nonparametric noise covariance of the outputs: residuals of the local polynomial method, smoothed.
+
+    Windows that do not overlap give independent estimates; those within +-smooth_Hz of a frequency are averaged, at
+    least as many as make it positive definite. All records count, those at rest as well (their u is 0), so records
+    should share their noise: choose them by `campaign.only`. Nonlinear distortion of driven records is part of it.
+
+    Parameters
+    ----------
+    frequency_Hz : (n,) where it is wanted. smooth_Hz : half the smoothing band; one window by default.
+    Others as in `local_polynomial`.
+
+    Raises
+    ------
+    InputError, ComputationError : as in `local_polynomial`.
+    """
+    records = tuple(r for r in campaign.records if r.header.excitation != "sine")
+    if not records:
+        raise InputError("expected a record other than a stepped sine", field="records")
+    used = channels(campaign, records, None, floor)
+    band = checked_band(band_Hz, campaign.sample_rate_Hz)
+    plan = _Plan.of(campaign, records, longest_piece)
+    driven = _driven(records, used, band, plan)
+    n_y = len(used.outputs)
+    width = half_width or least_half_width(plan.count, len(driven), n_y, order, spacing=plan.spacing)
+    step = campaign.sample_rate_Hz / plan.shortest
+    every = _grid(None, band, plan.shortest, campaign.sample_rate_Hz, width)
+    centres = every[width:every.size - width:2 * width + 1]
+    fit = LocalFit(centres, len(driven), n_y, order, width, width * step)
+    for part in _spectra(records, used, list(driven), band, width, plan):
+        fit.add(*part)
+    found = fit.estimate(tuple(used.inputs[j] for j in driven))
+    least = min(-(-(n_y + 2) // found.dof), centres.size)
+    return _smoothed(centres, found.noise, found.dof, np.asarray(frequency_Hz, float), smooth_Hz or width * step, least,
+                     used.outputs, campaign.sample_rate_Hz)
+
+
+def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np.ndarray, smooth_Hz: float, least: int,
+              outputs: tuple[str, ...], sample_rate_Hz: float) -> NoiseCovariance:
+    """Means over the centres near each frequency, at least `least` of them."""
+    total = np.concatenate([np.zeros((1, *noise.shape[1:])), np.cumsum(noise, axis=0)])
+    low = np.searchsorted(centres, frequency_Hz - smooth_Hz)
+    high = np.searchsorted(centres, frequency_Hz + smooth_Hz, side="right")
+    middle = np.clip(np.rint(np.interp(frequency_Hz, centres, np.arange(centres.size))).astype(int) - least // 2, 0,
+                     centres.size - least)
+    few = high - low < least
+    low, high = np.where(few, middle, low), np.where(few, middle + least, high)
+    count = high - low
+    mean = (total[high] - total[low]) / count[:, None, None]
+    mean = (mean + np.swapaxes(mean.conj(), 1, 2)) / 2
+    if least * dof < noise.shape[1]:
+        raise InputError(f"expected longer records: {least * dof} degrees of freedom cannot give a definite covariance "
+                         f"of {noise.shape[1]} outputs", field="records")
+    return NoiseCovariance(frequency_Hz, mean, (count * dof).astype(float), outputs, sample_rate_Hz)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How the records are cut: pieces in all, samples of the shortest, lines between excited ones."""
+
+    count: int
+    shortest: int
+    spacing: int
+    longest: int | None
+
+    @staticmethod
+    def of(campaign: Campaign, records: Sequence[RecordSource], longest: int | None) -> _Plan:
+        sizes, spacing = [], 1
+        for record in records:
+            whole, period = record.header.samples, record.header.period_samples
+            parts = 1 if longest is None else -(-whole // longest)
+            share = -(-whole // parts)
+            if parts > 1 and period:
+                share = max(share // period, 1) * period
+                parts = whole // share
+            sizes += [share] * parts
+            if period:
+                spacing = max(spacing, -(-share // period))
+        return _Plan(len(sizes), min(sizes), spacing, longest)
+
+
+def _grid(frequency_Hz: np.ndarray | None, band: Band, samples: int, rate: float, half_width: int) -> np.ndarray:
+    keep = lines(samples, rate, band)
+    every = np.arange(keep.start, keep.stop) * rate / samples
+    if every.size < 2 * half_width + 1:
+        raise InputError(f"expected at least {2 * half_width + 1} lines for the local models; the band {band[0]:g} to "
+                         f"{band[1]:g} Hz has {every.size} at {rate / samples:g} Hz: longer records, a wider band or "
+                         "fewer inputs", field="band_Hz", value=band)
+    if frequency_Hz is None:
+        return every
+    asked = np.asarray(frequency_Hz, float)
+    if asked.ndim != 1 or not np.all(np.diff(asked) > 0) or not (
+            asked.size and every[0] * (1 - 1e-9) <= asked[0] and asked[-1] <= every[-1] * (1 + 1e-9)):
+        raise InputError(f"expected increasing frequencies from {every[0]:g} to {every[-1]:g} Hz, lines in the band",
+                         field="frequency_Hz", value=asked if asked.size < 4 else f"{asked.size} values")
+    return asked
+
+
+def _spectra(records: Sequence[RecordSource], used: Channels, driven: list[int], band: Band, half_width: int,
+             plan: _Plan) -> Iterator[_Spectra]:
+    """Spectra of one length after the other; the band is widened by half a window, so that its ends are not
+    extrapolated."""
+    held: list[_Spectra] = []
+    for record in records:
+        rate = record.header.sample_rate_Hz
+        for piece in equal_pieces(record, plan.longest):
+            n = piece.header.samples
+            margin = half_width * rate / n
+            keep = lines(n, rate, (max(band[0] - margin, 0.0), min(band[1] + margin, rate / 2)))
+            u, y = used.of(piece)
+            new = _Spectra(transform(u[:, driven], keep)[None], transform(y, keep)[None],
+                           np.arange(keep.start, keep.stop) * rate / n)
+            full = sum(part.U.nbytes + part.Y.nbytes for part in held) > TOGETHER_BYTES
+            if held and (full or not np.array_equal(held[0].line_Hz, new.line_Hz)):
+                yield _together(held)
+                held = []
+            held.append(new)
+    if held:
+        yield _together(held)
+
+
+def _together(held: list[_Spectra]) -> _Spectra:
+    return _Spectra(np.concatenate([p.U for p in held]), np.concatenate([p.Y for p in held]), held[0].line_Hz)
+
+
+def _driven(records: Sequence[RecordSource], used: Channels, band: Band, plan: _Plan) -> list[int]:
+    """Inputs that are not silent in the band in every record, relative to their samples."""
+    moving = np.zeros(len(used.inputs), bool)
+    for record in records:
+        if np.all(moving):
+            break
+        piece = next(equal_pieces(record, plan.longest))
+        u, _ = used.of(piece)
+        U = transform(u, lines(u.shape[0], record.header.sample_rate_Hz, band))
+        moving |= np.linalg.norm(U, axis=0) > 1e-9 * np.linalg.norm(u, axis=0)
+    return [int(j) for j in np.flatnonzero(moving)]

@@ -1,0 +1,134 @@
+"""From samples to spectra: which channels and records take part, and discrete Fourier transforms in a band.
+
+Transforms are scaled by 1/sqrt(N), so that white noise has the same variance on every line whatever the length N of
+the record; a one-sided power spectral density is then 2/f_s times the mean square.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
+
+Band = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Channels:
+    """The inputs and outputs of an estimate.
+
+    inputs : names, the floor's after the actuators'; u : columns of Record.u that take part; floor : whether the
+    floor's velocity is an input.
+    """
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    u: tuple[int, ...]
+    floor: bool
+    input_unit: str
+    output_unit: str
+
+    def of(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
+        """Samples of the inputs (samples, n_u) and of the outputs (samples, n_y)."""
+        u = record.u[:, self.u]
+        return (np.hstack([u, record.floor]) if self.floor and record.floor is not None else u), record.y
+
+
+def channels(campaign: Campaign, records: Sequence[RecordSource], inputs: Sequence[str] | None,
+             floor: bool | None) -> Channels:
+    """Inputs and outputs of an estimate.
+
+    Parameters
+    ----------
+    records : those that take part.
+    inputs : names of actuators; all of them by default.
+    floor : whether the floor's velocity counts as inputs; by default where every record measured it.
+
+    Raises
+    ------
+    InputError : an unknown input, a record without floor channels where they are asked for, different ones.
+    """
+    names = campaign.u_names if inputs is None else tuple(inputs)
+    for name in names:
+        if name not in campaign.u_names:
+            raise InputError(f"expected some of {list(campaign.u_names)}", field="inputs", value=name)
+    first = records[0].header
+    lacking = [record.header.name for record in records if not record.header.floor_names]
+    if floor and lacking:
+        raise InputError("the floor is asked for as an input but was not measured", field=f"record {lacking[0]}: floor")
+    use = not lacking if floor is None else floor
+    for record in records:
+        if use and record.header.floor_names != first.floor_names:
+            raise InputError(f"expected {first.floor_names} as in record {first.name}",
+                             field=f"record {record.header.name}: floor_names", value=record.header.floor_names)
+    unit = f"{first.u_unit}; floor {first.floor_unit}" if use else first.u_unit
+    return Channels((*names, *(first.floor_names if use else ())), campaign.y_names,
+                    tuple(campaign.u_names.index(name) for name in names), use, unit, campaign.y_unit)
+
+
+def taking_part(campaign: Campaign, floor: bool | None) -> tuple[RecordSource, ...]:
+    """Records that tell of the response: stepped sines never, records with u = 0 only where the floor is an input.
+
+    Raises
+    ------
+    InputError : none is left.
+    """
+    moving = [r for r in campaign.records if r.header.excitation != "sine"]
+    driven = tuple(r for r in moving if r.header.excitation in ("multisine", "noise"))
+    quiet_count = floor is not False and bool(moving) and all(r.header.floor_names for r in moving)
+    chosen = tuple(moving) if quiet_count else driven
+    if not chosen:
+        raise InputError("expected at least one record with multisine or noise excitation, or with measured floor "
+                         "motion", field="records", value=[r.header.excitation for r in campaign.records])
+    return chosen
+
+
+def checked_band(band_Hz: Band | None, sample_rate_Hz: float) -> Band:
+    """A band within 0 .. f_s/2; all of it by default."""
+    low, high = (0.0, sample_rate_Hz / 2) if band_Hz is None else band_Hz
+    if not 0 <= low < high <= sample_rate_Hz / 2:
+        raise InputError(f"expected 0 <= low < high <= {sample_rate_Hz / 2:g} Hz, half the sample rate",
+                         field="band_Hz", value=band_Hz)
+    return low, high
+
+
+def lines(samples: int, sample_rate_Hz: float, band_Hz: Band) -> slice:
+    """Lines of a transform of that many samples within a band; line 0 holds the sensors' offsets and stays out."""
+    step = sample_rate_Hz / samples
+    first = max(1, int(np.ceil(band_Hz[0] / step - 1e-9)))
+    last = min((samples - 1) // 2, int(np.floor(band_Hz[1] / step + 1e-9)))
+    return slice(first, last + 1)
+
+
+def transform(x: np.ndarray, keep: slice) -> np.ndarray:
+    """Some lines of the transform along the first axis, over sqrt(N)."""
+    return fft.rfft(x, axis=0)[keep] / np.sqrt(x.shape[0])
+
+
+def equal_pieces(record: RecordSource, longest: int | None) -> Iterator[Record]:
+    """A record in pieces of nearly the same length (the whole of it where longest is None): a short last piece would
+    have a coarse resolution; one below half the others' length is left out."""
+    if longest is None or record.header.samples <= longest:
+        yield record.load()
+        return
+    count = -(-record.header.samples // longest)
+    # Whole periods round a piece's length down, so that an even share might lie below one period.
+    share = max(-(-record.header.samples // count), record.header.period_samples or 2)
+    longest_seen = 0
+    for piece in record.pieces(share):
+        longest_seen = max(longest_seen, piece.header.samples)
+        if 2 * piece.header.samples >= longest_seen:
+            yield piece
+
+
+def hermitian_solve(numerator: np.ndarray, gram: np.ndarray) -> np.ndarray:
+    """numerator inv(gram) for stacks of matrices, gram Hermitian; columns scaled, units differ by orders."""
+    size = np.sqrt(np.real(np.einsum("...ii->...i", gram)))
+    scaled = gram / (size[..., :, None] * size[..., None, :])
+    right = np.linalg.solve(scaled, np.swapaxes(numerator.conj() / size[..., None, :], -1, -2))
+    return np.swapaxes(right.conj(), -1, -2) / size[..., None, :]

@@ -1,0 +1,290 @@
+"""Local polynomial and rational methods on systems whose response is known exactly."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.measurement.local_fit import LocalFit, local_model
+from avis_ctrl.measurement.local_polynomial import local_polynomial, local_rational, noise_covariance
+from avis_ctrl.measurement.pooling import pool
+from known_systems import Modal, campaign, squared_error
+
+RATE = 200.0
+
+
+def noisy(system, rng, samples, records, noise=0.05, factor=None, discard=0):
+    factor = np.eye(system.n_y) if factor is None else factor
+    runs = []
+    for _ in range(records):
+        u = rng.standard_normal((samples + discard, system.n_u))
+        y = system.simulate(u) + noise * rng.standard_normal((samples + discard, system.n_y)) @ factor.T
+        runs.append((u[discard:], y[discard:]))
+    return campaign(runs, RATE)
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+def test_a_response_that_is_a_polynomial_is_found_exactly(rng, order):
+    """G and the transients polynomial over the band: no bias at all, transients included."""
+    f = np.arange(1, 61) * 0.5
+    G = sum(rng.standard_normal((2, 3)) * (f[:, None, None] / 30) ** s for s in range(order + 1))
+    U = rng.standard_normal((4, 60, 3)) + 1j * rng.standard_normal((4, 60, 3))
+    T = sum(rng.standard_normal((4, 1, 2)) * (f[:, None] / 30) ** s for s in range(order + 1))
+    found = local_model(U, (G @ U[..., None])[..., 0] + T, f, order=order, transient=True)
+    assert np.abs(found.value - G).max() < 1e-10
+    assert np.abs(found.transient - T).max() < 1e-9
+
+
+def test_the_same_estimate_as_the_full_least_squares_of_the_book(rng):
+    """One line solved by lstsq with the transients as explicit unknowns (P&S 2012, section 7.2.2)."""
+    f, n_rec, n_u, n_y, order, w = np.arange(1, 40.0), 3, 2, 2, 2, 4
+    U = rng.standard_normal((n_rec, 39, n_u)) + 1j * rng.standard_normal((n_rec, 39, n_u))
+    Y = rng.standard_normal((n_rec, 39, n_y)) + 1j * rng.standard_normal((n_rec, 39, n_y))
+    found = local_model(U, Y, f, f[20:21], order, w)
+    rows, right = [], []
+    for r in range(n_rec):
+        for k in range(20 - w, 20 + w + 1):
+            d = float(k - 20) ** np.arange(order + 1)
+            own = np.zeros((n_rec, order + 1))
+            own[r] = d
+            rows.append(np.concatenate([np.kron(d, U[r, k]), own.ravel()]))
+            right.append(Y[r, k])
+    K, right = np.array(rows), np.array(right)
+    solution, power, _, _ = np.linalg.lstsq(K, right)
+    assert found.dof == K.shape[0] - K.shape[1]
+    assert np.allclose(found.value[0], solution[:n_u].T)
+    residual = right - K @ solution
+    assert np.allclose(found.noise[0], residual.T @ residual.conj() / found.dof)
+    inverse = np.linalg.inv(K.conj().T @ K)[:n_u, :n_u]
+    assert np.allclose(np.linalg.inv(found.gram[0]).T, inverse)
+
+
+def test_records_taken_in_one_by_one_give_the_same_as_together(rng):
+    f = np.arange(1, 101.0)
+    U = rng.standard_normal((5, 100, 2)) + 1j * rng.standard_normal((5, 100, 2))
+    Y = rng.standard_normal((5, 100, 3)) + 1j * rng.standard_normal((5, 100, 3))
+    for rational in (False, True):
+        fit = LocalFit(f, 2, 3, 2, 5, 5.0, rational)
+        for r in range(5):
+            fit.add(U[r:r + 1], Y[r:r + 1], f)
+        one, together = fit.estimate(), local_model(U, Y, f, half_width=5, rational=rational)
+        for field in ("value", "noise", "gram"):
+            assert np.allclose(getattr(one, field), getattr(together, field), rtol=1e-9, atol=1e-12), field
+
+
+def test_covariance_covers_what_it_claims():
+    """200 campaigns of a 2x2 system: the error of vec(G), measured by its estimated covariance, follows Hotelling's
+    law, 2 n F(2n, 2(dof - n + 1))-like for complex errors; 95 % regions hold 95 %."""
+    rng = np.random.default_rng(5)
+    system = Modal(rng, 2, 2, [20.0, 50.0], 0.3, RATE)
+    mixing, noise = np.array([[1.0, 0.0], [0.8, 0.6]]), 0.2
+    ratio, scaled, entries = [], [], []
+    for _ in range(200):
+        got = local_polynomial(noisy(system, rng, 600, 3, noise, mixing), band_Hz=(10.0, 80.0),
+                               frequency_Hz=np.linspace(12, 78, 5))
+        error = got.value - system.response(got.frequency_Hz)
+        entries.append(squared_error(got, system.response(got.frequency_Hz)))
+        # Column j of G along S: e S^(1/2) has independent columns of covariance C.
+        root = np.linalg.cholesky(got.gram)
+        columns = error @ root
+        ratio.append(np.real(np.einsum("nij,nik,nkj->n", columns.conj(), np.linalg.inv(got.noise), columns)))
+        scaled.append(got.noise)
+    dof = got.dof
+    # A Student's law of each entry: |e|^2/var is F(2, 2 dof).
+    inside = np.mean(np.array(entries) < stats.f(2, 2 * dof).isf(0.05))
+    assert 0.93 < inside < 0.97
+    # E of the quadratic form over 2 columns: n_u n_y dof / (dof - n_y) for a complex Wishart estimate.
+    assert np.mean(ratio) == pytest.approx(4 * dof / (dof - 2), rel=0.08)
+    # 1/sqrt(N) scaling: variance of a line is that of a sample; trace test of chi-square at 1000 estimates.
+    mean = np.mean(scaled, axis=(0, 1))
+    assert np.allclose(mean, noise ** 2 * mixing @ mixing.T, atol=4 * noise ** 2 / np.sqrt(1000 * dof) * 2)
+
+
+def hann_error(system, u, y, keep):
+    """SISO H1 of a single record with a Hann window in the frequency domain (no averaging): for comparison only."""
+    def smooth(x):
+        X = np.fft.rfft(x[:, 0])
+        return X[1:-1] - 0.5 * (X[:-2] + X[2:])
+    return (smooth(y) / smooth(u))[keep]
+
+
+def test_leakage_falls_with_the_order_and_beats_a_hann_window():
+    """Noise-free: halving the resolution divides the error by about 2^(order + 1) at least, Hann's by less."""
+    rng = np.random.default_rng(8)
+    system = Modal(rng, 1, 1, [30.0], 0.05, RATE)
+    sizes, where = [1000, 2000, 4000], np.linspace(20, 40, 41)
+    rms = {2: [], 4: [], "hann": []}
+    for n in sizes:
+        data = noisy(system, rng, n, 1, 0.0, discard=700)
+        exact = system.response(where)
+        for order in (2, 4):
+            got = local_polynomial(data, band_Hz=(10, 60), frequency_Hz=where, order=order, half_width=8)
+            rms[order].append(np.sqrt(np.mean(np.abs(got.value - exact) ** 2)))
+        record = data.records[0]
+        got = hann_error(system, record.u, record.y, np.rint(where * n / RATE).astype(int) - 1)
+        rms["hann"].append(np.sqrt(np.median(np.abs(got - exact[:, 0, 0]) ** 2)))
+    slope = {key: np.log2(value[0] / value[-1]) / 2 for key, value in rms.items()}
+    assert slope[2] > 2.5 and slope[4] > 4.0 and slope["hann"] < 2.2, (slope, rms)
+    assert rms[2][-1] < rms["hann"][-1] / 5 and rms[4][-1] < rms["hann"][-1] / 50
+
+
+def test_rational_is_better_at_a_lightly_damped_resonance():
+    """One mode of 0.5 % damping, half-power width 2.0 lines: polynomials cannot follow it, one denominator can."""
+    rng = np.random.default_rng(3)
+    system = Modal(rng, 2, 1, [30.0], 0.005, RATE)
+    data = noisy(system, rng, 1333, 2, 1e-4)
+    where = np.linspace(29, 31, 21)
+    exact = system.response(where)
+    error = [np.abs(method(data, band_Hz=(20, 40), frequency_Hz=where, half_width=6).value - exact).max()
+             for method in (local_polynomial, local_rational)]
+    assert error[1] < error[0] / 20, error
+    got = local_rational(data, band_Hz=(20, 40), frequency_Hz=where, half_width=6)
+    assert np.mean(squared_error(got, exact)) < 2.0
+
+
+def test_rational_noise_covariance_where_the_response_is_flat():
+    """The worst place for its denominator: the least squares shrinks the residual to 4/9, which is undone."""
+    rng = np.random.default_rng(4)
+    U = rng.standard_normal((6, 400, 1)) + 1j * rng.standard_normal((6, 400, 1))
+    V = 0.2 * (rng.standard_normal((6, 400, 2)) + 1j * rng.standard_normal((6, 400, 2))) / np.sqrt(2)
+    found = local_model(U, U @ np.ones((1, 2)) + V, np.arange(1, 401.0), half_width=20, rational=True)
+    assert np.mean(np.real(np.einsum("nii->ni", found.noise))) == pytest.approx(0.04, rel=0.15)
+
+
+def test_long_records_in_pieces_and_records_of_different_length(rng):
+    system = Modal(rng, 2, 2, [20.0, 55.0], 0.1, RATE)
+    u = rng.standard_normal((30000, 2))
+    long = campaign([(u, system.simulate(u) + 0.1 * rng.standard_normal((30000, 2)))], RATE)
+    where = np.linspace(10, 80, 40)
+    whole = local_polynomial(long, band_Hz=(5, 90), frequency_Hz=where)
+    pieces = local_polynomial(long, band_Hz=(5, 90), frequency_Hz=where, longest_piece=5000)
+    assert "6 records or pieces" in pieces.method
+    for got in (whole, pieces):
+        assert np.mean(squared_error(got, system.response(where))) == pytest.approx(1.15, abs=0.3)
+    mixed = campaign([(u[:4000], system.simulate(u[:4000])), (u[4000:10000], system.simulate(u[4000:10000]))], RATE)
+    got = local_polynomial(mixed, band_Hz=(5, 90), frequency_Hz=where)
+    assert np.abs(got.value - system.response(where)).max() < 1e-2
+
+
+def test_pooled_estimates_weigh_by_their_gram_matrices(rng):
+    system = Modal(rng, 2, 2, [40.0], 0.3, RATE)
+    where = np.linspace(20, 80, 30)
+    parts = []
+    for scale in (1.0, 3.0):
+        u = scale * rng.standard_normal((4000, 2))
+        data = campaign([(u, system.simulate(u) + 0.3 * rng.standard_normal((4000, 2)))], RATE)
+        parts.append(local_polynomial(data, frequency_Hz=where))
+    both = pool(parts)
+    assert np.allclose(both.gram, parts[0].gram + parts[1].gram)
+    assert np.mean(squared_error(both, system.response(where))) == pytest.approx(1.0, abs=0.4)
+    error = [np.mean(np.abs(p.value - system.response(where)) ** 2) for p in (*parts, both)]
+    assert error[2] < error[1] < error[0]
+    with pytest.raises(InputError, match="same frequencies"):
+        pool([parts[0], parts[1].at(np.arange(3))])
+
+
+def test_floor_velocity_as_further_inputs(rng):
+    """A system of 2 actuators and 3 floor channels; without the floor its motion is noise, 10 times larger."""
+    system = Modal(rng, 2, 5, [25.0], 0.2, RATE)
+    runs, floors = [], []
+    for _ in range(2):
+        u, v = rng.standard_normal((3000, 2)), rng.standard_normal((3000, 3))
+        runs.append((u, system.simulate(np.hstack([u, v])) + 0.01 * rng.standard_normal((3000, 2))))
+        floors.append(v)
+    data = campaign(runs, RATE, floors=floors)
+    got = local_polynomial(data, band_Hz=(5, 80))
+    assert got.inputs == ("u1", "u2", "vx", "vy", "vz") and "floor m/s" in got.input_unit
+    assert np.mean(squared_error(got, system.response(got.frequency_Hz))) < 1.6
+    without = local_polynomial(data, band_Hz=(5, 80), floor=False)
+    assert without.inputs == ("u1", "u2")
+    assert np.mean(without.variance()) > 100 * np.mean(got.variance()[:, :, :2])
+    with pytest.raises(InputError, match="floor is asked for"):
+        local_polynomial(noisy(Modal(rng, 1, 1, [25.0], 0.2, RATE), rng, 400, 1), floor=True)
+
+
+def test_noise_covariance_of_coloured_noise(rng):
+    """First-order noise, correlated between outputs; the mean of C inv(C0) is 1 and C stays positive definite."""
+    system = Modal(rng, 3, 2, [25.0], 0.3, RATE)
+    mixing = np.array([[1.0, 0, 0], [0.9, 0.1, 0], [0.2, 0.3, 0.5]])
+    runs = []
+    for _ in range(4):
+        u, white = rng.standard_normal((8000, 2)), 0.1 * rng.standard_normal((8000, 3))
+        white[1:] += 0.8 * white[:-1]
+        runs.append((u, system.simulate(u) + white @ mixing.T))
+    where = np.linspace(2, 95, 50)
+    got = noise_covariance(campaign(runs, RATE), where, smooth_Hz=2.0)
+    shape = 0.01 * np.abs(1 + 0.8 * np.exp(-2j * np.pi * where / RATE)) ** 2
+    exact = shape[:, None, None] * (mixing @ mixing.T)
+    assert np.all(np.linalg.eigvalsh(got.covariance) > 0)
+    # dof C inv(C0) is complex Wishart: its trace is chi-square of 2 n dof degrees over 2.
+    trace = np.real(np.einsum("nij,nji->n", got.covariance, np.linalg.inv(exact))) / 3
+    assert abs(np.mean(trace) - 1) < 3 / np.sqrt(3 * got.dof.sum()) + 0.02
+    chi = stats.chi2(6 * got.dof)
+    inside = (6 * got.dof * trace > chi.ppf(0.005)) & (6 * got.dof * trace < chi.ppf(0.995))
+    assert np.mean(inside) > 0.93
+    assert np.allclose(got.density, got.covariance * 2 / RATE)
+
+
+def test_records_at_rest_give_the_sensors_noise(rng):
+    """u = 0: no input to estimate; offsets stay on line 0."""
+    runs = [(np.zeros((4000, 2)), 5.0 + 0.2 * rng.standard_normal((4000, 3))) for _ in range(2)]
+    got = noise_covariance(campaign(runs, RATE, "rest"), np.linspace(5, 90, 20), smooth_Hz=10.0)
+    assert np.allclose(got.covariance, 0.04 * np.eye(3), atol=0.04 * 5 / np.sqrt(got.dof.min()))
+
+
+def test_inputs_that_cannot_be_told_apart_are_named(rng):
+    system = Modal(rng, 1, 3, [25.0], 0.3, RATE)
+    u = rng.standard_normal((2000, 3))
+    u[:, 2] = 2 * u[:, 0]
+    with pytest.raises(ComputationError, match=r"u1, u3 cannot be told apart"):
+        local_polynomial(campaign([(u, system.simulate(u))], RATE))
+    u[:, 2] = 0
+    got = local_polynomial(campaign([(u, system.simulate(u))], RATE), band_Hz=(5, 80))
+    assert got.inputs == ("u1", "u2") and "left out: u3" in got.method
+    assert np.abs(got.value - system.response(got.frequency_Hz)[:, :, :2]).max() < 1e-3
+    with pytest.raises(ComputationError, match="u3"):
+        local_polynomial(campaign([(u, system.simulate(u))], RATE), inputs=("u1", "u3"))
+
+
+def test_an_input_silent_in_part_of_the_band_is_named_with_the_frequencies(rng):
+    """u2 has no power above 50 Hz: roundoff there is not an excitation."""
+    u = rng.standard_normal((2000, 2))
+    spectrum = np.fft.rfft(u[:, 1])
+    spectrum[500:] = 0
+    u[:, 1] = np.fft.irfft(spectrum, 2000)
+    data = campaign([(u, u @ np.ones((2, 1)))], RATE)
+    with pytest.raises(ComputationError, match=r"u2 .* to 80 Hz"):
+        local_polynomial(data, band_Hz=(5, 80))
+    assert local_polynomial(data, band_Hz=(5, 45)).inputs == ("u1", "u2")
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    ({"band_Hz": (50.0, 20.0)}, "band_Hz"), ({"band_Hz": (5.0, 120.0)}, "100 Hz"), ({"order": 9}, "order"),
+    ({"half_width": 1}, "half_width"), ({"inputs": ("u7",)}, "u7"), ({"band_Hz": (5.0, 5.5)}, "longer records"),
+    ({"frequency_Hz": np.array([5.0, 99.99])}, "frequency_Hz"), ({"half_width": 2, "order": 3}, "degrees of freedom")])
+def test_wrong_requests_are_answered(rng, change, words):
+    data = noisy(Modal(rng, 2, 2, [25.0], 0.3, RATE), rng, 1000, 1)
+    with pytest.raises(InputError, match=words):
+        local_polynomial(data, **change)
+
+
+def test_a_campaign_of_the_rigs_size_takes_seconds():
+    """6 records x 60 s x 1 kHz x (8 + 3) inputs x 6 outputs, 0.5 to 80 Hz: 4771 lines."""
+    rng = np.random.default_rng(1)
+    D = rng.standard_normal((6, 11))
+    runs, floors = [], []
+    for _ in range(6):
+        x = rng.standard_normal((60000, 11))
+        runs.append((x[:, :8], x @ D.T + rng.standard_normal((60000, 6))))
+        floors.append(x[:, 8:])
+    data = campaign(runs, 1000.0, floors=floors)
+    start = time.perf_counter()
+    got = local_polynomial(data, band_Hz=(0.5, 80.0))
+    taken = time.perf_counter() - start
+    assert got.value.shape == (4771, 6, 11) and got.dof == 27
+    assert np.mean(squared_error(got, D)) == pytest.approx(27 / 26, rel=0.02)
+    assert taken < 15.0, taken
