@@ -128,6 +128,7 @@ class MultisineSettings:
     group : odd lines in a group, of which one is left out.
     scheme : how the inputs are told apart, see above.
     realisations : independent draws of the phases; the lines are the same in all.
+    dealt : by how many places the zippered lines of the first realisation are dealt on.
     shape : relative amplitude, a function of Hz, or one number for each line that is excited; flat when None.
     compensate_hold : divide the amplitudes by the sinc of the zero-order hold, so that the held voltage, not its
         samples, has the shape asked.
@@ -150,6 +151,7 @@ class MultisineSettings:
     group: int = 4
     scheme: Scheme = "orthogonal"
     realisations: int = 1
+    dealt: int = 0
     shape: Shape | None = None
     compensate_hold: bool = False
     low_crest: bool = True
@@ -169,7 +171,7 @@ class MultisineSettings:
         for name, known in (("lines", get_args(Lines)), ("scheme", get_args(Scheme))):
             if getattr(self, name) not in known:
                 raise InputError(f"expected one of {', '.join(known)}", field=name, value=getattr(self, name))
-        for name, least in (("spacing", 1), ("group", 2), ("realisations", 1), ("seed", 0)):
+        for name, least in (("spacing", 1), ("group", 2), ("realisations", 1), ("dealt", 0), ("seed", 0)):
             _whole(getattr(self, name), name, least)
 
     @property
@@ -203,7 +205,7 @@ def multisine(settings: MultisineSettings) -> ExcitationSignals:
     for r in range(settings.realisations):
         record, drawn = np.zeros((len(T), N, n_u)), np.zeros((len(T), N, n_u))
         for i in range(n_u):
-            own = slice(None) if settings.scheme == "orthogonal" else slice((i + r) % n_u, None, n_u)
+            own = slice(None) if settings.scheme == "orthogonal" else slice((i + r + settings.dealt) % n_u, None, n_u)
             turns = np.angle(T[:, i]) if settings.scheme == "orthogonal" else np.zeros(1)
             record[:, :, i], drawn[:, :, i] = _one_input(lines[own], amplitude[own], turns, N, settings.low_crest, rng)
         u.append(record)

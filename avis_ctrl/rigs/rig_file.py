@@ -109,10 +109,15 @@ class PlateSection(_Section):
     L3_m: PositiveLength
     L4_plus_L5_m: PositiveLength
     L6_m: Length
+    M2_arm_m: Length = 0.2
+    M3_arm_m: Length = 0.15
 
 
 class SuspensionSection(_Section):
+    """k_s_each_N_per_m : the springs at the corners of A1..A4, where they differ; k_s_N_per_m is then their mean."""
+
     k_s_N_per_m: Positive
+    k_s_each_N_per_m: Annotated[list[Positive], Field(min_length=4, max_length=4)] | None = None
     k_a_N_per_m: Positive
     k_t_N_per_m: Positive
     k_r_Nm_per_rad: Positive
@@ -150,6 +155,8 @@ class LoadSection(_Section):
     Iyy_total_kgm2: Positive
     Izz_total_kgm2: Positive
     Ixy_load_kgm2: Number = 0.0
+    Ixz_load_kgm2: Number = 0.0
+    Iyz_load_kgm2: Number = 0.0
 
 
 class HalcyonicsFile(_Section):
@@ -274,11 +281,11 @@ def _halcyonics(file: HalcyonicsFile, loaded: bool) -> Halcyonics:
     if loaded and load is None:
         raise InputError("the loaded table was asked for, but the file has no [load] section", field="load")
     stiffness = {name.partition("_N")[0]: value for name, value in suspension.model_dump().items()}
-    k_s = stiffness.pop("k_s")
+    k_s, each = stiffness.pop("k_s"), stiffness.pop("k_s_each")
     lengths = {name.removesuffix("_m"): getattr(plate, name) for name in ("L1_m", "L2_m", "L3_m", "L4_plus_L5_m",
-                                                                          "L6_m")}
+                                                                          "L6_m", "M2_arm_m", "M3_arm_m")}
     Ixx, Iyy, Izz = plate.inertia_kgm2
-    return Halcyonics(file.name, plate.mass_kg, Ixx, Iyy, Izz, **lengths, **stiffness, k_s=(k_s,) * 4,
+    return Halcyonics(file.name, plate.mass_kg, Ixx, Iyy, Izz, **lengths, **stiffness, k_s=tuple(each or (k_s,) * 4),
                       e=tuple(actuators.constant_N_per_V), actuator_names=tuple(actuators.names),
                       reaction=ReactionMass(actuators.reaction_mass_kg, actuators.reaction_damping_Ns_per_m,
                                             actuators.free_constant_N_per_V),
@@ -294,9 +301,10 @@ def _load(section: LoadSection, plate: PlateSection) -> Load:
     """Table 2 prints plate plus load (I_xx + I^e_xx), without the terms m_e L^2: see `Load`."""
     totals = np.array([section.Ixx_total_kgm2, section.Iyy_total_kgm2, section.Izz_total_kgm2])
     Ixx, Iyy, Izz = (float(value) for value in totals - plate.inertia_kgm2)
-    load = Load(section.mass_kg, section.L7_m, section.L8_m, section.L9_m, Ixx, Iyy, Izz, section.Ixy_load_kgm2)
-    _check_inertia(load.inertia(), "load.Ixx_total_kgm2 .. Ixy_load_kgm2", [*totals, section.Ixy_load_kgm2],
-                   slender=True)
+    load = Load(section.mass_kg, section.L7_m, section.L8_m, section.L9_m, Ixx, Iyy, Izz, section.Ixy_load_kgm2,
+                section.Ixz_load_kgm2, section.Iyz_load_kgm2)
+    _check_inertia(load.inertia(), "load.Ixx_total_kgm2 .. Iyz_load_kgm2",
+                   [*totals, section.Ixy_load_kgm2, section.Ixz_load_kgm2, section.Iyz_load_kgm2], slender=True)
     return load
 
 

@@ -109,6 +109,8 @@ def test_zippered_lines_belong_to_one_input_each_and_to_all_in_turn():
     assert signals.u.shape == (3, 1000, 3)
     assert np.all(owner[:, lines].sum(axis=2) == 1) and owner.sum() == 3 * lines.size
     assert np.all(owner[:, lines].sum(axis=0) == 1)
+    on = np.abs(spectrum(multisine(wanted(3, scheme="zippered", dealt=2)).u)) ** 2
+    assert np.array_equal(on[0] > 1e-6 * on.max(), owner[2])
     assert np.allclose(signals.rms_V, 0.5)
 
 
@@ -202,7 +204,7 @@ WRONG = [({"inputs": ()}, "inputs"), ({"inputs": ("a", "a")}, "inputs"), ({"samp
          ({"band_Hz": (0.0, 10.0)}, "band_Hz"), ({"band_Hz": (20.0, 10.0)}, "band_Hz"),
          ({"band_Hz": (1.0, 250.0)}, "below half the sample rate"), ({"band_Hz": (1.1, 1.2)}, "at least 1 line"),
          ({"band_Hz": (1.0, 1.5), "scheme": "zippered"}, "at least 3 lines"), ({"lines": "even"}, "lines"),
-         ({"scheme": "none"}, "scheme"), ({"spacing": 0}, "spacing"), ({"group": 1}, "group"),
+         ({"scheme": "none"}, "scheme"), ({"spacing": 0}, "spacing"), ({"dealt": -1}, "dealt"), ({"group": 1}, "group"),
          ({"realisations": 1.5}, "realisations"), ({"seed": -1}, "seed"), ({"rms_V": 0.0}, "rms_V"),
          ({"limit_V": np.inf}, "limit_V"), ({"shape": np.zeros(119)}, "shape"), ({"shape": [1.0]}, "119 finite"),
          ({"shape": lambda f: f * np.nan}, "shape")]

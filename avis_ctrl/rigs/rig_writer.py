@@ -1,0 +1,169 @@
+"""A rig as a rig file: TOML that `load_rig` reads back, every value with all its digits."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.avis import AXES, INERTIA, AvisTable
+from avis_ctrl.rigs.equipment import Ambient
+from avis_ctrl.rigs.halcyonics import Halcyonics
+from avis_ctrl.rigs.rig import Rig
+
+
+@dataclass(frozen=True)
+class _Line:
+    """One key of a file and the parameters of the rig (flat names) that its value holds."""
+
+    key: str
+    value: Any
+    parameters: tuple[str, ...] = ()
+
+
+# Title as it stands in the file, the name that comments and messages use, and the lines.
+_Section = tuple[str, str, list[_Line]]
+
+
+def rig_toml(rig: Rig, comments: Mapping[str, str] | None = None, header: str = "") -> str:
+    """The text of a rig file.
+
+    A loaded Halcyonics table is read back with `load_rig(path, loaded=True)`. Two values are stored as sums, as the
+    file has them (total inertia of plate and load, chassis ends of isolators), and come back to the last digit of
+    the sum.
+
+    Parameters
+    ----------
+    comments : written behind the line of their key, which is a parameter's flat name ("isolator1.k_x", several on one
+        line are joined) or the key in the file as messages name it ("payload.mass_kg", "isolator[1].damping_Ns_per_m").
+    header : comment lines at the top.
+
+    Raises
+    ------
+    InputError : a rig of another kind, a comment for a line that is not there or that is no single line.
+    """
+    if isinstance(rig, AvisTable):
+        sections = _avis_sections(rig)
+    elif isinstance(rig, Halcyonics):
+        sections = _halcyonics_sections(rig)
+    else:
+        raise InputError("expected an AvisTable or a Halcyonics rig", field="rig", value=type(rig).__name__)
+    left = dict(comments or {})
+    text = "".join(_comment(line) + "\n" for line in header.splitlines())
+    for title, name, lines in sections:
+        text += f"\n{title}\n" if title else ""
+        for line in lines:
+            dotted = f"{name}.{line.key}" if name else line.key
+            said = [left.pop(known) for known in (dotted, *line.parameters) if known in left]
+            text += f"{line.key} = {_toml(line.value)}" + (f"  {_comment('; '.join(said))}" if said else "") + "\n"
+    if left:
+        raise InputError(f"the file of the rig {rig.name} has no such line or parameter", field="comments",
+                         value=next(iter(left)))
+    return text
+
+
+def _comment(text: str) -> str:
+    if any(not (character.isprintable() or character == "\t") for character in text):
+        raise InputError("expected one line of printable characters", field="comments", value=text)
+    return f"# {text}".rstrip()
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, str):
+        # JSON's strings are TOML's but for this character, which TOML wants escaped.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, (int, np.integer)):
+        return str(int(value))
+    if isinstance(value, (float, np.floating)):
+        return repr(float(value))
+    return f"[{', '.join(_toml(one) for one in value)}]"
+
+
+def _plain(thing: object, *names: str) -> list[_Line]:
+    """Attributes that the file calls as the rig does."""
+    return [_Line(name, getattr(thing, name)) for name in names]
+
+
+def _ambient(ambient: Ambient | None) -> list[_Section]:
+    names = ("floor_velocity_rms_m_per_s", "sensor_noise_rms_V")
+    return [("[ambient]", "ambient", _plain(ambient, *names))] if ambient else []
+
+
+def _sum_for(parts: Iterable[float], bases: Iterable[float]) -> list[float]:
+    """base + part, moved by the last digit where that makes sum - base the part exactly."""
+    sums = []
+    for part, base in zip(parts, bases, strict=True):
+        total = base + part
+        near = (total, np.nextafter(total, np.inf), np.nextafter(total, -np.inf))
+        sums.append(float(min(near, key=lambda one: abs((one - base) - part))))
+    return sums
+
+
+def _avis_sections(rig: AvisTable) -> list[_Section]:
+    sections: list[_Section] = [
+        ("", "", [_Line("name", rig.name)]),
+        ("[payload]", "payload", [
+            _Line("mass_kg", rig.mass, ("mass",)), _Line("inertia_kgm2", rig.inertia[:3], INERTIA[:3]),
+            _Line("inertia_offdiagonal_kgm2", rig.inertia[3:], INERTIA[3:]),
+            _Line("centre_of_mass_m", rig.centre_of_mass, tuple(f"com_{axis}" for axis in AXES))])]
+    for number, one in enumerate(rig.isolators, 1):
+        def of(kind: str, number: int = number) -> tuple[str, ...]:
+            return tuple(f"isolator{number}.{kind}_{axis}" for axis in AXES)
+        lines = [_Line("position_m", one.position, of("p")), _Line("stiffness_N_per_m", one.stiffness, of("k")),
+                 _Line("damping_Ns_per_m", one.damping, of("c"))]
+        if any(one.chassis_offset):
+            lines.append(_Line("chassis_point_m", _sum_for(one.chassis_offset, one.position)))
+        sections.append(("[[isolator]]", f"isolator[{number}]", lines))
+    motors, a = rig.motors, rig.acquisition
+    sections.append(("[actuators]", "actuators", [
+        _Line("names", [m.name for m in motors]), _Line("isolator", [m.isolator for m in motors]),
+        _Line("axis", [m.axis for m in motors]),
+        _Line("constant_N_per_V", [m.constant_N_per_V for m in motors], tuple(f"actuator.{m.name}" for m in motors)),
+        _Line("limit_V", rig.limit_V)]))
+    sections.append(("[geophones]", "geophones", _plain(
+        rig.geophones, "names", "isolator", "axis", "sensitivity_Vs_per_m", "suspension_Hz", "suspension_damping",
+        "compensated_Hz", "compensated_damping", "preamplifier_gain")))
+    sections.append(("[acquisition]", "acquisition",
+                     _plain(a, "sample_rate_Hz", "adc_bits", "adc_range_V", "loop_delay_s")))
+    return sections + _ambient(rig.ambient)
+
+
+def _halcyonics_sections(rig: Halcyonics) -> list[_Section]:
+    lengths = ("L1", "L2", "L3", "L4_plus_L5", "L6", "M2_arm", "M3_arm")
+    suspension = {"k_a": "N_per_m", "k_t": "N_per_m", "k_r": "Nm_per_rad", "d1": "Ns_per_m", "d3": "Ns_per_m",
+                  "d4": "Nms_per_rad", "d5": "Nms_per_rad", "d6": "Nms_per_rad"}
+    springs = [_Line("k_s_N_per_m", float(np.mean(rig.k_s)), ("k_s",))]
+    if len(set(rig.k_s)) > 1:
+        springs.append(_Line("k_s_each_N_per_m", rig.k_s, tuple(f"k_s{k}" for k in range(1, 5))))
+    else:
+        springs = [_Line("k_s_N_per_m", rig.k_s[0], ("k_s", "k_s1", "k_s2", "k_s3", "k_s4"))]
+    sections: list[_Section] = [
+        ("", "", [_Line("name", rig.name)]),
+        ("[payload]", "payload", [
+            _Line("mass_kg", rig.mass, ("mass",)),
+            _Line("inertia_kgm2", (rig.Ixx, rig.Iyy, rig.Izz), ("Ixx", "Iyy", "Izz")),
+            *(_Line(f"{name}_m", getattr(rig, name), (name,)) for name in lengths)]),
+        ("[suspension]", "suspension", springs + [
+            _Line(f"{name}_{unit}", getattr(rig, name), (name,)) for name, unit in suspension.items()]),
+        ("[actuators]", "actuators", [
+            _Line("names", rig.actuator_names),
+            _Line("constant_N_per_V", rig.e, tuple(f"e{k}" for k in range(1, 9))),
+            _Line("reaction_mass_kg", rig.reaction.mass), _Line("reaction_damping_Ns_per_m", rig.reaction.damping),
+            _Line("free_constant_N_per_V", rig.reaction.constant_N_per_V)]),
+        ("[accelerometers]", "accelerometers", _plain(
+            rig.accelerometers, "at", "sensitivity_Vs2_per_m", "low_corner_Hz", "noise_m_per_s2_rtHz",
+            "sample_rate_Hz", "loop_delay_s", "drive_limit_V"))]
+    if (load := rig.load) is not None:
+        moments = ("Ixx", "Iyy", "Izz")
+        totals = _sum_for((load.Ixx, load.Iyy, load.Izz), (rig.Ixx, rig.Iyy, rig.Izz))
+        sections.append(("[load]", "load", [
+            _Line("mass_kg", load.mass, ("load.mass",)),
+            *(_Line(f"{name}_m", getattr(load, name), (f"load.{name}",)) for name in ("L7", "L8", "L9")),
+            *(_Line(f"{name}_total_kgm2", total, (f"load.{name}",))
+              for name, total in zip(moments, totals, strict=True)),
+            *(_Line(f"{name}_load_kgm2", getattr(load, name), (f"load.{name}",)) for name in ("Ixy", "Ixz", "Iyz"))]))
+    return sections + _ambient(rig.ambient)
