@@ -23,7 +23,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.sequential_data import MeasuredTests
 from avis_ctrl.identification.sequential_problem import Problem, Spread, Weighting, spread_at
-from avis_ctrl.identification.sequential_tests import SIGNED, TestCase, unit_of, values_of
+from avis_ctrl.identification.sequential_tests import SIGNED, TestCase, unit_of, values_of, with_values
 from avis_ctrl.rigs.halcyonics import Halcyonics
 
 BAND_HZ = (2.5, 20.0)
@@ -102,6 +102,13 @@ class SequentialResult:
         B, move = self.spread.iteration, self.history[-1] - self.history[-2]
         left = B @ np.linalg.solve(np.eye(len(B)) - B, move) if self.spread.rate < 1 else np.full(len(B), np.nan)
         return dict(zip(self.names, left.tolist(), strict=True))
+
+    def extrapolated(self) -> Halcyonics:
+        """The rig moved by `to_rest`: a start from which few further rounds remain. The source does not do this.
+
+        Raises InputError where the values are no longer those of a body.
+        """
+        return with_values(self.rig, {name: value + self.to_rest[name] for name, value in self.final.items()})
 
     @property
     def standard_deviation(self) -> dict[str, float]:

@@ -122,7 +122,7 @@ def voltage_transfer(rig: Halcyonics, place: np.ndarray, direction: str, pattern
                      omega: np.ndarray) -> np.ndarray:
     """X/V [m/V], (n,): eq. 32 times e_r."""
     r = int(np.flatnonzero(pattern)[0])
-    return rig.e[r] * rig.transfer(place, direction, pattern, omega, rig.actuator_names[r])
+    return rig.e[r] * rig.transfer(place, direction, pattern.tolist(), omega, rig.actuator_names[r])
 
 
 def simulate_tests(rig: Halcyonics, tests: Sequence[TestCase], noise: Analyser | None = None,
