@@ -1,0 +1,194 @@
+"""What the extended Kalman filter found, and whether its innovations agree with its covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.ekf_settings import EkfSettings
+
+LAGS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Innovations:
+    """Innovations of one record over their predicted standard deviations: white and of unit variance if all is well.
+
+    Attributes
+    ----------
+    nis : mean over time of the normalised innovation squared e^T S^-1 e; expected n_y.
+    nis_interval : where 95 % of such means lie (chi-square of n n_y degrees of freedom).
+    autocorrelation : (LAGS, n_y) at 1, 2, .. samples, each output by itself.
+    bound : 1.96 / sqrt(n), within which 95 % of the autocorrelations of white noise lie.
+    """
+
+    nis: float
+    nis_interval: tuple[float, float]
+    autocorrelation: np.ndarray
+    bound: float
+
+    @property
+    def nis_per_output(self) -> float:
+        return self.nis / self.autocorrelation.shape[1]
+
+    @property
+    def outside(self) -> float:
+        """Share of the autocorrelations beyond the bound; 0.05 for white innovations."""
+        return float(np.mean(np.abs(self.autocorrelation) > self.bound))
+
+    @property
+    def consistent(self) -> bool:
+        """The mean of the normalised innovation squared lies in its interval, and at most 10 % of the lags stand out."""
+        low, high = self.nis_interval
+        return low <= self.nis <= high and self.outside <= 0.10
+
+
+def innovation_statistics(innovation: np.ndarray) -> Innovations:
+    """Of (n, n_y) innovations, each over its predicted standard deviation given the outputs before it.
+
+    Taken one by one, their squares sum to e^T S^-1 e of the whole sample.
+    """
+    n, n_y = innovation.shape
+    low, high = chi2.ppf((0.025, 0.975), n * n_y) / n
+    power = np.sum(innovation ** 2, axis=0)
+    lags = range(1, min(LAGS, n - 1) + 1)
+    with np.errstate(invalid="ignore"):
+        correlation = np.array([np.einsum("ij,ij->j", innovation[k:], innovation[:-k]) / power for k in lags])
+    return Innovations(float(np.mean(np.sum(innovation ** 2, axis=1))), (float(low), float(high)),
+                       np.nan_to_num(correlation), float(1.96 / np.sqrt(n)))
+
+
+@dataclass(frozen=True, eq=False)
+class EkfHistory:
+    """time_s (m,), theta (m, n_p), lower and upper (m, n_p) ends of the +-2 sigma band, boundaries_s (records + 1,)."""
+
+    time_s: np.ndarray
+    theta: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    boundaries_s: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """Combinations of parameters by how much the data told of them.
+
+    ratio : (n_p,) variance over the prior's, the least known last. vectors : (n_p, n_p) columns, orthonormal, in
+    relative changes of the parameters.
+    """
+
+    names: tuple[str, ...]
+    ratio: np.ndarray
+    vectors: np.ndarray
+
+    def kept(self, share: float = 0.5) -> np.ndarray:
+        """Columns of the directions that kept at least this share of their prior variance."""
+        return self.vectors[:, self.ratio >= share]
+
+    def words(self, share: float = 0.5) -> tuple[str, ...]:
+        """One line for each of them: the members that carry nine tenths of it, and the sign with which they move."""
+        lines = []
+        for vector, ratio in zip(self.kept(share).T, self.ratio[self.ratio >= share], strict=True):
+            order = np.argsort(-np.abs(vector))
+            count = int(np.searchsorted(np.cumsum(vector[order] ** 2), 0.9)) + 1
+            sign = np.sign(vector[order[0]])
+            parts = [f"{'+' if sign * vector[j] > 0 else '-'} {self.names[j]}" for j in order[:count]]
+            lines.append(f"not determined: {' '.join(parts).removeprefix('+ ')} moved together "
+                         f"(variance {ratio:.2g} of the prior's)")
+        return tuple(lines)
+
+
+@dataclass(frozen=True, eq=False)
+class EkfResult:
+    """Parameters as the filter left them.
+
+    Attributes
+    ----------
+    names, units, initial, values : n_p.
+    scaled_covariance : (n_p, n_p) of theta / initial (of log theta with the log parametrisation).
+    prior_share : prior standard deviation in the same units.
+    history : decimated. innovations : one a record.
+    guarded : (n_p,) at how many samples the guard held a parameter.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    initial: np.ndarray
+    values: np.ndarray
+    scaled_covariance: np.ndarray
+    logarithmic: bool
+    prior_share: float
+    history: EkfHistory
+    innovations: tuple[Innovations, ...]
+    guarded: np.ndarray
+    settings: EkfSettings
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(n_p, n_p) in the parameters' units; to first order with the log parametrisation."""
+        scale = self.values if self.logarithmic else self.initial
+        return self.scaled_covariance * np.outer(scale, scale)
+
+    @property
+    def sigma(self) -> np.ndarray:
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> np.ndarray:
+        sigma = np.sqrt(np.diag(self.scaled_covariance))
+        return self.scaled_covariance / np.outer(sigma, sigma)
+
+    @property
+    def directions(self) -> Directions:
+        """Eigenvectors of the covariance over the prior's, the best known first.
+
+        A ratio near 1 is a combination of which the data said nothing. With the source's reset it is the last record's.
+        """
+        values, vectors = np.linalg.eigh(self.scaled_covariance / self.prior_share ** 2)
+        return Directions(self.names, values, vectors)
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the innovations of the last record agree with the covariance; if not, sigma means little."""
+        return self.innovations[-1].consistent
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterCurves:
+    """One figure in the manner of figs. 3.1-3.3: estimates (m, n), band (m, n) each, true values (n,) or None."""
+
+    title: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    time_s: np.ndarray
+    estimate: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    boundaries_s: np.ndarray
+    true: np.ndarray | None
+
+
+def parameter_curves(result: EkfResult, true: Mapping[str, float] | None = None) -> tuple[ParameterCurves, ...]:
+    """The arrays of figs. 3.1-3.3: masses and inertias, damping, stiffness, and the rest where there is any.
+
+    true : values by name, of all parameters of the result, where they are known.
+
+    Raises
+    ------
+    InputError : `true` lacks a parameter.
+    """
+    if true is not None and (missing := [name for name in result.names if name not in true]):
+        raise InputError("expected the true value of every estimated parameter", field="true", value=missing)
+    groups: dict[str, list[int]] = {"Mass and inertia": [], "Damping": [], "Stiffness": [], "Other parameters": []}
+    for j, unit in enumerate(result.units):
+        groups[{"kg": "Mass and inertia", "kg m^2": "Mass and inertia", "N s/m": "Damping", "N/m": "Stiffness",
+                "N m s/rad": "Damping", "N m/rad": "Stiffness"}.get(unit, "Other parameters")].append(j)
+    h = result.history
+    return tuple(ParameterCurves(title, tuple(result.names[j] for j in index), tuple(result.units[j] for j in index),
+                                 h.time_s, h.theta[:, index], h.lower[:, index], h.upper[:, index], h.boundaries_s,
+                                 None if true is None else np.array([true[result.names[j]] for j in index]))
+                 for title, index in groups.items() if index)

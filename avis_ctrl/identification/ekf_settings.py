@@ -1,0 +1,140 @@
+"""Settings of the filter: the source's (Rademakers, TU/e 2005, section 3.3), and honest ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.converter import Converter
+from avis_ctrl.rigs.rig import Rig
+
+FLOOR_BAND_Hz = (0.5, 60.0)
+
+
+@dataclass(frozen=True, eq=False)
+class EkfSettings:
+    """Tuning.
+
+    Attributes
+    ----------
+    q_sigma, v_sigma : standard deviation of q [m, rad] and q' [m/s, rad/s] at the start of a record (eqs. 3.12, 3.13).
+    prior_share : of a parameter, as a share of its starting value (eq. 3.14).
+    Q : spectral density of the acceleration noise, E[W(t) W(t')] = Q delta(t - t'), a number, (6,) or (6, 6)
+        [(m/s^2)^2/Hz, two-sided] (eq. 3.16); None: the rig's ambient floor motion.
+    R : variance of a measurement [(m/s)^2], a number or (n_y,) (eq. 3.18); None: the rig's sensor noise and converter.
+    highpass_Hz, highpass_order : prefilter of u and y (section 3.2).
+    undo_chain : the prefilter also inverts the sensors' chain; False as the source, which biases the estimates.
+    settle_s : dropped at the front of each record after the prefilter; 0 for records that start at rest.
+    reset : start each record from the prior covariance about the last estimate (section 3.2); False keeps it.
+    parametrisation : "linear" (the source's; a guard holds parameters above `lowest`) or "log" (positive by nature).
+    lowest : share of its starting value below which a linear parameter is not let.
+    velocity_from_data : start q' from the first measurement, as the source does, instead of zero.
+    history_s : spacing of the history.
+    """
+
+    q_sigma: float = 2.5e-6
+    v_sigma: float = 1e-8
+    prior_share: float = 0.25
+    Q: float | Sequence[float] | np.ndarray | None = 1e-8
+    R: float | Sequence[float] | np.ndarray | None = 1e-8
+    highpass_Hz: float = 1.0
+    highpass_order: int = 6
+    undo_chain: bool = True
+    settle_s: float = 0.0
+    reset: bool = True
+    parametrisation: Literal["linear", "log"] = "linear"
+    lowest: float = 0.05
+    velocity_from_data: bool = True
+    history_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        for field in ("q_sigma", "v_sigma", "highpass_Hz", "prior_share", "history_s"):
+            value = getattr(self, field)
+            if not (isinstance(value, (int, float, np.floating)) and np.isfinite(value) and value > 0):
+                raise InputError("expected a finite positive number", field=field, value=value)
+        if self.parametrisation not in ("linear", "log"):
+            raise InputError("expected linear or log", field="parametrisation", value=self.parametrisation)
+        if not 0 < self.lowest < 1:
+            raise InputError("expected a share of the starting value, between 0 and 1", field="lowest",
+                             value=self.lowest)
+
+
+SOURCE_SETTINGS = EkfSettings()
+"""Section 3.3 as printed. What this tuning hides: R = 1e-8 is an r.m.s. velocity of 1e-4 m/s, the size of the payload's
+own motion, five orders of variance above sensor noise and converter (1e-13); Q = 1e-8 is an acceleration as strong as
+that of the drives. The source raised R because the filter was unstable without. The bands are therefore those of a
+filter that distrusts its data: they are wide, and cover errors that the data would have shown. And of the 26 parameters
+only 20 combinations act on the payload: the bands of the others tell the prior, not the data."""
+
+HONEST_SETTINGS = EkfSettings(q_sigma=2.5e-6, v_sigma=1e-4, Q=None, R=None, reset=False)
+"""R from the rig's sensor noise and quantiser, Q from its ambient floor motion, covariance kept from record to record:
+the bands are what the data say, as far as floor motion is white acceleration, which it is only near the resonances."""
+
+
+def measurement_variance(settings: EkfSettings, rig: Rig, y_names: Sequence[str], unit: str) -> np.ndarray:
+    """R's diagonal, (n_y,) [(m/s)^2, or m^2 for displacements].
+
+    From the rig: ambient noise and rounding in volts over the passband gain. Undoing the chain raises it near the corner
+    of the high-pass; that is 1 % of the band of 0-500 Hz and left out.
+
+    Raises
+    ------
+    InputError : values that are not positive; R = None for a rig without geophones or for data that are not in volts.
+    """
+    if settings.R is not None:
+        R = np.broadcast_to(np.asarray(settings.R, float), (len(y_names),)) if np.ndim(settings.R) == 0 else \
+            np.asarray(settings.R, float)
+        if R.shape != (len(y_names),) or not np.all(np.isfinite(R)) or not np.all(R > 0):
+            raise InputError(f"expected one positive variance, or {len(y_names)}", field="R", value=settings.R)
+        return np.array(R)
+    g, a = rig.geophones, rig.acquisition
+    if unit != "V" or g is None or a is None or rig.ambient is None:
+        raise InputError("the sensor noise is known for geophones in V of a rig with acquisition and ambient noise "
+                         "only; give R", field="R", value=None)
+    rounding = Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz).noise_rms_V
+    gain = np.array([g.sensitivity_Vs_per_m[g.names.index(name)] for name in y_names]) * g.preamplifier_gain
+    return (rig.ambient.sensor_noise_rms_V ** 2 + rounding ** 2) / gain ** 2
+
+
+def process_density(settings: EkfSettings, rig: Rig) -> np.ndarray:
+    """Q, (6, 6): spectral density of the acceleration noise.
+
+    From the rig: floor velocity of `rig.ambient` in each direction, flat over 0.5-60 Hz, through
+    M^-1 (K_f / jw + C_f) at the geometric mean of the natural frequencies. There the motion is largest; below it the
+    floor's acceleration of the payload is stronger than this (as 1/w), above it weaker.
+
+    Raises
+    ------
+    InputError : a matrix that is not symmetric and positive semidefinite; Q = None for a rig without ambient numbers.
+    """
+    if settings.Q is not None:
+        return density_matrix(settings.Q, 6)
+    if rig.ambient is None:
+        raise InputError("the rig file has no ambient floor motion; give Q", field="Q", value=None)
+    eom = rig.equations_of_motion()
+    omega = 2 * np.pi * np.exp(np.mean(np.log(np.abs(eom.natural_frequencies().frequencies_Hz))))
+    density = rig.ambient.floor_velocity_rms_m_per_s ** 2 / (2 * (FLOOR_BAND_Hz[1] - FLOOR_BAND_Hz[0]))
+    b = np.linalg.solve(eom.M, eom.K_floor[:, :3] / (1j * omega) + eom.C_floor[:, :3])
+    return np.real(b @ b.conj().T) * density
+
+
+def density_matrix(Q: float | Sequence[float] | np.ndarray, n: int) -> np.ndarray:
+    """(n, n) from a number, a diagonal or a matrix.
+
+    Raises
+    ------
+    InputError : another shape, values that are not finite, a matrix that is not symmetric positive semidefinite.
+    """
+    given = np.asarray(Q, float)
+    if given.ndim == 0:
+        given = np.full(n, float(given))
+    full = np.diag(given) if given.ndim == 1 else given
+    symmetric = full.shape == (n, n) and np.all(np.isfinite(full)) and np.allclose(full, full.T, rtol=1e-9, atol=0)
+    if not symmetric or np.min(np.linalg.eigvalsh(full)) < -1e-12 * np.max(np.abs(full)):
+        raise InputError(f"expected a spectral density: a number, {n} numbers or a symmetric {n} x {n} matrix, none "
+                         "negative", field="Q", value=np.shape(Q) if np.ndim(Q) else Q)
+    return full
