@@ -1,0 +1,256 @@
+"""CSV records: a header line with the channels' names, lines of numbers, and what `# key = value` comments state.
+
+    # sample_rate_Hz = 1000         (in the place of a column t)
+    # excitation = noise            (also level_V, period_s, start_s, rig)
+    t [s],Az1 [V],Sz1 [V]
+    0.000,0.1,-0.002
+
+Separator (comma, semicolon, tab) and decimal comma are detected. Without a mapping of columns, t or time is the time,
+u* and A1, Ax1, ... are inputs, y* and S1, Sx1, ... are outputs, vx, vy, vz the floor.
+"""
+
+from __future__ import annotations
+
+import codecs
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record
+from avis_ctrl.measurement.formats.common import as_number, existing_file, reading
+from avis_ctrl.measurement.formats.flat import Hints, Mapped, flat_record, mapped, one_clock, pick
+from avis_ctrl.measurement.formats.time_axis import sample_rate_from
+
+CHUNK = 1 << 16  # lines that are turned into numbers at once
+LONGEST_LINE = 1 << 20  # characters
+USUAL = {"t": r"t|time|t_s|time_s", "u": r"u_?\w*|a[xyz]?\d+", "y": r"y_?\w*|s[xyz]?\d+"}
+STATED = ("sample_rate_Hz", "level_V", "start_s", "period_s")
+TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the top of a CSV file says."""
+
+    names: list[str]
+    units: list[str | None]
+    separator: str
+    decimal_comma: bool
+    stated: dict[str, str]
+    lines: int  # above the first line of numbers
+
+
+def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None,
+         hints: Hints | None = None) -> Campaign:
+    """A CSV file (one record) or a directory of CSV files (one record each, in the order of their names).
+
+    columns : roles t, u, y, floor to names of columns; hints : what the file does not say.
+
+    Raises
+    ------
+    InputError : names file, line and column, or how many time stamps are wrong and where.
+    """
+    path, hints = Path(path), hints or Hints()
+    files = [path]
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir()
+                       if file.suffix.lower() == ".csv" and file.is_file() and not file.name.startswith("."))
+        if not files:
+            raise InputError("expected CSV files (*.csv) in the directory; there is none", file=path)
+    records, notes, rigs = [], [], []
+    for file in files:
+        with reading(file, "the CSV file"):
+            record, assumed, stated = _record(existing_file(file), columns, hints)
+        records.append(record)
+        notes += assumed
+        rigs.append(stated)
+    harmonised, assumed = one_clock(records)
+    with reading(path):
+        return Campaign(rig or rigs[0] or "unnamed", harmonised, str(path), tuple([*notes, *assumed]))
+
+
+def is_text(head: bytes) -> bool:
+    """Whether the first bytes of a file are those of a text."""
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return True
+    return bool(head.strip()) and not re.search(rb"[\x00-\x08\x0e-\x19\x1b-\x1f\x7f]", head)
+
+
+def _open(path: Path) -> TextIO:
+    with path.open("rb") as stream:
+        head = stream.read(4096)
+    if not is_text(head):
+        raise InputError("expected text; the file holds binary data or nothing", file=path)
+    utf16 = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return path.open(encoding="utf-16" if utf16 else "utf-8-sig", errors="replace" if utf16 else "surrogateescape")
+
+
+def _lines(stream: TextIO) -> Iterator[str]:
+    """Lines without their end; bytes that are no UTF-8 count as Latin-1, the older encoding of measuring software."""
+    while line := stream.readline(LONGEST_LINE):
+        if len(line) == LONGEST_LINE:
+            raise InputError(f"expected lines shorter than {LONGEST_LINE} characters")
+        line = line.rstrip("\r\n\x1a").replace('"', "")
+        if any("\udc80" <= letter <= "\udcff" for letter in line):
+            line = line.encode("utf-8", "surrogateescape").decode("latin-1")
+        yield line
+
+
+def _layout(lines: Iterator[str]) -> Layout:
+    stated: dict[str, str] = {}
+    count, line = 0, ""
+    for line in lines:
+        count += 1
+        if line.strip().startswith("#"):
+            key, equals, value = line.strip().lstrip("#").partition("=")
+            if equals:
+                stated[key.strip()] = value.strip()
+        elif line.strip():
+            break
+    else:
+        raise InputError(f"expected a header line with the names of the columns; there are {count} lines without one")
+    separator = next((mark for mark in ";\t," if mark in line), ",")
+    titles = [title.strip() for title in line.split(separator)]
+    if titles and not titles[-1]:  # a separator that ends every line
+        titles = titles[:-1]
+    if all(_is_number(title.replace(",", ".")) for title in titles):
+        raise InputError("expected a header line with the names of the columns, found numbers", field=f"line {count}",
+                         value=line[:60])
+    names, units = [], []
+    for title in titles:
+        match = re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", title)
+        names.append(match[1] if match and match[1] else title)
+        units.append(match[2] if match and match[1] else None)
+    for name in names:
+        if not name or names.count(name) > 1:
+            raise InputError("expected different names of columns, none empty", field=f"line {count}", value=name)
+    return Layout(names, units, separator, False, stated, count)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _roles(layout: Layout, columns: Mapped | None) -> dict[str, list[str]]:
+    """Names of the columns of each role, as the caller mapped them or as they are usually called."""
+    titles = {f"{name} [{unit}]": name for name, unit in zip(layout.names, layout.units, strict=True) if unit}
+    if columns is not None:
+        roles = {}
+        for role in ("t", "u", "y", "floor"):
+            names = [titles.get(name, name) for name in mapped(columns, role) or []]
+            pick(names, layout.names, role)
+            roles[role] = names
+    else:
+        roles = {role: [name for name in layout.names if re.fullmatch(pattern, name, re.IGNORECASE)]
+                 for role, pattern in USUAL.items()}
+        roles["floor"] = list(FLOOR_NAMES) if set(FLOOR_NAMES) <= set(layout.names) else []
+    for role, wanted in (("t", "at most one column"), ("y", "at least one column")):
+        if len(roles[role]) > 1 if role == "t" else not roles[role]:
+            raise InputError(f"expected {wanted}; the file has {', '.join(layout.names)}; say with columns which is "
+                             "what (roles t, u, y, floor)", field=role, value=roles[role])
+    return roles
+
+
+def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[Record, list[str], str]:
+    with _open(path) as stream:
+        lines = _lines(stream)
+        layout = _layout(lines)
+        roles = _roles(layout, columns)
+        wanted = [name for names in roles.values() for name in names]
+        table = _table(lines, layout, sorted({layout.names.index(name) for name in wanted}))
+    place = {layout.names.index(name): at for at, name in
+             enumerate(sorted(set(wanted), key=layout.names.index))}
+    parts = {}
+    for role in ("u", "y", "floor"):
+        if roles[role] or role != "floor":
+            index = [layout.names.index(name) for name in roles[role]]
+            parts[role] = (roles[role], [layout.units[i] for i in index], table[:, [place[i] for i in index]])
+    hints = _with_stated(hints, layout.stated)
+    time, unit = None, None
+    if roles["t"]:
+        index_t = layout.names.index(roles["t"][0])
+        time, unit = table[:, place[index_t]], layout.units[index_t]
+    rate, start, note = _clock(time, unit, hints)
+    record, notes = flat_record(path.stem, parts, rate, start, hints)
+    notes += [f"record {path.stem}: {note}"] if note else []
+    return record, notes, layout.stated.get("rig", "")
+
+
+def _with_stated(hints: Hints, stated: dict[str, str]) -> Hints:
+    """Hints completed by the comments of the file."""
+    found: dict[str, float | str] = {}
+    for field in STATED:
+        if field in stated and getattr(hints, field) is None:
+            text = stated[field].replace(",", ".")
+            found[field] = as_number(float(text) if _is_number(text) else text, f"comment {field}")
+    if "excitation" in stated and hints.excitation is None:
+        found["excitation"] = stated["excitation"]
+    return replace(hints, **found)  # type: ignore[arg-type]
+
+
+def _clock(time: np.ndarray | None, unit: str | None, hints: Hints) -> tuple[float, float, str]:
+    if time is not None:
+        if unit is not None and unit not in TIME_UNITS:
+            raise InputError(f"expected one of {', '.join(TIME_UNITS)}", field="unit of t", value=unit)
+        factor = TIME_UNITS[unit or "s"]
+        rate, start, note = sample_rate_from(time * factor, lambda sample: f"data row {sample + 1}")
+        if hints.sample_rate_Hz is None:
+            return rate, start, note
+        if abs(rate / hints.sample_rate_Hz - 1) > 1e-3:
+            raise InputError(f"expected {rate:.9g} Hz, as the time stamps say", field="sample_rate_Hz",
+                             value=hints.sample_rate_Hz)
+        return hints.sample_rate_Hz, start, note
+    if hints.sample_rate_Hz is None:
+        raise InputError("expected a column t (time in s) or a comment line such as '# sample_rate_Hz = 1000'",
+                         field="t")
+    return hints.sample_rate_Hz, 0.0, ""
+
+
+def _table(lines: Iterator[str], layout: Layout, use: list[int]) -> np.ndarray:
+    """(rows, columns used) numbers, read chunk by chunk."""
+    blocks, row, decimal_comma = [], layout.lines, None
+    separators = len(layout.names) - 1
+    while chunk := list(islice(lines, CHUNK)):
+        if decimal_comma is None:
+            decimal_comma = layout.separator != "," and any("," in line for line in chunk)
+        if decimal_comma:
+            chunk = [line.replace(",", ".") for line in chunk]
+        for number, line in enumerate(chunk, row + 1):
+            count = line.count(layout.separator)
+            if count != separators and line.strip() and (count, line.rstrip()[-1:]) != (separators + 1,
+                                                                                      layout.separator.strip()):
+                raise InputError(f"expected {separators + 1} columns, as in the header; there are {count + 1}",
+                                 field=f"line {number}", value=line[:60])
+        filled = [line for line in chunk if line.strip()]
+        try:
+            if filled:
+                blocks.append(np.loadtxt(filled, delimiter=layout.separator, usecols=use, ndmin=2, comments=None))
+        except ValueError:
+            raise _misfit(chunk, row, layout, use) from None
+        row += len(chunk)
+    table = np.concatenate(blocks) if blocks else np.zeros((0, len(use)))
+    if len(table) < 2:
+        raise InputError(f"expected at least two lines of numbers; there are {len(table)}")
+    return table
+
+
+def _misfit(chunk: list[str], row: int, layout: Layout, use: list[int]) -> InputError:
+    """Where the first entry stands that is no number."""
+    for number, line in enumerate(chunk, row + 1):
+        entries = line.split(layout.separator)
+        for column in use if line.strip() else ():
+            if not _is_number(entries[column]) or "_" in entries[column]:
+                found = entries[column].strip()
+                return InputError("expected a number" if found else "expected a number, found nothing",
+                                  field=f"line {number}, column {layout.names[column]}", value=found[:40])
+    return InputError("expected numbers", field=f"lines {row + 1} to {row + len(chunk)}")
