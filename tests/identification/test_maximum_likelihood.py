@@ -1,0 +1,177 @@
+"""The maximum likelihood fit against known truths, a general optimiser, and the statistics that it claims."""
+
+import numpy as np
+import pytest
+from exact import floor_velocity, multisine, record
+from scipy.optimize import least_squares
+from scipy.stats import chi2 as chi2_law
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.maximum_likelihood import fit
+from avis_ctrl.identification.noise import relative_noise, residual_noise
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.rigs import load_rig
+
+MOUNTS = [f"isolator{i}.{kind}_{axis}" for i in (1, 2, 3, 4) for kind in "kc" for axis in "xyz"]
+BODY = ["mass", "J1", "J2", "J3"]
+
+
+@pytest.fixture(scope="module")
+def avis():
+    return load_rig("avis")
+
+
+def responses(model, noise=0.01, seed=0, lines=200):
+    """A block of frequency responses with white relative noise, and its covariance."""
+    rng = np.random.default_rng(seed)
+    w = 2 * np.pi * np.geomspace(0.7, 60, lines)
+    U = np.zeros((lines, len(model.inputs), len(model.actuators)), complex)
+    U[:, :len(model.actuators)] = np.eye(len(model.actuators))
+    Y = model.driven(w, U, False).Y
+    size = noise * np.sqrt(np.mean(np.abs(Y) ** 2, axis=(1, 2)))
+    e = rng.normal(size=Y.shape) + 1j * rng.normal(size=Y.shape)
+    n_y = Y.shape[1]
+    return SpectralBlock("frf", w, U, Y + size[:, None, None] * e / np.sqrt(2)).with_noise(
+        size[:, None, None] ** 2 * np.eye(n_y))
+
+
+def off(model, seed, spread=0.1):
+    rng = np.random.default_rng(seed)
+    return model.at(model.values * (1 + spread * rng.uniform(-1, 1, len(model.names))))
+
+
+def test_exact_data_give_exact_parameters(avis):
+    """Without noise, what is determined is found to rounding; what is not stays off and costs nothing."""
+    true = ResponseModel.of(avis, [*BODY, *MOUNTS])
+    block = responses(true, noise=1e-12)
+    found = fit(off(true, 1), [block.with_noise(np.abs(block.noise[:, 0]) * 1e20)])
+    _, V = found.information.directions
+    relative = V.T @ ((found.values - true.values) / found.information.scale)
+    assert found.information.rank == 20 and found.converged
+    assert np.max(np.abs(relative[:20])) < 1e-6
+
+
+def test_the_optimum_is_that_of_a_general_optimiser(avis):
+    """scipy's trust region with differences, on a few parameters: same chi-square and the same place."""
+    names = ["mass", "J1", "isolator1.k_z", "isolator2.c_z", "sensor.Sz1"]
+    true = ResponseModel.of(avis, names)
+    block = responses(true, lines=40)
+    found = fit(off(true, 2), [block])
+
+    def residual(x):
+        e = block.Y - true.at(x * true.values).driven(block.omega, block.U, False).Y
+        white = e / np.sqrt(block.noise[:, 0, 0, 0].real)[:, None, None] * np.sqrt(2)
+        return np.concatenate([white.real.ravel(), white.imag.ravel()])
+    other = least_squares(residual, np.full(len(names), 1.05), x_scale="jac")
+    assert found.chi2 == pytest.approx(2 * other.cost, rel=1e-9)
+    assert np.allclose(found.values, other.x * true.values, rtol=1e-6)
+    J = other.jac / true.values
+    assert np.allclose(found.information.matrix, J.T @ J, rtol=1e-3, atol=1e-3 * np.max(J.T @ J))
+
+
+def test_chi_square_and_errors_are_what_they_claim(avis):
+    """Over 16 draws: chi-square within its law, errors normalised by the Cramer-Rao bound standard normal."""
+    names = [*BODY, *MOUNTS]
+    true = ResponseModel.of(avis, names)
+    totals, z, dof = [], [], 0
+    for seed in range(16):
+        found = fit(off(true, seed, 0.05), [responses(true, seed=seed, lines=30)])
+        sigma, V = found.information.directions
+        error = V.T @ ((found.values - true.values) / found.information.scale)
+        # Directions far from being linear in their parameters would need a larger sample.
+        z.append((error / sigma)[:20])
+        # dof counts all free parameters; eight of them were never used
+        totals.append(found.chi2)
+        dof = found.dof + 8
+    assert chi2_law.ppf(1e-4, 16 * dof) < np.sum(totals) < chi2_law.ppf(1 - 1e-4, 16 * dof)
+    spread = np.mean(np.square(z))
+    assert abs(spread - 1) < 4 * np.sqrt(2 / np.size(z))
+
+
+def test_records_of_a_rig_with_floor_motion(avis):
+    """Three records of 60 s, floor unknown: errors as small as claimed, every one of 20 directions."""
+    true = off(ResponseModel.of(avis, [*BODY, *MOUNTS]), 5, 0.05)
+    rng = np.random.default_rng(6)
+    records = []
+    for k in range(3):
+        u = multisine(rng, 0.3)
+        records.append(record(true.rig, u, floor_velocity(rng, len(u)), rng, name=f"{k:02d}"))
+    model = ResponseModel.of(avis, true.names)
+    blocks = relative_noise([record_block(one, model, (0.5, 60.0)) for one in records])
+    for _ in range(3):
+        found = fit(model, blocks)
+        model, blocks = found.model, residual_noise(found.residuals)
+    found = fit(model, blocks)
+    sigma, V = found.information.directions
+    z = (V.T @ ((found.values - true.values) / found.information.scale) / sigma)[:20]
+    assert found.information.rank == 20
+    assert np.mean(z ** 2) < 2.2 and np.max(np.abs(z)) < 4.5
+    known = found.information.known
+    assert np.all(np.abs(found.values - true.values)[known] < 1e-3 * true.values[known])
+
+
+def test_a_prior_and_data_share_out_by_their_precision(avis):
+    """Conjugate normal law: with the rest known, the estimate is the weighted mean and precisions add."""
+    true = ResponseModel.of(avis, ["mass"])
+    block = responses(true, noise=0.05, lines=20)
+    alone = fit(true, [block])
+    sigma = float(alone.information.standard_deviation[0])
+    prior = (alone.values[0] + sigma, sigma)
+    both = fit(true, [block], priors={"mass": prior})
+    assert both.values[0] == pytest.approx((alone.values[0] + prior[0]) / 2, abs=0.01 * sigma)
+    assert both.information.standard_deviation[0] == pytest.approx(sigma / np.sqrt(2), rel=0.02)
+
+
+def test_priors_make_everything_determined(avis):
+    names = [*BODY, *MOUNTS]
+    true = ResponseModel.of(avis, names)
+    priors = {name: (value, 0.2 * value) for name, value in zip(names, true.values, strict=True)}
+    found = fit(off(true, 3), [responses(true)], priors=priors)
+    assert found.information.rank == len(names)
+    k = names.index("isolator1.k_x")
+    assert 0.05 < found.information.standard_deviation[k] / true.values[k] < 0.2
+
+
+def test_several_starts_agree(avis):
+    true = ResponseModel.of(avis, [*BODY, *MOUNTS])
+    found = fit(true, [responses(true, lines=60)], starts=4, spread=0.25)
+    assert np.ptp(found.starts) < 1e-3 * min(found.starts)
+
+
+def test_a_measured_response_weighs_like_its_experiments(avis):
+    """FRFs with a Gram matrix, and the same data as records, hold the same information."""
+    rng = np.random.default_rng(4)
+    model = ResponseModel.of(avis, BODY)
+    w = 2 * np.pi * np.geomspace(1, 40, 15)
+    W = rng.normal(size=(15, 8, 10)) + 1j * rng.normal(size=(15, 8, 10))
+    C = np.eye(6) * 1e-8
+    U = np.zeros((15, 11, 10), complex)
+    U[:, :8] = W
+    Y = model.driven(w, U, False).Y + 1e-5 * rng.normal(size=(15, 6, 10))
+    direct = fit(model, [SpectralBlock("records", w, U, Y).with_noise(np.broadcast_to(C, (15, 6, 6)))])
+    gram = W @ np.conj(W.swapaxes(1, 2))
+    G = Y @ np.conj(W.swapaxes(1, 2)) @ np.linalg.inv(gram)
+    measured = FrequencyResponse(w / (2 * np.pi), G, np.broadcast_to(C, (15, 6, 6)), gram, model.actuators,
+                                 model.sensors.names)
+    through = fit(model, [response_block(measured, model)])
+    assert np.allclose(through.values, direct.values, rtol=1e-9)
+    assert np.allclose(through.information.matrix, direct.information.matrix, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    ({"priors": {"weight": (1.0, 1.0)}}, "free parameter"), ({"priors": {"mass": (1.0, 0.0)}}, "standard deviation"),
+    ({"starts": 0}, "start"), ({"blocks": []}, "record")])
+def test_wrong_calls_are_answered(avis, change, said):
+    model = ResponseModel.of(avis, ["mass"])
+    arguments = {"model": model, "blocks": [responses(model, lines=5)]} | change
+    with pytest.raises(InputError, match=said):
+        fit(**arguments)
+
+
+def test_noise_that_is_singular_is_answered(avis):
+    model = ResponseModel.of(avis, ["mass"])
+    block = responses(model, lines=5)
+    with pytest.raises(InputError, match="positive definite"):
+        fit(model, [block.with_noise(np.zeros((5, 6, 6)))])
