@@ -4,7 +4,8 @@
 
 Printed: Table 1 and its basin of starts; Table 2, round by round, with what the 5 % rule leaves; the same over the
 load's mass, which the source does not print; rest points of a rig known slightly wrongly; and a Monte Carlo of the
-sequential against the joint fit. Nothing here is the source's hardware: the "actual" rig is the model with the printed values.
+sequential against the joint fit. Nothing here is the source's hardware: the "actual" rig is the model with the
+printed values.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ class Problem:
             except InputError:  # no positive definite mass matrix there: the search steps back
                 return refused
             return found if np.all(np.isfinite(found)) else refused
-        found = least_squares(residual, np.zeros(len(free)), jac="3-point", xtol=1e-12, ftol=1e-14, gtol=1e-14,
+        found = least_squares(residual, np.zeros(len(free)), jac="3-point", xtol=1e-9, ftol=1e-12, gtol=1e-14,
                               max_nfev=200)
         if not found.success:
             raise ComputationError(f"the fit of {', '.join(names)} to test {', '.join(str(t.number) for t in tests)} "
