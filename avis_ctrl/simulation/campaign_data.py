@@ -1,0 +1,277 @@
+"""Measurement campaigns from the nonlinear model: what a measurement on a rig would have given.
+
+Open loop: the drives play the planned voltages and nothing is fed back. Each record is preceded by `settle_s` with the
+drives at zero on the ambient floor, so that a record begins in stationary ambient motion but before anything has
+answered the drives: the first period of a multisine holds a transient, as the contract of a campaign says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti.statespace import gain
+from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordHeader
+from avis_ctrl.measurement.excitation import (
+    ExcitationSignals,
+    MultisineSettings,
+    NoiseSettings,
+    band_limited,
+    multisine,
+    noise,
+)
+from avis_ctrl.rigs.floor_spectrum import SpectrumModel, realise, shipped_spectrum
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.simulation.campaign_plan import CampaignPlan, RecordPlan
+from avis_ctrl.simulation.loop import SimulationRecord, simulate
+from avis_ctrl.simulation.sampled_loop import SampledLoop, accelerometer_bank, geophone_bank
+
+# Largest level: the share of the converter's range that the drives' answer may take on the rig as its file has it;
+# the rest is for ambient motion, noise and a table that is not as its file has it.
+RANGE_SHARE = 0.8
+# Range of sensors whose rig file has no converter; for the level only, nothing is clipped to it.
+ASSUMED_RANGE_V = 10.0
+DEFAULT_LEVEL_PERCENT = 50.0
+# The amplifiers of rigs with accelerometers, as in design files.
+ACCELEROMETER_AMPLIFIER_HZ = 300.0
+# What the draws of a campaign's seed are for.
+_SIGNALS, _FLOOR, _NOISE, _FLOOR_SENSOR = range(4)
+
+# (records done, records in all, name of the one just done)
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Planned:
+    """One record to come: what is played (samples, n_u) [V], over how many samples, out of which line of the plan."""
+
+    plan: RecordPlan
+    u: np.ndarray
+    level_V: float
+    period_s: float | None
+
+
+def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig | None = None,
+                      progress: Progress | None = None) -> Campaign:
+    """The records of the plan, with notes of levels, clipping and what was assumed.
+
+    Parameters
+    ----------
+    rig : as its file has it; sensors, converter, delay, limits and levels are its.
+    seed : of all signals, floors and noise; the same seed gives the same campaign.
+    truth : the table that moves; `rig` by default (`perturbed_truth` makes one).
+
+    Raises
+    ------
+    InputError : a plan that the rig cannot follow: a level beyond the limit, a band beyond half the sample rate, a
+        multisine record shorter than two periods, no ambient motion in plan or rig, no sensors.
+    ComputationError : a table that leaves its stops.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError("expected a whole number, 0 or more", field="seed", value=seed)
+    loop = open_loop(rig, plan).with_plant("truth", truth)
+    ambient = _ambient(rig, plan)
+    planned = list(_signals(loop, plan, seed))
+    records, notes, start_s = [], _assumptions(loop, plan, seed, ambient), 0.0
+    for k, one in enumerate(planned):
+        start_s += plan.settle_s
+        record, note = _record(loop, plan, one, ambient, (seed, k), start_s)
+        records.append(record)
+        notes.append(note)
+        start_s += record.header.duration_s
+        if progress is not None:
+            progress(k + 1, len(planned), record.header.name)
+    return Campaign(rig.name, tuple(records), "simulated", tuple(notes))
+
+
+def open_loop(rig: Rig, plan: CampaignPlan) -> SampledLoop:
+    """The rig with its sensors as the plan has them, and no controller."""
+    corner = plan.amplifier_corner_Hz
+    if rig.geophones is not None:
+        bank = geophone_bank(rig)
+    else:
+        # The integrator is the controller's and does not act on what is recorded.
+        bank = accelerometer_bank(rig, 1.0)
+        corner = corner or ACCELEROMETER_AMPLIFIER_HZ
+    bank = replace(bank, noise_rms_V=bank.noise_rms_V if plan.sensors.noise else np.zeros(len(bank.chains)),
+                   converter=bank.converter if plan.sensors.quantiser else None)
+    return SampledLoop(rig, gain(np.zeros((0, 0))), (), {}, bank, {}, amplifier_corner_Hz=corner)
+
+
+def _ambient(rig: Rig, plan: CampaignPlan) -> SpectrumModel | None:
+    """Spectrum of the ambient floor in each direction; None for a floor at rest."""
+    rms = plan.ambient.velocity_rms_m_per_s
+    if rms is None:
+        if rig.ambient is None:
+            raise InputError(f"missing; the file of the rig {rig.name} does not say how much its floor moves",
+                             field="ambient.velocity_rms_m_per_s")
+        rms = rig.ambient.floor_velocity_rms_m_per_s
+    if rms == 0:
+        return None
+    low, high = plan.ambient.band_Hz
+    return shipped_spectrum(plan.ambient.spectrum).scaled_to_rms(rms, low, high)
+
+
+def _signals(loop: SampledLoop, plan: CampaignPlan, seed: int) -> Iterator[_Planned]:
+    """Every record of the plan in order, at its level."""
+    fs, dealt = loop.sample_rate_Hz, 0
+    for line, one in enumerate(plan.record):
+        samples = round((one.duration_s or plan.duration_s) * fs)
+        if one.excitation == "floor":
+            _check_floor_band(one.band_Hz or plan.band_Hz, samples, fs, f"record[{line + 1}].band_Hz")
+        if one.excitation in ("rest", "floor"):
+            for _ in range(one.records):
+                yield _Planned(one, np.zeros((samples, loop.n_drives)), 0.0, None)
+            continue
+        try:
+            signals = _drawn(loop, plan, one, samples, dealt, int(_rng(seed, line, _SIGNALS).integers(2 ** 63)))
+            largest = largest_level(loop, signals, samples)
+            percent = one.level_percent or DEFAULT_LEVEL_PERCENT
+            signals = signals.scaled_to(one.level_V or percent / 100 * largest)
+        except InputError as error:
+            field = {"rms_V": "level_V"}.get(error.field or "", error.field)
+            raise InputError(error.expected, field=f"record[{line + 1}].{field}", value=error.value) from None
+        dealt += one.records
+        for u in signals.u:
+            yield _Planned(one, _played(u, samples), float(np.mean(signals.rms_V)), signals.period_s)
+
+
+def _check_floor_band(band_Hz: list[float], samples: int, fs: float, field: str) -> None:
+    low, high = band_Hz
+    if high >= fs / 2 or np.floor(high * samples / fs) < max(np.ceil(low * samples / fs), 1):
+        raise InputError(f"expected a band below half the sample rate ({fs / 2:g} Hz) with a multiple of 1/duration = "
+                         f"{fs / samples:.4g} Hz inside", field=field, value=band_Hz)
+
+
+def _drawn(loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int, dealt: int,
+           seed: int) -> ExcitationSignals:
+    """The signals of one line of the plan, as large as the drives allow."""
+    fs, names = loop.sample_rate_Hz, loop.rig.equations_of_motion().actuators
+    low, high = one.band_Hz or plan.band_Hz
+    if one.excitation == "noise":
+        return noise(NoiseSettings(names, fs, samples / fs, (low, high), loop.limit_V, None, one.records, seed))
+    m = plan.multisine
+    signals = multisine(MultisineSettings(names, fs, m.period_s, (low, high), loop.limit_V, None, m.lines, m.spacing,
+                                          m.group, m.scheme, one.records, dealt, None, m.compensate_hold, m.low_crest,
+                                          seed))
+    if samples < 2 * signals.u.shape[1]:
+        raise InputError(f"expected at least two periods of {m.period_s:g} s: the first holds the transient",
+                         field="duration_s", value=samples / fs)
+    return signals
+
+
+def _played(u: np.ndarray, samples: int) -> np.ndarray:
+    """u from its start, repeated as long as the record lasts."""
+    return np.resize(u, (samples, u.shape[1]))
+
+
+def largest_level(loop: SampledLoop, signals: ExcitationSignals, samples: int) -> float:
+    """R.m.s. [V] up to which neither drives nor converter clip, by a linear noise-free run of each record.
+
+    On the rig as its file has it; RANGE_SHARE of the converter's range is for the answer to the drives. Where there is
+    no converter, ASSUMED_RANGE_V stands for its range.
+    """
+    most = signals.scaled_to_limit()
+    level, range_V = float(np.mean(most.rms_V)), ASSUMED_RANGE_V
+    if loop.sensors.converter is not None:
+        range_V = loop.sensors.converter.limits_V[1]
+    nominal, peak = replace(loop, plant=loop.rig), 0.0
+    for u in most.u:
+        run = _run(nominal, _played(u, samples), 0, None, (0,), False)
+        peak = max(peak, float(np.max(np.abs(run.sensed))))
+    return level * min(1.0, RANGE_SHARE * range_V / peak)
+
+
+def _run(loop: SampledLoop, u: np.ndarray, settle: int, floor: np.ndarray | None, seed: tuple[int, ...],
+         nonlinear: bool) -> SimulationRecord:
+    """u (samples, n_u) after `settle` samples of silence, without noise when floor is None."""
+    samples, fs = settle + len(u), loop.sample_rate_Hz
+    if floor is None:
+        floor = np.zeros((samples + 1, 6))
+        loop = replace(loop, sensors=replace(loop.sensors, noise_rms_V=np.zeros(len(loop.sensors.chains))))
+    drive = np.concatenate([np.zeros((settle, u.shape[1])), u])
+    return simulate(loop, len(u) / fs, seed, settle_s=settle / fs, nonlinear=nonlinear, floor=floor, drive=drive)
+
+
+def _record(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: SpectrumModel | None,
+            seed: tuple[int, int], start_s: float) -> tuple[Record, str]:
+    """One record, and a sentence on its levels."""
+    fs, samples, name = loop.sample_rate_Hz, len(one.u), f"{seed[1]:02d}"
+    settle = round(plan.settle_s * fs)
+    floor = _floor(loop, plan, one, ambient, settle, _rng(*seed, _FLOOR))
+    run = _run(loop, one.u, settle, floor, (*seed, _NOISE), plan.truth.nonlinear)
+    if run.diverged:
+        raise ComputationError(f"record {name}: the table left its stops", cause="a level or a floor far too large",
+                               measured=f"{np.max(np.abs(run.q[-1, :3])):.3g} m from rest",
+                               next_step="lower the level of this record in the plan")
+    converter = loop.sensors.converter
+    y = converter.convert(run.sensed) if converter else run.sensed
+    header = RecordHeader(name, fs, samples, loop.rig.equations_of_motion().actuators, loop.rig.sensor_rows()[0],
+                          one.plan.excitation, one.level_V, start_s, one.period_s,
+                          floor_names=FLOOR_NAMES if plan.floor_sensor.recorded else ())
+    measured = None
+    if plan.floor_sensor.recorded:
+        draw = _rng(*seed, _FLOOR_SENSOR).standard_normal((samples, 3))
+        measured = run.floor_dot[:, :3] + plan.floor_sensor.noise_rms_m_per_s * draw
+    return Record(header, run.demanded, y, measured), _levels(header, run, y)
+
+
+def _floor(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: SpectrumModel | None, settle: int,
+           rng: np.random.Generator) -> np.ndarray:
+    """(settle + samples + 1, 6) floor velocity: ambient throughout, shaken during the record."""
+    fs, samples = loop.sample_rate_Hz, settle + len(one.u)
+    velocity = np.zeros((samples + 1, 6))
+    if ambient is not None:
+        for axis in range(3):
+            velocity[:-1, axis] = realise(ambient, samples / fs, 1 / fs, rng).velocity
+    if one.plan.floor_rms_m_per_s is not None:
+        low, high = one.plan.band_Hz or plan.band_Hz
+        velocity[settle:-1, :3] += one.plan.floor_rms_m_per_s * band_limited(len(one.u), fs, (low, high), 3, rng)
+    velocity[-1] = velocity[-2]  # ends the step behind the last sample, which nothing records
+    return velocity
+
+
+def _levels(header: RecordHeader, run: SimulationRecord, y: np.ndarray) -> str:
+    of_u, of_y = (np.sqrt(np.mean(one ** 2, axis=0)) for one in (run.demanded, y))
+    converter, clipped = run.loop.sensors.converter, run.clipped_adc
+    text = (f"Record {header.name} ({header.excitation}): u {_span(of_u)} V r.m.s., peak "
+            f"{np.max(np.abs(run.demanded)):.4g} V; y {_span(of_y)} V r.m.s., peak {np.max(np.abs(run.sensed)):.4g} V")
+    if converter is not None:
+        text += f" of {converter.limits_V[1]:.4g} V"
+        if clipped:
+            channels = np.flatnonzero(np.any(converter.clipped(run.sensed), axis=0))
+            text += (f"; WARNING: {clipped} samples of y clip, in {', '.join(header.y_names[k] for k in channels)}: "
+                     "lower the level")
+    return text + "."
+
+
+def _span(values: np.ndarray) -> str:
+    low, high = float(np.min(values)), float(np.max(values))
+    return f"{high:.4g}" if high - low <= 1e-3 * high else f"{low:.4g} to {high:.4g}"
+
+
+def _assumptions(loop: SampledLoop, plan: CampaignPlan, seed: int, ambient: SpectrumModel | None) -> list[str]:
+    bank, rms = loop.sensors, plan.ambient.velocity_rms_m_per_s
+    if rms is None and loop.rig.ambient is not None:
+        rms = loop.rig.ambient.floor_velocity_rms_m_per_s
+    table = "nonlinear" if plan.truth.nonlinear else "linear"
+    low, high = plan.ambient.band_Hz
+    floor = (f"ambient floor {rms:.4g} m/s r.m.s. from {low:g} to {high:g} Hz along each of x, y, z, shape "
+             f"{plan.ambient.spectrum}" if ambient else "floor at rest")
+    noises = (f"sensor noise {_span(bank.noise_rms_V)} V r.m.s. a sample, "
+              + (f"quantiser {bank.converter.lsb_V:.4g} V" if bank.converter
+                 else f"no quantiser, levels chosen for a range of {ASSUMED_RANGE_V:g} V"))
+    lag = (f"amplifiers with a first-order lag of {loop.amplifier_corner_Hz:g} Hz" if loop.amplifier_corner_Hz
+           else "amplifiers without lag")
+    return [f"Simulated with the {table} table in open loop, seed {seed}: {floor}; {noises}; {lag}; delay "
+            f"{loop.loop_delay_s:g} s.",
+            f"Before each record the drives are silent for {plan.settle_s:g} s: a multisine's first period holds a "
+            "transient."]
+
+
+def _rng(*seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+

@@ -1,0 +1,141 @@
+"""What to record in a simulated measurement campaign. Read from a file by `avis_ctrl.study.campaign_plan`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+
+from avis_ctrl.rigs.floor_spectrum import shipped_spectra
+from avis_ctrl.rigs.rig_file import NotNegative, Positive
+
+
+def _rising(band: list[float]) -> list[float]:
+    if band[0] >= band[1]:
+        raise ValueError("expected the lower end first, the upper one after it")
+    return band
+
+
+Band = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(_rising)]
+Duration = Annotated[float, Field(gt=0, le=36000)]
+Percent = Annotated[float, Field(gt=0, le=100)]
+Spread = Annotated[float, Field(ge=0, lt=100)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class RecordPlan(_Section):
+    """One record, or a set of them at one level.
+
+    level_V : r.m.s. of every drive. level_percent : instead, a share of the largest level at which neither drives nor
+        converter clip on the rig as its file has it; 50 where neither is given.
+    records : how many, with other draws; an orthogonal multisine takes as many again as the rig has drives.
+    floor_rms_m_per_s : r.m.s. velocity of the shaken floor along each of x, y, z, on top of what is ambient.
+    duration_s, band_Hz : the plan's where absent.
+    """
+
+    excitation: Literal["multisine", "noise", "rest", "floor"]
+    level_V: Positive | None = None
+    level_percent: Percent | None = None
+    floor_rms_m_per_s: Annotated[Positive | None, Field(validate_default=True)] = None
+    records: Annotated[int, Field(ge=1, le=200)] = 1
+    duration_s: Duration | None = None
+    band_Hz: Band | None = None
+
+    @field_validator("level_V", "level_percent")
+    @classmethod
+    def _driven(cls, level: float | None, info: ValidationInfo) -> float | None:
+        if level is not None and info.data.get("excitation") in ("rest", "floor"):
+            raise ValueError(f"expected no level: in a {info.data['excitation']} record the drives are silent")
+        if level is not None and info.field_name == "level_percent" and info.data.get("level_V") is not None:
+            raise ValueError("expected one of level_V and level_percent, not both")
+        return level
+
+    @field_validator("floor_rms_m_per_s")
+    @classmethod
+    def _shaken(cls, rms: float | None, info: ValidationInfo) -> float | None:
+        shaken = info.data.get("excitation") == "floor"
+        if shaken and rms is None:
+            raise ValueError("expected the r.m.s. velocity of the shaken floor in m/s")
+        if not shaken and rms is not None:
+            raise ValueError("expected only in records with excitation = \"floor\"")
+        return rms
+
+
+class MultisinePlan(_Section):
+    """As `avis_ctrl.measurement.excitation.MultisineSettings`."""
+
+    period_s: Duration = 10.0
+    lines: Literal["full", "odd", "odd_detection"] = "full"
+    spacing: Annotated[int, Field(ge=1, le=10000)] = 1
+    group: Annotated[int, Field(ge=2, le=10000)] = 4
+    scheme: Literal["orthogonal", "zippered"] = "zippered"
+    compensate_hold: bool = False
+    low_crest: bool = True
+
+
+class AmbientPlan(_Section):
+    """Floor motion that is always there, along x, y and z, independent: a measured shape at the level of the site.
+
+    velocity_rms_m_per_s : in band_Hz; what the rig's file says where absent, 0 for a floor at rest.
+    """
+
+    spectrum: str = "kamioka_quiet"
+    velocity_rms_m_per_s: NotNegative | None = None
+    band_Hz: Band = [0.5, 60.0]
+
+    @field_validator("spectrum")
+    @classmethod
+    def _known(cls, spectrum: str) -> str:
+        if spectrum not in shipped_spectra():
+            raise ValueError(f"expected one of {', '.join(shipped_spectra())}")
+        return spectrum
+
+
+class FloorSensorPlan(_Section):
+    """Whether the floor's velocity is recorded, and the white noise of one sample of that measurement."""
+
+    recorded: bool = True
+    noise_rms_m_per_s: NotNegative = 0.0
+
+
+class SensorPlan(_Section):
+    """Switches for what the rig's file says of noise and quantiser."""
+
+    noise: bool = True
+    quantiser: bool = True
+
+
+class TruthPlan(_Section):
+    """How far the table that moves differs from the rig's file: each parameter by a uniform draw within these percent.
+
+    perturb_percent : stiffness, mass and inertia. perturb_damping_percent : damping.
+    nonlinear : False for the table linearised about rest.
+    """
+
+    perturb_percent: Spread = 0.0
+    perturb_damping_percent: Spread = 0.0
+    nonlinear: bool = True
+
+
+class CampaignPlan(_Section):
+    """A whole campaign.
+
+    settle_s : time with the drives at zero before each record, on the ambient floor.
+    amplifier_corner_Hz : first-order lag of the amplifiers; none where absent, but 300 Hz for rigs with
+        accelerometers, which cannot be simulated without.
+    """
+
+    title: str = ""
+    duration_s: Duration = 60.0
+    settle_s: Annotated[float, Field(ge=0, le=3600)] = 10.0
+    band_Hz: Band = [0.5, 100.0]
+    amplifier_corner_Hz: Positive | None = None
+    multisine: MultisinePlan = MultisinePlan()
+    ambient: AmbientPlan = AmbientPlan()
+    floor_sensor: FloorSensorPlan = FloorSensorPlan()
+    sensors: SensorPlan = SensorPlan()
+    truth: TruthPlan = TruthPlan()
+    record: Annotated[list[RecordPlan], Field(min_length=1)]

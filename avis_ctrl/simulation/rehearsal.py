@@ -1,0 +1,81 @@
+"""Rehearse an identification: a campaign from a table that differs from its file by amounts kept aside."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_file import rig_from
+from avis_ctrl.rigs.rig_writer import rig_toml
+from avis_ctrl.simulation.campaign_data import Progress, simulate_campaign
+from avis_ctrl.simulation.campaign_plan import CampaignPlan
+
+# Flat names of parameters, AVIS and Halcyonics.
+STIFF_OR_HEAVY = re.compile(r"mass|J[123]|I(xx|yy|zz)|isolator\d+\.k_[xyz]|k_[atr]|k_s\d|load\.mass")
+DAMPING = re.compile(r"isolator\d+\.c_[xyz]|d[13456]")
+# Draws of an inertia that no body can have are drawn again; nearly flat payloads need some.
+ATTEMPTS = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Rehearsal:
+    """A campaign and, beside it and nowhere in it, the truth.
+
+    truth : the table that moved. true_values : the parameters that were changed, by flat name.
+    factors : true over file's value of each.
+    """
+
+    campaign: Campaign
+    truth: Rig
+    true_values: dict[str, float]
+    factors: dict[str, float]
+
+    def truth_toml(self) -> str:
+        """The truth as a rig file, the changed lines marked with the change."""
+        values = {name: f"{name} x {factor:.6f}" for name, factor in self.factors.items()}
+        return rig_toml(self.truth, values, "The table that moved in a rehearsal; what identification should find.")
+
+
+def rehearse(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | None = None) -> Rehearsal:
+    """Perturb the rig as `plan.truth` says and record the campaign on it; raises as `simulate_campaign` does."""
+    truth = perturbed_truth(rig, plan.truth.perturb_percent, plan.truth.perturb_damping_percent, seed)
+    old, new = rig.parameters(), truth.parameters()
+    changed = {name: new[name].value for name in old if new[name].value != old[name].value}
+    campaign = simulate_campaign(rig, plan, seed, truth=truth, progress=progress)
+    return Rehearsal(campaign, truth, changed, {name: value / old[name].value for name, value in changed.items()})
+
+
+def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.0, seed: int = 1) -> Rig:
+    """Stiffness, mass and inertia within +-percent, damping within +-damping_percent; independent uniform draws.
+
+    Products of inertia, positions, actuators, sensors and the inertia of a load stay as they are.
+
+    Raises
+    ------
+    InputError : percentages outside 0 .. 100; no draw that is a rig (an inertia that a body can have).
+    """
+    for name, value in (("perturb_percent", percent), ("perturb_damping_percent", damping_percent)):
+        if not (np.isfinite(value) and 0 <= value < 100):
+            raise InputError("expected 0 or more, and less than 100", field=name, value=value)
+    rng, known = np.random.default_rng((seed, 5)), rig.parameters()
+    spread = {name: (damping_percent if DAMPING.fullmatch(name) else percent) / 100 for name in known
+              if DAMPING.fullmatch(name) or STIFF_OR_HEAVY.fullmatch(name)}
+    for _ in range(ATTEMPTS):
+        draws = rng.uniform(-1, 1, len(spread))
+        changes = {name: known[name].value * (1 + width * draw)
+                   for (name, width), draw in zip(spread.items(), draws, strict=True) if width}
+        try:
+            truth = rig.with_parameters(changes)
+            rig_from(tomllib.loads(rig_toml(truth)), loaded=getattr(rig, "load", None) is not None)
+        except InputError as error:
+            refused = error
+        else:
+            return truth
+    raise InputError(f"{ATTEMPTS} draws gave no body that can exist; the last: {refused}", field="perturb_percent",
+                     value=percent)
