@@ -1,0 +1,233 @@
+"""Gate for channels that carry nothing: constant, stuck at a code, or noise alone while others respond."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import stats
+
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
+from avis_ctrl.measurement.gates.finding import (
+    FALSE_ALARM,
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Series,
+    Severity,
+    quoted,
+    thinned,
+)
+from avis_ctrl.measurement.gates.h1 import h1, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.sine_fit import fit_sine
+
+# A stuck run is at least this long, and this many times as long as any other run of the channel.
+STUCK_SAMPLES, STUCK_FACTOR = 50, 5
+# A dead channel stays below this part of what chance may do, where the median channel exceeds it as often.
+RESPONDS = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    record: str
+    driven: bool
+    rms: np.ndarray
+    spread: np.ndarray
+    codes: np.ndarray
+    longest: np.ndarray
+    stuck: dict[int, tuple[int, int]]
+    response: np.ndarray | None
+    traces: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+
+
+class DeadChannel(Gate):
+    """Sensors that do not sense and drives that are never driven.
+
+    Constant channels need no statistics. A stuck code is a run of equal samples, at least 50 and five times as long as
+    any
+    other such run of the channel. A channel is noise alone where its largest multiple coherence over the driven lines
+    is what
+    chance gives (beta distribution of n_u and K - n_u, 1 % shared over channels, records and lines) while half of the
+    channels exceed ten times as much in terms of coherence / (1 - coherence); that is judged over all driven records.
+    Of a
+    sine record the fitted sine's power is judged against the residual, by F(2, samples - 3).
+    On clean data the channel's signal-to-noise ratio would have to be at fault, so false alarms come from small signals
+    only.
+    """
+
+    name = "dead channel"
+
+    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
+        y = np.concatenate([p.y for p in seen.pieces])
+        t = np.concatenate([p.time for p in seen.pieces]) - seen.header.start_s
+        stuck, longest = {}, np.zeros(y.shape[1], int)
+        for k in range(y.shape[1]):
+            runs = equal_runs(y[:, k])
+            longest[k] = runs[0][0]
+            second = runs[1][0] if len(runs) > 1 else 1
+            if longest[k] < len(y) and longest[k] >= max(STUCK_SAMPLES, STUCK_FACTOR * second):
+                stuck[k] = runs[0]
+        traces = {k: (t[(part := slice(max(0, at - n), at + 2 * n))], y[part, k]) for k, (n, at) in stuck.items()}
+        codes = np.array([len(np.unique(y[: 1 << 14, k])) for k in range(y.shape[1])])
+        spread = np.ptp(np.concatenate([p.u for p in seen.pieces]), axis=0)
+        return _Kept(seen.header.name, seen.driven, y.std(axis=0), spread, codes, longest, stuck, _excess(seen), traces)
+
+    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+        names = campaign.y_names
+        rms = np.array([k.rms for k in kept])
+        found = []
+        responses = [k.response for k in kept if k.response is not None]
+        picture = self._picture(kept, rms, campaign)
+        # Drift looks like a slow sine: of many sine records the middle one counts.
+        sines = all(record.header.excitation == "sine" for record in campaign.records)
+        excess = (np.median if sines else np.max)(responses, axis=0) if responses else None
+        constant: set[str] = set()
+        for j, name in enumerate(names):
+            dead = tuple(k.record for k in kept if k.rms[j] == 0)
+            if dead:
+                constant.add(name)
+                found.append(
+                    Finding(
+                        self.name,
+                        "stop",
+                        f"Channel {name!r} is constant in {_records(dead, kept)}: the sensor is "
+                        "not connected or not recorded. Check its cable and input, or leave the channel out.",
+                        (name,),
+                        dead,
+                        0.0,
+                        0.0,
+                        picture,
+                    )
+                )
+            for k in kept:
+                if j in k.stuck:
+                    found.append(self._stuck(name, j, k, campaign))
+            if name not in constant and excess is not None and excess[j] < 1 and np.median(excess) > RESPONDS:
+                found.append(
+                    Finding(
+                        self.name,
+                        "stop",
+                        f"Channel {name!r} holds only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} r.m.s."
+                        f" ({int(np.median([k.codes[j] for k in kept]))} different values) in every driven record while"
+                        f" the other channels respond (its ratio of response to noise is {excess[j]:.2g} of what chance"
+                        f" may give, the median channel's {np.median(excess):.3g}): not connected, or recorded under"
+                        " another name. Check its cable, or leave it out.",
+                        (name,),
+                        tuple(k.record for k in kept if k.response is not None),
+                        float(excess[j]),
+                        1.0,
+                        picture,
+                    )
+                )
+        found += self._never_driven(kept, campaign, picture)
+        if not found:
+            found.append(
+                Finding(
+                    self.name,
+                    "ok",
+                    f"All {len(names)} channels move; the quietest is "
+                    f"{names[int(np.argmin(rms.max(axis=0)))]!r} with {rms.max(axis=0).min():.3g} "
+                    f"{campaign.y_unit} r.m.s. in its strongest record.",
+                    value=float(rms.max(axis=0).min()),
+                    limit=0.0,
+                    picture=picture,
+                )
+            )
+        return found
+
+    def _never_driven(self, kept: list[_Kept], campaign: Campaign, picture: Picture) -> list[Finding]:
+        driven = [k for k in kept if k.driven]
+        if not driven:
+            return []
+        idle = tuple(n for j, n in enumerate(campaign.u_names) if not any(k.spread[j] > 0 for k in driven))
+        if not idle:
+            return []
+        return [
+            Finding(
+                self.name,
+                "note",
+                f"Input {quoted(idle)} never moves in any driven record: nothing can be said of "
+                "its effect. Drive it in a further record, or leave it out.",
+                idle,
+                picture=picture,
+            )
+        ]
+
+    def _stuck(self, name: str, j: int, kept: _Kept, campaign: Campaign) -> Finding:
+        n, at = kept.stuck[j]
+        rate = campaign.sample_rate_Hz
+        t, x = kept.traces[j]
+        severity: Severity = "warning"
+        picture = Picture(
+            f"Record {kept.record}, {name}",
+            "time [s]",
+            f"{name} [{campaign.y_unit}]",
+            (Series(name, *thinned(t, x)),),
+            (Limit("stuck from", at / rate, "x"),),
+        )
+        return Finding(
+            self.name,
+            severity,
+            f"Channel {name!r} of record {kept.record} repeats one value for {n} samples "
+            f"({n / rate:.3g} s) from {at / rate:.4g} s on: the converter or the link stuck. "
+            "Leave that part out or repeat the record.",
+            (name,),
+            (kept.record,),
+            float(n),
+            float(STUCK_SAMPLES),
+            picture,
+        )
+
+    def _picture(self, kept: list[_Kept], rms: np.ndarray, campaign: Campaign) -> Picture:
+        x = np.arange(len(kept))
+        return Picture(
+            "R.m.s. of each channel by record",
+            "record number",
+            f"r.m.s. [{campaign.y_unit}]",
+            tuple(Series(name, x, rms[:, j], "points") for j, name in enumerate(campaign.y_names)),
+            y_scale="log",
+        )
+
+
+def _records(names: tuple[str, ...], kept: list[_Kept]) -> str:
+    return "every record" if len(names) == len(kept) else f"record {', '.join(names[:5])}"
+
+
+def equal_runs(x: np.ndarray) -> list[tuple[int, int]]:
+    """(length, start) of the two longest runs of equal samples."""
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(x)) + 1])
+    lengths = np.diff(np.concatenate([starts, [len(x)]]))
+    order = np.argsort(lengths)[::-1][:2]
+    return [(int(lengths[k]), int(starts[k])) for k in order]
+
+
+def _excess(seen: Excerpt) -> np.ndarray | None:
+    """(n_y,) largest coherence / (1 - coherence) over the driven lines, divided by what chance gives at 1 %."""
+    if not seen.driven:
+        return None
+    if seen.header.excitation == "sine":
+        return _sine_excess(seen)
+    u, y, wrap = usable(seen)
+    moving = np.ptp(u, axis=0) > 0
+    if not moving.any():
+        return None
+    of = spectra(u, y, seen.header.sample_rate_Hz, segment_length(len(u), int(moving.sum())), wrap)
+    estimate = h1([of])
+    if estimate is None:
+        return None
+    n_u = int(moving.sum())
+    level = FALSE_ALARM / estimate.coherence.size
+    chance = stats.beta.isf(level, n_u, estimate.dof)
+    ratio = estimate.coherence / np.maximum(1 - estimate.coherence, 1e-12)
+    return np.max(ratio, axis=0) / (chance / max(1 - chance, 1e-12))
+
+
+def _sine_excess(seen: Excerpt) -> np.ndarray:
+    """(n_y,), the same for a sine: power of the fitted sine by that of the residual, against F(2, samples - 3)."""
+    piece = seen.first
+    n_u = piece.u.shape[1]
+    fit = fit_sine(piece.header.name, np.hstack([piece.u, piece.y]), n_u, seen.header.sample_rate_Hz)
+    ratio = np.abs(fit.X[n_u:]) ** 2 / 4 * fit.samples / np.maximum(fit.rest[n_u:] ** 2, 1e-300)
+    return ratio / float(stats.f.isf(FALSE_ALARM / len(ratio), 2, fit.samples - 3))

@@ -1,0 +1,76 @@
+"""What the gates look at: a record, or evenly spread pieces of one that is too long to hold in memory."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader, RecordSource
+from avis_ctrl.measurement.gates.finding import Expectation, Finding
+
+LONGEST = 1 << 20
+PIECES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Excerpt:
+    """A record's header with the pieces that were loaded; one piece where the record is short."""
+
+    header: RecordHeader
+    pieces: tuple[Record, ...]
+
+    @property
+    def whole(self) -> bool:
+        return sum(len(piece.y) for piece in self.pieces) == self.header.samples
+
+    @property
+    def first(self) -> Record:
+        return self.pieces[0]
+
+    @property
+    def periodic(self) -> bool:
+        """At least two whole periods in the first piece."""
+        period = self.header.period_samples
+        return period is not None and len(self.first.y) >= 2 * period
+
+    @property
+    def driven(self) -> bool:
+        """Some commanded voltage moves."""
+        return self.header.excitation not in ("rest", "floor") and any(np.ptp(p.u, axis=0).any() for p in self.pieces)
+
+    def periods(self, what: str = "y") -> np.ndarray:
+        """(periods, samples, channels) of u or y, over all pieces; the last, broken period is left out."""
+        length = self.header.period_samples or 0
+        arrays = [getattr(piece, what) for piece in self.pieces]
+        cut = [a[: len(a) // length * length].reshape(-1, length, a.shape[1]) for a in arrays]
+        return np.concatenate(cut)
+
+
+def excerpt(record: RecordSource, longest: int = LONGEST) -> Excerpt:
+    """The record, or four evenly spread pieces of at most `longest` samples together, cut between periods."""
+    samples, period = record.header.samples, record.header.period_samples or 1
+    if samples <= longest:
+        return Excerpt(record.header, (record.load(),))
+    size = longest // PIECES
+    if period > size:
+        return Excerpt(record.header, (record.load(0, longest),))
+    size = size // period * period
+    starts = np.linspace(0, samples - size, PIECES).astype(int) // period * period
+    return Excerpt(record.header, tuple(record.load(int(start), int(start) + size) for start in starts))
+
+
+class Gate(ABC):
+    """One question put to a campaign: `look` at each record once, then `conclude`."""
+
+    name: ClassVar[str]
+
+    @abstractmethod
+    def look(self, seen: Excerpt, expectation: Expectation) -> Any:
+        """What is kept of a record; small."""
+
+    @abstractmethod
+    def conclude(self, kept: list[Any], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+        """At least one finding."""

@@ -1,0 +1,131 @@
+"""What a gate says of a campaign: a sentence with numbers, and plain data for its plot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+
+Severity = Literal["ok", "note", "warning", "stop"]
+SEVERITIES: tuple[str, ...] = ("ok", "note", "warning", "stop")
+Response = Callable[[np.ndarray, tuple[str, ...]], np.ndarray]
+# Chance that a gate raises an alarm on clean data of one campaign, over all its channels and records.
+FALSE_ALARM = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """A curve of a picture: x and y of equal length; style "line", "points" or "bars"."""
+
+    name: str
+    x: np.ndarray
+    y: np.ndarray
+    style: str = "line"
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A straight line across a picture at `value` of the axis "x" or "y"."""
+
+    name: str
+    value: float
+    axis: str = "y"
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """Plain data for a plot. Labels carry the unit; scales are "linear" or "log"."""
+
+    title: str
+    x_label: str
+    y_label: str
+    series: tuple[Series, ...]
+    limits: tuple[Limit, ...] = ()
+    x_scale: str = "linear"
+    y_scale: str = "linear"
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One sentence of a gate.
+
+    Attributes
+    ----------
+    gate : name of the gate.
+    severity : "ok", "note" (know it), "warning" (results suffer), "stop" (results would be wrong).
+    sentence : measured numbers, likely cause, next step.
+    channels, records : that it concerns; empty where it concerns all.
+    value, limit : the number judged and what it was judged against.
+    """
+
+    gate: str
+    severity: Severity
+    sentence: str
+    channels: tuple[str, ...] = ()
+    records: tuple[str, ...] = ()
+    value: float | None = None
+    limit: float | None = None
+    picture: Picture | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """What is known of the rig before its records are looked at; every field may be absent.
+
+    Attributes
+    ----------
+    y_range_V : lowest and highest value that the converter reports, unit of y.
+    y_lsb_V : its step.
+    drive_limit_V : largest commanded voltage.
+    sensor_noise_rms_V : of each channel, white at the sample rate, unit of y.
+    u_names, y_names : channels that the rig has.
+    u_unit, y_unit : their units.
+    response : response(omega (n,) rad/s, inputs) -> (n, n_y, n_u) complex, from commanded volts to y, rows in the
+        order of `y_names` (or of the campaign's channels where that is absent).
+
+    Raises
+    ------
+    InputError : a range whose ends are exchanged, limits that are not positive.
+    """
+
+    y_range_V: tuple[float, float] | None = None
+    y_lsb_V: float | None = None
+    drive_limit_V: float | None = None
+    sensor_noise_rms_V: float | None = None
+    u_names: tuple[str, ...] | None = None
+    y_names: tuple[str, ...] | None = None
+    u_unit: str | None = None
+    y_unit: str | None = None
+    response: Response | None = None
+
+    def __post_init__(self) -> None:
+        if self.y_range_V is not None and not self.y_range_V[0] < self.y_range_V[1]:
+            raise InputError("expected the lower end below the upper end", field="y_range_V", value=self.y_range_V)
+        for field in ("y_lsb_V", "drive_limit_V", "sensor_noise_rms_V"):
+            value = getattr(self, field)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise InputError("expected a positive number", field=field, value=value)
+
+
+def worst(severities: list[str]) -> str:
+    """The gravest of some severities; "ok" of none."""
+    return max(severities, key=SEVERITIES.index, default="ok")
+
+
+def quoted(names: tuple[str, ...] | list[str], most: int = 4) -> str:
+    """'a', 'b' and 3 more."""
+    shown = ", ".join(repr(name) for name in names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
+def thinned(x: np.ndarray, y: np.ndarray, most: int = 2000) -> tuple[np.ndarray, np.ndarray]:
+    """At most about `most` points of a curve for a plot, keeping smallest and largest of each bin."""
+    if len(x) <= most:
+        return np.asarray(x), np.asarray(y)
+    bins = np.array_split(np.arange(len(x)), most // 2)
+    keep = np.unique([k for part in bins for k in (part[np.argmin(y[part])], part[np.argmax(y[part])])])
+    return np.asarray(x)[keep], np.asarray(y)[keep]

@@ -1,0 +1,192 @@
+"""Gate for lines of the mains: narrow lines at 50 or 60 Hz and their harmonics above the local noise floor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal, stats
+
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
+from avis_ctrl.measurement.gates.finding import (
+    FALSE_ALARM,
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Series,
+    Severity,
+    thinned,
+)
+
+MAINS_HZ = (50.0, 60.0)
+HARMONICS = 6
+# The mains stays within this of its nominal frequency.
+TOLERANCE = 0.004
+REFERENCE = 16
+GUARD = 3
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """A tested line: p by the F test, the line's r.m.s., ratio of its power to the local floor."""
+
+    channel: int
+    mains_Hz: float
+    at_Hz: float
+    p: float
+    ratio: float
+    rms: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    record: str
+    lines: list[_Line]
+    tested: int
+    passed_over: int
+    rms: np.ndarray
+    f: np.ndarray
+    asd: np.ndarray
+
+
+class Hum(Gate):
+    """Narrow lines at k 50 Hz and k 60 Hz, k = 1 .. 6, within 0.4 %.
+
+    Power spectra are means over K Hann segments without overlap (K from 4 to 32). The largest bin within the
+    tolerance is compared with 16 bins on either side, the first three next to it left out; the louder side is the
+    floor.
+    Their ratio is F(2K, 2 16 K) distributed where the floor is locally flat, so that 1 % shared over bins, lines,
+    channels and
+    records controls false alarms; a line must moreover exceed its floor by a factor of 3, for floors that are not quite
+    flat.
+    Lines that the commanded u drives (bins with more than 1e-6 of the median power of its driven bins) are passed over:
+    they
+    are the experiment.
+    A line is a warning where it makes more than 1 % of the channel's r.m.s. in that record, otherwise a note.
+    """
+
+    name = "hum"
+
+    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
+        h = seen.header
+        y, u = seen.first.y, seen.first.u
+        length = _length(len(y), h.sample_rate_Hz)
+        f, P = signal.welch(y, h.sample_rate_Hz, "hann", length, 0, axis=0, detrend="linear")
+        _, Pu = signal.welch(u, h.sample_rate_Hz, "hann", length, 0, axis=0)
+        K = len(y) // length
+        driven = _driven(Pu, h.excitation)
+        lines, passed = [], 0
+        for mains in MAINS_HZ:
+            for k in range(1, HARMONICS + 1):
+                made = _tested(f, P, driven, k * mains, mains, K)
+                lines += made or []
+                passed += made is None
+        return _Kept(h.name, lines, len(lines), passed, y.std(axis=0), f, np.sqrt(P))
+
+    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+        tested = sum(k.tested for k in kept)
+        found = []
+        names = campaign.y_names
+        for j, name in enumerate(names):
+            for mains in MAINS_HZ:
+                hits = [
+                    (k, line)
+                    for k in kept
+                    for line in k.lines
+                    if line.channel == j and line.mains_Hz == mains and line.p < FALSE_ALARM / tested and line.ratio > 3
+                ]
+                if hits:
+                    found.append(self._finding(name, mains, hits, campaign.y_unit))
+        passed = sum(k.passed_over for k in kept)
+        if not found:
+            note = f"; {passed} lines lie where u drives and were not tested" if passed else ""
+            what = "No line of the mains stands out" if tested else "No line of the mains could be tested"
+            last = kept[-1]
+            found.append(
+                Finding(
+                    self.name,
+                    "ok",
+                    f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).",
+                    value=None,
+                    limit=FALSE_ALARM,
+                    picture=self._picture(last, 0, names[0], campaign.y_unit, []),
+                )
+            )
+        return found
+
+    def _finding(self, name: str, mains: float, hits: list[tuple[_Kept, _Line]], unit: str) -> Finding:
+        record, line = max(hits, key=lambda hit: hit[1].ratio)
+        part = max(hit.rms / max(k.rms[hit.channel], 1e-300) for k, hit in hits)
+        severity: Severity = "warning" if part > 0.01 else "note"
+        records = tuple(dict.fromkeys(k.record for k, _ in hits))
+        at = sorted({round(hit.at_Hz / mains) for _, hit in hits})
+        harmonics = ", ".join(f"{k * mains:g}" for k in at)
+        picture = self._picture(record, line.channel, name, unit, [k * mains for k in at])
+        return Finding(
+            self.name,
+            severity,
+            f"Channel {name!r} carries mains hum at {harmonics} Hz: at {line.at_Hz:.4g} Hz {line.rms:.3g} {unit}"
+            f" r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, {100 * part:.2g} % of the channel's"
+            f" r.m.s. (record {record.record}). Check grounding and shielding; keep these lines out of the fit.",
+            (name,),
+            records,
+            float(line.ratio),
+            3.0,
+            picture,
+        )
+
+    def _picture(self, kept: _Kept, j: int, name: str, unit: str, at: list[float]) -> Picture:
+        f, a = thinned(kept.f[1:], kept.asd[1:, j])
+        return Picture(
+            f"Record {kept.record}, {name}",
+            "frequency [Hz]",
+            f"amplitude density [{unit}/sqrt(Hz)]",
+            (Series(name, f, a),),
+            tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ),
+            "log",
+            "log",
+        )
+
+
+def _length(samples: int, rate: float) -> int:
+    """Segments of about 4 s, 4 of them at least and 32 at most."""
+    return int(np.clip(4 * rate, samples // 32, max(samples // 4, 2)))
+
+
+def _driven(Pu: np.ndarray, excitation: str) -> np.ndarray:
+    """(n,) bins in which u puts lines: of a noise excitation none, since its spectrum is smooth."""
+    power = Pu.sum(axis=1)
+    if excitation == "noise" or not power.any():
+        return np.zeros(len(power), bool)
+    strong = power[power > 1e-3 * power.max()]
+    return power > 1e-6 * np.median(strong)
+
+
+def _tested(f: np.ndarray, P: np.ndarray, driven: np.ndarray, at: float, mains: float, K: int) -> list[_Line] | None:
+    """The line at `at` in each channel; empty beyond the band, None where u drives it."""
+    df = f[1]
+    width = max(1, int(np.ceil(TOLERANCE * at / df)))
+    middle = round(at / df)
+    low, high = middle - width, middle + width
+    if low - GUARD - REFERENCE < 1 or high + GUARD + REFERENCE >= len(f) - 1:
+        return []
+    around = slice(low - GUARD - REFERENCE, high + GUARD + REFERENCE + 1)
+    if driven[around].any():
+        return None
+    lines = []
+    for j in range(P.shape[1]):
+        floor = max(
+            P[low - GUARD - REFERENCE : low - GUARD, j].mean(),
+            P[high + GUARD + 1 : high + GUARD + REFERENCE + 1, j].mean(),
+        )
+        peak = low + int(np.argmax(P[low : high + 1, j]))
+        if floor <= 0:
+            continue
+        ratio = float(P[peak, j] / floor)
+        # The largest of 2 width + 1 bins; neighbouring Hann bins are dependent, which makes the bound safe.
+        p = min(1.0, (2 * width + 1) * float(stats.f.sf(ratio, 2 * K, 2 * K * REFERENCE)))
+        around_peak = P[max(peak - 2, 0) : peak + 3, j] - floor
+        lines.append(_Line(j, mains, float(f[peak]), p, ratio, float(np.sqrt(max(around_peak.sum(), 0.0) * df))))
+    return lines

@@ -1,0 +1,246 @@
+"""Gate for samples that were lost or repeated, and for records whose clocks contradict each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy import stats
+
+from avis_ctrl.measurement.campaign import Campaign, RecordHeader
+from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
+from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series
+from avis_ctrl.measurement.gates.h1 import h1, segment_length, spectra
+
+# A repeated block has at least this many rows, equal in every channel.
+BLOCK = 16
+# A jump of the delay smaller than this many samples is no lost sample.
+JUMP = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    header: RecordHeader
+    block: tuple[int, int, int] | None
+    t: np.ndarray
+    delay: np.ndarray
+    standard: np.ndarray
+    clock: np.ndarray | None
+
+
+class MissingSamples(Gate):
+    """Lost samples, repeated blocks, overlapping records.
+
+    Lost samples shift y against the commanded u. In each segment the delay of y behind H1 u is fitted to the phase of
+    the driven lines, weighted by the residual; the largest step between means of the segments before and after any
+    instant is
+    tested (normal distribution with the segments' own scatter, 1 % shared over instants and records; Student's t for
+    few segments), and must exceed half a sample. Where rows were lost from u and y together, a periodic u shows it:
+    each
+    period is compared with the first by circular correlation, exactly, for u is commanded.
+    A repeated block is 16 or more rows equal in every channel of y to earlier ones, not a whole number of periods away
+    where the record is periodic; noise in one channel alone makes that impossible by chance.
+    """
+
+    name = "missing samples"
+
+    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
+        t, delay, standard = delays(seen)
+        return _Kept(
+            seen.header, repeated_block(seen.first.y, seen.header.period_samples), t, delay, standard, _clock(seen)
+        )
+
+    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+        found = self._overlaps(kept)
+        level = FALSE_ALARM / max(1, sum(len(k.t) for k in kept))
+        for k in kept:
+            picture = _picture(k)
+            rate, name = k.header.sample_rate_Hz, k.header.name
+            if k.block:
+                at, back, n = k.block
+                found.append(
+                    Finding(
+                        self.name,
+                        "stop",
+                        f"Record {name} repeats {n} rows at {at / rate:.5g} s that it already had "
+                        f"{back} samples before: a buffer was written twice. Repeat the record.",
+                        (),
+                        (name,),
+                        float(n),
+                        float(BLOCK),
+                        picture,
+                    )
+                )
+            if k.clock is not None and np.any(k.clock != 0):
+                p = int(np.flatnonzero(k.clock)[0])
+                found.append(
+                    Finding(
+                        self.name,
+                        "stop",
+                        f"The commanded voltage of record {name} is {abs(k.clock[p]):g} samples off its period of"
+                        f" {k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, or the stated"
+                        " period is wrong. Check period_s, or repeat the record.",
+                        (),
+                        (name,),
+                        float(k.clock[p]),
+                        0.0,
+                        picture,
+                    )
+                )
+            step = delay_step(k.delay, level)
+            if step is not None and abs(step[1]) > JUMP:
+                at, size = step
+                found.append(
+                    Finding(
+                        self.name,
+                        "stop",
+                        f"In record {name} the measured channels come {abs(size):.1f} samples"
+                        f" {'earlier' if size < 0 else 'later'} behind the commanded voltage from about"
+                        f" {k.t[at] - k.header.start_s:.4g} s on: about {max(1, round(abs(size)))} samples were"
+                        f" {'lost' if size < 0 else 'doubled'}. Repeat the record, or use only the part before.",
+                        (),
+                        (name,),
+                        float(size),
+                        JUMP,
+                        picture,
+                    )
+                )
+        if not found:
+            longest = max(kept, key=lambda k: len(k.t))
+            tested = sum(len(k.t) > 3 for k in kept)
+            scatter = float(np.std(longest.delay)) if len(longest.t) > 1 else None
+            said = f"; the delay scatters by {scatter:.2g} samples r.m.s." if scatter is not None else ""
+            found.append(
+                Finding(
+                    self.name,
+                    "ok",
+                    f"No lost or repeated samples ({tested} of {len(kept)} records could be compared with a moving "
+                    f"commanded voltage{said}).",
+                    value=scatter,
+                    limit=JUMP,
+                    picture=_picture(longest),
+                )
+            )
+        return found
+
+    def _overlaps(self, kept: list[_Kept]) -> list[Finding]:
+        if len(kept) < 2 or len({k.header.start_s for k in kept}) == 1:
+            return []
+        ordered = sorted(kept, key=lambda k: k.header.start_s)
+        found = []
+        for a, b in pairwise(ordered):
+            end = a.header.start_s + a.header.duration_s
+            if b.header.start_s < end - 1.5 / a.header.sample_rate_Hz:
+                found.append(
+                    Finding(
+                        self.name,
+                        "warning",
+                        f"Record {b.header.name} starts at {b.header.start_s:.6g} s, before record {a.header.name} ends"
+                        f" at {end:.6g} s: the clocks or the sample rate are wrong. Check start_s and sample_rate_Hz.",
+                        (),
+                        (a.header.name, b.header.name),
+                        float(b.header.start_s - end),
+                        0.0,
+                        _picture(a),
+                    )
+                )
+        return found[:3]
+
+
+def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """t (K,) s of segments' middles, delay (K,) of y behind H1 u in samples, standard (K,)."""
+    empty = (np.zeros(0),) * 3
+    if not seen.driven or seen.header.excitation == "sine":
+        return empty
+    rate, n_u = seen.header.sample_rate_Hz, int(np.count_nonzero(np.ptp(seen.first.u, axis=0)))
+    u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
+    length = segment_length(len(u), n_u)
+    of = spectra(u, y, rate, length, wrap=False)
+    estimate = h1([of])
+    if estimate is None:
+        return empty
+    keep = of.driven()
+    expected = np.einsum("fij,kfj->kfi", estimate.G, of.U[:, keep])
+    cross = of.Y[:, keep] * expected.conj() / np.maximum(estimate.noise, 1e-300)
+    weight = np.abs(expected) ** 2 / np.maximum(estimate.noise, 1e-300)
+    omega = 2 * np.pi * estimate.f[None, :, None] / rate
+    # Gauss-Newton of sum weight |Y / expected - exp(-j omega d)|^2, from the best of a scan over whole samples.
+    scan = np.arange(-32, 33)
+    power = np.array([np.sum(np.real(cross * np.exp(1j * omega * d)), axis=(1, 2)) for d in scan])
+    d = scan[np.argmax(power, axis=0)].astype(float)
+    for _ in range(4):
+        turned = cross * np.exp(1j * omega * d[:, None, None])
+        d = d - np.sum(omega * turned.imag, axis=(1, 2)) / np.maximum(np.sum(omega**2 * weight, axis=(1, 2)), 1e-300)
+    standard = 1 / np.sqrt(2 * np.maximum(np.sum(omega**2 * weight, axis=(1, 2)), 1e-300))
+    t = seen.first.header.start_s + (np.arange(len(d)) * (length // 2) + length / 2) / rate
+    return t, d, standard
+
+
+def delay_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:
+    """(index, size in samples) of the most significant step of the delay; None where none is."""
+    n = len(delay)
+    best: tuple[float, int, float] | None = None
+    for k in range(2, n - 1):
+        a, b = delay[:k], delay[k:]
+        # Medians: the first segment holds the transient, and the one across the step belongs to neither.
+        size = float(np.median(b) - np.median(a))
+        scatter = 1.4826 * np.concatenate([np.abs(a - np.median(a)), np.abs(b - np.median(b))])
+        sigma = max(float(np.median(scatter)), 1e-6)
+        # 1.57: variance of a median by that of a mean; 1.5: half-overlapping segments are not quite independent.
+        t = abs(size) / (sigma * np.sqrt(1.57 * 1.5 * (1 / len(a) + 1 / len(b))))
+        p = float(stats.t.sf(t, max(n // 2 - 2, 2)) * 2)
+        if best is None or p < best[0] or (p == best[0] and abs(size) > abs(best[2])):
+            best = p, k, size
+    return None if best is None or best[0] > level else (best[1], best[2])
+
+
+def repeated_block(y: np.ndarray, period: int | None) -> tuple[int, int, int] | None:
+    """(where, how far back, rows) of the longest block equal to earlier rows; None where there is none."""
+    moving = np.ptp(y, axis=0) > 0
+    if not moving.any() or len(y) < 2 * BLOCK:
+        return None
+    _, codes = np.unique(
+        np.ascontiguousarray(y[:, moving]).view(np.dtype((np.void, 8 * int(moving.sum())))).ravel(), return_inverse=True
+    )
+    changed = np.concatenate([[True], np.diff(codes) != 0])
+    factors = np.random.default_rng(0).integers(1, 1 << 62, BLOCK, dtype=np.int64) | 1
+    windows = np.lib.stride_tricks.sliding_window_view(codes.astype(np.int64), BLOCK)
+    hashed = sum(windows[:, k] * factors[k] for k in range(BLOCK))
+    order = np.argsort(hashed, kind="stable")
+    same = np.flatnonzero(np.diff(hashed[order]) == 0)
+    later, back = order[same + 1], order[same + 1] - order[same]
+    # Rows that stand still are for the dead-channel gate.
+    lively = np.lib.stride_tricks.sliding_window_view(changed, BLOCK).sum(axis=1)[later] > BLOCK // 2
+    if period:
+        lively &= back % period != 0
+    if not lively.any():
+        return None
+    later, back = later[lively], back[lively]
+    lag = int(np.bincount(back).argmax())
+    where = np.sort(later[back == lag])
+    return int(where[0]), lag, int(len(where) + BLOCK - 1)
+
+
+def _clock(seen: Excerpt) -> np.ndarray | None:
+    """(periods,) samples by which each period of u is shifted against the first; None where u is not periodic."""
+    if not seen.periodic or not seen.driven:
+        return None
+    u = seen.periods("u")
+    if np.allclose(u, u[:1], rtol=0, atol=1e-6 * np.max(np.abs(u))):
+        return np.zeros(len(u))
+    U = np.fft.rfft(u, axis=1)
+    c = np.fft.irfft(np.sum(U * U[:1].conj(), axis=2), u.shape[1], axis=1)
+    shift = np.argmax(c, axis=1)
+    return np.where(shift > u.shape[1] // 2, shift - u.shape[1], shift).astype(float)
+
+
+def _picture(kept: _Kept) -> Picture:
+    t = kept.t - kept.header.start_s
+    return Picture(
+        f"Record {kept.header.name}: delay of y behind the response to u",
+        "time [s]",
+        "delay [samples]",
+        (Series("delay", t, kept.delay, "points"),),
+        (Limit("half a sample", JUMP), Limit("half a sample", -JUMP)),
+    )

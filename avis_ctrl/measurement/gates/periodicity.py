@@ -1,0 +1,171 @@
+"""Gate for periodic records: how many periods hold the transient of the start, and whether the rest repeats."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
+from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
+
+# Lines over which the noise level is averaged, and lines looked at: those that carry most of the power.
+SMOOTH = 9
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """T (periods, n_y): mean over lines of |difference from the reference|^2 by its variance, 1 on average."""
+
+    record: str
+    period_s: float
+    whole: bool
+    T: np.ndarray | None
+    relative: np.ndarray | None
+    lines: int
+    dof: int
+
+
+class Periodicity(Gate):
+    """Each period against the mean of the last half, line by line and channel by channel.
+
+    Differences pass a Hann window, which keeps low frequencies from leaking into all lines. With noise variances from
+    the periods of the
+    reference, smoothed over 9 lines, T is F(L, L (R - 1)) distributed for L independent lines and R reference periods;
+    1 % is
+    shared over periods, channels and records. Periods up to the last one before the reference that fails are to be
+    dropped: a note, for a rig that starts at rest always has a transient. Where the reference's first period itself
+    fails against the
+    others, the response drifts: a warning.
+    """
+
+    name = "periodicity"
+
+    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
+        period_s = seen.header.period_s or 0.0
+        none = _Kept(seen.header.name, period_s, seen.whole, None, None, 0, 0)
+        if not seen.periodic or not seen.driven:
+            return none
+        y = seen.periods("y")
+        P = len(y)
+        if P < 4:
+            return none
+        T, relative, lines, R = compared(y)
+        return _Kept(seen.header.name, period_s, seen.whole, T, relative, lines, R - 1)
+
+    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+        judged = [k for k in kept if k.T is not None]
+        if not judged:
+            why = "no record is periodic with four periods or more"
+            return [
+                Finding(
+                    self.name,
+                    "ok",
+                    f"Periodicity was not tested: {why}.",
+                    picture=Picture("Periods against the last ones", "period", "ratio to noise [-]", ()),
+                )
+            ]
+        tests = sum(k.T.size for k in judged if k.T is not None)
+        found, drops = [], {}
+        for k in judged:
+            assert k.T is not None and k.relative is not None
+            limit = float(stats.f.isf(FALSE_ALARM / tests, k.lines, k.lines * k.dof))
+            failed = np.flatnonzero((limit < k.T).any(axis=1))
+            P = len(k.T)
+            reference = P - P // 2
+            picture = Picture(
+                f"Record {k.record}: periods against the last {P // 2}",
+                "period",
+                "difference by noise, power [-]",
+                tuple(Series(n, np.arange(1, P + 1), k.T[:, j], "points") for j, n in enumerate(campaign.y_names)),
+                (Limit("1 % by chance", limit),),
+                y_scale="log",
+            )
+            drop = int(failed[-1]) + 1 if len(failed) else 0
+            if drop >= reference:
+                bad = tuple(n for j, n in enumerate(campaign.y_names) if (k.T[reference - 1 :, j] > limit).any())
+                found.append(
+                    Finding(
+                        self.name,
+                        "warning",
+                        f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s:"
+                        f" {quoted(bad)} still differ by {np.sqrt(k.T[drop - 1].max()):.1f} times the noise,"
+                        f" {100 * k.relative[drop - 1].max():.2g} % of the signal. The rig drifts, or the transient is"
+                        " longer than the record. Wait longer before recording, or look for drift.",
+                        bad,
+                        (k.record,),
+                        float(k.T[drop - 1].max()),
+                        limit,
+                        picture,
+                    )
+                )
+            else:
+                drops[k.record] = (drop, k, limit, picture)
+        late = {r: d for r, d in drops.items() if d[0] > 0}
+        if late:
+            most, k, limit, picture = max(late.values(), key=lambda d: d[0])
+            assert k.relative is not None and k.T is not None
+            found.append(
+                Finding(
+                    self.name,
+                    "note",
+                    f"The transient of the start fills {most} period{'s' if most > 1 else ''} of {k.period_s:g} s"
+                    f" (record {k.record}: the first differs from the last ones by {100 * k.relative[0].max():.2g} % of"
+                    f" the signal). Drop the first {most} of each record.",
+                    (),
+                    tuple(late),
+                    float(most),
+                    0.0,
+                    picture,
+                )
+            )
+        elif drops and not found:
+            _, k, limit, picture = next(iter(drops.values()))
+            assert k.T is not None
+            found.append(
+                Finding(
+                    self.name,
+                    "ok",
+                    f"All periods repeat within the noise (largest ratio {k.T.max():.2f}, by chance up to"
+                    f" {limit:.2f}).",
+                    value=float(k.T.max()),
+                    limit=limit,
+                    picture=picture,
+                )
+            )
+        return found
+
+
+def windowed(difference: np.ndarray) -> np.ndarray:
+    """(..., lines, n_y) spectra of Hann-windowed differences (..., samples, n_y), every second line, no mean."""
+    n = difference.shape[-2]
+    window = np.hanning(n + 1)[:-1, None] * np.sqrt(8 / 3)
+    return np.fft.rfft(difference * window, axis=-2)[..., 2:-1:2, :]
+
+
+def smoothed(power: np.ndarray, width: int = SMOOTH) -> np.ndarray:
+    """(lines, n_y) moving mean over lines."""
+    kernel = np.ones(min(width, len(power)))
+    count = np.convolve(np.ones(len(power)), kernel, "same")
+    return np.stack([np.convolve(power[:, j], kernel, "same") / count for j in range(power.shape[1])], axis=1)
+
+
+def compared(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
+    """T (P, n_y), relative difference (P, n_y), lines and reference periods of y (P, samples, n_y)."""
+    P = len(y)
+    R = P // 2
+    reference = y[P - R :].mean(axis=0)
+    of = windowed(y[P - R :] - reference)
+    variance = smoothed(np.sum(np.abs(of) ** 2, axis=0) / (R - 1))
+    rms = np.maximum((reference - reference.mean(axis=0)).std(axis=0), 1e-300)
+    # A computed record without any noise repeats only to rounding.
+    variance = np.maximum(variance, (1e-9 * rms) ** 2 * y.shape[1])
+    T, relative = np.zeros((P, y.shape[2])), np.zeros((P, y.shape[2]))
+    for p in range(P):
+        others = reference if p < P - R else (reference * R - y[p]) / (R - 1)
+        n = R if p < P - R else R - 1
+        T[p] = np.mean(np.abs(windowed(y[p] - others)) ** 2 / (variance * (1 + 1 / n)), axis=0)
+        relative[p] = (y[p] - others).std(axis=0) / rms
+    return T, relative, len(variance), R

@@ -1,0 +1,306 @@
+"""Gates that compare records with each other: repeatability at one level, dependence on the level."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy import stats
+
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
+from avis_ctrl.measurement.gates.finding import (
+    FALSE_ALARM,
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Series,
+    Severity,
+    quoted,
+)
+from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
+
+# Differences below these parts of the response are not worth a note, or a warning.
+NOTABLE, LARGE = 0.01, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """u, y: mean period after the first (samples, channels) with the variance of its windowed lines, where periodic."""
+
+    record: str
+    level: float
+    rate: float
+    u: np.ndarray | None
+    y: np.ndarray | None
+    variance: np.ndarray | None
+    dof: int
+    of: Spectra | None
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """Of two records (or levels): T (n_y,) mean |difference|^2 by variance, limit, relative (n_y,) free of noise."""
+
+    a: str
+    b: str
+    T: np.ndarray
+    limit: float
+    relative: np.ndarray
+    f: np.ndarray
+    by_line: np.ndarray
+
+
+class _Records(Gate):
+    """What both gates look at."""
+
+    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept | None:
+        h = seen.header
+        if not seen.driven or h.excitation == "sine":
+            return None
+        u, y, wrap = usable(seen)
+        of = spectra(u, y, h.sample_rate_Hz, segment_length(len(u), int(np.count_nonzero(np.ptp(u, axis=0)))), wrap)
+        if not wrap or (periods := seen.periods("y")[1:]).shape[0] < 3:
+            return _Kept(h.name, h.level_V, h.sample_rate_Hz, None, None, None, 0, of)
+        P = len(periods)
+        lines = windowed(periods - y)
+        variance = smoothed(np.sum(np.abs(lines) ** 2, axis=0) / (P - 1)) / P
+        return _Kept(h.name, h.level_V, h.sample_rate_Hz, u, y, variance, P - 1, of)
+
+    def _picture(self, d: Difference, names: tuple[str, ...]) -> Picture:
+        return Picture(
+            f"{d.a} against {d.b}",
+            "frequency [Hz]",
+            "relative difference [-]",
+            tuple(Series(n, d.f, d.by_line[:, j]) for j, n in enumerate(names)),
+            (Limit("large", LARGE),),
+            "log",
+            "log",
+        )
+
+
+class Repeatability(_Records):
+    """Records of the same level against the first of them.
+
+    Where two records repeat one periodic u, their mean periods are compared line by line against the variance between
+    periods (Hann-windowed, smoothed
+    over 9 lines): T is F(L, L (P - 1)). Otherwise their H1 estimates are, with their covariance: T = mean of
+    d* inv(V) d over every second line, F(n_u L, K L) distributed. 1 % is shared over pairs and channels. What is
+    significant but below 1 % of the response (free of noise) is passed; above 5 % is a warning.
+    """
+
+    name = "repeatability"
+
+    def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+        groups: dict[float, list[_Kept]] = {}
+        for k in kept:
+            if k is not None:
+                groups.setdefault(_rounded(k.level), []).append(k)
+        pairs = [(group[0], other) for group in groups.values() for other in group[1:]]
+        level = FALSE_ALARM / max(1, len(pairs) * len(campaign.y_names))
+        differences = [d for a, b in pairs if (d := difference(a, b, level)) is not None]
+        if not differences:
+            return [
+                Finding(
+                    self.name,
+                    "ok",
+                    "Repeatability was not tested: no two driven records of one level and enough length.",
+                    picture=Picture("Repeatability", "frequency [Hz]", "relative difference [-]", ()),
+                )
+            ]
+        found = []
+        for d in differences:
+            bad = (d.limit < d.T) & (d.relative > NOTABLE)
+            if bad.any():
+                names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
+                severity: Severity = "warning" if d.relative[bad].max() > LARGE else "note"
+                found.append(
+                    Finding(
+                        self.name,
+                        severity,
+                        f"Record {d.b} does not repeat record {d.a}: {quoted(names)} differ by up to"
+                        f" {100 * d.relative[bad].max():.2g} % of the response, {d.T[bad].max():.1f} times the noise"
+                        f" power (by chance up to {d.limit:.2f}). The rig drifted or was changed in between; treat its"
+                        " parameters as uncertain by as much, or use one of the two.",
+                        names,
+                        (d.a, d.b),
+                        float(d.T[bad].max()),
+                        d.limit,
+                        self._picture(d, campaign.y_names),
+                    )
+                )
+        if not found:
+            d = max(differences, key=lambda d: float(d.T.max()))
+            found.append(
+                Finding(
+                    self.name,
+                    "ok",
+                    f"{len(differences)} pair{'s' if len(differences) > 1 else ''} of records agree within their noise"
+                    f" or 1 % (largest ratio {d.T.max():.2f}, by chance up to {d.limit:.2f}).",
+                    value=float(d.T.max()),
+                    limit=d.limit,
+                    picture=self._picture(d, campaign.y_names),
+                )
+            )
+        return found
+
+
+class LevelDependence(_Records):
+    """The response at different level_V, compared as in `Repeatability` (scaled where u is the same up to a factor).
+
+    H1 estimates are taken over all records of a level. 1 % is shared over pairs of levels and channels.
+    """
+
+    name = "level dependence"
+
+    def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+        groups: dict[float, list[_Kept]] = {}
+        for k in kept:
+            if k is not None:
+                groups.setdefault(_rounded(k.level), []).append(k)
+        pairs = list(combinations(sorted(groups), 2))
+        level = FALSE_ALARM / max(1, len(pairs) * len(campaign.y_names))
+        differences = [d for a, b in pairs if (d := _of_levels(groups[a], groups[b], a, b, level)) is not None]
+        if not differences:
+            return [
+                Finding(
+                    self.name,
+                    "ok",
+                    "Dependence on the level was not tested: no driven records of two levels and enough length.",
+                    picture=Picture("Level dependence", "frequency [Hz]", "relative difference [-]", ()),
+                )
+            ]
+        found = []
+        for d in differences:
+            bad = (d.limit < d.T) & (d.relative > NOTABLE)
+            if bad.any():
+                names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
+                severity: Severity = "warning" if d.relative[bad].max() > LARGE else "note"
+                j = int(np.argmax(np.where(bad, d.relative, 0)))
+                at = d.f[int(np.argmax(d.by_line[:, j]))]
+                found.append(
+                    Finding(
+                        self.name,
+                        severity,
+                        f"The response depends on the level: from {d.a} to {d.b} {quoted(names)} change by up to"
+                        f" {100 * d.relative[bad].max():.2g} % (most near {at:.3g} Hz), {d.T[bad].max():.1f} times the"
+                        f" noise power (by chance up to {d.limit:.2f}): nonlinearity. Identify at the level of use, and"
+                        " carry the difference as uncertainty.",
+                        names,
+                        (),
+                        float(d.T[bad].max()),
+                        d.limit,
+                        self._picture(d, campaign.y_names),
+                    )
+                )
+        if not found:
+            d = max(differences, key=lambda d: float(d.T.max()))
+            found.append(
+                Finding(
+                    self.name,
+                    "ok",
+                    f"The response is the same at all levels within noise or 1 % (largest ratio {d.T.max():.2f}, by"
+                    f" chance up to {d.limit:.2f}).",
+                    value=float(d.T.max()),
+                    limit=d.limit,
+                    picture=self._picture(d, campaign.y_names),
+                )
+            )
+        return found
+
+
+def _rounded(level: float) -> float:
+    """Levels within half a percent are one; what scatters by chance in r.m.s. does not make a new level."""
+    return float(f"{level:.2g}")
+
+
+def difference(a: _Kept, b: _Kept, level: float) -> Difference | None:
+    """Two records; None where they cannot be compared."""
+    names = f"record {a.record}", f"record {b.record}"
+    return _same_input(a, b, level, names) or _by_h1(a.of, b.of, level, names)
+
+
+def _of_levels(a: list[_Kept], b: list[_Kept], low: float, high: float, level: float) -> Difference | None:
+    names = f"{low:g} V", f"{high:g} V"
+    for one in a:
+        for other in b:
+            if (d := _same_input(one, other, level, names)) is not None:
+                return d
+
+    def of(group: list[_Kept]) -> list[Spectra]:
+        first = next(k.of for k in group if k.of is not None)
+        return [k.of for k in group if k.of is not None and len(k.of.f) == len(first.f)]
+
+    return _compare(h1(of(a)), h1(of(b)), level, names)
+
+
+def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Difference | None:
+    """Where u of b is u of a times a constant: y of b against y of a times it."""
+    if (
+        a.u is None
+        or b.u is None
+        or a.y is None
+        or b.y is None
+        or a.variance is None
+        or b.variance is None
+        or a.u.shape != b.u.shape
+    ):
+        return None
+    power = float(np.sum(a.u * a.u))
+    scale = float(np.sum(a.u * b.u)) / power if power else 0.0
+    if scale <= 0 or np.max(np.abs(b.u - scale * a.u)) > 1e-3 * np.max(np.abs(b.u)):
+        return None
+    D = windowed(b.y - scale * a.y)
+    variance = np.maximum(b.variance + scale**2 * a.variance, 1e-300)
+    T = np.mean(np.abs(D) ** 2 / variance, axis=0)
+    size = np.abs(windowed(b.y - b.y.mean(axis=0))) ** 2
+    excess = np.maximum(np.sum(np.abs(D) ** 2 - variance, axis=0), 0) / np.maximum(np.sum(size, axis=0), 1e-300)
+    lines = len(D)
+    f = np.fft.rfftfreq(len(a.y), 1 / a.rate)[2:-1:2]
+    driven = np.sum(np.abs(windowed(b.u)) ** 2, axis=1)
+    keep = driven > 1e-3 * driven.max()
+    by_line = np.sqrt(np.abs(D) ** 2 / np.maximum(size, 1e-300))
+    return Difference(
+        *names, T, float(stats.f.isf(level, lines, lines * min(a.dof, b.dof))), np.sqrt(excess), f[keep], by_line[keep]
+    )
+
+
+def _by_h1(a: Spectra | None, b: Spectra | None, level: float, names: tuple[str, str]) -> Difference | None:
+    if a is None or b is None or len(a.f) != len(b.f):
+        return None
+    return _compare(h1([a]), h1([b]), level, names)
+
+
+def _compare(a: H1 | None, b: H1 | None, level: float, names: tuple[str, str]) -> Difference | None:
+    if a is None or b is None:
+        return None
+    f, ia, ib = np.intersect1d(a.f, b.f, return_indices=True)
+    active = a.G.any(axis=(0, 1)) & b.G.any(axis=(0, 1))
+    ia, ib, f = ia[::2], ib[::2], f[::2]
+    if not len(f) or not active.any():
+        return None
+    # Columns that only one of the two drives cannot be compared.
+    pick = np.ix_(np.arange(len(f)), np.flatnonzero(active), np.flatnonzero(active))
+    Va, Vb = (np.linalg.pinv(of.gram[index], hermitian=True)[pick] for of, index in ((a, ia), (b, ib)))
+    D = (b.G[ib] - a.G[ia])[:, :, active]
+    V = a.noise[ia][:, :, None, None] * Va[:, None] + b.noise[ib][:, :, None, None] * Vb[:, None]
+    n_u = int(active.sum())
+    ridge = 1e-12 * np.trace(V, axis1=2, axis2=3).real[..., None, None] * np.eye(n_u) + 1e-300 * np.eye(n_u)
+    T = np.real(np.einsum("fyi,fyi->fy", D.conj(), np.linalg.solve(V + ridge, D[..., None])[..., 0])).mean(axis=0) / n_u
+    spread = np.trace(V, axis1=2, axis2=3).real
+    size = np.sum(np.abs(a.G[ia][:, :, active]) ** 2, axis=2)
+    power = np.sum(np.abs(D) ** 2, axis=2)
+    excess = np.maximum(np.sum((power - spread) / np.maximum(size.mean(axis=1, keepdims=True), 1e-300), axis=0), 0)
+    total = np.sum(size / np.maximum(size.mean(axis=1, keepdims=True), 1e-300), axis=0)
+    lines = len(f)
+    return Difference(
+        *names,
+        T,
+        float(stats.f.isf(level, n_u * lines, min(a.dof, b.dof) * lines)),
+        np.sqrt(excess / np.maximum(total, 1e-300)),
+        f,
+        np.sqrt(power / np.maximum(size, 1e-300)),
+    )

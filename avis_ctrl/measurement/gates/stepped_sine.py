@@ -1,0 +1,209 @@
+"""Gate for stepped-sine campaigns: a sine is fitted to each channel of each record.
+
+    x = Re(X exp(j w t)) + mean,     H = X_channel / X_drive
+
+Over the frequencies H is smooth, and each kind of channel has its own shape: a drive is proportional to the other
+drives, a
+sensor on a mass-spring system follows b s^k / (s^2 + 2 zeta w0 s + w0^2).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
+from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series
+from avis_ctrl.measurement.gates.sine_fit import KINDS, SineFit, fit_sine, second_order
+
+# A residual is off where it exceeds its neighbours' median (two on either side) this many times, and this part
+# of the sine.
+RESIDUAL_FACTOR, RESIDUAL = 4.0, 0.1
+# A ratio is off where it leaves the line between its neighbours by this part, and by this many times the median
+# departure.
+RATIO, RATIO_FACTOR = 0.15, 6.0
+# A channel is proportional where its ratio varies by less than this, and of second order where that fits within this.
+CONSTANT, SECOND_ORDER = 0.2, 0.1
+FEWEST = 5
+
+
+class SteppedSine(Gate):
+    """Records and labels of a stepped-sine campaign.
+
+    A record is bad where a channel's residual after the sine exceeds 10 % of the sine and 4 times the median of its
+    neighbours'
+    in frequency, or where |H| leaves the straight line (in logarithms) between its neighbours by 15 % and by 6 times
+    the
+    median departure of that channel. A recorded drive whose ratio to another drive is not constant but follows a
+    second-order
+    response is a sensor's output. Channels without the sine are for the dead-channel gate. These are limits of
+    engineering, not tests: records
+    are few, and residuals are distortion rather than noise, so that no false-alarm rate is claimed.
+    """
+
+    name = "stepped sine"
+
+    def look(self, seen: Excerpt, expectation: Expectation) -> SineFit | None:
+        if seen.header.excitation != "sine" or not seen.driven:
+            return None
+        piece = seen.first
+        return fit_sine(piece.header.name, np.hstack([piece.u, piece.y]), piece.u.shape[1], seen.header.sample_rate_Hz)
+
+    def conclude(self, kept: list[SineFit | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+        fits = sorted((k for k in kept if k is not None), key=lambda k: k.f)
+        names = (*campaign.u_names, *campaign.y_names)
+        if len(fits) < FEWEST:
+            return [
+                Finding(
+                    self.name,
+                    "ok",
+                    f"No stepped-sine campaign: {len(fits)} sine records, {FEWEST} are needed to compare neighbours.",
+                    picture=Picture("Stepped sine", "frequency [Hz]", "ratio to the drive [-]", ()),
+                )
+            ]
+        f, X = np.array([k.f for k in fits]), np.array([k.X for k in fits])
+        rest = np.array([k.rest for k in fits]) / np.maximum(np.abs(X), 1e-300) * np.sqrt(2)
+        silent = [j for j in range(len(names)) if np.median(rest[:, j]) > 10]
+        live = [j for j in range(len(names)) if j not in silent]
+        drive = _drive(rest, live, len(campaign.u_names))
+        picture = _bode(f, X, names, live, drive)
+        found = self._labels(f, X, names, live, drive, len(campaign.u_names), silent, picture)
+        found += self._bad_records(fits, f, X, rest, names, live, drive)
+        if not found:
+            found.append(
+                Finding(
+                    self.name,
+                    "ok",
+                    f"{len(fits)} sine records from {f[0]:.3g} to {f[-1]:.3g} Hz are smooth in frequency; the largest"
+                    f" residual is {100 * rest[:, live].max():.2g} % of its sine.",
+                    value=float(rest[:, live].max()),
+                    limit=RESIDUAL,
+                    picture=picture,
+                )
+            )
+        return found
+
+    def _labels(
+        self,
+        f: np.ndarray,
+        X: np.ndarray,
+        names: tuple[str, ...],
+        live: list[int],
+        drive: int,
+        n_u: int,
+        silent: list[int],
+        picture: Picture,
+    ) -> list[Finding]:
+        found = []
+        for j in (j for j in live if j < n_u and j != drive):
+            H = X[:, j] / X[:, drive]
+            spread = float(np.exp(np.std(np.log(np.abs(H)))) - 1)
+            turned = float(np.ptp(np.degrees(np.unwrap(np.angle(H)))))
+            if spread < CONSTANT and turned < 45:
+                continue
+            model = second_order(f, H)
+            if model.misfit > SECOND_ORDER:
+                continue
+            lost = [names[k] for k in silent if k >= n_u]
+            likely = (
+                f"; the channel {lost[0]!r}, which should hold a sensor, is silent: their names or cables are probably"
+                " exchanged"
+                if lost
+                else ""
+            )
+            found.append(
+                Finding(
+                    self.name,
+                    "stop",
+                    f"Channel {names[j]!r} is recorded as a drive but is a sensor's output: its ratio to"
+                    f" {names[drive]!r} is not constant (it varies from {np.abs(H).min():.3g} to {np.abs(H).max():.3g}"
+                    f" and turns by {turned:.0f} degrees from {f[0]:.3g} to {f[-1]:.3g} Hz) but follows a second-order"
+                    f" {KINDS[model.k]} response with corner {model.corner_Hz:.3f} Hz and damping {model.damping:.3f}"
+                    f" within {100 * model.misfit:.1f} %{likely}. Record it as an output, and find out what measures"
+                    " the drive.",
+                    (names[j], *lost),
+                    value=spread,
+                    limit=CONSTANT,
+                    picture=picture,
+                )
+            )
+        return found
+
+    def _bad_records(
+        self,
+        fits: list[SineFit],
+        f: np.ndarray,
+        X: np.ndarray,
+        rest: np.ndarray,
+        names: tuple[str, ...],
+        live: list[int],
+        drive: int,
+    ) -> list[Finding]:
+        found = []
+        for j in live:
+            H = np.abs(X[:, j] / X[:, drive])
+            off = _departure(np.log(f), np.log(H)) if j != drive else np.zeros(len(f))
+            usual = float(np.median(np.abs(off[1:-1])))
+            for k, fit in enumerate(fits):
+                around = [i for i in range(max(0, k - 2), min(len(f), k + 3)) if i != k]
+                near = float(np.median(rest[around, j]))
+                noisy = rest[k, j] > RESIDUAL and rest[k, j] > RESIDUAL_FACTOR * near
+                # A bad neighbour makes its neighbours depart too: the largest departure around counts.
+                astray = abs(off[k]) > max(RATIO, RATIO_FACTOR * usual) and abs(off[k]) >= np.max(
+                    np.abs(off[max(0, k - 1) : k + 2])
+                )
+                if not noisy and not (astray and rest[k, j] > 2 * near):
+                    continue
+                ratio = (
+                    f"its ratio to {names[drive]!r} is {H[k]:.3g} where its neighbours lead to"
+                    f" {H[k] * np.exp(-off[k]):.3g}"
+                    if off[k]
+                    else ""
+                )
+                found.append(
+                    Finding(
+                        self.name,
+                        "stop",
+                        f"Record {fit.record} is bad in channel {names[j]!r}: after the sine of {f[k]:.4g} Hz"
+                        f" {100 * rest[k, j]:.3g} % of it remain, where neighbouring records leave {100 * near:.2g}"
+                        f" %{'; ' + ratio if ratio else ''}. The signal is distorted, clipped or out of range there"
+                        " (see its picture); leave the record out.",
+                        (names[j],),
+                        (fit.record,),
+                        float(rest[k, j]),
+                        float(max(RESIDUAL, RESIDUAL_FACTOR * near)),
+                        Picture(
+                            f"Record {fit.record}, {names[j]}",
+                            "time [s]",
+                            names[j],
+                            (Series(names[j], fit.t, fit.traces[:, j]),),
+                        ),
+                    )
+                )
+        return found
+
+
+def _drive(rest: np.ndarray, live: list[int], n_u: int) -> int:
+    """The recorded drive that is the cleanest sine."""
+    among = [j for j in live if j < n_u] or live
+    return min(among, key=lambda j: float(np.median(rest[:, j])))
+
+
+def _departure(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(n,) of each point from the straight line between its neighbours; 0 at the ends."""
+    d = np.zeros(len(x))
+    share = (x[1:-1] - x[:-2]) / (x[2:] - x[:-2])
+    d[1:-1] = y[1:-1] - (y[:-2] + share * (y[2:] - y[:-2]))
+    return d
+
+
+def _bode(f: np.ndarray, X: np.ndarray, names: tuple[str, ...], live: list[int], drive: int) -> Picture:
+    return Picture(
+        f"Amplitude of each channel by {names[drive]}",
+        "frequency [Hz]",
+        "ratio [-]",
+        tuple(Series(names[j], f, np.abs(X[:, j] / X[:, drive]), "points") for j in live if j != drive),
+        (Limit("proportional", 1.0),),
+        "log",
+        "log",
+    )
