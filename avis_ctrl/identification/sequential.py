@@ -132,7 +132,7 @@ class SequentialResult:
             raise InputError(f"expected one of {[t.number for t in self.tests]}", field="test", value=number)
         problem = Problem(self.rig, [test], self.measured.between(*DRAWN_HZ))
         e_r = self.rig.e[test.reference - 1]
-        measured, theory = problem.measured.transfers[number] / e_r, problem.theory(self.rig, test) / e_r
+        measured, theory = problem.measured.transfers[number] / e_r, problem.theory(self.rig, [test])[0] / e_r
         return FigureData(test, problem.measured.frequency_Hz, _decibel(measured), _decibel(theory),
                           _degrees(measured), _degrees(theory))
 
@@ -212,7 +212,7 @@ def _quality(problem: Problem, rig: Halcyonics) -> tuple[dict[int, float], dict[
     misfit, chi_square = {}, {}
     for test in problem.tests:
         experiment = problem.measured.transfers[test.number]
-        distance = np.abs(problem.theory(rig, test) - experiment)**2
+        distance = np.abs(problem.theory(rig, [test])[0] - experiment)**2
         misfit[test.number] = float(np.sqrt(np.sum(distance) / np.sum(np.abs(experiment)**2)))
         if variance is not None:
             chi_square[test.number] = float(np.mean(distance / variance[test.number]))

@@ -118,11 +118,20 @@ class Analyser:
         return 2 * np.pi * self.resolution_Hz * np.arange(first, last + 1)
 
 
-def voltage_transfer(rig: Halcyonics, place: np.ndarray, direction: str, pattern: np.ndarray,
-                     omega: np.ndarray) -> np.ndarray:
-    """X/V [m/V], (n,): eq. 32 times e_r."""
-    r = int(np.flatnonzero(pattern)[0])
-    return rig.e[r] * rig.transfer(place, direction, pattern.tolist(), omega, rig.actuator_names[r])
+def voltage_transfers(rig: Halcyonics, rows: np.ndarray, patterns: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """X/V [m/V], (k, n) complex: eq. 32 times e_r for k pairs of measured displacement and drive at once.
+
+    rows : (k, 6) from the plate's motion w to the displacement, see `row_of`; patterns : (k, 8) voltages A.
+    """
+    eom = rig.equations_of_motion()
+    w = omega[:, None, None]
+    W = np.linalg.solve(-w**2 * eom.M + 1j * w * eom.C + eom.K, eom.T @ patterns.T)
+    return np.einsum("kj,njk->kn", rows, W)
+
+
+def row_of(rig: Halcyonics, test: TestCase) -> np.ndarray:
+    """(6,) from the plate's motion w to the test's displacement, eq. 31."""
+    return point_map(place_of(rig, test))["xyz".index(test.direction)]
 
 
 def simulate_tests(rig: Halcyonics, tests: Sequence[TestCase], noise: Analyser | None = None,
@@ -143,12 +152,12 @@ def simulate_tests(rig: Halcyonics, tests: Sequence[TestCase], noise: Analyser |
     lines = (noise or Analyser()).omega if omega is None else np.asarray(omega, float)
     transfers, variance = {}, {}
     for test in tests:
-        place = place_of(rig, test)
+        row = row_of(rig, test)
         total, spread = np.zeros(lines.size, complex), np.zeros(lines.size)
         for sign, pattern in test.drive_cases:
-            H = voltage_transfer(rig, place, test.direction, pattern, lines)
+            H = voltage_transfers(rig, row[None], pattern[None], lines)[0]
             if noise is not None:
-                disturbance = np.sqrt(disturbance_density(rig, place, test.direction, lines, noise))
+                disturbance = np.sqrt(disturbance_density(rig, row, lines, noise))
                 H, v = _averaged(H * _high_pass(lines, noise.low_corner_Hz), disturbance, noise, rng)
                 spread += v
             total += sign * H
@@ -156,12 +165,10 @@ def simulate_tests(rig: Halcyonics, tests: Sequence[TestCase], noise: Analyser |
     return MeasuredTests(lines, transfers, None if noise is None else variance)
 
 
-def disturbance_density(rig: Halcyonics, place: np.ndarray, direction: str, omega: np.ndarray,
-                        noise: Analyser) -> np.ndarray:
-    """(n,) power spectral density [m^2/Hz] of what the measured displacement holds beside the drive."""
+def disturbance_density(rig: Halcyonics, row: np.ndarray, omega: np.ndarray, noise: Analyser) -> np.ndarray:
+    """(n,) power spectral density [m^2/Hz] of what a measured displacement, row (6,), holds beside the drive."""
     eom = rig.equations_of_motion()
     w = omega[:, None, None]
-    row = point_map(place)["xyz".index(direction)]
     G = -w**2 * eom.M + 1j * w * eom.C + eom.K
     carried = np.linalg.solve(G, (1j * w * eom.C_floor + eom.K_floor)[:, :, :3])
     through = np.einsum("j,njk->nk", row, carried)

@@ -10,12 +10,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.identification.sequential_data import MeasuredTests, voltage_transfer
+from avis_ctrl.identification.sequential_data import MeasuredTests, row_of, voltage_transfers
 from avis_ctrl.identification.sequential_tests import (
     SIGNED,
     TestCase,
     parameters_of,
-    place_of,
     values_of,
     with_values,
 )
@@ -62,7 +61,7 @@ class Problem:
             raise InputError("expected a measured transfer for each test", field="measured", value=missing)
         if wrong := [name for name in self.names if name in ("M2_arm", "M3_arm")]:
             raise InputError("the measured points are fixed; expected another parameter", field="tests", value=wrong)
-        self.places = {test.number: place_of(rig, test) for test in tests}
+        self.rows = {test.number: row_of(rig, test) for test in tests}
         self.scale = {test.number: self._scale(step, test, weighting) for step in self.steps for test in step.tests}
         self.positive = np.array([name not in SIGNED for name in self.names])
         if np.any(self.start[self.positive] <= 0):
@@ -87,15 +86,16 @@ class Problem:
     def rig_at(self, theta: np.ndarray) -> Halcyonics:
         return with_values(self.rig, dict(zip(self.names, theta.tolist(), strict=True)))
 
-    def theory(self, rig: Halcyonics, test: TestCase) -> np.ndarray:
-        """Theoretical X/V [m/V], (n,)."""
-        return voltage_transfer(rig, self.places[test.number], test.direction, test.pattern, self.measured.omega)
+    def theory(self, rig: Halcyonics, tests: Sequence[TestCase]) -> np.ndarray:
+        """Theoretical X/V [m/V] of some tests, (tests, n)."""
+        rows = np.array([self.rows[test.number] for test in tests])
+        patterns = np.array([test.pattern for test in tests])
+        return voltage_transfers(rig, rows, patterns, self.measured.omega)
 
     def residual(self, tests: Sequence[TestCase], theta: np.ndarray) -> np.ndarray:
         """Real and imaginary parts of theory minus experiment over `scale`, stacked."""
-        rig = self.rig_at(theta)
-        parts = [(self.theory(rig, test) - self.measured.transfers[test.number]) / self.scale[test.number]
-                 for test in tests]
+        parts = [(transfer - self.measured.transfers[test.number]) / self.scale[test.number]
+                 for test, transfer in zip(tests, self.theory(self.rig_at(theta), tests), strict=True)]
         return np.concatenate([part.view(float) for part in parts])
 
     def jacobian(self, tests: Sequence[TestCase], theta: np.ndarray) -> np.ndarray:
@@ -140,7 +140,7 @@ class Problem:
         """E|error|^2 [m^2/V^2] of each line, (n,): measured, otherwise the mean of what the fit leaves in this test."""
         if self.measured.variance is not None:
             return self.measured.variance[test.number]
-        left = np.abs(self.theory(self.rig_at(theta), test) - self.measured.transfers[test.number])**2
+        left = np.abs(self.theory(self.rig_at(theta), [test])[0] - self.measured.transfers[test.number])**2
         n = self.measured.omega.size
         return np.full(n, float(np.sum(left)) / (n - len(test.parameters) / 2))
 

@@ -16,7 +16,7 @@ from avis_ctrl.identification.sequential_data import (
     disturbance_density,
     simulate_tests,
     transfers_from_response,
-    voltage_transfer,
+    voltage_transfers,
 )
 from avis_ctrl.identification.sequential_problem import steps_of
 from avis_ctrl.identification.sequential_tests import (
@@ -33,6 +33,7 @@ from avis_ctrl.identification.sequential_tests import (
 )
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
+from avis_ctrl.rigs.rigid_body import point_map
 
 BARE, LOADED = load_rig("halcyonics"), load_rig("halcyonics_loaded")
 START = loaded_start(BARE, 10.0)
@@ -42,6 +43,12 @@ BAND = 2 * np.pi * np.arange(2.5, 20.01, 0.5)
 
 def start_of(name):
     return perturbed_start(BARE, UNLOADED_TESTS, 0) if name == "unloaded" else START
+
+
+def voltage_transfer(rig, place, direction, pattern, omega):
+    """One displacement and drive, place (3,)."""
+    row = point_map(place)["xyz".index(direction)]
+    return voltage_transfers(rig, row[None], np.asarray(pattern, float)[None], omega)[0]
 
 
 def independent_transfer(rig, test, omega):
@@ -71,6 +78,15 @@ def test_transfers_against_the_state_space_by_positions(name):
     for test in tests:
         expected = independent_transfer(rig, test, omega)
         assert np.allclose(measured.transfers[test.number], expected, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_transfers_are_eq_32_times_the_actuators_constant(name):
+    rig, tests = CASES[name]
+    measured = simulate_tests(rig, tests, omega=BAND)
+    for test in tests:
+        printed = rig.transfer(test.point, test.direction, test.pattern.tolist(), BAND, f"A{test.reference}")
+        assert np.allclose(measured.transfers[test.number], printed * rig.e[test.reference - 1], rtol=1e-12)
 
 
 def test_a_transfer_is_the_steady_response_to_a_sine():
@@ -214,7 +230,7 @@ def test_h1_of_the_simulated_analyser_has_the_variance_it_states():
     """E|error|^2 = S_nn / (S_vv (n - 1)) for a complex Gaussian voltage: the mean of 1/chi^2."""
     noise, test = Analyser(averages=20, resolution_Hz=2.0), UNLOADED_TESTS[0]
     exact = simulate_tests(BARE, [test], omega=noise.omega).transfers[1]
-    density = disturbance_density(BARE, np.zeros(3), "z", noise.omega, noise)
+    density = disturbance_density(BARE, np.eye(6)[2], noise.omega, noise)
     expected = density / noise.drive_V_rtHz**2 / (noise.averages - 1)
     rng = np.random.default_rng(5)
     runs = [simulate_tests(BARE, [test], noise, rng) for _ in range(800)]
@@ -228,7 +244,7 @@ def test_h1_of_the_simulated_analyser_has_the_variance_it_states():
 def test_floor_motion_alone_reaches_the_plate_rigidly_far_below_resonance():
     noise = Analyser(accelerometer_m_s2_rtHz=0.0)
     omega = 2 * np.pi * np.array([0.02, 0.05])
-    density = disturbance_density(BARE, np.zeros(3), "z", omega, noise)
+    density = disturbance_density(BARE, np.eye(6)[2], omega, noise)
     assert density == pytest.approx((noise.floor_m_s_rtHz / omega)**2, rel=1e-3)
 
 
