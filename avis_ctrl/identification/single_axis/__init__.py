@@ -1,0 +1,1 @@
+"""Models of one axis, identified from measured records in the same frame as the rig: see `identify_single_axis`."""

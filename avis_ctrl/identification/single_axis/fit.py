@@ -1,0 +1,205 @@
+"""What every single-axis fit returns, and standard deviations that stand up to coloured residuals.
+
+A regression of a time series whose residual is correlated from sample to sample knows less than its number of samples
+says. With J the Jacobian, e the residual and s_t = J_t e_t the scores, the covariance of the estimate is
+
+    inv(J^T J) n S inv(J^T J),    S = sum over lags l of w_l E[s_t s_(t-l)^T]
+
+(Newey and West, Econometrica 55 (1987) 703, Bartlett weights w_l = 1 - |l|/(L+1), which keep S non-negative). The
+number of lags L follows Andrews, Econometrica 59 (1991) 817, eq. 6.4, from a first-order autoregression of each score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.identification.information import Information
+
+
+@dataclass(frozen=True)
+class ResidualStatistics:
+    """What a model leaves.
+
+    rms : in the unit of the measured quantity. share : norm of the residual over norm of what was measured.
+    lag_one : correlation of neighbouring residuals (0 white, 1 the same again). inflation : largest ratio of an honest
+    standard deviation to the one that a white residual would give. lags : L above, 0 where none was used.
+    """
+
+    rms: float
+    share: float
+    lag_one: float
+    inflation: float
+    lags: int
+
+
+@dataclass(frozen=True, eq=False)
+class SingleAxisFit:
+    """Parameters of a model of one axis.
+
+    Attributes
+    ----------
+    model : its equation, in words.
+    information : names, values, units, rank and the Cramer-Rao bound for a white residual of the level found.
+    covariance : (n_p, n_p) with the colour of the residual, or the misfit, accounted for as `covariance_method` says.
+    chi2, dof : against `noise`: "given" (measured beforehand), or "residual" (estimated from what is left, so that
+        chi2/dof is 1 by construction and says nothing of the model).
+    abscissa, measured, predicted : for a figure; time s or frequency Hz along axis 0.
+    notes : what a reader of the numbers must know.
+    """
+
+    model: str
+    information: Information
+    covariance: np.ndarray
+    covariance_method: str
+    chi2: float
+    dof: int
+    noise: str
+    residual: ResidualStatistics
+    abscissa: np.ndarray
+    measured: np.ndarray
+    predicted: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.information.names
+
+    @property
+    def values(self) -> np.ndarray:
+        return self.information.values
+
+    @property
+    def chi2_per_dof(self) -> float:
+        return self.chi2 / self.dof
+
+    @property
+    def standard_deviation(self) -> np.ndarray:
+        """(n_p,) honest; infinite where the data do not determine the parameter by itself."""
+        return np.where(self.information.known, np.sqrt(np.diag(self.covariance)), np.inf)
+
+    def of(self, name: str) -> tuple[float, float]:
+        """Value and standard deviation of a parameter."""
+        if name not in self.names:
+            raise InputError(f"expected one of {', '.join(self.names)}", field="parameter", value=name)
+        j = self.names.index(name)
+        return float(self.values[j]), float(self.standard_deviation[j])
+
+    def derived(self, function: Callable[[np.ndarray], float]) -> tuple[float, float]:
+        """Value and standard deviation of a function of the parameters, to first order."""
+        value, slope = float(function(self.values)), np.zeros(len(self.values))
+        for j, scale in enumerate(self.information.scale):
+            step = np.zeros(len(self.values))
+            step[j] = 1e-5 * scale
+            slope[j] = (function(self.values + step) - function(self.values - step)) / (2e-5 * scale)
+        return value, float(np.sqrt(max(slope @ self.covariance @ slope, 0.0)))
+
+    def lines(self) -> list[str]:
+        """The result as text: one line for each parameter, then the residual."""
+        found = [f"{name} = {value:.6g} +- {sigma:.2g} {unit}".rstrip() for name, value, sigma, unit
+                 in zip(self.names, self.values, self.standard_deviation, self.information.units, strict=True)]
+        found.append(f"rank {self.information.rank} of {len(self.names)}; residual "
+                     f"{100 * self.residual.share:.2f} % of the measured, chi2/dof {self.chi2_per_dof:.3g} ({self.noise} noise)")
+        return [*found, f"standard deviations: {self.covariance_method}", *self.notes]
+
+
+def andrews_lags(scores: np.ndarray) -> int:
+    """Number of lags of the Bartlett kernel for scores (n, p): 1.1447 (alpha(1) n)^(1/3)."""
+    n = len(scores)
+    now, before = scores[1:], scores[:-1]
+    power = np.maximum(np.sum(before ** 2, axis=0), np.finfo(float).tiny)
+    rho = np.clip(np.sum(now * before, axis=0) / power, -0.999, 0.999)
+    sigma4 = np.mean((now - rho * before) ** 2, axis=0) ** 2
+    # Each score in its own size, so that no parameter's unit decides.
+    weight = 1 / np.maximum(np.mean(scores ** 2, axis=0) ** 2, np.finfo(float).tiny)
+    top = np.sum(weight * 4 * rho ** 2 * sigma4 / ((1 - rho) ** 6 * (1 + rho) ** 2))
+    bottom = np.sum(weight * sigma4 / (1 - rho) ** 4)
+    alpha = top / bottom if bottom > 0 else 0.0
+    return int(min(np.ceil(1.1447 * (alpha * n) ** (1 / 3)), n // 4))
+
+
+def long_run_covariance(scores: np.ndarray, lags: int) -> np.ndarray:
+    """(p, p) S above of scores (n, p)."""
+    n = len(scores)
+    total = scores.T @ scores / n
+    for lag in range(1, lags + 1):
+        gamma = scores[lag:].T @ scores[:-lag] / n
+        total += (1 - lag / (lags + 1)) * (gamma + gamma.T)
+    return total
+
+
+def sandwich(bread: np.ndarray, scores: np.ndarray, lags: int) -> np.ndarray:
+    """(p, p) covariance of an estimate: bread n S bread^T with the correction n/(n - p) for fitted parameters."""
+    n, p = scores.shape
+    return bread @ (n * long_run_covariance(scores, lags)) @ bread.T * n / (n - p)
+
+
+def regression(model: str, names: Sequence[str], units: Sequence[str], X: np.ndarray, y: np.ndarray,
+               time: np.ndarray, instruments: np.ndarray | None = None) -> SingleAxisFit:
+    """y = X theta + e for time series, by least squares or with instruments.
+
+    X, instruments : (n, p); y : (n,). Instruments Z of the same shape give theta = inv(Z^T X) Z^T y, consistent
+    where they do not correlate with the noise, as is not so of X in a closed loop.
+
+    Raises
+    ------
+    InputError : shapes that do not fit, numbers that are not finite. ComputationError : columns that vanish.
+    """
+    Z = X if instruments is None else instruments
+    n, p = X.shape
+    if y.shape != (n,) or Z.shape != (n, p) or n <= 4 * p:
+        raise InputError(f"expected {p} columns and more than {4 * p} samples of equal length", field="samples",
+                         value=(X.shape, y.shape, Z.shape))
+    if not (np.all(np.isfinite(X)) and np.all(np.isfinite(y)) and np.all(np.isfinite(Z))):
+        raise InputError("expected finite numbers", field="samples")
+    size, size_z = np.linalg.norm(X, axis=0), np.linalg.norm(Z, axis=0)
+    if not np.all(size > 0) or not np.all(size_z > 0):
+        lost = names[int(np.argmin(size * size_z))]
+        raise ComputationError(f"the data hold nothing of {lost}", measured="its column is zero throughout",
+                               cause="an axis that never moved, or a channel that was mapped wrongly",
+                               next_step="look at the columns, or leave the parameter out")
+    # The pseudo-inverse holds combinations that the data do not determine at zero.
+    bread = np.linalg.pinv((Z / size_z).T @ (X / size), rcond=1e-10) / size[:, None] / size_z
+    theta = bread @ (Z.T @ y)
+    e = y - X @ theta
+    scores = Z * e[:, None]
+    lags = andrews_lags(scores)
+    covariance = sandwich(bread, scores, lags)
+    white = float(e @ e) / (n - p)
+    scale = np.where(theta == 0, 1.0, np.abs(theta))
+    information = Information(tuple(names), theta, tuple(units), X.T @ X / white, scale)
+    plain = np.sqrt(np.abs(np.diag(bread @ (Z.T @ Z) @ bread.T)) * white)
+    statistics = residual_statistics(e, y, np.sqrt(np.diag(covariance)), plain, lags)
+    return SingleAxisFit(model, information, covariance,
+                         f"Newey-West, {lags} lags by Andrews' rule; {statistics.inflation:.1f} times those of a "
+                         "white residual", (n - p) * 1.0, n - p, "residual", statistics, time, y, X @ theta)
+
+
+def residual_statistics(e: np.ndarray, y: np.ndarray, honest: np.ndarray, plain: np.ndarray, lags: int
+                        ) -> ResidualStatistics:
+    """Of a residual e and what was measured y, equal shapes, correlation along axis 0."""
+    flat = np.abs(e) ** 2
+    lag_one = float(np.sum(np.real(np.conj(e[1:]) * e[:-1])) / max(float(np.sum(flat)), np.finfo(float).tiny))
+    ratio = float(np.max(honest / np.maximum(plain, np.finfo(float).tiny)))
+    share = float(np.linalg.norm(e) / max(float(np.linalg.norm(y)), np.finfo(float).tiny))
+    return ResidualStatistics(float(np.sqrt(np.mean(flat))), share, lag_one, ratio, lags)
+
+
+def block_bootstrap(estimate: Callable[[np.ndarray], np.ndarray], samples: int, block: int, draws: int,
+                    rng: np.random.Generator) -> np.ndarray:
+    """(p,) standard deviations of estimate(indices) over moving blocks of rows (Kuensch, Ann. Statist. 17 (1989) 1217).
+
+    It assumes nothing of the scores but that blocks are long against their correlation.
+    """
+    if not 1 <= block <= samples // 4 or draws < 2:
+        raise InputError(f"expected blocks of 1 to {samples // 4} samples and at least two draws", field="block, draws",
+                         value=(block, draws))
+    count = -(-samples // block)
+    found = []
+    for _ in range(draws):
+        starts = rng.integers(0, samples - block + 1, count)
+        found.append(estimate((starts[:, None] + np.arange(block)).ravel()[:samples]))
+    return np.std(found, axis=0, ddof=1)
