@@ -38,8 +38,10 @@ ROLES = ("u", "y", "floor")
 CHUNK = 1 << 14  # samples of a record that lie together on disk
 
 
-def read(path: str | Path) -> Campaign:
+def read(path: str | Path, rig: str | None = None) -> Campaign:
     """An HDF5 campaign; its samples stay in the file until they are loaded.
+
+    rig : name of the rig, in the place of the file's.
 
     Raises
     ------
@@ -47,7 +49,7 @@ def read(path: str | Path) -> Campaign:
     """
     path = existing_file(path)
     with reading(path, "the HDF5 file"), open_hdf5(path) as file:
-        rig = check_root(file)
+        stated = check_root(file)
         if "records" not in file:
             raise InputError(f"missing; the file holds {listed(file)}", field="/records")
         group = file["records"]
@@ -56,7 +58,7 @@ def read(path: str | Path) -> Campaign:
         records = tuple(_record(group, name, str(path)) for name in _in_order(group))
         if not records:
             raise InputError("expected at least one record; the group is empty", field="/records")
-        return Campaign(rig, records, str(path))
+        return Campaign(rig or stated, records, str(path))
 
 
 def open_hdf5(path: Path) -> h5py.File:

@@ -52,10 +52,10 @@ def sample_rate_from(time_s: np.ndarray, place: Callable[[int], str] = "sample {
                          f"sample off, the worst at {place(worst)} by {off[worst]:.3g} samples of {mean:.6g} s",
                          field=field)
     note = f"time stamps are uneven by up to {off[worst]:.2g} of a sample; taken as even" if off[worst] > SILENT else ""
-    return _rounded(1 / mean, (2 * float(off[worst]) + 1e-9) / (len(time_s) - 1)), float(time_s[0]), note
+    return rounded(1 / mean, (2 * float(off[worst]) + 1e-9) / (len(time_s) - 1)), float(time_s[0]), note
 
 
-def _rounded(rate: float, uncertainty: float) -> float:
+def rounded(rate: float, uncertainty: float) -> float:
     """The shortest decimal number within the relative uncertainty."""
     for digits in range(2, 16):
         short = float(f"{rate:.{digits}g}")

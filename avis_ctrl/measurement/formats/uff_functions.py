@@ -74,10 +74,11 @@ def functions(path: Path) -> list[Function]:
 
     Raises
     ------
-    InputError : a data set that is cut short or whose numbers cannot be read; names the line it starts at.
+    InputError : a data set that is cut short or whose numbers cannot be read; names the byte it starts at.
     """
     text = path.read_bytes()
-    found, at, number = [], 0, 0
+    at, number = 0, 0
+    found: list[Function] = []
     length = force = 1.0
     while True:
         line, after = _line(text, at)
@@ -130,7 +131,7 @@ def _units(body: bytes, place: str) -> tuple[float, float]:
 
 
 def _function(text: bytes, title: bytes, at: int, factors: tuple[float, float], place: str) -> tuple[Function, int]:
-    header = []
+    header: list[str] = []
     for _ in range(HEADER_LINES):
         if at >= len(text):
             raise InputError(f"cut short: {len(header)} of {HEADER_LINES} header lines", field=place)
