@@ -167,7 +167,6 @@ def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz:
 def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np.ndarray, smooth_Hz: float, least: int,
               outputs: tuple[str, ...], sample_rate_Hz: float) -> NoiseCovariance:
     """Means over the centres near each frequency, at least `least` of them."""
-    total = np.concatenate([np.zeros((1, *noise.shape[1:])), np.cumsum(noise, axis=0)])
     low = np.searchsorted(centres, frequency_Hz - smooth_Hz)
     high = np.searchsorted(centres, frequency_Hz + smooth_Hz, side="right")
     middle = np.clip(np.rint(np.interp(frequency_Hz, centres, np.arange(centres.size))).astype(int) - least // 2, 0,
@@ -175,7 +174,7 @@ def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np
     few = high - low < least
     low, high = np.where(few, middle, low), np.where(few, middle + least, high)
     count = high - low
-    mean = (total[high] - total[low]) / count[:, None, None]
+    mean = np.stack([noise[a:b].mean(axis=0) for a, b in zip(low, high, strict=True)])
     mean = (mean + np.swapaxes(mean.conj(), 1, 2)) / 2
     if least * dof < noise.shape[1]:
         raise InputError(f"expected longer records: {least * dof} degrees of freedom cannot give a definite covariance "

@@ -1,0 +1,216 @@
+"""Best linear approximation of a nonlinear rig from random-phase multisines, with noise and distortion separated.
+
+Robust method for many inputs (Pintelon and Schoukens, System Identification, 2nd ed., 2012, sections 4.3 and 7.3):
+periods that repeat within a record tell the noise; different phase realisations tell noise and stochastic nonlinear
+distortion together. With experiments e, mean periods Y_e, U_e,
+
+    G = (sum Y_e U_e^H) inv(S),   S = sum U_e U_e^H,   C = sum (Y_e - G U_e)(Y_e - G U_e)^H / (n_e - n_u).
+
+For M realisations of n_u experiments with invertible U this is the mean of the M responses Y_r inv(U_r), weighted by
+power, and C their scatter with n_u (M - 1) degrees of freedom; experiments need not come in such groups, though, nor
+is their grouping needed. Within one group of orthogonal multisines the distortion can look linear, so that only
+different groups tell it: a campaign of one group separates nothing.
+
+The distortion is averaged over the inputs: the covariance inv(S)^T kron C has no place for a distortion that differs
+from input to input. A measured U is allowed: its noise, with that of Y, is taken over as [I, -G] cov [I, -G]^H.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.periodic import PeriodMean, average, periodic_records, settled_after
+from avis_ctrl.measurement.spectra import Band, Channels, channels, checked_band, hermitian_solve, lines
+
+Transient = Literal["auto", "drop", "remove", "none"]
+# A line is excited where the mean power of an input exceeds this part of its largest, and this many times its noise.
+EXCITED_POWER, EXCITED_OVER_NOISE = 1e-6, 30.0
+# Experiments whose inputs differ by less than this part of their power are repetitions of one.
+REPEATED = 1e-2
+DEPENDENT = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class _Experiments:
+    """Mean periods of all experiments: U (n_e, n, n_u), Y (n_e, n, n_y); covariance (n, n_z, n_z) of their noise."""
+
+    U: np.ndarray
+    Y: np.ndarray
+    covariance: np.ndarray | None
+    dof: int
+
+
+def best_linear_approximation(campaign: Campaign, *, band_Hz: Band | None = None, level_V: float | None = None,
+                              inputs: Sequence[str] | None = None, transient: Transient = "auto",
+                              drop: int | None = None, smooth_lines: int | None = None) -> FrequencyResponse:
+    """G on the excited lines, with total, noise and distortion covariances.
+
+    Parameters
+    ----------
+    band_Hz : all lines by default.
+    level_V : r.m.s. level of the records to use, where the campaign has several.
+    inputs : names of actuators; by default those that some record drives. The floor's motion is not periodic and
+        counts as noise.
+    transient : "drop" the periods that still settle (all but two at most); "remove" the transient by local polynomials
+        through the lines between harmonics; "none"; "auto": drop where three or more periods show that the rest is
+        settled, otherwise remove.
+    drop : periods to drop, instead of the number found.
+    smooth_lines : C is averaged over 2 smooth_lines + 1 excited lines; by default as few as leave 2 n_y + 4 degrees
+        of freedom.
+
+    Raises
+    ------
+    InputError : no periodic records, several levels or periods, different inputs on different lines (then use
+        `best_linear_approximations`), neither repeated periods nor realisations.
+    ComputationError : experiments that cannot tell the inputs apart.
+    """
+    found = best_linear_approximations(campaign, band_Hz=band_Hz, level_V=level_V, inputs=inputs, transient=transient,
+                                       drop=drop, smooth_lines=smooth_lines)
+    if len(found) > 1:
+        sets = "; ".join(f"{', '.join(r.inputs)} on {r.frequency_Hz.size} lines" for r in found)
+        raise InputError(f"different lines excite different inputs ({sets}): use best_linear_approximations, which "
+                         "gives one response for each set", field="records")
+    return found[0]
+
+
+def best_linear_approximations(campaign: Campaign, *, band_Hz: Band | None = None, level_V: float | None = None,
+                               inputs: Sequence[str] | None = None, transient: Transient = "auto",
+                               drop: int | None = None,
+                               smooth_lines: int | None = None) -> tuple[FrequencyResponse, ...]:
+    """One response for each set of inputs that are excited on the same lines (several for zippered multisines).
+
+    Parameters and errors as in `best_linear_approximation`.
+    """
+    if transient not in ("auto", "drop", "remove", "none"):
+        raise InputError("expected auto, drop, remove or none", field="transient", value=transient)
+    records = periodic_records(campaign, level_V)
+    used = channels(campaign, records, inputs, False)
+    n, rate = records[0].header.period_samples or 0, campaign.sample_rate_Hz
+    keep = lines(n, rate, checked_band(band_Hz, rate))
+    if keep.stop <= keep.start:
+        raise InputError(f"expected a band with harmonics of {rate / n:g} Hz", field="band_Hz", value=band_Hz)
+    found, settled = (0, False) if transient == "none" else settled_after(records, used, keep)
+    dropped = drop if drop is not None else 0 if transient == "remove" else found
+    repeated = min(r.header.periods for r in records) - dropped >= 2
+    remove = transient == "remove" or (transient == "auto" and not settled and drop is None and repeated)
+    means = [average(record, used, keep, dropped, remove) for record in records]
+    data = _experiments(means, len(used.inputs))
+    frequency = np.arange(keep.start, keep.stop) * rate / n
+    told = f"{dropped} periods dropped" + (", transient removed" if remove else "")
+    words = f"best linear approximation, {len(data.U)} experiments of {means[0].periods} periods, {told}"
+    return tuple(_response(data, frequency, line, active, used, smooth_lines, words)
+                 for active, line in _excited_sets(data, used))
+
+
+def _experiments(means: Sequence[PeriodMean], n_u: int) -> _Experiments:
+    """Mean periods; records with the same inputs are repetitions of one experiment, not realisations."""
+    groups: list[list[PeriodMean]] = []
+    for mean in means:
+        for group in groups:
+            first = group[0].Z[:, :n_u]
+            if np.linalg.norm(mean.Z[:, :n_u] - first) ** 2 < REPEATED * np.linalg.norm(first) ** 2:
+                group.append(mean)
+                break
+        else:
+            groups.append([mean])
+    Z = np.stack([np.mean([m.Z for m in group], axis=0) for group in groups])
+    parts = [(m, len(group)) for group in groups for m in group if m.covariance is not None]
+    covariance, dof = None, sum(m.dof for m, _ in parts)
+    if parts and len(parts) == len(means):
+        # Pooled by degrees of freedom; a mean of r records has 1/r of their covariance.
+        each = np.zeros_like(np.asarray(parts[0][0].covariance))
+        for m, _ in parts:
+            each += m.dof / dof * np.asarray(m.covariance)
+        covariance = each * np.mean([1 / len(group) for group in groups])
+    return _Experiments(Z[:, :, :n_u], Z[:, :, n_u:], covariance, dof if covariance is not None else 0)
+
+
+def _excited_sets(data: _Experiments, used: Channels) -> list[tuple[list[int], np.ndarray]]:
+    """(inputs, lines) of each set of inputs that are excited together, by first line."""
+    power = np.mean(np.abs(data.U) ** 2, axis=0)
+    noise = np.zeros_like(power)
+    if data.covariance is not None:
+        n_u = power.shape[1]
+        # Smoothed over lines: a few periods tell the noise of a single line badly.
+        raw = np.real(np.einsum("nii->ni", data.covariance))[:, :n_u]
+        noise = _running_mean(raw, min(10, (len(raw) - 1) // 2))
+    on = (power > EXCITED_POWER * power.max(axis=0)) & (power > EXCITED_OVER_NOISE * noise)
+    if not np.any(on):
+        raise InputError("expected at least one excited line in the band", field="inputs", value=used.inputs)
+    sets: dict[tuple[int, ...], list[int]] = {}
+    for line in np.flatnonzero(on.any(axis=1)):
+        sets.setdefault(tuple(np.flatnonzero(on[line]).tolist()), []).append(int(line))
+    return [(list(active), np.array(where)) for active, where in sets.items()]
+
+
+def _response(data: _Experiments, frequency_Hz: np.ndarray, line: np.ndarray, active: list[int], used: Channels,
+              smooth_lines: int | None, words: str) -> FrequencyResponse:
+    names = tuple(used.inputs[j] for j in active)
+    U, Y = np.moveaxis(data.U[:, line][:, :, active], 0, 1), np.moveaxis(data.Y[:, line], 0, 1)
+    gram = np.swapaxes(U, 1, 2) @ U.conj()
+    _check_rank(gram, names, len(data.U), frequency_Hz[line])
+    G = hermitian_solve(np.swapaxes(Y, 1, 2) @ U.conj(), gram)
+    dof, n_y = len(data.U) - len(active), Y.shape[2]
+    noise = None
+    if data.covariance is not None:
+        columns = [*active, *range(len(used.inputs), data.covariance.shape[1])]
+        both = np.concatenate([-G, np.broadcast_to(np.eye(n_y), (line.size, n_y, n_y))], axis=2)
+        noise = both @ data.covariance[line][:, columns][:, :, columns] @ np.swapaxes(both.conj(), 1, 2)
+    if dof == 0 and noise is None:
+        raise InputError(f"expected repeated periods or more than {len(active)} experiments: without either nothing "
+                         "tells the noise", field="records", value=len(data.U))
+    per_line = dof or data.dof
+    half = _smoothing(smooth_lines, per_line, n_y, line.size)
+    total = None
+    if dof:
+        E = Y - U @ np.swapaxes(G, 1, 2)
+        total = _running_mean(np.swapaxes(E, 1, 2) @ E.conj() / dof, half)
+    noise = None if noise is None else _running_mean(noise, half)
+    separated = total is not None and noise is not None
+    said = f"C over {2 * half + 1} lines" + ("" if separated else "; noise only, distortion not separated"
+                                             if total is None else "; noise and distortion together")
+    return FrequencyResponse(
+        frequency_Hz[line], G, total if total is not None else noise, gram, names, used.outputs, used.input_unit,
+        used.output_unit, float(per_line * (2 * half + 1)), noise,
+        total - noise if total is not None and noise is not None else None, method=f"{words}, {said}")
+
+
+def _check_rank(gram: np.ndarray, names: tuple[str, ...], experiments: int, frequency_Hz: np.ndarray) -> None:
+    size = np.sqrt(np.real(np.einsum("nii->ni", gram)))
+    values, vectors = np.linalg.eigh(gram / (size[:, :, None] * size[:, None, :]))
+    bad = np.flatnonzero(values[:, 0] < DEPENDENT)
+    if bad.size:
+        which = [n for n, part in zip(names, np.abs(vectors[bad[0], :, 0]), strict=True) if part > 0.03]
+        raise ComputationError(
+            f"the responses to {', '.join(which)} cannot be told apart",
+            measured=f"{experiments} different experiments on {bad.size} of {frequency_Hz.size} lines from "
+                     f"{frequency_Hz[bad[0]]:.6g} Hz",
+            cause=f"{len(names)} inputs need as many experiments with independent phases on each line",
+            next_step="measure further realisations, choose fewer inputs, or use local_polynomial, which takes "
+                      "neighbouring lines together")
+
+
+def _smoothing(asked: int | None, dof: int, n_y: int, count: int) -> int:
+    """Lines to each side over which C is averaged."""
+    if asked is not None:
+        if not 0 <= asked <= (count - 1) // 2:
+            raise InputError(f"expected 0 to {(count - 1) // 2} lines to each side", field="smooth_lines", value=asked)
+        return asked
+    half = 0
+    while (2 * half + 1) * dof < 2 * n_y + 4 and 2 * half + 3 <= count:
+        half += 1
+    return half
+
+
+def _running_mean(x: np.ndarray, half: int) -> np.ndarray:
+    """Means over 2 half + 1 entries along the first axis; at the ends the window is shifted inwards."""
+    width = 2 * half + 1
+    start = np.clip(np.arange(len(x)) - half, 0, len(x) - width)
+    return sum((x[start + k] for k in range(width)), np.zeros_like(x)) / width

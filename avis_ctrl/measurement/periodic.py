@@ -1,0 +1,154 @@
+"""Periods of periodic records: when they are settled, their mean, and the covariance of their noise.
+
+A record starts from rest, so its first periods hold a transient. Either these are dropped (`settled_after`), or the
+transient is removed (`average(..., remove=True)`): on the lines of the whole record that lie between the harmonics of
+the period there is only transient and noise, and the transient is smooth over frequency, so that local polynomials
+through those lines give it on the harmonics (Pintelon and Schoukens, System Identification, 2nd ed., 2012, section
+7.3.5, robust local polynomial method). Their residuals give the noise covariance with many more degrees of freedom
+than the differences of a few periods.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft, stats
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.campaign import Campaign, RecordSource
+from avis_ctrl.measurement.spectra import Channels
+
+# Lines over which powers are added before they are compared, and the chance of dropping a settled period.
+BLOCK, FALSE_ALARM = 8, 1e-3
+# Degree of the transient's polynomials, and degrees of freedom that their residuals must leave.
+DEGREE = 2
+# Relative difference of r.m.s. levels that still counts as the same level.
+SAME_LEVEL = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodMean:
+    """Mean period of inputs and outputs on harmonics of the period.
+
+    Z : (n, n_u + n_y) transform of the mean period over sqrt(samples of a period), inputs first.
+    covariance : (n, n_z, n_z) noise covariance of Z, or None where there is one period only; dof : its degrees of
+    freedom; periods : kept.
+    """
+
+    Z: np.ndarray
+    covariance: np.ndarray | None
+    dof: int
+    periods: int
+
+
+def periodic_records(campaign: Campaign, level_V: float | None) -> tuple[RecordSource, ...]:
+    """Records with multisine excitation, of one period and one level.
+
+    Raises
+    ------
+    InputError : none, several periods, several levels without a choice (a best linear approximation belongs to one).
+    """
+    found = [r for r in campaign.records if r.header.excitation == "multisine" and r.header.periods >= 1]
+    if not found:
+        raise InputError("expected multisine records that hold at least one period; other records are for "
+                         "local_polynomial or spectral_average", field="records",
+                         value=[r.header.excitation for r in campaign.records])
+    if level_V is not None:
+        levels = sorted({r.header.level_V for r in found})
+        found = [r for r in found if abs(r.header.level_V - level_V) <= SAME_LEVEL * abs(level_V)]
+        if not found:
+            raise InputError(f"expected one of the levels {levels}", field="level_V", value=level_V)
+    levels = sorted({r.header.level_V for r in found})
+    if levels[-1] - levels[0] > SAME_LEVEL * levels[-1]:
+        raise InputError("the records have several levels, and the response of a nonlinear rig depends on the level: "
+                         "choose one", field="level_V", value=levels)
+    periods = sorted({r.header.period_s for r in found if r.header.period_s is not None})
+    if len(periods) > 1:
+        raise InputError("expected records of one period; choose them by Campaign.only", field="period_s",
+                         value=periods)
+    return tuple(found)
+
+
+def periods_of(record: RecordSource, used: Channels) -> np.ndarray:
+    """(periods, samples, n_u + n_y) whole periods; samples after the last whole one are left out."""
+    n, count = record.header.period_samples or 0, record.header.periods
+    return np.hstack(used.of(record.load(0, n * count))).reshape(count, n, -1)
+
+
+def settled_after(records: Sequence[RecordSource], used: Channels, keep: slice) -> tuple[int, bool]:
+    """How many periods to drop before the outputs repeat, and whether the rest is settled.
+
+    The power of the difference of consecutive periods, over blocks of 8 lines and all records, is compared with that of
+    the last two by an F test (0.1 % over all blocks and outputs). At least two periods are kept. With two periods
+    nothing can be compared: (0, False).
+    """
+    n_u, count = len(used.inputs), min(record.header.periods for record in records)
+    if count < 3:
+        return 0, False
+    power: np.ndarray | float = 0.0
+    for record in records:
+        Y = fft.rfft(periods_of(record, used)[:count, :, n_u:], axis=1)[:, keep]
+        square = np.abs(np.diff(Y, axis=0)) ** 2
+        starts = np.arange(0, square.shape[1] - BLOCK + 1, BLOCK) if square.shape[1] >= BLOCK else np.array([0])
+        power = power + np.add.reduceat(square, starts, axis=1)
+    power = np.asarray(power)
+    dof = 2 * BLOCK * len(records)
+    limit = stats.f(dof, dof).isf(FALSE_ALARM / power[0].size)
+    moving = [bool(np.any(p > limit * power[-1] + 1e-24 * power.max())) for p in power[:-1]]
+    if not any(moving):
+        return 0, True
+    last = max(p for p, yes in enumerate(moving) if yes)
+    # Where even the last difference that can be judged still moves, the reference may hold a transient too.
+    return last + 1, last + 1 < count - 2
+
+
+def average(record: RecordSource, used: Channels, keep: slice, drop: int, remove: bool) -> PeriodMean:
+    """Mean period after dropping some, on harmonics `keep`, with its noise covariance.
+
+    Raises
+    ------
+    InputError : no period left; removal of the transient with fewer than two periods or too few harmonics.
+    """
+    x = periods_of(record, used)[drop:]
+    count, n = x.shape[:2]
+    if count < 1 or (remove and count < 2):
+        raise InputError(f"expected at least {drop + 1 + remove} periods: {drop} are dropped"
+                         + (" and the removal of a transient needs two" if remove else ""),
+                         field=f"record {record.header.name}: periods", value=record.header.periods)
+    if remove:
+        return _without_transient(x.reshape(count * n, -1), count, keep, record.header.name)
+    X = fft.rfft(x, axis=1)[:, keep] / np.sqrt(n)
+    mean = X.mean(axis=0)
+    if count == 1:
+        return PeriodMean(mean, None, 0, 1)
+    E = np.moveaxis(X - mean, 0, 1)
+    return PeriodMean(mean, np.swapaxes(E, 1, 2) @ E.conj() / ((count - 1) * count), count - 1, count)
+
+
+def _without_transient(x: np.ndarray, count: int, keep: slice, name: str) -> PeriodMean:
+    """Whole-record lines between harmonics, `side` periods of lines to each side, carry the polynomials."""
+    X = fft.rfft(x, axis=0) / np.sqrt(x.shape[0])
+    n_z, last = X.shape[1], (X.shape[0] - 1) // count
+    side = 1
+    while 2 * side * (count - 1) < DEGREE + 1 + max(4, n_z // 2):
+        side += 1
+    harmonic = np.arange(keep.start, keep.stop)
+    if 2 * side > last:
+        raise InputError(f"expected at least {2 * side} harmonics of the period below half the sample rate",
+                         field=f"record {name}: period_s", value=last)
+    base = np.clip(harmonic, side, last - side)
+    offset = np.array([j for j in range(-side * count + 1, side * count) if j % count])
+    span = offset / (side * count)
+    basis = np.vander(span, DEGREE + 1, increasing=True)
+    shift = (harmonic - base) / side
+    weight = np.vander(shift, DEGREE + 1, increasing=True) @ np.linalg.pinv(basis)
+    around = X[count * base[:, None] + offset]
+    transient = np.einsum("nj,njz->nz", weight, around)
+    free = np.eye(offset.size) - basis @ np.linalg.pinv(basis)
+    E = free @ around
+    dof = offset.size - DEGREE - 1
+    leverage = 1 + np.sum(weight ** 2, axis=1)
+    covariance = np.swapaxes(E, 1, 2) @ E.conj() * (leverage / (dof * count))[:, None, None]
+    return PeriodMean((X[count * harmonic] - transient) / np.sqrt(count), covariance, dof, count)
