@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from avis_ctrl.errors import InputError
+
 # A direction known to worse than this, as a fraction of the parameters' own size, is not determined.
 UNDETERMINED = 1.0
+# Share of a combination that may lie in directions without any information: what round-off turns them by.
+ROUNDED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +25,10 @@ class Information:
     names, units : n_p. values : (n_p,) where it was computed.
     matrix : (n_p, n_p) J^T J of the whitened residuals, in the parameters' units; priors included where given.
     scale : (n_p,) size of each parameter, which makes relative units.
+
+    Raises
+    ------
+    InputError : shapes that do not belong together, numbers that are not finite, scales that are not positive.
     """
 
     names: tuple[str, ...]
@@ -29,6 +37,19 @@ class Information:
     matrix: np.ndarray
     scale: np.ndarray
 
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if len(self.units) != n:
+            raise InputError(f"expected a unit for each of {n} parameters", field="units", value=self.units)
+        for field, shape in (("values", (n,)), ("matrix", (n, n)), ("scale", (n,))):
+            array = np.asarray(getattr(self, field), float)
+            if array.shape != shape or not np.all(np.isfinite(array)):
+                raise InputError(f"expected finite numbers of shape {shape}", field=f"information: {field}",
+                                 value=array.shape)
+            object.__setattr__(self, field, array)
+        if np.any(self.scale <= 0):
+            raise InputError("expected positive sizes", field="information: scale", value=self.scale.tolist())
+
     @cached_property
     def relative(self) -> np.ndarray:
         """The matrix in relative parameters."""
@@ -36,16 +57,27 @@ class Information:
 
     @cached_property
     def directions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Relative standard deviations (n_p,), best known first, and orthonormal directions (columns)."""
+        """Relative standard deviations (n_p,), best known first, and orthonormal directions (columns).
+
+        Infinite where the information is no more than round-off of its largest part: a data matrix without any
+        information on a direction looks like that, however precise the rest is.
+        """
         values, vectors = np.linalg.eigh((self.relative + self.relative.T) / 2)
-        # Round-off of the largest eigenvalue is what a zero looks like.
-        values = np.maximum(values, values[-1] * 1e-15)[::-1]
-        return 1 / np.sqrt(values), vectors[:, ::-1]
+        values, vectors = values[::-1], vectors[:, ::-1]
+        floor = 4 * len(values) * np.finfo(float).eps * max(values[0], 0.0) if len(values) else 0.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sigma = np.where(values > floor, 1 / np.sqrt(np.maximum(values, np.finfo(float).tiny)), np.inf)
+        return sigma, vectors
 
     @cached_property
     def determined(self) -> np.ndarray:
         """(n_p,) which of the directions the data determine."""
         return self.directions[0] < UNDETERMINED
+
+    @cached_property
+    def null_space(self) -> np.ndarray:
+        """(n_p, n_p - rank) orthonormal, relative: what the data do not determine."""
+        return self.directions[1][:, ~self.determined]
 
     @property
     def rank(self) -> int:
@@ -67,20 +99,58 @@ class Information:
     @cached_property
     def known(self) -> np.ndarray:
         """(n_p,) which single parameters are determined by themselves."""
-        _, V = self.directions
-        lost = np.sum(V[:, ~self.determined] ** 2, axis=1)
-        return lost < 1e-4
+        return np.isfinite(self.standard_deviation)
 
-    @property
+    @cached_property
     def standard_deviation(self) -> np.ndarray:
         """(n_p,) of each parameter by itself; infinite where only combinations of it are determined."""
-        return np.where(self.known, np.sqrt(np.diag(self.covariance)), np.inf)
+        return np.array([self.of(row)[1] for row in np.eye(len(self.names))])
 
     def of(self, weights: Sequence[float] | np.ndarray) -> tuple[float, float]:
-        """Value and standard deviation of a linear combination (n_p,); infinite where it is not determined."""
+        """Value and standard deviation of a linear combination (n_p,); infinite where it is not determined.
+
+        A small share in a weakly known direction counts with that direction's whole uncertainty.
+        """
         w = np.asarray(weights, float)
-        _, V = self.directions
+        if w.shape != (len(self.names),) or not np.any(w):
+            raise InputError(f"expected {len(self.names)} weights, not all zero", field="weights", value=w.tolist())
+        sigma, V = self.directions
         relative = w * self.scale
-        lost = np.linalg.norm(V[:, ~self.determined].T @ relative) / np.linalg.norm(relative)
-        sigma = np.inf if lost > 1e-2 else float(np.sqrt(w @ self.covariance @ w))
-        return float(w @ self.values), sigma
+        size = float(np.linalg.norm(relative))
+        along, dark = V.T @ relative, np.isinf(sigma)
+        spread = float(np.linalg.norm(along[~dark] * sigma[~dark]))
+        lost = np.linalg.norm(along[dark]) > ROUNDED * size or spread >= UNDETERMINED * size
+        return float(w @ self.values), np.inf if lost else spread
+
+    def plus(self, other: Information) -> Information:
+        """With independent data added."""
+        if other.names != self.names:
+            raise InputError(f"expected the same parameters, {', '.join(self.names)}", field="information",
+                             value=other.names)
+        return replace(self, matrix=self.matrix + other.matrix)
+
+    def with_priors(self, deviations: Mapping[str, float]) -> Information:
+        """With independent knowledge of single parameters: standard deviations in their units."""
+        return replace(self, matrix=self.matrix + self._priors(deviations))
+
+    def without_priors(self, deviations: Mapping[str, float]) -> Information:
+        """What the data alone hold, of an information that these priors went into."""
+        return replace(self, matrix=self.matrix - self._priors(deviations))
+
+    def fixing(self, names: Sequence[str]) -> Information:
+        """Of the other parameters, when these are known exactly."""
+        if unknown := [name for name in names if name not in self.names]:
+            raise InputError(f"expected some of {', '.join(self.names)}", field="fixed parameters", value=unknown)
+        keep = [j for j, name in enumerate(self.names) if name not in names]
+        return Information(tuple(self.names[j] for j in keep), self.values[keep], tuple(self.units[j] for j in keep),
+                           self.matrix[np.ix_(keep, keep)], self.scale[keep])
+
+    def _priors(self, deviations: Mapping[str, float]) -> np.ndarray:
+        diagonal = np.zeros(len(self.names))
+        for name, sigma in deviations.items():
+            if name not in self.names:
+                raise InputError(f"expected some of {', '.join(self.names)}", field="priors", value=name)
+            if not (np.isfinite(sigma) and sigma > 0):
+                raise InputError("expected a positive standard deviation", field=f"prior of {name}", value=sigma)
+            diagonal[self.names.index(name)] = 1 / sigma ** 2
+        return np.diag(diagonal)
