@@ -1,0 +1,212 @@
+"""From a campaign to the most likely parameters: what to fit, what to hold out, which band, which weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy.fft
+
+from avis_ctrl.errors import AvisError, InputError
+from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, Prior, fit
+from avis_ctrl.identification.noise import relative_noise, residual_noise
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.local_polynomial import local_polynomial, noise_covariance
+
+# Longer records are cut: their spectra would fill the memory and their lines say the same.
+LONGEST_PIECE = 1 << 18
+# Spectral lines of all records together that are fitted one by one; more are averaged into frequency responses.
+MOST_LINES = 60_000
+# Where no input says what band is excited.
+QUIET_BAND_Hz = (0.5, 60.0)
+Progress = Callable[[str], None]
+
+
+class Split(NamedTuple):
+    """What is fitted and what no fit sees, with a sentence how it was chosen."""
+
+    fitted: Campaign
+    held_out: Campaign
+    how: str
+
+
+def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) -> Split:
+    """Hold out whole records, or the last third of each where the others would not excite everything.
+
+    Parameters
+    ----------
+    hold_out : names of records; by default the last driven one whose inputs are all driven by the others too.
+
+    Raises
+    ------
+    InputError : unknown names, nothing left to fit, records too short to divide.
+    """
+    names = [record.header.name for record in campaign.records]
+    if hold_out is not None:
+        for name in hold_out:
+            campaign.named(name)
+        rest = tuple(name for name in names if name not in hold_out)
+        if not rest or not hold_out:
+            raise InputError(f"expected some of the records {', '.join(names)}, but not all", field="hold out",
+                             value=list(hold_out))
+        return Split(campaign.only(rest), campaign.only(tuple(hold_out)),
+                     f"records {', '.join(hold_out)} held out, as asked")
+    driven = {record.header.name: driven_inputs(record) for record in campaign.records}
+    active = [name for name in names if driven[name]]
+    for name in reversed(active):
+        others = [driven[other] for other in active if other != name]
+        # Several inputs at once need as many records, or different lines, to be told apart: never less than two.
+        if len(others) >= 2 and driven[name] <= set.intersection(*map(set, others[:1])) | set().union(*others):
+            rest = tuple(other for other in names if other != name)
+            return Split(campaign.only(rest), campaign.only((name,)), f"record {name} held out")
+    parts = [_divided(record) for record in campaign.records]
+    return Split(replace(campaign, records=tuple(first for first, _ in parts)),
+                 replace(campaign, records=tuple(last for _, last in parts)),
+                 "the last third of every record held out, for too few records excite every input")
+
+
+def driven_inputs(record: RecordSource) -> set[str]:
+    """Inputs that are not zero in the first quarter of a million samples."""
+    piece = record.load(0, min(record.header.samples, LONGEST_PIECE))
+    return {name for name, column in zip(piece.header.u_names, piece.u.T, strict=True) if np.any(column)}
+
+
+def _divided(record: RecordSource) -> tuple[RecordSource, RecordSource]:
+    h = record.header
+    if h.samples < 300:
+        raise InputError("expected at least 300 samples, of which a third is held out", value=h.samples,
+                         field=f"record {h.name}")
+    at = 2 * h.samples // 3
+    if h.period_samples and h.periods >= 2:
+        at = max(round(2 * h.periods / 3), 1) * h.period_samples
+    return Portion(record, 0, at), Portion(record, at, h.samples)
+
+
+class Portion(RecordSource):
+    """Samples start .. stop of another record, still where they lie."""
+
+    def __init__(self, whole: RecordSource, start: int, stop: int):
+        h = whole.header
+        self.whole, self.start, self.stop = whole, start, stop
+        self.header = replace(h, samples=stop - start, start_s=h.start_s + start / h.sample_rate_Hz)
+
+    def load(self, start: int = 0, stop: int | None = None) -> Record:
+        stop = self.header.samples if stop is None else stop
+        return self.whole.load(self.start + start, self.start + stop)
+
+
+def excited_band(campaign: Campaign) -> tuple[float, float]:
+    """Lowest and highest frequency [Hz] that some record drives, within 0.2 Hz and a quarter of the sample rate.
+
+    A line counts where its power is above a thousandth of the strongest ones of its record.
+    """
+    ends: list[tuple[float, float]] = []
+    for record in campaign.records:
+        piece = record.load(0, min(record.header.samples, LONGEST_PIECE))
+        drive = piece.u if np.any(piece.u) else piece.floor
+        if drive is None or not np.any(drive):
+            continue
+        power = np.sum(np.abs(scipy.fft.rfft(drive - drive.mean(0), axis=0)) ** 2, axis=1)
+        frequency = scipy.fft.rfftfreq(piece.header.samples, 1 / piece.header.sample_rate_Hz)
+        strong = frequency[power > 1e-3 * np.sort(power)[-max(1, len(power) // 1000):].mean()]
+        ends.append((float(strong[0]), float(strong[-1])))
+    low, high = (min(e[0] for e in ends), max(e[1] for e in ends)) if ends else QUIET_BAND_Hz
+    return max(low, 0.2), min(high, campaign.sample_rate_Hz / 4)
+
+
+def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float],
+                    progress: Progress | None = None) -> tuple[list[SpectralBlock], list[str]]:
+    """Spectral blocks of every record, long ones in pieces, and sentences on what was done to keep memory bounded."""
+    lines = sum(record.header.duration_s * (band_Hz[1] - band_Hz[0]) for record in campaign.records)
+    if lines > MOST_LINES:
+        if progress:
+            progress(f"{lines:.3g} lines: averaging the records into frequency responses, piece by piece")
+        grid = np.geomspace(*band_Hz, 1000)
+        measured = local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=grid, longest_piece=LONGEST_PIECE)
+        averaged = (f"the records hold {lines:.3g} lines in the band; they were averaged into frequency responses at "
+                    f"{len(measured.frequency_Hz)} frequencies ({measured.method})")
+        return [response_block(measured, model)], [averaged]
+    blocks = []
+    for record in campaign.records:
+        for piece in record.pieces(max(LONGEST_PIECE, record.header.period_samples or 0)):
+            if piece.header.duration_s * (band_Hz[1] - band_Hz[0]) > 10:
+                blocks.append(record_block(piece, model, band_Hz))
+    # A record without input or measured floor says nothing of the response.
+    useful = [block for block in blocks if np.any(block.U)]
+    if not useful:
+        raise InputError("expected a record that drives an actuator, or one with the floor measured", field="records")
+    quiet = sorted({b.name for b in blocks} - {b.name for b in useful})
+    said = [f"records at rest with the floor not measured ({', '.join(quiet)}) tell of the noise only"] if quiet else []
+    return useful, said
+
+
+def weighted(blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple[float, float]
+             ) -> tuple[list[SpectralBlock], str]:
+    """The blocks with the noise that a local model measures, whatever the rig's model; and a sentence on it."""
+    if all(block.noise is not None for block in blocks):
+        return list(blocks), "noise as estimated with the frequency responses"
+    found: list[SpectralBlock] = []
+    try:
+        for block in blocks:
+            known = block.kind == "floor measured"
+            alike = campaign.only(tuple(r.header.name for r in campaign.records
+                                        if (len(r.header.floor_names) > 0) == known))
+            noise = _measured_noise(alike, block, band_Hz, known)
+            found.append(noise)
+    except AvisError as error:
+        return relative_noise(blocks), f"no measured noise covariance ({error}); lines weigh alike at first"
+    return found, (f"noise covariance measured by a local polynomial model, {found[0].dof:.0f} degrees of freedom a "
+                   "line")
+
+
+def _measured_noise(alike: Campaign, block: SpectralBlock, band_Hz: tuple[float, float], floor: bool) -> SpectralBlock:
+    frequency = block.omega / (2 * np.pi)
+    at = np.unique(np.clip(np.linspace(frequency[0], frequency[-1], min(len(frequency), 1500)), *band_Hz))
+    noise = noise_covariance(alike, at, band_Hz=band_Hz, floor=floor, smooth_Hz=0.3, longest_piece=LONGEST_PIECE)
+    nearest = np.clip(np.searchsorted(at, frequency), 0, len(at) - 1)
+    return block.with_noise(noise.covariance[nearest], float(np.median(noise.dof)))
+
+
+@dataclass(frozen=True, eq=False)
+class CampaignFit:
+    """A fit to a campaign.
+
+    fit : with the noise of its own residuals. first : with the noise that was measured without a model of the rig;
+    its chi-square per degree of freedom is 1 where the model leaves nothing but noise. notes : sentences.
+    """
+
+    fit: LikelihoodFit
+    first: LikelihoodFit
+    band_Hz: tuple[float, float]
+    notes: tuple[str, ...]
+
+
+def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, band_Hz: tuple[float, float],
+                 priors: Mapping[str, Prior] | None = None, starts: int = 1, seed: int = 1, reweights: int = 2,
+                 progress: Progress | None = None) -> CampaignFit:
+    """The most likely parameters, first with measured noise, then with the noise of the residuals.
+
+    Raises
+    ------
+    InputError, ComputationError : as `fit`, `record_block`, `response_block`.
+    """
+    if isinstance(campaign, FrequencyResponse):
+        blocks, notes = [response_block(campaign.between(*band_Hz), model)], ["frequency responses as measured"]
+    else:
+        raw, notes = campaign_blocks(campaign, model, band_Hz, progress)
+        blocks, said = weighted(raw, campaign, band_Hz)
+        notes = [*notes, said]
+    found = fit(model, blocks, priors, starts, seed=seed, progress=progress)
+    first = found
+    if isinstance(campaign, FrequencyResponse) or not blocks[0].transient:
+        return CampaignFit(found, first, band_Hz, tuple(notes))
+    for k in range(reweights):
+        found = fit(found.model, residual_noise(found.residuals), priors, seed=seed)
+        if progress:
+            progress(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
+    return CampaignFit(replace(found, starts=first.starts), first, band_Hz, tuple(notes))

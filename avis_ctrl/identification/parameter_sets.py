@@ -1,0 +1,55 @@
+"""Which parameters of a rig are worth estimating: what a tape measure or a data sheet does not give."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.rigs.rig import Rig
+
+# Rademakers, eq. 3.11: b_11 and k_11 are left out, positions and motor constants are known.
+_SOURCE_AVIS = ("mass", "J1", "J2", "J3", *(f"isolator{i}.{kind}_{axis}" for kind in "ck" for i in (1, 2, 3, 4)
+                                            for axis in "xyz" if (i, axis) != (1, "x")))
+_HALCYONICS = ("Ixx", "Iyy", "Izz", "k_s", "k_t", "k_r", "d1", "d3", "d4", "d5", "d6", *(f"e{k}" for k in range(1, 9)))
+_LOAD = ("load.L7", "load.L8", "load.L9", "load.Ixx", "load.Iyy", "load.Izz", "load.Ixy")
+
+
+def source_parameters() -> tuple[str, ...]:
+    """The 26 parameters of Rademakers' eq. 3.11 by our names."""
+    return _SOURCE_AVIS
+
+
+def default_parameters(rig: Rig) -> tuple[str, ...]:
+    """Free parameters where the user names none.
+
+    AVIS: mass, principal inertias, stiffness and damping of every mount along every axis; positions and motor
+    constants are known (Rademakers, section 3.2). Halcyonics: what Table 1 identifies, with the load of Table 2 in
+    place of the plate where it is on; mass, lengths and k_a are known.
+    """
+    known = rig.parameters()
+    if "mass" in known and "J1" in known:
+        mounts = [name for name in known if name.startswith("isolator") and name.rpartition(".")[2][:2] in ("k_", "c_")]
+        return ("mass", "J1", "J2", "J3", *mounts)
+    if "load.mass" in known:
+        return ("k_s", "k_t", "k_r", "d1", "d3", "d4", "d5", "d6", *_LOAD)
+    return _HALCYONICS
+
+
+def named_parameters(model_of: Rig, patterns: Sequence[str], unit: str = "V") -> tuple[str, ...]:
+    """Parameters that match names or wildcards such as "isolator*.k_z" or "sensor.*", each once.
+
+    Raises
+    ------
+    InputError : a pattern that matches nothing.
+    """
+    known = tuple(ResponseModel.of(model_of, (), unit).all_parameters())
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        matching = [name for name in known if fnmatchcase(name, pattern)]
+        if not matching:
+            raise InputError(f"the rig {model_of.name} has no parameter that matches; it has {', '.join(known)}",
+                             field="parameters", value=pattern)
+        found |= dict.fromkeys(matching)
+    return tuple(found)
