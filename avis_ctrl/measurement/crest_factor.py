@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize
 
-# Exponents of the norm, and steps spent on each.
+# Exponents of the norm, powers of two, and steps spent on each.
 EXPONENTS = (4, 8, 16, 32, 64, 128, 256)
 STEPS = 60
 
@@ -63,9 +63,13 @@ def low_crest_phases(lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray
         lines_now, u = signals(phi)
         peak = np.max(np.abs(u))
         ratio = u / peak
-        power = np.abs(ratio) ** (p - 1)
-        total = np.sum(power * np.abs(ratio))
-        slope = power * np.sign(ratio) / (total * peak)
+        square = ratio * ratio
+        factor, power = square.copy(), square.copy()  # r^2, and r^(p-2) = r^2 r^4 .. r^(p/2)
+        for _ in range(p.bit_length() - 3):
+            factor *= factor
+            power *= factor
+        total = np.vdot(power, square)
+        slope = power * ratio / (total * peak)
         # d u_n / d phi_k = Re(j A_k exp(j phi_k) exp(2 pi j k n / N))
         gradient = np.real(1j * lines_now * np.conj(np.fft.rfft(slope)[:, lines])).sum(axis=0)
         return float(np.log(peak) + np.log(total / u.size) / p), gradient

@@ -219,3 +219,16 @@ def test_wrong_settings_are_answered_in_one_line(changes, expected):
         if changes.get("scheme") is None and changes[name] != (1.1, 1.2):
             with pytest.raises(InputError, match=name):
                 noise(replace(NoiseSettings(("a",), 500.0, 5.0, (1.0, 100.0), 10.0, 1.0), **{name: changes[name]}))
+
+
+def test_the_gradient_of_the_norm_leads_to_a_stationary_peak():
+    """Three lines: the least peak over all phases, by brute force over a grid, is found from one start in some."""
+    lines, one = np.array([1, 2, 3]), np.ones(3)
+    turn = np.linspace(0, 2 * np.pi, 181)
+    # A shift in time takes the first phase to zero.
+    grid = np.stack(np.meshgrid([0.0], turn, turn, indexing="ij"), -1).reshape(-1, 3)
+    least = np.abs(synthesise(lines, one, grid, 96)).max(axis=1).min()
+    found = [np.abs(synthesise(lines, one, low_crest_phases(lines, one, start, 96), 96)).max()
+             for start in np.random.default_rng(2).uniform(0, 2 * np.pi, (8, 3))]
+    # The last norm, p = 256, still differs from the peak by up to 96^(1/256) - 1 = 1.8 %.
+    assert min(found) < 1.018 * least
