@@ -102,7 +102,8 @@ class SingleAxisFit:
         found = [f"{name} = {value:.6g} +- {sigma:.2g} {unit}".rstrip() for name, value, sigma, unit
                  in zip(self.names, self.values, self.standard_deviation, self.information.units, strict=True)]
         found.append(f"rank {self.information.rank} of {len(self.names)}; residual "
-                     f"{100 * self.residual.share:.2f} % of the measured, chi2/dof {self.chi2_per_dof:.3g} ({self.noise} noise)")
+                     f"{100 * self.residual.share:.2f} % of the measured; chi2/dof {self.chi2_per_dof:.3g} against "
+                     f"{self.noise} noise")
         return [*found, f"standard deviations: {self.covariance_method}", *self.notes]
 
 
@@ -131,10 +132,10 @@ def long_run_covariance(scores: np.ndarray, lags: int) -> np.ndarray:
     return total
 
 
-def sandwich(bread: np.ndarray, scores: np.ndarray, lags: int) -> np.ndarray:
-    """(p, p) covariance of an estimate: bread n S bread^T with the correction n/(n - p) for fitted parameters."""
-    n, p = scores.shape
-    return bread @ (n * long_run_covariance(scores, lags)) @ bread.T * n / (n - p)
+def sandwich(bread: np.ndarray, scores: np.ndarray, lags: int, dof: float) -> np.ndarray:
+    """(p, p) covariance of an estimate: bread n S bread^T n/dof, dof = n less what was fitted."""
+    n = len(scores)
+    return bread @ (n * long_run_covariance(scores, lags)) @ bread.T * n / dof
 
 
 def regression(model: str, names: Sequence[str], units: Sequence[str], X: np.ndarray, y: np.ndarray,
@@ -167,7 +168,7 @@ def regression(model: str, names: Sequence[str], units: Sequence[str], X: np.nda
     e = y - X @ theta
     scores = Z * e[:, None]
     lags = andrews_lags(scores)
-    covariance = sandwich(bread, scores, lags)
+    covariance = sandwich(bread, scores, lags, n - p)
     white = float(e @ e) / (n - p)
     scale = np.where(theta == 0, 1.0, np.abs(theta))
     information = Information(tuple(names), theta, tuple(units), X.T @ X / white, scale)

@@ -48,8 +48,8 @@ class SineRecord:
         if self.unexplained[i] <= LARGEST_SHARE:
             return ""
         # A sine stays within 0.1 % of its range next to one end for 2 % of its period.
-        stuck = f"; it stays at one end of its range for {100 * self.held[i]:.0f} % of a period, where a sine does for " \
-                "2 %: out of range" if self.held[i] > 0.06 else ""
+        stuck = (f"; it stays at one end of its range for {100 * self.held[i]:.0f} % of a period, where a sine does "
+                 "for 2 %: out of range") if self.held[i] > 0.04 else ""
         return f"record {self.name}, {channel}: a sine leaves {100 * self.unexplained[i]:.0f} % unexplained{stuck}"
 
     def _index(self, channel: str) -> int:
@@ -128,9 +128,9 @@ def _line_noise(e: np.ndarray, cycles_per_sample: float) -> np.ndarray:
 
 
 def _longest_hold(y: np.ndarray) -> int:
-    """Samples of the longest stretch within 0.1 % of the range from the largest or the smallest value."""
+    """Steps of the longest stretch within 0.1 % of the range from the largest or the smallest value."""
     near, longest = 1e-3 * np.ptp(y), 0
     for at in (y > y.max() - near, y < y.min() + near):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], at.astype(int), [0]])))
         longest = max(longest, int(np.max(edges[1::2] - edges[::2], initial=0)))
-    return longest
+    return max(longest - 1, 0)

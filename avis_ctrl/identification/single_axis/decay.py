@@ -1,0 +1,131 @@
+"""Corner and damping from free decays, and how they move with the amplitude.
+
+A released oscillator decays as a combination of exp(s_1 t), exp(s_2 t), s^2 + 2 zeta omega_0 s + omega_0^2 = 0, in
+every channel that sees it; the amplitudes and a drifting zero of each channel are projected out (Golub and Pereyra
+1973).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.identification.information import Information
+from avis_ctrl.identification.single_axis.fit import SingleAxisFit, andrews_lags, residual_statistics, sandwich
+
+
+def fit_decay(time: np.ndarray, channels: np.ndarray, corner_Hz: float, damping: float, drift: int = 1
+              ) -> SingleAxisFit:
+    """Corner and damping ratio of a decay, common to all channels.
+
+    Parameters
+    ----------
+    time : (n,) s, from after the release. channels : (n, c), each brought to unit r.m.s. corner_Hz, damping : start.
+    drift : degree of the polynomial that each channel's zero follows.
+
+    Raises
+    ------
+    InputError : shapes, start values. ComputationError : nothing that decays.
+    """
+    time, y = np.asarray(time, float).ravel(), np.asarray(channels, float)
+    y = y[:, None] if y.ndim == 1 else y
+    if y.shape[0] != len(time) or len(time) < 32 or not np.all(np.isfinite(y)) or not np.all(np.diff(time) > 0):
+        raise InputError("expected at least 32 finite samples of each channel at increasing times", field="decay",
+                         value=(len(time), y.shape))
+    if not (corner_Hz > 0 and damping > 0) or not 0 <= drift <= 3:
+        raise InputError("expected a positive corner in Hz and damping to start from, and a drift of degree 0 to 3",
+                         field="corner_Hz, damping, drift", value=(corner_Hz, damping, drift))
+    if not np.all(y.std(0) > 0):
+        raise InputError("expected channels that move; one is constant", field="decay")
+    y, t = y / y.std(0), time - time[0]
+    start = np.array([corner_Hz, damping])
+
+    def left(x: np.ndarray) -> np.ndarray:
+        X = _columns(t, x * start, drift)
+        return y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    found = least_squares(lambda x: left(x).ravel(), np.ones(2), bounds=(1e-3, 1e3), xtol=1e-12, ftol=1e-12)
+    theta, e = found.x * start, left(found.x)
+    if np.linalg.norm(e) > 0.5 * np.linalg.norm(y):
+        raise ComputationError("no decaying oscillation fits the record",
+                               measured=f"{100 * np.linalg.norm(e) / np.linalg.norm(y):.0f} % of it is left",
+                               cause="a start before the release, or a second event inside",
+                               next_step="choose the stretch after one release")
+    return _result(time, y, e, theta, found.jac.reshape(*e.shape, 2) / start, drift)
+
+
+def _result(time: np.ndarray, y: np.ndarray, e: np.ndarray, theta: np.ndarray, J: np.ndarray, drift: int
+            ) -> SingleAxisFit:
+    flat = J.reshape(-1, 2)
+    bread = np.linalg.inv(flat.T @ flat)
+    scores = np.einsum("ncp,nc->np", J, e)
+    lags = andrews_lags(scores)
+    spent = 2 + (3 + drift) * y.shape[1]
+    dof = e.size - spent
+    covariance = sandwich(bread, scores, lags, len(e) - spent / y.shape[1])
+    white = float(np.sum(e ** 2)) / dof
+    statistics = residual_statistics(e, y, np.sqrt(np.diag(covariance)), np.sqrt(np.diag(bread) * white), lags)
+    information = Information(("corner_Hz", "damping"), theta, ("Hz", ""), flat.T @ flat / white, np.abs(theta))
+    return SingleAxisFit("free decay of a second-order oscillator", information, covariance,
+                         f"Newey-West, {lags} lags by Andrews' rule; {statistics.inflation:.1f} times those of a white "
+                         "residual", float(dof), dof, "residual", statistics, time, y, y - e)
+
+
+def _columns(t: np.ndarray, theta: np.ndarray, drift: int) -> np.ndarray:
+    """(n, 3 + drift): both solutions and the drift, finite at critical damping and beyond."""
+    w0, zeta = 2 * np.pi * theta[0], theta[1]
+    rest = complex(w0 * np.emath.sqrt(1 - zeta ** 2))
+    envelope = np.exp(-zeta * w0 * t)
+    if rest.imag:  # aperiodic: cosh and sinh, taken into the exponential before they overflow
+        slow, fast = np.exp(-(zeta * w0 - abs(rest.imag)) * t), np.exp(-(zeta * w0 + abs(rest.imag)) * t)
+        first, second = (slow + fast) / 2, (slow - fast) / (2 * abs(rest.imag))
+    else:
+        first, second = envelope * np.cos(rest.real * t), envelope * t * np.sinc(rest.real * t / np.pi)
+    return np.column_stack([first, second * w0, (2 * t[:, None] / t[-1] - 1) ** np.arange(drift + 1)])
+
+
+@dataclass(frozen=True, eq=False)
+class AmplitudeDependence:
+    """Corner and damping of consecutive stretches of a long decay.
+
+    amplitude : (k,) of the first channel in its unit, root mean square times sqrt(2). corner_Hz, damping : (k,) with
+    standard deviations. at_rest : corner extrapolated linearly to zero amplitude, with its standard deviation from the
+    scatter about the line. slope : Hz a unit of amplitude.
+    """
+
+    amplitude: np.ndarray
+    corner_Hz: np.ndarray
+    corner_deviation: np.ndarray
+    damping: np.ndarray
+    damping_deviation: np.ndarray
+    at_rest: tuple[float, float]
+    slope: tuple[float, float]
+
+
+def amplitude_dependence(time: np.ndarray, channel: np.ndarray, corner_Hz: float, damping: float, stretches: int = 8
+                         ) -> AmplitudeDependence:
+    """Fit consecutive stretches of one decay each by itself.
+
+    Raises
+    ------
+    InputError : fewer than three stretches, or of less than two periods each.
+    """
+    time, y = np.asarray(time, float), np.asarray(channel, float)
+    if stretches < 3 or (time[-1] - time[0]) / stretches * corner_Hz < 2:
+        raise InputError("expected at least three stretches of at least two periods each", field="stretches",
+                         value=stretches)
+    rows = []
+    for keep in np.array_split(np.arange(len(time)), stretches):
+        fit = fit_decay(time[keep], y[keep], corner_Hz, damping)
+        amplitude = np.sqrt(2) * y[keep].std()
+        rows.append((amplitude, *fit.of("corner_Hz"), *fit.of("damping")))
+    amplitude, corner, corner_sd, zeta, zeta_sd = np.array(rows).T
+    X = np.column_stack([np.ones(stretches), amplitude / amplitude.max()])
+    line, *_ = np.linalg.lstsq(X, corner, rcond=None)
+    e = corner - X @ line
+    covariance = np.linalg.inv(X.T @ X) * float(e @ e) / (stretches - 2)
+    sigma = np.sqrt(np.diag(covariance))
+    return AmplitudeDependence(amplitude, corner, corner_sd, zeta, zeta_sd, (float(line[0]), float(sigma[0])),
+                               (float(line[1] / amplitude.max()), float(sigma[1] / amplitude.max())))

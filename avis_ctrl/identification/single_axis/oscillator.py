@@ -1,0 +1,182 @@
+"""A lumped oscillator m y'' + d y' + k y = u from records of input and output, in the frequency domain.
+
+For a stretch of record that is not periodic, the discrete Fourier transforms obey exactly (Pintelon and Schoukens 2012,
+section 6.3.2; band-limited signals)
+
+    Y = (U + T) / (m s^2 + d s + k),    T a polynomial in s: the state at both ends of the stretch, and leakage
+
+whose coefficients are projected out. The noise is what the fit leaves, smoothed over neighbouring lines, so that its
+colour weighs the lines. A cubic spring k3 y^3 is not a parameter here: under a Gaussian output of variance sigma^2 the
+best linear spring is k + 3 k3 sigma^2 (equivalent linearisation, Caughey 1963), and `by_level` shows this line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.identification.information import Information
+from avis_ctrl.identification.single_axis.fit import SingleAxisFit, residual_statistics, sandwich
+
+TRANSIENT = 4  # coefficients of T
+SMOOTHED = 8  # lines on either side whose residual gives the noise
+CORRELATED_LINES = 4
+NAMES, UNITS = ("m", "d", "k"), ("u s^2 a unit of y", "u s a unit of y", "u a unit of y")
+
+
+def resonance_Hz(fit: SingleAxisFit) -> tuple[float, float]:
+    """sqrt(k/m)/2 pi and its standard deviation."""
+    return fit.derived(lambda theta: float(np.sqrt(theta[2] / theta[0]) / (2 * np.pi)))
+
+
+def damping_ratio(fit: SingleAxisFit) -> tuple[float, float]:
+    """d/(2 sqrt(k m)) and its standard deviation."""
+    return fit.derived(lambda theta: float(theta[1] / (2 * np.sqrt(theta[2] * theta[0]))))
+
+
+def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz: tuple[float, float]) -> SingleAxisFit:
+    """m, d and k from one stretch of record.
+
+    Parameters
+    ----------
+    u, y : (n,), band-limited (not held between samples). band_Hz : lines used; the input must be there.
+
+    Raises
+    ------
+    InputError : shapes, a band outside 0 .. half the sample rate or with fewer than 40 lines.
+    ComputationError : no oscillator with positive mass and stiffness fits.
+    """
+    U, Y, f = _lines(u, y, sample_rate_Hz, band_Hz)
+    s = 2j * np.pi * f
+    s0 = 2 * np.pi * float(np.sqrt(band_Hz[0] * band_Hz[1])) if band_Hz[0] > 0 else np.pi * band_Hz[1]
+    powers = (s / s0)[:, None] ** np.arange(TRANSIENT)
+
+    def oscillator(x: np.ndarray) -> np.ndarray:
+        return x[0] * (s / s0) ** 2 + x[1] * s / s0 + x[2]
+
+    def left(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        D = oscillator(x)
+        T, e = _parts(powers / D[:, None] * weight[:, None]), _parts((Y - U / D) * weight)
+        return e - T @ np.linalg.lstsq(T, e, rcond=None)[0]
+
+    weight = np.full(len(f), 1 / np.linalg.norm(Y))
+    x = _linear(U, Y, s / s0, powers)
+    for _ in range(4):
+        scale = np.where(x == 0, 1.0, np.abs(x))
+        found = least_squares(lambda z, w=weight, a=scale: left(z * a, w), x / scale, xtol=1e-13, ftol=1e-13)
+        x = found.x * scale
+        e = left(x, weight)
+        error = (e[:len(f)] + 1j * e[len(f):]) / weight
+        weight = np.sqrt(2 / _smoothed(np.abs(error) ** 2))
+    to_units = np.array([1 / s0 ** 2, 1 / s0, 1.0])
+    if not (x[0] > 0 and x[2] > 0):
+        raise ComputationError("no oscillator with positive mass and stiffness fits the record",
+                               measured=f"m {x[0] * to_units[0]:.3g}, k {x[2]:.3g}",
+                               cause="input and output exchanged, or a band without the resonance",
+                               next_step="check the columns and widen the band")
+    e = left(x, weight)
+    J = np.column_stack([(left(x + h, weight) - left(x - h, weight)) / (2 * h.max())
+                         for h in np.diag(1e-6 * np.abs(x) + 1e-300)]) / to_units
+    return _result(f, Y, error, x * to_units, e, J)
+
+
+def _result(f: np.ndarray, Y: np.ndarray, error: np.ndarray, theta: np.ndarray, e: np.ndarray, J: np.ndarray
+            ) -> SingleAxisFit:
+    n = len(f)
+    size = np.linalg.norm(J, axis=0)
+    bread = np.linalg.inv((J / size).T @ (J / size)) / np.outer(size, size)
+    scores = J[:n] * e[:n, None] + J[n:] * e[n:, None]
+    spent = len(theta) + TRANSIENT
+    covariance = sandwich(bread, scores, CORRELATED_LINES, n * (1 - spent / (2 * n)))
+    statistics = residual_statistics(error, Y, np.sqrt(np.diag(covariance)), np.sqrt(np.diag(bread)), CORRELATED_LINES)
+    information = Information(NAMES, theta, UNITS, J.T @ J, np.abs(theta))
+    return SingleAxisFit("m y'' + d y' + k y = u", information, covariance,
+                         f"noise from the residual's spectrum, neighbouring {CORRELATED_LINES} lines correlated",
+                         float(e @ e), 2 * n - spent, "residual", statistics, f, Y, Y - error,
+                         ("figure data: spectrum of the output and of the model's, transient included",))
+
+
+def _lines(u: np.ndarray, y: np.ndarray, rate: float, band_Hz: tuple[float, float]
+           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    u, y = np.asarray(u, float).ravel(), np.asarray(y, float).ravel()
+    if u.shape != y.shape or not (np.all(np.isfinite(u)) and np.all(np.isfinite(y))):
+        raise InputError("expected finite samples, as many of u as of y", field="u, y", value=(u.shape, y.shape))
+    low, high = band_Hz
+    if not (np.isfinite(rate) and rate > 0 and 0 <= low < high < rate / 2):
+        raise InputError(f"expected low < high between 0 and {rate / 2:g} Hz", field="band_Hz", value=(low, high))
+    f = np.fft.rfftfreq(len(u), 1 / rate)
+    keep = (f >= low) & (f <= high) & (f > 0)
+    if np.count_nonzero(keep) < 40:
+        raise InputError("expected at least 40 lines in the band; a longer stretch has more", field="band_Hz",
+                         value=(low, high))
+    U, Y = np.fft.rfft(u)[keep], np.fft.rfft(y)[keep]
+    if not (np.any(U) and np.any(Y)):
+        raise InputError("expected an input and an output that move in the band", field="u, y")
+    return U, Y, f[keep]
+
+
+def _linear(U: np.ndarray, Y: np.ndarray, s: np.ndarray, powers: np.ndarray) -> np.ndarray:
+    """Start: Y (m s^2 + d s + k) - T = U is linear."""
+    A = np.column_stack([Y * s ** 2, Y * s, Y, -powers])
+    return np.linalg.lstsq(_parts(A), _parts(U), rcond=None)[0][:3]
+
+
+def _parts(z: np.ndarray) -> np.ndarray:
+    return np.concatenate([z.real, z.imag])
+
+
+def _smoothed(power: np.ndarray) -> np.ndarray:
+    """Mean over the neighbouring lines."""
+    width = 2 * SMOOTHED + 1
+    mean = np.convolve(np.pad(power, SMOOTHED, mode="edge"), np.ones(width) / width, mode="valid")
+    return np.maximum(mean, 1e-12 * power.mean() + np.finfo(float).tiny)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelDependence:
+    """Linear oscillators of stretches of a record, in the order of their level.
+
+    level : (k,) r.m.s. of y in each stretch. resonance_Hz, deviation_Hz, damping, share : (k,) of each; share is the
+    part of y that the linear oscillator does not explain. at_rest_Hz : resonance at zero level from the straight line
+    of the squared resonance over level^2, and cubic: its slope over three resonances squared at rest, k3/k (1/y^2),
+    each with a standard deviation from the scatter about the line.
+    """
+
+    level: np.ndarray
+    resonance_Hz: np.ndarray
+    deviation_Hz: np.ndarray
+    damping: np.ndarray
+    share: np.ndarray
+    at_rest_Hz: tuple[float, float]
+    cubic: tuple[float, float]
+
+
+def by_level(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz: tuple[float, float], stretch: int
+             ) -> LevelDependence:
+    """Fit each whole stretch of `stretch` samples by itself, sorted by the r.m.s. of y.
+
+    Raises
+    ------
+    InputError : fewer than four stretches, and as fit_oscillator.
+    """
+    count = len(y) // stretch if stretch > 0 else 0
+    if count < 4:
+        raise InputError("expected at least four stretches in the record", field="stretch", value=stretch)
+    rows = []
+    for k in range(count):
+        part = slice(k * stretch, (k + 1) * stretch)
+        fit = fit_oscillator(u[part], y[part], sample_rate_Hz, band_Hz)
+        rows.append((float(np.std(y[part])), *resonance_Hz(fit), damping_ratio(fit)[0], fit.residual.share))
+    level, found, deviation, damping, share = np.array(sorted(rows)).T
+    X = np.column_stack([np.ones(count), level ** 2])
+    line, *_ = np.linalg.lstsq(X, found ** 2, rcond=None)
+    e = found ** 2 - X @ line
+    C = np.linalg.inv(X.T @ X) * float(e @ e) / (count - 2)
+    rest = float(np.sqrt(max(line[0], 0.0)))
+    cubic = line[1] / line[0] / 3
+    gradient = np.array([-line[1] / line[0] ** 2, 1 / line[0]]) / 3
+    return LevelDependence(level, found, deviation, damping, share, (rest, float(np.sqrt(C[0, 0]) / (2 * rest))),
+                           (float(cubic), float(np.sqrt(gradient @ C @ gradient))))

@@ -1,0 +1,201 @@
+"""A second-order seismometer from sine amplitudes and phases, driven by its calibration coil or by the ground.
+
+With the mass m on the suspension omega_0, zeta, a force F moves it relative to the frame by x, and its coil gives V:
+
+    x/F = (1/m) / (s^2 + 2 zeta omega_0 s + omega_0^2)        V = S s x
+    V/v_ground = S s^2 / (s^2 + 2 zeta omega_0 s + omega_0^2)   (Wielandt, IASPEI NMSOP chapter 5; sign of S free)
+
+so that coil, displacement and ground responses are one denominator under s^1, s^0 and s^2. A displacement sensor may
+report late by delay_s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq, least_squares
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.identification.information import Information
+from avis_ctrl.identification.single_axis.fit import SingleAxisFit, residual_statistics, sandwich
+
+# The misfit of neighbouring frequencies is alike; scores are taken as correlated over this many.
+CORRELATED_LINES = 2
+POWER = {"coil": 1, "displacement": 0, "ground": 2}
+PARAMETERS = {"corner_Hz": "Hz", "damping": ""}
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """Measured responses at n frequencies.
+
+    value : by kind ("coil" V over drive, "displacement" m over drive, "ground" V over m/s), (n,) complex.
+    variance : by kind, (n,) E|error|^2.
+    """
+
+    frequency_Hz: np.ndarray
+    value: Mapping[str, np.ndarray]
+    variance: Mapping[str, np.ndarray]
+
+    def __post_init__(self) -> None:
+        n = len(self.frequency_Hz)
+        if not self.value or not set(self.value) <= set(POWER) or ("ground" in self.value and len(self.value) > 1):
+            raise InputError("expected coil, displacement or both (driven by a force), or ground alone",
+                             field="responses", value=sorted(self.value))
+        for kind, H in self.value.items():
+            V = self.variance.get(kind)
+            if V is None or np.shape(H) != (n,) or np.shape(V) != (n,) or not np.all(np.isfinite(H)) \
+                    or not np.all(np.isfinite(V)) or not np.all(V > 0) or not np.all(np.abs(H) > 0):
+                raise InputError(f"expected {n} finite values with positive variances, none zero", field=kind)
+        if n < 4 or not np.all(np.diff(self.frequency_Hz) > 0) or self.frequency_Hz[0] <= 0:
+            raise InputError("expected at least four increasing, positive frequencies", field="frequency_Hz", value=n)
+
+    def at(self, keep: np.ndarray) -> Responses:
+        """Some of the frequencies."""
+        return Responses(self.frequency_Hz[keep], {kind: H[keep] for kind, H in self.value.items()},
+                         {kind: V[keep] for kind, V in self.variance.items()})
+
+
+def response(frequency_Hz: np.ndarray, names: tuple[str, ...], values: np.ndarray) -> dict[str, np.ndarray]:
+    """The model's responses by kind, (n,) each, for parameters as a fit names them."""
+    p = dict(zip(names, values, strict=True))
+    s, w0 = 2j * np.pi * np.asarray(frequency_Hz, float), 2 * np.pi * p["corner_Hz"]
+    D = s ** 2 + 2 * p["damping"] * w0 * s + w0 ** 2
+    late, driven = np.exp(-s * p.get("delay_s", 0.0)), np.exp(-s * p.get("drive_delay_s", 0.0))
+    if "force_gain" in p:
+        moved = p["force_gain"] / D * driven
+        coil = {"coil": p["sensitivity"] * s * moved} if "sensitivity" in p else {}
+        return {"displacement": moved * late} | coil
+    return {"coil": p["gain"] * s / D * late} if "gain" in p else {"ground": p["sensitivity"] * s ** 2 / D * late}
+
+
+def fit_seismometer(data: Responses, delay: bool = True) -> SingleAxisFit:
+    """Corner, damping and gains.
+
+    With coil and displacement: force_gain (m/s^2 a unit of drive), sensitivity (V s/m) and, if asked for,
+    drive_delay_s of both against the drive and delay_s of the displacement against the coil. With one channel alone,
+    its gain, and delay_s against the drive.
+
+    The responses' own noise is far below what a linear model misses of a real instrument, so a relative misfit r, the
+    same at every frequency, is added to the noise and chosen so that chi-square per degree of freedom is one; the
+    chi-square that is reported is against the noise alone. Standard deviations let the misfit of neighbouring
+    frequencies correlate, and are not taken below those of independent misfits of size r.
+
+    Raises
+    ------
+    ComputationError : no oscillator with positive corner and damping comes near the data.
+    """
+    names, units, start = _start(data, delay)
+    kinds = list(data.value)
+    scale = np.where(start == 0, 1e-3, np.abs(start))
+
+    def misses(theta: np.ndarray, r: float) -> np.ndarray:
+        model = response(data.frequency_Hz, names, theta)
+        columns = [(data.value[kind] - model[kind])
+                   / np.sqrt((data.variance[kind] + r ** 2 * np.abs(data.value[kind]) ** 2) / 2) for kind in kinds]
+        return np.stack([part for c in columns for part in (c.real, c.imag)], axis=1)
+
+    def solved(r: float, begin: np.ndarray) -> np.ndarray:
+        found = least_squares(lambda x: misses(x * scale, r).ravel(), begin / scale, x_scale="jac", xtol=1e-12,
+                              ftol=1e-12)
+        return found.x * scale
+
+    theta, r = _with_misfit(misses, solved, start)
+    if not np.all(theta[:2] > 0):
+        raise ComputationError("no oscillator fits the responses", measured=f"corner {theta[0]:.3g} Hz, damping "
+                               f"{theta[1]:.3g}", cause="channels that were exchanged, or frequencies on one side of "
+                               "the corner only", next_step="check which column is the drive and which the coil")
+    return _result(data, names, units, theta, r, misses, scale)
+
+
+def _result(data: Responses, names: tuple[str, ...], units: tuple[str, ...], theta: np.ndarray, r: float,
+            misses: Callable[[np.ndarray, float], np.ndarray], scale: np.ndarray) -> SingleAxisFit:
+    e, p = misses(theta, r), len(names)
+    J = np.empty((*e.shape, p))
+    for j in range(p):
+        step = np.zeros(p)
+        step[j] = 1e-5 * scale[j]
+        J[..., j] = (misses(theta + step, r) - misses(theta - step, r)) / (2 * step[j])
+    flat = J.reshape(-1, p)
+    size = np.linalg.norm(flat, axis=0)
+    bread = np.linalg.pinv((flat / size).T @ (flat / size), rcond=1e-12) / np.outer(size, size)
+    scores = np.einsum("nkp,nk->np", J, e)
+    lags = min(CORRELATED_LINES, len(scores) // 4)
+    # Of the numbers of a frequency, p / n were spent on the fit.
+    covariance = sandwich(bread, scores, lags, len(scores) * (1 - p / e.size))
+    # Few frequencies: a parameter on which their misfits happen to cancel is not known better for it.
+    lift = np.sqrt(np.maximum(np.diag(bread) / np.maximum(np.diag(covariance), np.finfo(float).tiny), 1.0))
+    covariance = covariance * np.outer(lift, lift)
+    chi2 = float(np.sum(misses(theta, 0.0) ** 2))
+    model = response(data.frequency_Hz, names, theta)
+    measured = np.column_stack([data.value[kind] for kind in data.value])
+    predicted = np.column_stack([model[kind] for kind in data.value])
+    relative = (measured - predicted) / np.abs(measured)
+    plain, honest = np.sqrt(np.diag(bread)), np.sqrt(np.diag(covariance))
+    statistics = residual_statistics(relative, measured / np.abs(measured), honest, plain, lags)
+    information = Information(names, theta, units, flat.T @ flat, np.abs(scale))
+    return SingleAxisFit(
+        f"second-order seismometer, {' and '.join(data.value)}", information, covariance,
+        f"misfit of {100 * r:.2g} % a frequency added to the noise, neighbouring frequencies correlated (Newey-West, "
+        f"{lags} lags)", chi2, e.size - p, "given", statistics, data.frequency_Hz, measured, predicted,
+        (f"columns of the figure data: {', '.join(data.value)}",))
+
+
+def _with_misfit(misses: Callable[[np.ndarray, float], np.ndarray], solved: Callable[[float, np.ndarray], np.ndarray],
+                 start: np.ndarray) -> tuple[np.ndarray, float]:
+    """Estimate and relative misfit r with chi2/dof = 1; r = 0 where the noise alone explains the data."""
+    theta = solved(0.03, start)
+    for _ in range(20):
+        e = misses(theta, 0.0)
+        dof = e.size - len(theta)
+        if np.sum(e ** 2) <= dof:
+            found = solved(0.0, theta)
+            if np.sum(misses(found, 0.0) ** 2) <= dof * 1.0001:
+                return found, 0.0
+
+        def excess(log_r: float, at: np.ndarray = theta, dof: int = dof) -> float:
+            return float(np.log(np.sum(misses(at, np.exp(log_r)) ** 2) / dof))
+        if excess(np.log(1e-9)) <= 0:
+            return solved(0.0, theta), 0.0
+        r = float(np.exp(brentq(excess, np.log(1e-9), np.log(1e3))))
+        new = solved(r, theta)
+        done = np.allclose(new, theta, rtol=1e-9, atol=0)
+        theta = new
+        if done:
+            break
+    return theta, r
+
+
+def _start(data: Responses, delay: bool) -> tuple[tuple[str, ...], tuple[str, ...], np.ndarray]:
+    """Names, units, and a linear estimate: H (s^2 + a1 s + a0) = b s^p is linear in a1, a0 and b (Levy, 1959)."""
+    kind = next(iter(data.value))
+    H, s = data.value[kind], 2j * np.pi * data.frequency_Hz
+    s0 = float(np.sqrt(np.abs(s[0] * s[-1])))
+    A = np.column_stack([H * s * s0, H * s0 ** 2, -s ** POWER[kind] * s0 ** (2 - POWER[kind])])
+    weight = 1 / (np.abs(H) * (np.abs(s) ** 2 + s0 ** 2))
+    A, y = A * weight[:, None], -H * s ** 2 * weight
+    size = np.maximum(np.linalg.norm(A, axis=0), np.finfo(float).tiny)
+    a1, a0, b = np.linalg.lstsq(np.vstack([(A / size).real, (A / size).imag]), np.concatenate([y.real, y.imag]),
+                                rcond=None)[0] / size
+    w0 = s0 * np.sqrt(a0) if a0 > 0 else s0
+    zeta = a1 * s0 / (2 * w0) if a1 > 0 else 0.5
+    b *= s0 ** (2 - POWER[kind])
+    start, names, units = [w0 / (2 * np.pi), zeta], list(PARAMETERS), list(PARAMETERS.values())
+    if "ground" in data.value:
+        start, names, units = [*start, b], [*names, "sensitivity"], [*units, "V s/m"]
+    elif "displacement" in data.value:
+        D = s ** 2 + 2 * zeta * w0 * s + w0 ** 2
+        gain = float(np.median((data.value["displacement"] * D).real))
+        start, names, units = [*start, gain], [*names, "force_gain"], [*units, "m/s^2 a unit of drive"]
+        if "coil" in data.value:
+            S = np.median((data.value["coil"] / data.value["displacement"] / s).real)
+            start, names, units = [*start, S], [*names, "sensitivity"], [*units, "V s/m"]
+    else:
+        start, names, units = [*start, b], [*names, "gain"], [*units, "V/s a unit of drive"]
+    if delay and len(data.value) > 1:
+        start, names, units = [*start, 0.0], [*names, "drive_delay_s"], [*units, "s"]
+    if delay:
+        start, names, units = [*start, 0.0], [*names, "delay_s"], [*units, "s"]
+    return tuple(names), tuple(units), np.array(start, float)
