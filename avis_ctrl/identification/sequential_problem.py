@@ -23,6 +23,8 @@ from avis_ctrl.rigs.halcyonics import Halcyonics
 Weighting = Literal["equal", "variance"]
 # Unit of the search for a parameter that may vanish [m or kg m^2]; positive ones are searched by their logarithm.
 _SIGNED_UNIT = 0.1
+# A positive parameter a thousand times above or below its start is none that was fitted.
+_RUNAWAY = np.log(1e3)
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class Problem:
     def minimise(self, tests: Sequence[TestCase], names: Sequence[str], theta: np.ndarray) -> np.ndarray:
         """theta with some parameters at the least sum of squares over some tests, from theta on.
 
-        Raises ComputationError where the search ends without a minimum.
+        Raises ComputationError where the search ends without a minimum or runs away.
         """
         free = [self.names.index(name) for name in names]
         positive, base = self.positive[free], theta[free]
@@ -134,6 +136,13 @@ class Problem:
                                    "found no minimum", measured=f"{found.nfev} evaluations, cost {found.cost:.3g}",
                                    cause="a start far off, or transfers that do not hold these parameters",
                                    next_step="start nearer, or look at the measured transfer of that test")
+        away = [name for name, up, x in zip(names, positive, found.x, strict=True) if up and abs(x) > _RUNAWAY]
+        if away:
+            raise ComputationError(f"the fit to test {', '.join(str(t.number) for t in tests)} ran away",
+                                   measured=", ".join(f"{name} = {at(found.x)[self.names.index(name)]:.3g}"
+                                                      for name in away),
+                                   cause="a start too far off, or transfers that do not hold these parameters",
+                                   next_step="start nearer: for the joint fit, from the result of the sequential one")
         return at(found.x)
 
     def line_variance(self, test: TestCase, theta: np.ndarray) -> np.ndarray:
