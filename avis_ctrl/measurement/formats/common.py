@@ -29,8 +29,8 @@ INPUT_UNITS, OUTPUT_UNITS, FLOOR_UNITS = ("V", "N"), ("V", "m/s", "m/s^2", "m"),
 ALLOWED = {"u": INPUT_UNITS, "y": OUTPUT_UNITS, "floor": FLOOR_UNITS}
 
 # What a library may raise over a damaged file; anything else is our own mistake and must be seen.
-DAMAGE = (OSError, EOFError, KeyError, IndexError, AttributeError, ValueError, TypeError, RuntimeError, OverflowError,
-          NotImplementedError, AssertionError, UnicodeError, struct.error, zlib.error)
+DAMAGE = (OSError, EOFError, KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError, struct.error,
+          zlib.error)
 
 
 def short(error: BaseException) -> str:
@@ -83,7 +83,7 @@ def _single(value: Any) -> Any:
     """A value that files store as a scalar, a 0-d array or an array of one."""
     if isinstance(value, (np.ndarray, np.generic)):
         array = np.asarray(value)
-        return array.reshape(-1)[0].item() if array.size == 1 and array.dtype.names is None else value
+        return array.reshape(-1).tolist()[0] if array.size == 1 and array.dtype.names is None else value
     if isinstance(value, (list, tuple)) and len(value) == 1:
         return _single(value[0])
     return value
@@ -161,7 +161,7 @@ def unit_of(label: str, field: str, allowed: Sequence[str] | None = None) -> Uni
     text = text[:-1] + "^2" if text.endswith("s2") else text
     known = UNITS.get(text)
     if known is None or (allowed is not None and known[0] not in allowed):
-        raise InputError(f"expected a unit of {', '.join(allowed or OUTPUT_UNITS)} (also mV, mm/s, g, ...)",
+        raise InputError(f"expected a unit of {', '.join(allowed or OUTPUT_UNITS)} (or mV, mm/s, g, ...)",
                          field=field, value=label)
     return Unit(*known)
 

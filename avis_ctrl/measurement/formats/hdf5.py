@@ -31,7 +31,7 @@ from avis_ctrl.measurement.formats.common import (
     short,
     units_of,
 )
-from avis_ctrl.measurement.formats.stored import Columns, StoredRecord
+from avis_ctrl.measurement.formats.stored import Columns, StoredRecord, open_hdf5
 
 FORMAT, VERSION = "avis-campaign", 1
 ROLES = ("u", "y", "floor")
@@ -59,16 +59,6 @@ def read(path: str | Path, rig: str | None = None) -> Campaign:
         if not records:
             raise InputError("expected at least one record; the group is empty", field="/records")
         return Campaign(rig or stated, records, str(path))
-
-
-def open_hdf5(path: Path) -> h5py.File:
-    """The open file; InputError if it is no HDF5."""
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        if "truncated" in str(error):
-            raise InputError(f"the HDF5 file is cut short ({short(error)})", file=path) from None
-        raise InputError(f"not a readable HDF5 file ({short(error)})", file=path) from None
 
 
 def listed(group: h5py.Group) -> str:

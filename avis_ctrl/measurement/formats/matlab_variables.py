@@ -19,8 +19,8 @@ import scipy.io
 import scipy.sparse
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.formats.common import reading
-from avis_ctrl.measurement.formats.hdf5 import open_hdf5
+from avis_ctrl.measurement.formats.common import reading, short
+from avis_ctrl.measurement.formats.stored import open_hdf5
 
 DEEPEST = 8  # nested structs and cells
 MOST_CELLS = 10_000
@@ -63,7 +63,13 @@ def variables(path: Path) -> dict[str, Any]:
         raise InputError("expected a .mat file of version 5 to 7.3", file=path)
     with reading(path, "the .mat file (v5)"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of variables that are written twice or cannot be read: judged where used
-        loaded = scipy.io.loadmat(path, chars_as_strings=True, struct_as_record=True, squeeze_me=False)
+        try:
+            loaded = scipy.io.loadmat(path, chars_as_strings=True, struct_as_record=True, squeeze_me=False)
+        except MemoryError:
+            raise
+        except Exception as error:  # over a damaged file scipy raises whatever comes, an UnboundLocalError too
+            raise InputError(f"the .mat file (v5) cannot be read; damaged or cut short? ({short(error)})",
+                             file=path) from error
         return {name: _loaded(value, 0) for name, value in loaded.items() if not name.startswith("__")}
 
 

@@ -13,6 +13,7 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import csv, hdf5, matlab, uff
 from avis_ctrl.measurement.formats.common import existing_file, reading
 from avis_ctrl.measurement.formats.flat import ROLES, hints_from
+from avis_ctrl.measurement.formats.stored import open_hdf5
 from avis_ctrl.measurement.formats.stored_response import read_frequency_response
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
@@ -95,7 +96,7 @@ def _is_uff(head: bytes) -> bool:
 
 def _hdf5(path: Path, columns: Mapping[str, Any] | None, rig: str | None,
           hints: Mapping[str, Any]) -> Campaign | FrequencyResponse:
-    with reading(path, "the HDF5 file"), hdf5.open_hdf5(path) as file:
+    with reading(path, "the HDF5 file"), open_hdf5(path) as file:
         matlab_classes = "format" not in file.attrs and any("MATLAB_class" in item.attrs for item in file.values())
         response = "frf" in file and "records" not in file
     if matlab_classes:  # a v7.3 file that lost its text header

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import h5py
 import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Record, RecordHeader, RecordSource
-from avis_ctrl.measurement.formats.common import numbers, reading, require_finite
+from avis_ctrl.measurement.formats.common import existing_file, numbers, reading, require_finite, short
+
+
+def open_hdf5(path: Path) -> h5py.File:
+    """The open file; InputError if it is no HDF5."""
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        if "truncated" in str(error):
+            raise InputError(f"the HDF5 file is cut short ({short(error)})", file=path) from None
+        raise InputError(f"not a readable HDF5 file ({short(error)})", file=path) from None
 
 
 @dataclass(frozen=True)
@@ -67,7 +78,7 @@ class StoredRecord(RecordSource):
                              field=f"record {self.header.name}: samples", value=(start, stop))
         header = replace(self.header, samples=stop - start,
                          start_s=self.header.start_s + start / self.header.sample_rate_Hz)
-        with reading(self.path, f"record {self.header.name}"), h5py.File(self.path, "r") as file:
+        with reading(self.path, f"record {self.header.name}"), open_hdf5(existing_file(self.path)) as file:
             arrays = {role: self._role(file, role, start, stop) for role in self.columns}
             return Record(header, arrays["u"], arrays["y"], arrays.get("floor"))
 

@@ -27,8 +27,9 @@ from avis_ctrl.measurement.formats.common import (
     require,
     unit_of,
 )
-from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_root, listed, open_hdf5, replacing
+from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_root, listed, replacing
 from avis_ctrl.measurement.formats.response import response_from
+from avis_ctrl.measurement.formats.stored import open_hdf5
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 COVARIANCES = ("noise", "gram", "measurement_noise", "distortion")
