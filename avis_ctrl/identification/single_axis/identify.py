@@ -1,0 +1,182 @@
+"""From files to a single-axis model.
+
+    identify_single_axis("seismometer", folder, {"drive": "FuncGen", "coil": "Current", "displacement": "Laser",
+                         "t": "Seconds"}, scale={"coil": 0.9425e-6, ...})
+    identify_single_axis("drive", file, {"force": "vir", "position": "qm", "reference": "qg", "t": "t"},
+                         scale={"force": 35.15})
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import AvisError, ComputationError, InputError
+from avis_ctrl.identification.single_axis.decay import fit_decay
+from avis_ctrl.identification.single_axis.drive import fit_drive
+from avis_ctrl.identification.single_axis.fit import SingleAxisFit
+from avis_ctrl.identification.single_axis.oscillator import fit_oscillator
+from avis_ctrl.identification.single_axis.seismometer import Responses, fit_seismometer
+from avis_ctrl.identification.single_axis.sine import SineRecord, fit_sine
+from avis_ctrl.measurement.campaign import Campaign, RecordSource
+from avis_ctrl.measurement.formats.reader import read_measurements
+
+# kind -> (role that drives, other roles that must be mapped, roles that may be)
+ROLES: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
+    "seismometer": ("drive", (), ("coil", "displacement", "ground")),
+    "decay": ("", ("y",), ()),
+    "drive": ("force", ("position",), ("reference",)),
+    "oscillator": ("u", ("y",), ()),
+}
+OPTIONS = {"seismometer": {"delay"}, "drive": {"cutoff_Hz", "coulomb", "offset"}, "oscillator": {"band_Hz"},
+           "decay": {"corner_Hz", "damping", "start_s", "end_s", "drift"}}
+
+
+def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str], *,
+                         scale: Mapping[str, float] | None = None, sample_rate_Hz: float | None = None,
+                         **options: Any) -> SingleAxisFit:
+    """Read measurements of one axis and fit a model of it.
+
+    Parameters
+    ----------
+    kind : "seismometer" (stepped sine, a directory with one CSV a frequency, or a campaign), "decay" (one record),
+        "drive" or "oscillator" (one record).
+    columns : role to name of a column or variable, and "t" to that of the time where there is one. Roles:
+        seismometer: drive, and coil, displacement or both; with a shaken ground its velocity is the drive, and the coil
+        is mapped as "ground". decay: y. drive: force, position, and reference for instruments. oscillator: u, y.
+    scale : role to the factor that brings the file's numbers to SI; 1 otherwise.
+    sample_rate_Hz : where the file has no time.
+    options : of `fit_seismometer`, `fit_decay` (with start_s and end_s from the record's start), `fit_drive`,
+        `fit_oscillator`.
+
+    Raises
+    ------
+    InputError : an unknown kind, role, option or column; a file that cannot be read. ComputationError : as the fits.
+    """
+    if kind not in ROLES:
+        raise InputError(f"expected one of {', '.join(ROLES)}", field="kind", value=kind)
+    for name in options:
+        if name not in OPTIONS[kind]:
+            raise InputError(f"expected one of {', '.join(sorted(OPTIONS[kind]))}", field=f"option of {kind}",
+                             value=name)
+    scale = dict(scale or {})
+    driven, measured = _roles(kind, columns, scale)
+    campaign = _read(path, columns, driven, measured, sample_rate_Hz)
+    if kind == "seismometer":
+        responses, refused = stepped_sine(campaign, driven, measured, scale)
+        fit = fit_seismometer(responses, **options)
+        return _noted(fit, refused)
+    time, channel = _channels(_single(campaign, path), driven, measured, scale)
+    if kind == "drive":
+        return fit_drive(time, channel["position"], channel["force"], reference=channel.get("reference"), **options)
+    if kind == "decay":
+        return _decay(time, channel["y"], **options)
+    rate = campaign.sample_rate_Hz
+    return fit_oscillator(channel["u"], channel["y"], rate, **{"band_Hz": (0.005 * rate, 0.4 * rate)} | options)
+
+
+def sine_records(campaign: Campaign, driven: str, measured: Sequence[str], scale: Mapping[str, float] | None = None
+                 ) -> tuple[list[SineRecord], list[str]]:
+    """The sine of each record by frequency, and why the others were refused.
+
+    driven, measured : roles, in the order of the campaign's u and y.
+    """
+    found, refused = [], []
+    for source in campaign.records:
+        time, channel = _channels(source, driven, measured, dict(scale or {}))
+        try:
+            record = fit_sine(source.header.name, time, channel, driven)
+        except AvisError as error:
+            refused.append(str(error))
+            continue
+        reasons = [reason for name in record.channels if (reason := record.refusal(name))]
+        refused += reasons
+        if not reasons:
+            found.append(record)
+    return sorted(found, key=lambda record: record.frequency_Hz), refused
+
+
+def stepped_sine(campaign: Campaign, driven: str, measured: Sequence[str], scale: Mapping[str, float] | None = None
+                 ) -> tuple[Responses, list[str]]:
+    """Responses to the drive from sine records, and the records that were left out, with the reason.
+
+    Raises
+    ------
+    ComputationError : fewer than four usable frequencies.
+    """
+    records, refused = sine_records(campaign, driven, measured, scale)
+    records = [record for k, record in enumerate(records)
+               if k == 0 or record.frequency_Hz > 1.001 * records[k - 1].frequency_Hz]
+    if len(records) < 4:
+        raise ComputationError("too few sine records", measured=f"{len(records)} usable of {len(campaign.records)}",
+                               cause=refused[0] if refused else "repeated frequencies",
+                               next_step="map the columns, and give at least four frequencies about the corner")
+    pairs = {role: [record.ratio(role, driven) for record in records] for role in measured}
+    return Responses(np.array([record.frequency_Hz for record in records]),
+                     {role: np.array([H for H, _ in pair]) for role, pair in pairs.items()},
+                     {role: np.array([v for _, v in pair]) for role, pair in pairs.items()}), refused
+
+
+def _roles(kind: str, columns: Mapping[str, str], scale: Mapping[str, float]) -> tuple[str, list[str]]:
+    driven, needed, optional = ROLES[kind]
+    known = {"t", *needed, *optional, *([driven] if driven else [])}
+    for role in [*columns, *scale]:
+        if role not in known:
+            raise InputError(f"expected one of {', '.join(sorted(known))}", field=f"role of {kind}", value=role)
+    for role in [*([driven] if driven else []), *needed]:
+        if role not in columns:
+            raise InputError(f"expected a column for {role}", field="columns", value=dict(columns))
+    for role, factor in scale.items():
+        if role not in columns or not (np.isfinite(factor) and factor != 0):
+            raise InputError("expected a finite factor, not zero, of a role that is mapped", field=f"scale of {role}",
+                             value=factor)
+    measured = [role for role in (*needed, *optional) if role in columns]
+    if not measured:
+        raise InputError(f"expected a column for {' or '.join(optional)}", field="columns", value=dict(columns))
+    return driven, measured
+
+
+def _read(path: str | Path, columns: Mapping[str, str], driven: str, measured: Sequence[str],
+          sample_rate_Hz: float | None) -> Campaign:
+    mapping = {"y": [columns[role] for role in measured]}
+    if driven:
+        mapping["u"] = [columns[driven]]
+    if "t" in columns:
+        mapping["t"] = [columns["t"]]
+    hints: dict[str, Any] = {} if sample_rate_Hz is None else {"sample_rate_Hz": sample_rate_Hz}
+    found = read_measurements(path, mapping, **hints)
+    if not isinstance(found, Campaign):
+        raise InputError("expected records over time, found a frequency response", file=path)
+    return found
+
+
+def _single(campaign: Campaign, path: str | Path) -> RecordSource:
+    if len(campaign.records) != 1:
+        raise InputError("expected one record", file=path, field="records", value=len(campaign.records))
+    return campaign.records[0]
+
+
+def _channels(source: RecordSource, driven: str, measured: Sequence[str], scale: Mapping[str, float]
+              ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    record = source.load()
+    found = {driven: record.u[:, 0]} if driven else {}
+    found |= {role: record.y[:, k] for k, role in enumerate(measured)}
+    time = np.arange(source.header.samples) / source.header.sample_rate_Hz
+    return time, {role: scale.get(role, 1.0) * values for role, values in found.items()}
+
+
+def _decay(time: np.ndarray, y: np.ndarray, corner_Hz: float = 1.0, damping: float = 0.1, start_s: float = 0.0,
+           end_s: float = np.inf, drift: int = 1) -> SingleAxisFit:
+    keep = (time >= start_s) & (time <= end_s)
+    if np.count_nonzero(keep) < 32:
+        raise InputError(f"expected at least 32 samples between start_s and end_s; the record lasts {time[-1]:g} s",
+                         field="start_s, end_s", value=(start_s, end_s))
+    return fit_decay(time[keep], y[keep], corner_Hz, damping, drift)
+
+
+def _noted(fit: SingleAxisFit, refused: Sequence[str]) -> SingleAxisFit:
+    return replace(fit, notes=(*fit.notes, *(f"left out: {reason}" for reason in refused)))
