@@ -144,15 +144,15 @@ def _pinned(null: np.ndarray, scalings: tuple[Scaling, ...], names: Sequence[str
     found = []
     for k, scaling in enumerate(scalings):
         best: tuple[tuple[int, int, int], int] | None = None
-        for j in np.flatnonzero(scaling.exponents):
+        for j in np.flatnonzero(scaling.exponents).tolist():
             exponents = np.array([[one.exponents[i] for i in [*pins, j]] for one in scalings[:k + 1]])
             if abs(np.linalg.det(exponents)) < 1e-9:
                 continue
-            left = reduced_rows(_without(null, [*pins, int(j)]), tolerance)
+            left = reduced_rows(_without(null, [*pins, j]), tolerance)
             liking = 0 if names[j].rpartition(".")[2] == "mass" or names[j].startswith("sensor.") else 1
-            rank = (int(np.count_nonzero(left)), liking, int(j))
+            rank = (int(np.count_nonzero(left)), liking, j)
             if best is None or rank < best[0]:
-                best = rank, int(j)
+                best = rank, j
         if best is not None:
             pins.append(best[1])
             found.append(Scaling(scaling.exponents, best[1]))

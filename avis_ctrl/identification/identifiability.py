@@ -1,0 +1,319 @@
+"""Which combinations of a rig's parameters the data determine, which they do not, in words.
+
+Three sources of information are read alike: the maximum likelihood fit holds its own, the extended Kalman filter's is
+what its covariance lost against the prior's, the sequential fit's is that of its tests taken jointly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.identifiability_words import (
+    combination_text,
+    group_sentence,
+    number,
+    scaling_sentence,
+    unit_text,
+    weak_direction_sentence,
+    weak_sentence,
+)
+from avis_ctrl.identification.information import UNDETERMINED, Information
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.sequential_problem import Problem
+from avis_ctrl.identification.structure import Group, Structure, size_of, structural_null_space, structure_of
+
+# A combination known to worse than this share of its value is called weak.
+WEAK = 0.05
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A combination of parameters.
+
+    weights : derivative of its value by each parameter. value : of the expression, with its standard deviation
+    (infinite where it is not determined). words : the expression, such as "isolator1.k_x + isolator2.k_x".
+    """
+
+    weights: Mapping[str, float]
+    value: float
+    standard_deviation: float
+    unit: str
+    words: str
+
+    @property
+    def relative(self) -> float:
+        return self.standard_deviation / abs(self.value) if self.value else np.inf
+
+    @property
+    def determined(self) -> bool:
+        return bool(np.isfinite(self.standard_deviation))
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """A line of the table: known is "alone", "ratio" (with the pins known it is), or "together"; or "not" at all.
+
+    standard_deviation : by itself, infinite where it is not known alone. with_others : the combinations it stands in.
+    """
+
+    name: str
+    value: float
+    unit: str
+    known: str
+    standard_deviation: float
+    with_others: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiabilityReport:
+    """What an information matrix says.
+
+    Attributes
+    ----------
+    parameters, rank, condition : how many, how many combinations are determined, conditioning of those.
+    rows : one a parameter. combinations : as many as the structure leaves; their standard deviation may still be
+        infinite, where the data are too poor. unseen : what no such data show, in the parameters' units.
+    pins : parameters that the ratios refer to. sentences : all of it in words.
+    """
+
+    information: Information
+    rank: int
+    condition: float
+    rows: tuple[ParameterRow, ...]
+    structure: Structure
+    combinations: tuple[Combination, ...]
+    unseen: tuple[Mapping[str, float], ...]
+    pins: tuple[str, ...]
+    sentences: tuple[str, ...]
+
+    @property
+    def parameters(self) -> int:
+        return len(self.rows)
+
+    @property
+    def weak(self) -> tuple[Combination, ...]:
+        """Determined combinations known to worse than 5 %, the worst first."""
+        found = [one for one in self.combinations if one.determined and one.relative > WEAK]
+        return tuple(sorted(found, key=lambda one: -one.relative))
+
+
+def identifiability_report(information: Information, model: ResponseModel | None = None, floor: bool = False,
+                           priors: Mapping[str, float] | None = None) -> IdentifiabilityReport:
+    """Rank, combinations and sentences.
+
+    Parameters
+    ----------
+    model : separates what no data could show (exactly) from what these data show too poorly. Without it all that the
+        information leaves undetermined is taken for the former, with the precision of round-off.
+    floor : whether a record with measured floor is part of the data.
+    priors : standard deviations of parameters that are part of the information.
+
+    Raises
+    ------
+    InputError : a model of other parameters.
+    """
+    if model is not None and model.names != information.names:
+        raise InputError(f"expected a model with the free parameters {', '.join(information.names)}", field="model",
+                         value=model.names)
+    values, units, names = information.values, information.units, information.names
+    if model is None:
+        null, own = information.null_space, information.null_space
+        structure = structure_of(null, values, units, names, 1e-3)
+    else:
+        own = structural_null_space(model, floor) * (size_of(model.values) / information.scale)[:, None]
+        own = np.linalg.qr(own)[0] if own.size else own
+        null = _left_dark(information, own)
+        # Relative units of the structure are those of the values.
+        structure = structure_of(_orthonormal(null * (information.scale / size_of(values))[:, None]), values, units,
+                                 names)
+    combinations = _combinations(information, structure)
+    unseen = tuple(_by_name(row, names) for group in structure.groups for row in group.unseen)
+    pins = tuple(names[one.pin] for one in structure.scalings)
+    rows = _rows(information, structure, combinations)
+    said = _sentences(information, structure, combinations, rows)
+    if model is not None and own.shape[1] > null.shape[1]:
+        said = (*said, _prior_sentence(own.shape[1] - null.shape[1], priors or {}))
+    return IdentifiabilityReport(information, information.rank, information.condition, rows, structure, combinations,
+                                 unseen, pins, said)
+
+
+def _orthonormal(basis: np.ndarray) -> np.ndarray:
+    return np.linalg.qr(basis)[0] if basis.size else basis
+
+
+def _left_dark(information: Information, null: np.ndarray) -> np.ndarray:
+    """The directions of a null space of the equations on which priors bring no information either."""
+    if not null.shape[1]:
+        return null
+    inside = null.T @ information.relative @ null
+    values, vectors = np.linalg.eigh((inside + inside.T) / 2)
+    floor = 4 * len(null) * np.finfo(float).eps * np.max(np.linalg.eigvalsh(information.relative))
+    return null @ vectors[:, values <= max(1 / UNDETERMINED ** 2, floor)]
+
+
+def _combinations(information: Information, structure: Structure) -> tuple[Combination, ...]:
+    rows = [(min(group.members), row) for group in structure.groups for row in group.seen]
+    rows += [(j, np.eye(len(information.names))[j]) for j in structure.singles]
+    return tuple(_combination(information, structure, row) for _, row in sorted(rows, key=lambda pair: pair[0]))
+
+
+def _combination(information: Information, structure: Structure, row: np.ndarray) -> Combination:
+    """The sum row @ theta, multiplied by powers of the pins that make it blind to the scalings."""
+    values, units, names = information.values, information.units, information.names
+    inside = np.flatnonzero(row)
+    value, gradient = float(row @ values), np.array(row, float)
+    powers: dict[int, float] = {}
+    if structure.scalings:
+        exponents = np.array([one.exponents for one in structure.scalings])
+        pins = [one.pin for one in structure.scalings]
+        of_pins = np.linalg.solve(exponents[:, pins], exponents[:, inside[0]])
+        powers = {pin: -power for pin, power in zip(pins, np.round(of_pins, 9), strict=True) if power}
+        total = value
+        for pin, power in powers.items():
+            total *= values[pin] ** power
+        gradient = gradient * (total / value) if value else gradient
+        for pin, power in powers.items():
+            gradient[pin] += power * total / values[pin]
+        value = total
+    sigma = information.of(gradient)[1]
+    text = combination_text([(names[j], row[j]) for j in inside], [(names[j], p) for j, p in powers.items()])
+    unit = unit_text(_common([units[j] for j in inside]), [(units[j], p) for j, p in powers.items()])
+    return Combination(_by_name(gradient, names), value, sigma, unit, text)
+
+
+def _common(units: Sequence[str]) -> str:
+    return units[0] if len(set(units)) == 1 else "mixed units"
+
+
+def _by_name(row: np.ndarray, names: Sequence[str]) -> dict[str, float]:
+    return {name: float(weight) for name, weight in zip(names, row, strict=True) if weight}
+
+
+def _rows(information: Information, structure: Structure, combinations: Sequence[Combination]
+          ) -> tuple[ParameterRow, ...]:
+    grouped = {j: group for group in structure.groups for j in group.members}
+    pins = {one.pin for one in structure.scalings}
+    found = []
+    for j, name in enumerate(information.names):
+        sigma = float(information.standard_deviation[j])
+        others = tuple(one.words for one in combinations if name in one.weights)
+        if np.isfinite(sigma):
+            known = "alone"
+        elif j in grouped:
+            known = "together" if len(grouped[j].seen) else "not"
+        elif any(one.exponents[j] for one in structure.scalings):
+            own = [one for one in combinations if name in one.weights and one.determined]
+            known = "ratio" if own or j in pins else "not"
+        else:
+            known = "not"
+        found.append(ParameterRow(name, float(information.values[j]), information.units[j], known, sigma, others))
+    return tuple(found)
+
+
+def _sentences(information: Information, structure: Structure, combinations: Sequence[Combination],
+               rows: Sequence[ParameterRow]) -> tuple[str, ...]:
+    names, count = information.names, len(information.names)
+    alone = [row for row in rows if row.known == "alone"]
+    said = [f"{information.rank} combinations of the {count} parameters are determined; the best and the worst known "
+            f"of them differ by a factor {number(np.sqrt(information.condition))} in relative standard deviation."
+            if information.rank else f"Not one combination of the {count} parameters is determined."]
+    if len(alone) == count:
+        said.append("Every parameter is determined by itself.")
+    elif alone:
+        said.append(f"Determined by themselves ({len(alone)}): {', '.join(row.name for row in alone)}.")
+    said += [scaling_sentence(one, information) for one in structure.scalings]
+    if structure.scalings:
+        shared = [text for text in (_combination(information, structure, row).words
+                                    for row in np.eye(count)[list(structure.singles)]) if text not in names]
+        if shared:
+            said.append(f"Determined as such ratios and products ({len(shared)}): {', '.join(shared)}.")
+    by_text = {one.words: one for one in combinations}
+    for group in structure.groups:
+        own = [by_text[_combination(information, structure, row).words] for row in group.seen]
+        said.append(group_sentence([names[j] for j in group.members], own))
+    poor = [one for one in combinations if not one.determined]
+    if poor:
+        said.append(f"The equations show these, but the data do not (standard deviation above the value itself): "
+                    f"{', '.join(one.words for one in poor)}.")
+    weak = sorted((one for one in combinations if one.determined and one.relative > WEAK),
+                  key=lambda one: -one.relative)
+    said += [weak_sentence(one) for one in weak]
+    sigma, V = information.directions
+    last = information.rank - 1
+    if last >= 0 and sigma[last] > WEAK:
+        said.append(weak_direction_sentence(names, V[:, last], float(sigma[last])))
+    return tuple(said)
+
+
+def _prior_sentence(count: int, priors: Mapping[str, float]) -> str:
+    named = f" on {', '.join(priors)}" if 0 < len(priors) <= 6 else ""
+    return (f"{count} of the combinations stand on what was known beforehand{named} alone: "
+            f"these data say nothing of them, and never will.")
+
+
+def information_from_covariance(names: Sequence[str], P: np.ndarray, P0: np.ndarray, values: np.ndarray,
+                                units: Sequence[str] | None = None, share: float = 0.5) -> Information:
+    """What the data told a filter: inv(P) - inv(P0), for the directions whose variance fell.
+
+    Parameters
+    ----------
+    P, P0 : (n_p, n_p) covariance after and before the data, in the parameters' units. values : (n_p,) estimates.
+    share : a direction that kept this share of its prior variance holds no information. A filter's covariance
+        shrinks a little along such directions too, by linearising at changing parameters.
+
+    Raises
+    ------
+    InputError : matrices that are no covariances of these parameters.
+    """
+    n = len(names)
+    P, P0, values = np.asarray(P, float), np.asarray(P0, float), np.asarray(values, float)
+    if not 0 < share <= 1:
+        raise InputError("expected a share from 0 to 1", field="share", value=share)
+    for field, matrix in (("P", P), ("P0", P0)):
+        if matrix.shape != (n, n) or not np.all(np.isfinite(matrix)):
+            raise InputError(f"expected a finite ({n}, {n}) covariance", field=field, value=matrix.shape)
+    try:
+        L = np.linalg.cholesky(P0)
+    except np.linalg.LinAlgError:
+        raise InputError("expected a positive definite prior covariance", field="P0") from None
+    white = np.linalg.solve(L, np.linalg.solve(L, P).T)
+    ratio, vectors = np.linalg.eigh((white + white.T) / 2)
+    if ratio[0] <= 0:
+        raise InputError("expected a positive definite covariance; a filter whose covariance lost this has diverged",
+                         field="P", value=float(ratio[0]))
+    gained = np.where(ratio < share, 1 / ratio - 1, 0.0)
+    half = np.linalg.solve(L.T, vectors * np.sqrt(gained))
+    return Information(tuple(names), values, tuple(units) if units is not None else ("",) * n, half @ half.T,
+                       size_of(values))
+
+
+def information_of_tests(problem: Problem, theta: np.ndarray, units: Sequence[str] | None = None) -> Information:
+    """Of all tests of a sequential fit jointly, at theta: no scheme that takes them in turn knows more.
+
+    Variances of the lines are the measured ones, or what the fit leaves in each test.
+
+    Raises
+    ------
+    InputError : a line without variance, or a test that the fit meets exactly.
+    """
+    theta = np.asarray(theta, float)
+    H = np.zeros((theta.size, theta.size))
+    for test in problem.tests:
+        variance = np.asarray(problem.line_variance(test, theta), float)
+        if not np.all(variance > 0):
+            raise InputError("expected a positive variance on every line", field=f"test {test.number}",
+                             value=float(np.min(variance)))
+        J = problem.jacobian([test], theta) * np.repeat(problem.scale[test.number] / np.sqrt(variance / 2), 2)[:, None]
+        H += J.T @ J
+    return Information(problem.names, theta, tuple(units) if units is not None else ("",) * theta.size, H,
+                       size_of(theta))
+
+
+def group_of(report: IdentifiabilityReport, name: str) -> Group | None:
+    """The group that a parameter stands in."""
+    index = report.information.names.index(name)
+    return next((group for group in report.structure.groups if index in group.members), None)

@@ -1,0 +1,131 @@
+"""Sentences on what is determined, for a mechanical engineer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avis_ctrl.identification.information import Information
+from avis_ctrl.identification.structure import Scaling
+
+if TYPE_CHECKING:
+    from avis_ctrl.identification.identifiability import Combination
+
+_KINDS = {"kg": ("mass", "masses"), "kg m^2": ("inertia", "inertias"), "N/m": ("stiffness", "stiffnesses"),
+          "N m/rad": ("rotational stiffness", "rotational stiffnesses"), "N s/m": ("damping", "dampings"),
+          "N m s/rad": ("rotational damping", "rotational dampings"), "N/V": ("force constant", "force constants"),
+          "m": ("length", "lengths")}
+
+
+def number(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
+
+
+def combination_text(terms: Sequence[tuple[str, float]], powers: Sequence[tuple[str, float]]) -> str:
+    """A weighted sum, times powers of other parameters."""
+    text = ""
+    for name, weight in terms:
+        size = "" if abs(weight) == 1 else f"{abs(weight):.4g} "
+        text += f" {'-' if weight < 0 else '+'} {size}{name}"
+    text = text.removeprefix(" + ").removeprefix(" ")
+    if len(terms) > 1 and powers:
+        text = f"({text})"
+    for name, power in powers:
+        text += (" * " if power > 0 else " / ") + name + (f"^{abs(power):g}" if abs(power) != 1 else "")
+    return text
+
+
+def unit_text(unit: str, powers: Sequence[tuple[str, float]]) -> str:
+    if unit == "mixed units":
+        return unit
+    for other, power in powers:
+        if (unit, power) == (other, -1):
+            unit = "1"
+            continue
+        compound = f"({other})" if any(ch in other for ch in " /") else other
+        unit += (" * " if power > 0 else " / ") + compound + (f"^{abs(power):g}" if abs(power) != 1 else "")
+    return unit
+
+
+def known_text(one: Combination) -> str:
+    """Value and standard deviation."""
+    unit = "" if one.unit in ("1", "", "mixed units") else f" {one.unit}"
+    if not one.determined:
+        return f"{one.words} (not determined by these data)"
+    return f"{one.words} = {one.value:.6g} +- {number(one.standard_deviation)}{unit}"
+
+
+def group_sentence(members: Sequence[str], seen: Sequence[Combination]) -> str:
+    if not seen:
+        return (f"{listed(members)} {'acts' if len(members) == 1 else 'act'} on no response to these inputs: "
+                "nothing is known of it.")
+    few = listed(members) if len(members) <= 8 else f"{', '.join(members[:7])} and {len(members) - 7} more"
+    if len(seen) == 1:
+        plain = all(weight in seen[0].words for weight in members) and " - " not in seen[0].words
+        sort = "their sum" if plain and not any(ch.isdigit() and ch != "0" for ch in _coefficients(seen[0])) \
+            else "one combination"
+        return f"{few} only as {sort}: {known_text(seen[0])}."
+    shown = "; ".join(known_text(one) for one in seen[:8]) + ("; .." if len(seen) > 8 else "")
+    return f"{few} ({len(members)}) only through {len(seen)} combinations: {shown}."
+
+
+def _coefficients(one: Combination) -> str:
+    """What stands in front of the names in a sum."""
+    inner = one.words.partition(")")[0].removeprefix("(") if one.words.startswith("(") else one.words
+    return "".join(term.strip().rpartition(" ")[0] for term in inner.split(" + "))
+
+
+def _upper(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def kinds(exponents: np.ndarray, information: Information, of: float) -> list[str]:
+    """Kinds of parameters with this exponent; single ones by name."""
+    members: dict[str, list[str]] = {}
+    for name, unit, exponent in zip(information.names, information.units, exponents, strict=True):
+        if exponent == of:
+            kind = "sensor" if name.startswith("sensor.") else unit
+            members.setdefault(kind, []).append(name)
+    said = []
+    for kind, names in members.items():
+        if len(names) == 1:
+            said.append(names[0])
+            continue
+        plural = "sensor sensitivities" if kind == "sensor" else _KINDS.get(kind, ("", f"parameters in {kind}"))[1]
+        said.append(plural + (f" ({', '.join(names)})" if len(names) <= 3 else ""))
+    return said
+
+
+def scaling_sentence(scaling: Scaling, information: Information) -> str:
+    sizes = sorted(set(scaling.exponents[scaling.exponents != 0].tolist()), reverse=True)
+    if sizes == [1.0]:
+        return (f"{_upper(listed(kinds(scaling.exponents, information, 1.0)))} only as ratios: a common factor of "
+                f"all of them changes no response. With {information.names[scaling.pin]} known, that is settled.")
+    if sizes == [1.0, -1.0]:
+        up, down = (kinds(scaling.exponents, information, sign) for sign in (1.0, -1.0))
+        return (f"{_upper(listed(up))} and {listed(down)} only as products: larger {listed(up)} with smaller "
+                f"{listed(down)} change no response. With {information.names[scaling.pin]} known, that is settled.")
+    parts = [f"{listed(kinds(scaling.exponents, information, size))} by the factor"
+             + (f" to the power {size:g}" if size != 1 else "") for size in sizes]
+    return (f"A factor on {'; '.join(parts)} changes no response. With {information.names[scaling.pin]} known, "
+            "that is settled.")
+
+
+def weak_sentence(one: Combination) -> str:
+    unit = "" if one.unit in ("1", "", "mixed units") else f" {one.unit}"
+    return (f"{one.words} is known only to {number(100 * one.relative)} %: {one.value:.4g} +- "
+            f"{number(one.standard_deviation)}{unit}.")
+
+
+def weak_direction_sentence(names: Sequence[str], direction: np.ndarray, sigma: float) -> str:
+    order = np.argsort(-np.abs(direction))
+    count = min(int(np.searchsorted(np.cumsum(direction[order] ** 2), 0.9)) + 1, 6)
+    sign = np.sign(direction[order[0]])
+    moved = [f"{names[j]} by {100 * sigma * sign * direction[j]:+.2g} %" for j in order[:count]]
+    return f"The worst known combination: {listed(moved)} together lie within one standard deviation."
