@@ -24,7 +24,7 @@ from typing import Literal
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.campaign import Campaign, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.periodic import PeriodMean, average, periodic_records, settled_after
 from avis_ctrl.measurement.spectra import Band, Channels, channels, checked_band, hermitian_solve, lines
@@ -88,18 +88,13 @@ def best_linear_approximations(campaign: Campaign, *, band_Hz: Band | None = Non
 
     Parameters and errors as in `best_linear_approximation`.
     """
-    if transient not in ("auto", "drop", "remove", "none"):
-        raise InputError("expected auto, drop, remove or none", field="transient", value=transient)
     records = periodic_records(campaign, level_V)
     used = channels(campaign, records, inputs, False)
     n, rate = records[0].header.period_samples or 0, campaign.sample_rate_Hz
     keep = lines(n, rate, checked_band(band_Hz, rate))
     if keep.stop <= keep.start:
         raise InputError(f"expected a band with harmonics of {rate / n:g} Hz", field="band_Hz", value=band_Hz)
-    found, settled = (0, False) if transient == "none" else settled_after(records, used, keep)
-    dropped = drop if drop is not None else 0 if transient == "remove" else found
-    repeated = min(r.header.periods for r in records) - dropped >= 2
-    remove = transient == "remove" or (transient == "auto" and not settled and drop is None and repeated)
+    dropped, remove = chosen_treatment(records, used, keep, transient, drop)
     means = [average(record, used, keep, dropped, remove) for record in records]
     data = _experiments(means, len(used.inputs))
     frequency = np.arange(keep.start, keep.stop) * rate / n
@@ -107,6 +102,19 @@ def best_linear_approximations(campaign: Campaign, *, band_Hz: Band | None = Non
     words = f"best linear approximation, {len(data.U)} experiments of {means[0].periods} periods, {told}"
     return tuple(_response(data, frequency, line, active, used, smooth_lines, words)
                  for active, line in _excited_sets(data, used))
+
+
+def chosen_treatment(records: Sequence[RecordSource], used: Channels, keep: slice, transient: Transient,
+                     drop: int | None) -> tuple[int, bool]:
+    """How many periods to drop, and whether to remove a transient from the rest."""
+    if transient not in ("auto", "drop", "remove", "none"):
+        raise InputError("expected auto, drop, remove or none", field="transient", value=transient)
+    if drop is not None and drop < 0:
+        raise InputError("expected 0 or more periods", field="drop", value=drop)
+    found, settled = settled_after(records, used, keep) if transient in ("auto", "drop") else (0, False)
+    dropped = found if drop is None else drop
+    repeated = min(record.header.periods for record in records) - dropped >= 2
+    return dropped, transient == "remove" or (transient == "auto" and not settled and drop is None and repeated)
 
 
 def _experiments(means: Sequence[PeriodMean], n_u: int) -> _Experiments:

@@ -1,0 +1,96 @@
+"""Even and odd distortion of a single record, from the lines that its multisine leaves out (fast method).
+
+A periodic odd multisine excites some odd harmonics only. Even nonlinearities answer on even harmonics, odd ones on the
+odd harmonics, of which those left out are the detection lines (Pintelon and Schoukens, System Identification, 2nd ed.,
+2012, section 4.3.2). Noise is told by the lines between harmonics or by repeated periods.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.best_linear import Transient, chosen_treatment
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.periodic import average
+from avis_ctrl.measurement.spectra import Band, channels, checked_band, lines
+
+Kind = Literal["excited", "odd", "even"]
+# Amplitude of an input relative to its largest line, above which a line counts as excited.
+EXCITED = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class DistortionLevels:
+    """Powers of the outputs of one record, line by line.
+
+    frequency_Hz : (n,) harmonics; kind : (n,) "excited", "odd" (detection) or "even"; power : (n, n_y) mean square of
+    the line's sine, squared unit of y; noise : (n, n_y) what noise alone would give there on the mean.
+    """
+
+    frequency_Hz: np.ndarray
+    kind: np.ndarray
+    power: np.ndarray
+    noise: np.ndarray
+    outputs: tuple[str, ...]
+    output_unit: str
+
+    def rms(self, kind: Kind) -> np.ndarray:
+        """(n_y,) r.m.s. of a part, noise subtracted; that of the odd distortion is scaled from the detection lines to
+        all odd lines, as it falls on the excited lines too. 0 where noise hides it."""
+        here = self.kind == kind
+        if not np.any(here):
+            return np.zeros(len(self.outputs))
+        share = np.sum(self.kind != "even") / np.sum(here) if kind == "odd" else 1.0
+        return np.sqrt(np.maximum(share * np.sum(self.power[here] - self.noise[here], axis=0), 0.0))
+
+    def above_noise_dB(self, kind: Kind) -> np.ndarray:
+        """(n_y,) total power of a kind of lines, noise included, over that of noise alone."""
+        here = self.kind == kind
+        return 10 * np.log10(np.sum(self.power[here], axis=0) / np.sum(self.noise[here], axis=0))
+
+
+def distortion_levels(campaign: Campaign, record: str, *, band_Hz: Band | None = None,
+                      inputs: Sequence[str] | None = None, transient: Transient = "auto") -> DistortionLevels:
+    """Even and odd distortion of one record of an odd multisine with detection lines.
+
+    Only harmonics from the lowest to the highest excited one are judged. What the generator itself puts on these lines
+    counts as distortion of the rig; the commanded u has none.
+
+    Raises
+    ------
+    InputError : a record that is not periodic, excites even lines, or leaves out no odd ones; fewer than two periods.
+    """
+    source = campaign.named(record)
+    header = source.header
+    field = f"record {header.name}"
+    if not header.period_samples or header.periods < 2:
+        raise InputError("expected a periodic record of at least two periods", field=f"{field}: period_s",
+                         value=header.period_s)
+    n, rate = header.period_samples, header.sample_rate_Hz
+    used = channels(campaign, (source,), inputs, False)
+    keep = lines(n, rate, checked_band(band_Hz, rate))
+    drop, remove = chosen_treatment((source,), used, keep, transient, None)
+    mean = average(source, used, keep, drop, remove)
+    n_u, harmonic = len(used.inputs), np.arange(keep.start, keep.stop)
+    size = np.abs(mean.Z[:, :n_u])
+    on = np.any((size > EXCITED * size.max(axis=0, initial=0)) & (size > 0), axis=1)
+    if not np.any(on):
+        raise InputError("expected an excited line in the band", field=field)
+    if np.any(harmonic[on] % 2 == 0):
+        raise InputError("expected an odd multisine; it excites even harmonics, the first at "
+                         f"{harmonic[on & (harmonic % 2 == 0)][0] * rate / n:g} Hz", field=field)
+    between = (harmonic >= harmonic[on][0]) & (harmonic <= harmonic[on][-1])
+    kind = np.where(on, "excited", np.where(harmonic % 2 == 1, "odd", "even"))
+    if not np.any(between & (kind == "odd")):
+        raise InputError("expected odd harmonics that are left out, to detect odd distortion", field=field)
+    if mean.covariance is None:
+        raise InputError("expected at least two settled periods, to tell the noise", field=field)
+    # |Z|^2 is over the samples of a period; a line of amplitude a has |Z|^2 = a^2 n / 4 and mean square a^2 / 2.
+    power = 2 / n * np.abs(mean.Z[between, n_u:]) ** 2
+    noise = 2 / n * np.real(np.einsum("nii->ni", mean.covariance))[between, n_u:]
+    return DistortionLevels(harmonic[between] * rate / n, kind[between], power, noise, used.outputs, used.output_unit)

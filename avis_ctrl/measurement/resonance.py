@@ -1,0 +1,164 @@
+"""Frequency and damping of one measured mode.
+
+Near a lightly damped mode every entry of G is a pole with a smooth background,
+
+    G_ij(jw) = r_ij / (jw - p) + b_ij + c_ij (w - w0),     p = w_n (-zeta + j sqrt(1 - zeta^2)),
+
+with the complex conjugate pole and all other modes in the background. For a given p the other unknowns are linear, so
+the search is over p only (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973), weighted by the
+entries' variances.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+from scipy.optimize import least_squares
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+
+# Half-power bandwidths to each side that the fit tries, narrow first: the wider one is kept while the misfit says that
+# the background is still a straight line there. Fewest lines of a fit.
+REACH, MISFIT, FEWEST_LINES = (1.0, 2.0, 4.0), 1.3, 9
+# Part of near_Hz within which the mode is looked for.
+SEARCH = 0.05
+# Chance that noise passes for a mode; small, as the pole was searched for.
+FALSE_ALARM = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Resonance:
+    """A mode: undamped natural frequency and damping with standard deviations, residues (n_y, n_u) of G in 1/s units.
+
+    misfit : weighted mean square residual, 1 where the model explains all but the noise; standard deviations are
+    multiplied by its root where it is larger. band_Hz, lines : what was fitted.
+    """
+
+    frequency_Hz: float
+    damping: float
+    frequency_std_Hz: float
+    damping_std: float
+    residue: np.ndarray
+    misfit: float
+    band_Hz: tuple[float, float]
+    lines: int
+
+
+def resonance(response: FrequencyResponse, near_Hz: float, *, width_Hz: float | None = None) -> Resonance:
+    """Local fit of one mode near a frequency.
+
+    Parameters
+    ----------
+    near_Hz : the largest response within 5 % of it (or within width_Hz / 2) starts the search.
+    width_Hz : band of the fit around the mode; by default 1, 2 or 4 half-power bandwidths to each side,
+        the widest over which the model still explains all but the noise.
+
+    Raises
+    ------
+    InputError : no lines there. ComputationError : no mode inside the band.
+    """
+    f = response.frequency_Hz
+    reach = SEARCH * near_Hz if width_Hz is None else width_Hz / 2
+    inside = np.flatnonzero(np.abs(f - near_Hz) <= reach)
+    if not (np.isfinite(near_Hz) and near_Hz > 0) or inside.size < 3 or f.size < FEWEST_LINES:
+        raise InputError(f"expected at least three lines within {reach:g} Hz and {FEWEST_LINES} in all; there are "
+                         f"lines from {f[0]:g} to {f[-1]:g} Hz" if f.size else "expected lines", field="near_Hz",
+                         value=near_Hz)
+    size = np.sum(np.abs(response.value) ** 2 / np.mean(np.abs(response.value[inside]) ** 2, axis=0), axis=(1, 2))
+    peak = f[inside[np.argmax(size[inside])]]
+    half = reach if width_Hz is not None else max(reach / 2, FEWEST_LINES / 2 * float(np.median(np.diff(f))))
+    found = _fit(response, peak, half, near_Hz, reach)
+    for width in REACH if width_Hz is None else ():
+        wider = found
+        for _ in range(4):
+            again = _fit(response, wider.frequency_Hz, width * 2 * wider.damping * wider.frequency_Hz, near_Hz, reach,
+                         wider)
+            settled, wider = again.band_Hz == wider.band_Hz, again
+            if settled:
+                break
+        if width > REACH[0] and wider.misfit > max(MISFIT, found.misfit):
+            break
+        found = wider
+    return found
+
+
+def _fit(response: FrequencyResponse, centre: float, half: float, near_Hz: float, reach: float,
+         start: Resonance | None = None) -> Resonance:
+    f = response.frequency_Hz
+    use = np.flatnonzero(np.abs(f - centre) <= half)
+    if use.size < FEWEST_LINES:
+        use = np.sort(np.argsort(np.abs(f - centre), kind="stable")[:FEWEST_LINES])
+    w, w0 = 2 * np.pi * f[use], 2 * np.pi * centre
+    scale = (w[-1] - w[0]) / 2
+    G = response.value[use].reshape(use.size, -1)
+    variance = response.variance()[use].reshape(use.size, -1)
+    floor = np.finfo(float).eps * np.max(np.abs(G)) ** 2
+    weight = 1 / np.sqrt(np.maximum(variance, floor))
+
+    def project(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (lines, entries) and coefficients (entries, 3) for a pole w0 + scale x0, decay scale exp(x1)."""
+        pole = -scale * np.exp(x[1]) + 1j * (w0 + scale * x[0])
+        basis = np.stack([scale / (1j * w - pole), np.ones(w.size), (w - w0) / scale], axis=1)
+        q, r = np.linalg.qr(weight.T[:, :, None] * basis)
+        right = (weight * G).T[:, :, None]
+        along = np.swapaxes(q.conj(), 1, 2) @ right
+        return (right - q @ along)[:, :, 0], np.linalg.solve(r, along)[:, :, 0]
+
+    def stacked(x: np.ndarray) -> np.ndarray:
+        left = project(x)[0].ravel()
+        return np.concatenate([left.real, left.imag])
+
+    decays = (0.03, 0.3) if start is None else (2 * np.pi * start.damping * start.frequency_Hz / scale,)
+    fits = [least_squares(stacked, [0.0, np.clip(np.log(decay), -13.9, 2.9)], bounds=([-1.5, -14.0], [1.5, 3.0]))
+            for decay in decays]
+    best = min(fits, key=lambda s: s.cost)
+    free = 2 * (use.size - 3) * G.shape[1] - 2
+    _check_significant(best.cost, _without_pole(weight, G, w - w0), G.shape[1], free, near_Hz, f[use])
+    # E|e|^2 counts real and imaginary parts, each of half the variance.
+    misfit = 2 * 2 * best.cost / free
+    return _result(best, project(best.x)[1], misfit, scale, w0, f[use], response.value.shape[1:], near_Hz, reach)
+
+
+def _without_pole(weight: np.ndarray, G: np.ndarray, d: np.ndarray) -> float:
+    """Half the weighted square residual of the background alone."""
+    q, _ = np.linalg.qr(weight.T[:, :, None] * np.stack([np.ones(d.size), d / np.abs(d).max()], axis=1))
+    right = (weight * G).T[:, :, None]
+    return float(np.sum(np.abs(right - q @ (np.swapaxes(q, 1, 2) @ right)) ** 2) / 2)
+
+
+def _check_significant(with_pole: float, without: float, entries: int, free: int, near_Hz: float,
+                       f: np.ndarray) -> None:
+    """F test of the pole against the background alone."""
+    added = 2 * entries + 2
+    ratio = (without - with_pole) / added / max(with_pole / free, np.finfo(float).tiny)
+    limit = float(stats.f(added, free).isf(FALSE_ALARM))
+    if ratio < limit:
+        raise ComputationError(f"no mode found near {near_Hz:g} Hz",
+                               measured=f"a pole explains {ratio:.3g} times what noise would give it, from {f[0]:.6g} "
+                                        f"to {f[-1]:.6g} Hz; {limit:.3g} is needed",
+                               cause="no resonance there, or one hidden by noise",
+                               next_step="look at the response, and give near_Hz and width_Hz around a peak")
+
+
+def _result(best: object, coefficients: np.ndarray, misfit: float, scale: float, w0: float, f: np.ndarray,
+            shape: tuple[int, ...], near_Hz: float, reach: float) -> Resonance:
+    x, J = np.asarray(best.x), np.asarray(best.jac)  # type: ignore[attr-defined]
+    decay, turn = scale * np.exp(x[1]), w0 + scale * x[0]
+    natural = np.hypot(decay, turn)
+    if abs(natural / (2 * np.pi) - near_Hz) > 2 * reach or abs(x[0]) >= 1.5 or x[1] >= 3.0 or x[1] <= -14.0:
+        raise ComputationError(f"no mode found near {near_Hz:g} Hz",
+                               measured=f"the fit ended at {natural / (2 * np.pi):.6g} Hz with damping "
+                                        f"{decay / natural:.3g} over {f[0]:.6g} to {f[-1]:.6g} Hz",
+                               cause="no resonance there, or one too broad or too close to another for a local fit",
+                               next_step="look at the response, and give near_Hz and width_Hz around a single peak")
+    # Rows of J are whitened to variance 1/2.
+    covariance = np.linalg.inv(2 * J.T @ J) * max(misfit, 1.0)
+    # d(natural), d(damping) for x: natural^2 = decay^2 + turn^2, damping = decay / natural.
+    by_x = np.array([[turn / natural * scale, decay / natural * decay],
+                     [-decay * turn / natural ** 3 * scale, decay / natural - decay ** 3 / natural ** 3]])
+    spread = np.sqrt(np.diag(by_x @ covariance @ by_x.T))
+    return Resonance(natural / (2 * np.pi), decay / natural, spread[0] / (2 * np.pi), spread[1],
+                     scale * coefficients[:, 0].reshape(shape), float(misfit), (float(f[0]), float(f[-1])), f.size)
