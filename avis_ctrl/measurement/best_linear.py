@@ -59,8 +59,9 @@ def best_linear_approximation(campaign: Campaign, *, band_Hz: Band | None = None
     inputs : names of actuators; by default those that some record drives. The floor's motion is not periodic and
         counts as noise.
     transient : "drop" the periods that still settle (all but two at most); "remove" the transient by local polynomials
-        through the lines between harmonics; "none"; "auto": drop where three or more periods show that the rest is
-        settled, otherwise remove.
+        through the lines between harmonics; "none"; "auto": drop where that leaves half of the periods and these are
+        settled, otherwise drop half of them (none of two) and remove what is left. Removal needs modes that are wider
+        than some four lines of the kept record; a narrower one keeps part of its transient, which counts in C.
     drop : periods to drop, instead of the number found.
     smooth_lines : C is averaged over 2 smooth_lines + 1 excited lines; by default as few as leave 2 n_y + 4 degrees
         of freedom.
@@ -111,10 +112,13 @@ def chosen_treatment(records: Sequence[RecordSource], used: Channels, keep: slic
         raise InputError("expected auto, drop, remove or none", field="transient", value=transient)
     if drop is not None and drop < 0:
         raise InputError("expected 0 or more periods", field="drop", value=drop)
+    count = min(record.header.periods for record in records)
     found, settled = settled_after(records, used, keep) if transient in ("auto", "drop") else (0, False)
-    dropped = found if drop is None else drop
-    repeated = min(record.header.periods for record in records) - dropped >= 2
-    return dropped, transient == "remove" or (transient == "auto" and not settled and drop is None and repeated)
+    if drop is not None or transient != "auto":
+        return found if drop is None else drop, transient == "remove"
+    # A slow transient would cost most of the data; what half of the periods leaves of it is easily removed.
+    dropped = min(found, count // 2)
+    return dropped, (not settled or dropped < found) and count - dropped >= 2
 
 
 def _experiments(means: Sequence[PeriodMean], n_u: int) -> _Experiments:

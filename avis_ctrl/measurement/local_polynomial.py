@@ -106,15 +106,18 @@ def _local_response(campaign: Campaign, rational: bool, band_Hz: Band | None, fr
     used = channels(campaign, records, inputs, floor)
     band = checked_band(band_Hz, campaign.sample_rate_Hz)
     plan = _Plan.of(campaign, records, longest)
-    driven = range(len(used.inputs)) if inputs is not None else _driven(records, used, band, plan)
+    moving, spacing = _driven(records, used, band, plan)
+    driven = list(range(len(used.inputs))) if inputs is not None else moving
     names = tuple(used.inputs[j] for j in driven)
     if not names:
         raise InputError("expected at least one input that is not zero in the band", field="inputs", value=used.inputs)
     n_y = len(used.outputs)
-    width = half_width or least_half_width(plan.count, len(names), n_y, order, rational, plan.spacing)
+    width = half_width
+    if width is None:
+        width = least_half_width(plan.count, len(names), n_y, order, rational, spacing)
     where = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
     fit = LocalFit(where, len(names), n_y, order, width, width * campaign.sample_rate_Hz / plan.shortest, rational)
-    for part in _spectra(records, used, list(driven), band, width, plan):
+    for part in _spectra(records, used, driven, band, width, plan):
         fit.add(*part)
     found = fit.estimate(names)
     kind = "rational" if rational else "polynomial"
@@ -149,18 +152,23 @@ def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz:
     used = channels(campaign, records, None, floor)
     band = checked_band(band_Hz, campaign.sample_rate_Hz)
     plan = _Plan.of(campaign, records, longest_piece)
-    driven = _driven(records, used, band, plan)
+    driven, spacing = _driven(records, used, band, plan)
     n_y = len(used.outputs)
-    width = half_width or least_half_width(plan.count, len(driven), n_y, order, spacing=plan.spacing)
+    width = half_width
+    if width is None:
+        width = least_half_width(plan.count, len(driven), n_y, order, spacing=spacing)
     step = campaign.sample_rate_Hz / plan.shortest
     every = _grid(None, band, plan.shortest, campaign.sample_rate_Hz, width)
+    asked = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
+    if smooth_Hz is not None and not smooth_Hz > 0:
+        raise InputError("expected a positive frequency", field="smooth_Hz", value=smooth_Hz)
     centres = every[width:every.size - width:2 * width + 1]
     fit = LocalFit(centres, len(driven), n_y, order, width, width * step)
-    for part in _spectra(records, used, list(driven), band, width, plan):
+    for part in _spectra(records, used, driven, band, width, plan):
         fit.add(*part)
     found = fit.estimate(tuple(used.inputs[j] for j in driven))
     least = min(-(-(n_y + 2) // found.dof), centres.size)
-    return _smoothed(centres, found.noise, found.dof, np.asarray(frequency_Hz, float), smooth_Hz or width * step, least,
+    return _smoothed(centres, found.noise, found.dof, asked, smooth_Hz or width * step, least,
                      used.outputs, campaign.sample_rate_Hz)
 
 
@@ -184,16 +192,17 @@ def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np
 
 @dataclass(frozen=True)
 class _Plan:
-    """How the records are cut: pieces in all, samples of the shortest, lines between excited ones."""
+    """How the records are cut: pieces in all, samples of the shortest, longest allowed."""
 
     count: int
     shortest: int
-    spacing: int
     longest: int | None
 
     @staticmethod
     def of(campaign: Campaign, records: Sequence[RecordSource], longest: int | None) -> _Plan:
-        sizes, spacing = [], 1
+        if longest is not None and longest < 16:
+            raise InputError("expected at least 16 samples", field="longest_piece", value=longest)
+        sizes: list[int] = []
         for record in records:
             whole, period = record.header.samples, record.header.period_samples
             parts = 1 if longest is None else -(-whole // longest)
@@ -202,9 +211,7 @@ class _Plan:
                 share = max(share // period, 1) * period
                 parts = whole // share
             sizes += [share] * parts
-            if period:
-                spacing = max(spacing, -(-share // period))
-        return _Plan(len(sizes), min(sizes), spacing, longest)
+        return _Plan(len(sizes), min(sizes), longest)
 
 
 def _grid(frequency_Hz: np.ndarray | None, band: Band, samples: int, rate: float, half_width: int) -> np.ndarray:
@@ -251,14 +258,16 @@ def _together(held: list[_Spectra]) -> _Spectra:
     return _Spectra(np.concatenate([p.U for p in held]), np.concatenate([p.Y for p in held]), held[0].line_Hz)
 
 
-def _driven(records: Sequence[RecordSource], used: Channels, band: Band, plan: _Plan) -> list[int]:
-    """Inputs that are not silent in the band in every record, relative to their samples."""
-    moving = np.zeros(len(used.inputs), bool)
+def _driven(records: Sequence[RecordSource], used: Channels, band: Band, plan: _Plan) -> tuple[list[int], int]:
+    """Inputs that are not silent in the band in every record, relative to their samples; and how many lines lie from
+    one excited line to the next, more than one for periodic records."""
+    moving, spacing = np.zeros(len(used.inputs), bool), 1
     for record in records:
-        if np.all(moving):
-            break
-        piece = next(equal_pieces(record, plan.longest))
-        u, _ = used.of(piece)
-        U = transform(u, lines(u.shape[0], record.header.sample_rate_Hz, band))
-        moving |= np.linalg.norm(U, axis=0) > 1e-9 * np.linalg.norm(u, axis=0)
-    return [int(j) for j in np.flatnonzero(moving)]
+        u, _ = used.of(next(equal_pieces(record, plan.longest)))
+        U = np.abs(transform(u, lines(u.shape[0], record.header.sample_rate_Hz, band)))
+        here = np.linalg.norm(U, axis=0) > 1e-9 * np.linalg.norm(u, axis=0)
+        moving |= here
+        if U.size and np.any(here):
+            excited = np.flatnonzero(np.any(U[:, here] > 1e-3 * U[:, here].max(axis=0), axis=1))
+            spacing = max(spacing, round((excited[-1] - excited[0] + 1) / excited.size))
+    return [int(j) for j in np.flatnonzero(moving)], spacing

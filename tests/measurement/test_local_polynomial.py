@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from known_systems import Modal, campaign, squared_error
+from known_systems import Modal, campaign, multisine, squared_error
 from scipy import stats
 
 from avis_ctrl.errors import ComputationError, InputError
@@ -306,11 +306,32 @@ def test_an_input_silent_in_part_of_the_band_is_named_with_the_frequencies(rng):
 @pytest.mark.parametrize(("change", "words"), [
     ({"band_Hz": (50.0, 20.0)}, "band_Hz"), ({"band_Hz": (5.0, 120.0)}, "100 Hz"), ({"order": 9}, "order"),
     ({"half_width": 1}, "half_width"), ({"inputs": ("u7",)}, "u7"), ({"band_Hz": (5.0, 5.5)}, "longer records"),
+    ({"half_width": 0}, "half_width"), ({"longest_piece": 0}, "longest_piece"),
     ({"frequency_Hz": np.array([5.0, 99.99])}, "frequency_Hz"), ({"half_width": 2, "order": 3}, "degrees of freedom")])
 def test_wrong_requests_are_answered(rng, change, words):
     data = noisy(Modal(rng, 2, 2, [25.0], 0.3, RATE), rng, 1000, 1)
     with pytest.raises(InputError, match=words):
         local_polynomial(data, **change)
+
+
+@pytest.mark.parametrize("change", [{"frequency_Hz": [5.0, 150.0]}, {"smooth_Hz": -1.0}, {"frequency_Hz": [9.0, 8.0]}])
+def test_wrong_requests_of_a_noise_covariance_are_answered(rng, change):
+    data = noisy(Modal(rng, 2, 2, [25.0], 0.3, RATE), rng, 1000, 2)
+    with pytest.raises(InputError, match=next(iter(change))):
+        noise_covariance(data, **({"frequency_Hz": [5.0, 50.0]} | change))
+
+
+def test_odd_periodic_records_get_windows_that_hold_enough_lines(rng):
+    """Three periods of odd multisines: one line in six is excited."""
+    system = Modal(rng, 2, 2, [25.0], 0.2, RATE)
+    runs = []
+    for _ in range(2):
+        for period in multisine(rng, 1000, np.arange(11, 400, 2), 2):
+            u = np.tile(period, (3, 1))
+            runs.append((u, system.simulate(u) + 0.001 * rng.standard_normal((3000, 2))))
+    got = local_polynomial(campaign(runs, RATE, "multisine", 5.0), band_Hz=(3.0, 78.0))
+    exact = system.response(got.frequency_Hz)
+    assert np.median(np.abs(got.value - exact) / np.abs(exact).max()) < 0.003
 
 
 def test_a_campaign_of_the_rigs_size_takes_seconds():
