@@ -20,6 +20,7 @@ import scipy.sparse
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.formats.common import reading, short
+from avis_ctrl.measurement.formats.matlab_structure import check_structure
 from avis_ctrl.measurement.formats.stored import open_hdf5
 
 DEEPEST = 8  # nested structs and cells
@@ -63,6 +64,7 @@ def variables(path: Path) -> dict[str, Any]:
         raise InputError("expected a .mat file of version 5 to 7.3", file=path)
     with reading(path, "the .mat file (v5)"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of variables that are written twice or cannot be read: judged where used
+        check_structure(path)
         try:
             loaded = scipy.io.loadmat(path, chars_as_strings=True, struct_as_record=True, squeeze_me=False)
         except MemoryError:

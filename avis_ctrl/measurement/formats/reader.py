@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ def read_measurements(path: str | Path, columns: Mapping[str, Any] | None = None
     known = hints_from(hints)
     path = Path(path)
     with reading(path):
-        if path.is_dir():
+        if os.path.isdir(path):  # False, not an error, for names that no file can have
             return csv.read(path, columns, rig, known)
         path = existing_file(path)
         with path.open("rb") as stream:

@@ -1,0 +1,211 @@
+"""Damaged files of every format: a result that can be trusted, or one line that names the file; never another error."""
+
+from __future__ import annotations
+
+import struct
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
+from avis_ctrl.measurement.formats import (
+    FORMATS,
+    parse_columns,
+    read_measurements,
+    write_campaign,
+    write_frequency_response,
+)
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+
+CSV = "# excitation = noise\r\nt [s];A1 [V];S1 [mV]\r\n" + "".join(f"{i / 8:g};{i % 3},5;-1,{i}\r\n".replace(".", ",")
+                                                                  for i in range(12))
+
+
+def time_function(name, values, binary):
+    """A data set 58 or 58b of a real, single precision, even time response."""
+    head = ["NONE"] * 5 + [f"{1:5d}{0:10d}{0:5d}{0:10d} {name:10s}{1:10d}{3:4d} {'NONE':10s}{0:10d}{0:4d}",
+                           f"{2:10d}{len(values):10d}{1:10d}{0.0:13.5E}{0.125:13.5E}{0.0:13.5E}",
+                           f"{17:10d}{0:5d}{0:5d}{0:5d} {'Time':20s} {'s':20s}",
+                           f"{1:10d}{0:5d}{0:5d}{0:5d} {'Voltage':20s} {'V':20s}"]
+    head += [f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':20s} {'NONE':20s}"] * 2
+    if binary:
+        body = np.asarray(values, "<f4").tobytes()
+        title = f"{58:6d}b{1:6d}{2:6d}{11:12d}{len(body):12d}{0:6d}{0:6d}{0:12d}{0:12d}"
+    else:
+        body = "".join(f"{v:13.5E}" + "\n" * (i % 6 == 5) for i, v in enumerate(values)).encode()
+        title = f"{58:6d}"
+    return ("    -1\n" + "\n".join([title, *head]) + "\n").encode() + body + b"\n    -1\n"
+
+
+class Files(dict):
+    """Bytes by format, that a failing test does not print."""
+
+    def __repr__(self):
+        return f"Files({', '.join(self)})"
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory):
+    """One valid file of each format, as bytes."""
+    rng, folder = np.random.default_rng(3), tmp_path_factory.mktemp("valid")
+    u, y = rng.normal(size=(60, 2)), rng.normal(size=(60, 3))
+    header = RecordHeader("00", 100.0, 60, ("A1", "A2"), ("S1", "S2", "S3"), "noise", 1.0)
+    write_campaign(folder / "h5", Campaign("avis", (Record(header, u, y),)))
+    write_frequency_response(folder / "frf", FrequencyResponse(
+        np.arange(1.0, 9.0), rng.normal(size=(8, 1, 1)) + 0j, None, None, ("A1",), ("S1",),
+        entry_variance=np.ones((8, 1, 1))))
+    fields = {"sample_rate_Hz": 100.0, "excitation": "noise", "level_V": 1.0, "start_s": 0.0, "u": u, "y": y,
+              "u_names": np.array(["A1", "A2"], object), "y_names": np.array(["S1", "S2", "S3"], object)}
+    scipy.io.savemat(folder / "mat", {"records": [fields, fields], "rig": "avis"})
+    scipy.io.savemat(folder / "zip", {"u": u, "y": y, "fs": 100.0}, do_compression=True)
+    (folder / "csv").write_bytes(CSV.encode())
+    for name, binary in (("uff", False), ("58b", True)):
+        (folder / name).write_bytes(time_function("A1", u[:, 0], binary) + time_function("S1", y[:, 0], binary))
+    return Files({path.name: path.read_bytes() for path in folder.iterdir()})
+
+
+FORMATS_FUZZED = ["h5", "frf", "mat", "zip", "csv", "uff", "58b"]
+
+
+def read_whole(path, **hints):
+    """Everything that the file gives, or the refusal; any other exception fails the test."""
+    try:
+        read = read_measurements(path, **hints)
+        if isinstance(read, Campaign):
+            for record in read.records:
+                piece = record.load(0, min(record.header.samples, 1000))
+                assert np.all(np.isfinite(piece.u)) and np.all(np.isfinite(piece.y))
+        return read
+    except InputError as error:
+        text = str(error)
+        assert text.startswith(str(path)) and "\n" not in text and len(text) < 900
+        return text
+
+
+@pytest.mark.parametrize("kind", FORMATS_FUZZED)
+def test_the_valid_files_are_valid(valid, tmp_path, kind):
+    path = tmp_path / "file"
+    path.write_bytes(valid[kind])
+    assert not isinstance(read_whole(path), str)
+
+
+@pytest.mark.parametrize("kind", FORMATS_FUZZED)
+@given(data=st.data())
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+def test_cut_anywhere(valid, tmp_path_factory, kind, data):
+    path = tmp_path_factory.getbasetemp() / f"cut_{kind}"
+    content = valid[kind]
+    path.write_bytes(content[:data.draw(st.integers(0, len(content) - 1))])
+    read_whole(path)
+
+
+@pytest.mark.parametrize("kind", FORMATS_FUZZED)
+@given(data=st.data())
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+def test_bytes_changed_anywhere(valid, tmp_path_factory, kind, data):
+    path = tmp_path_factory.getbasetemp() / f"flip_{kind}"
+    content = bytearray(valid[kind])
+    for _ in range(data.draw(st.integers(1, 4))):
+        # Half of the changes in the first kilobytes, where structure lies.
+        top = data.draw(st.sampled_from([min(len(content), 2000), len(content)]))
+        content[data.draw(st.integers(0, top - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(bytes(content))
+    read_whole(path)
+
+
+@given(content=st.binary(max_size=300), head=st.sampled_from([
+    b"", b"MATLAB 5.0 MAT-file" + b" " * 105 + b"\x00\x01IM", b"MATLAB 7.3 MAT-file", b"\x89HDF\r\n\x1a\n",
+    b"    -1\n    58\n", b"    -1\n    58b     1     2          11         100\n", b"t,u1,y1\n", b"\xff\xfe"]))
+@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
+def test_garbage_behind_a_good_beginning(tmp_path_factory, content, head):
+    path = tmp_path_factory.getbasetemp() / "garbage"
+    path.write_bytes(head + content)
+    read_whole(path)
+
+
+def refusal(path, **hints):
+    with pytest.raises(InputError) as caught:
+        read_measurements(path, **hints)
+    return str(caught.value)
+
+
+def test_what_is_no_measurement_at_all(tmp_path):
+    path = tmp_path / "a.h5"
+    assert refusal(path) == f"{path}: no such file"
+    assert refusal(tmp_path) == f"{tmp_path}: expected CSV files (*.csv) in the directory; there is none"
+    path.write_bytes(b"")
+    assert refusal(path) == f"{path}: the file is empty (0 bytes)"
+    path.write_bytes(np.random.default_rng(1).bytes(5000))
+    assert refusal(path) == (f"{path}: expected HDF5, MATLAB .mat (v5 to v7.3), UFF 58 or CSV; the content is none of "
+                             "them")
+    path.write_text("just words\nand more\n")
+    assert "y = []: expected at least one column; the file has just words" in refusal(path)
+    assert "cannot be opened" in refusal(tmp_path / ("long" * 100))
+    assert "cannot be opened" in refusal(tmp_path / "x\0y")
+
+
+def test_the_content_tells_the_format_not_the_name(valid, tmp_path):
+    for kind in FORMATS_FUZZED:
+        for suffix in ("h5", "mat", "csv", "uff", "txt"):
+            path = tmp_path / f"file.{suffix}"
+            path.write_bytes(valid[kind])
+            assert not isinstance(read_whole(path), str), (kind, suffix)
+
+
+def test_messages_of_cut_files(valid, tmp_path):
+    path = tmp_path / "a"
+    parts = {"h5": (0.5, "the HDF5 file is cut short (Unable to"), "mat": (0.5, "the .mat file (v5) cannot be read;"),
+             "uff": (0.7, "data set 2 (byte "), "58b": (0.3, "of 240 bytes of data are there"),
+             "csv": (0.95, "expected 3 columns, as in the header; there are 1")}
+    for kind, (share, message) in parts.items():
+        path.write_bytes(valid[kind][:int(share * len(valid[kind]))])
+        assert message in refusal(path), kind
+
+
+def test_hints_and_columns_that_nobody_knows(valid, tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(valid["csv"])
+    assert "hint = 'speed': expected one of sample_rate_Hz, excitation" in refusal(path, speed=3)
+    assert "sample_rate_Hz = '1 kHz': expected one number" in refusal(path, sample_rate_Hz="1 kHz")
+    assert "excitation = 'loud': expected one of" in refusal(path, excitation="loud")
+    assert "columns = 'x': expected the roles t, u, y" in refusal(path, columns={"x": "A1"})
+    assert "columns: y = 'S9': not there; the file has t, A1, S1" in refusal(path, columns={"y": "S9", "u": "A1"})
+    path.write_bytes(valid["h5"])
+    assert "period_s = 1.0: an HDF5 campaign states this itself" in refusal(path, period_s=1.0)
+
+
+def test_columns_from_a_command_line():
+    assert parse_columns("u=A1+A2, y=S1,t=time") == {"u": ["A1", "A2"], "y": ["S1"], "t": ["time"]}
+    for wrong in ("", "u", "u=", "u=A1,u=A2", "speed=A1", "u=A1++A2"):
+        with pytest.raises(InputError, match="expected role=name, each role once"):
+            parse_columns(wrong)
+    assert all(word in FORMATS for word in ("HDF5", "MATLAB", "UFF", "CSV"))
+
+
+def test_a_huge_size_in_a_small_file_costs_no_memory(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs.update({"format": "avis-campaign", "version": 1, "rig": "avis"})
+        group = file.create_group("records/00")
+        group.attrs.update({"sample_rate_Hz": 100.0, "excitation": "noise", "level_V": 0.5, "start_s": 0.0})
+        for role in "uy":
+            group.create_dataset(role, (1 << 50, 1), float, chunks=(1024, 1))
+            group[role].attrs.update({"names": [role], "unit": "V"})
+    record = read_measurements(tmp_path / "a.h5").records[0]
+    assert record.load(1 << 49, (1 << 49) + 2).u.shape == (2, 1)
+    with pytest.raises(InputError, match="do not fit in memory"):
+        record.load()
+
+
+def test_a_uff_that_states_a_huge_number_of_values(tmp_path):
+    content = time_function("A1", [1.0] * 12, True)
+    path = tmp_path / "a"
+    path.write_bytes(content.replace(f"{2:10d}{12:10d}".encode(), f"{2:10d}{999999999:10d}".encode()))
+    assert "expected 3999999996 bytes for 999999999 values" in refusal(path)
+    path.write_bytes(content.replace(struct.pack("<f", 1.0), struct.pack("<f", np.nan), 1))
+    assert "expected finite numbers; 1 are not, the first at sample 0 of channel A1" in refusal(path, excitation="rest",
+                                                                                              columns={"y": "A1"})
