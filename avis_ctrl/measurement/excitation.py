@@ -33,6 +33,8 @@ from avis_ctrl.measurement.crest_factor import crest_factor, low_crest_phases, s
 
 Lines = Literal["full", "odd", "odd_detection"]
 Scheme = Literal["orthogonal", "zippered"]
+# Samples times drives times records: 1 GiB.
+MOST_VOLTAGES = 2 ** 27
 # Relative amplitude of the lines: at frequencies [Hz], or one number a line.
 Shape = Callable[[np.ndarray], np.ndarray] | Sequence[float] | np.ndarray
 
@@ -173,6 +175,8 @@ class MultisineSettings:
                 raise InputError(f"expected one of {', '.join(known)}", field=name, value=getattr(self, name))
         for name, least in (("spacing", 1), ("group", 2), ("realisations", 1), ("dealt", 0), ("seed", 0)):
             _whole(getattr(self, name), name, least)
+        experiments = len(self.inputs) if self.scheme == "orthogonal" else 1
+        _check_size(self.realisations * experiments * len(self.inputs) * self.samples, "period_s, realisations")
 
     @property
     def samples(self) -> int:
@@ -284,6 +288,7 @@ class NoiseSettings:
         _check_band(self.band_Hz, self.sample_rate_Hz)
         _whole(self.records, "records", 1)
         _whole(self.seed, "seed", 0)
+        _check_size(self.records * len(self.inputs) * self.duration_s * self.sample_rate_Hz, "duration_s, records")
 
 
 def noise(settings: NoiseSettings) -> ExcitationSignals:
@@ -340,6 +345,12 @@ def _check_band(band_Hz: tuple[float, float], sample_rate_Hz: float) -> None:
     if len(band_Hz) != 2 or not (np.all(np.isfinite(band_Hz)) and 0 < band_Hz[0] <= band_Hz[1] < sample_rate_Hz / 2):
         raise InputError(f"expected two frequencies above 0 and below half the sample rate ({sample_rate_Hz / 2:g} "
                          "Hz), the lower one first", field="band_Hz", value=tuple(band_Hz))
+
+
+def _check_size(voltages: float, field: str) -> None:
+    if voltages > MOST_VOLTAGES:
+        raise InputError(f"expected at most {MOST_VOLTAGES} voltages in all records and drives, which fit into memory; "
+                         f"these are {voltages:.3g}", field=field)
 
 
 def _positive(value: float, name: str) -> None:

@@ -36,19 +36,19 @@ def write_signals(signals: ExcitationSignals, path: str | Path, periods: int = 1
     if not isinstance(periods, (int, np.integer)) or periods < 1 or (periods > 1 and signals.period_s is None):
         raise InputError("expected a whole number, 1 or more (noise is not periodic: 1)", field="periods",
                          value=periods)
-    u = np.tile(signals.u, (1, int(periods), 1))
     writer = {".csv": _write_csv, ".mat": _write_mat}.get(path.suffix.lower(), _write_hdf5)
     try:
-        writer(signals, u, path, rig)
+        writer(signals, int(periods), path, rig)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror or error}", file=path) from None
 
 
-def _write_hdf5(signals: ExcitationSignals, u: np.ndarray, path: Path, rig: str) -> None:
+def _write_hdf5(signals: ExcitationSignals, periods: int, path: Path, rig: str) -> None:
     with h5py.File(path, "w") as file:
         file.attrs.update({"format": "avis-excitation", "version": 1, "rig": rig,
                            "seed": signals.settings.get("seed", 0), "settings": json.dumps(signals.settings)})
-        for k, (record, level) in enumerate(zip(u, signals.rms_V, strict=True)):
+        for k, (one, level) in enumerate(zip(signals.u, signals.rms_V, strict=True)):
+            record = np.tile(one, (periods, 1))
             group = file.create_group(f"records/{k:02d}")
             group.attrs.update({"sample_rate_Hz": signals.sample_rate_Hz, "excitation": signals.kind,
                                 "level_V": float(np.sqrt(np.mean(level ** 2))),
@@ -59,23 +59,23 @@ def _write_hdf5(signals: ExcitationSignals, u: np.ndarray, path: Path, rig: str)
             volts.attrs.update({"names": list(signals.inputs), "unit": "V"})
 
 
-def _write_csv(signals: ExcitationSignals, u: np.ndarray, path: Path, rig: str) -> None:
+def _write_csv(signals: ExcitationSignals, periods: int, path: Path, rig: str) -> None:
     settings = {"rig": rig, "excitation": signals.kind, "period_s": signals.period_s, **signals.settings}
-    time = np.arange(u.shape[1]) / signals.sample_rate_Hz
+    time = np.arange(periods * signals.u.shape[1]) / signals.sample_rate_Hz
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.writelines(f"# {key} = {json.dumps(value)}\n" for key, value in settings.items())
         file.write(",".join(["record", "time_s", *signals.inputs]) + "\n")
-        for k, record in enumerate(u):
-            rows = zip(time.tolist(), record.tolist(), strict=True)
+        for k, record in enumerate(signals.u):
+            rows = zip(time.tolist(), np.tile(record, (periods, 1)).tolist(), strict=True)
             file.writelines(f"{k},{t!r},{','.join(map(repr, row))}\n" for t, row in rows)
 
 
-def _write_mat(signals: ExcitationSignals, u: np.ndarray, path: Path, rig: str) -> None:
-    if u.nbytes >= MAT5_BYTES:
+def _write_mat(signals: ExcitationSignals, periods: int, path: Path, rig: str) -> None:
+    if (total := signals.u.nbytes * periods) >= MAT5_BYTES:
         raise InputError(f"expected less than {MAT5_BYTES / 2 ** 30:g} GiB in a .mat file; write .h5 instead",
-                         file=path, field="u", value=f"{u.nbytes / 2 ** 30:.1f} GiB")
-    content = {"u": np.moveaxis(u, 0, -1), "names": np.array(signals.inputs, object), "rig": rig,
-               "sample_rate_Hz": signals.sample_rate_Hz,
+                         file=path, field="u", value=f"{total / 2 ** 30:.1f} GiB")
+    content = {"u": np.moveaxis(np.tile(signals.u, (1, periods, 1)), 0, -1),
+               "names": np.array(signals.inputs, object), "rig": rig, "sample_rate_Hz": signals.sample_rate_Hz,
                "period_s": np.nan if signals.period_s is None else signals.period_s, "excitation": signals.kind,
                "level_V": signals.rms_V, "seed": signals.settings.get("seed", 0),
                "settings": json.dumps(signals.settings)}

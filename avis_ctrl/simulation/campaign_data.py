@@ -37,8 +37,10 @@ ASSUMED_RANGE_V = 10.0
 DEFAULT_LEVEL_PERCENT = 50.0
 # The amplifiers of rigs with accelerometers, as in design files.
 ACCELEROMETER_AMPLIFIER_HZ = 300.0
-# What the draws of a campaign's seed are for.
-_SIGNALS, _FLOOR, _NOISE, _FLOOR_SENSOR = range(4)
+# What the draws of a campaign's seed are for; not 0, since trailing zeros do not change a seed.
+_SIGNALS, _FLOOR, _NOISE, _FLOOR_SENSOR = range(1, 5)
+# What fits into memory: a record takes some 600 bytes a sample while it is simulated, and 150 after that.
+MOST_SAMPLES, MOST_SAMPLES_IN_ALL = 4_000_000, 20_000_000
 
 # (records done, records in all, name of the one just done)
 Progress = Callable[[int, int, str], None]
@@ -117,9 +119,15 @@ def _ambient(rig: Rig, plan: CampaignPlan) -> SpectrumModel | None:
 
 def _signals(loop: SampledLoop, plan: CampaignPlan, seed: int) -> Iterator[_Planned]:
     """Every record of the plan in order, at its level."""
-    fs, dealt = loop.sample_rate_Hz, 0
+    fs, dealt, total = loop.sample_rate_Hz, 0, 0
     for line, one in enumerate(plan.record):
         samples = round((one.duration_s or plan.duration_s) * fs)
+        orthogonal = one.excitation == "multisine" and plan.multisine.scheme == "orthogonal"
+        total += samples * one.records * (loop.n_drives if orthogonal else 1)
+        if not 2 <= samples <= MOST_SAMPLES or total > MOST_SAMPLES_IN_ALL:
+            raise InputError(f"expected records of 2 to {MOST_SAMPLES} samples at {fs:g} Hz, and no more than "
+                             f"{MOST_SAMPLES_IN_ALL} in all records", field=f"record[{line + 1}].duration_s",
+                             value=one.duration_s or plan.duration_s)
         if one.excitation == "floor":
             _check_floor_band(one.band_Hz or plan.band_Hz, samples, fs, f"record[{line + 1}].band_Hz")
         if one.excitation in ("rest", "floor"):
@@ -154,13 +162,12 @@ def _drawn(loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int,
     if one.excitation == "noise":
         return noise(NoiseSettings(names, fs, samples / fs, (low, high), loop.limit_V, None, one.records, seed))
     m = plan.multisine
-    signals = multisine(MultisineSettings(names, fs, m.period_s, (low, high), loop.limit_V, None, m.lines, m.spacing,
-                                          m.group, m.scheme, one.records, dealt, None, m.compensate_hold, m.low_crest,
-                                          seed))
-    if samples < 2 * signals.u.shape[1]:
+    if samples < 2 * m.period_s * fs * (1 - 1e-9):
         raise InputError(f"expected at least two periods of {m.period_s:g} s: the first holds the transient",
                          field="duration_s", value=samples / fs)
-    return signals
+    return multisine(MultisineSettings(names, fs, m.period_s, (low, high), loop.limit_V, None, m.lines, m.spacing,
+                                       m.group, m.scheme, one.records, dealt, None, m.compensate_hold, m.low_crest,
+                                       seed))
 
 
 def _played(u: np.ndarray, samples: int) -> np.ndarray:

@@ -6,9 +6,10 @@ expected.
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import ValidationError
 
@@ -17,7 +18,7 @@ from avis_ctrl.rigs.file_errors import first_complaint
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
 
-__all__ = ["CampaignPlan", "default_plan", "plan_from_table", "read_plan"]
+__all__ = ["CampaignPlan", "default_plan", "plan_from_table", "plan_toml", "read_plan"]
 
 # Where the rig's file does not say how much its floor moves: what the AVIS file says, and a floor shaken by
 # hundred times as much, which the drives' noise does not hide [m/s].
@@ -71,3 +72,19 @@ def default_plan(rig: Rig, scheme: Literal["zippered", "orthogonal"] = "zippered
     truth = {"perturb_percent": 5.0, "perturb_damping_percent": 20.0} if perturbed else {}
     return plan_from_table({"title": f"Default campaign of {rig.name}", "duration_s": duration_s, "ambient": ambient,
                             "multisine": {"scheme": scheme}, "truth": truth, "record": records})
+
+
+def plan_toml(plan: CampaignPlan) -> str:
+    """The plan as a file that `read_plan` reads back; keys that are absent by default stay so."""
+    content = plan.model_dump(exclude_none=True)
+    records = content.pop("record")
+    sections = [("", {key: value for key, value in content.items() if not isinstance(value, dict)})]
+    sections += [(f"[{key}]", value) for key, value in content.items() if isinstance(value, dict)]
+    sections += [("[[record]]", record) for record in records]
+    return "\n".join("\n".join([title] * bool(title) + [f"{key} = {_toml(value)}" for key, value in lines.items()])
+                     + "\n" for title, lines in sections)
+
+
+def _toml(value: Any) -> str:
+    # JSON writes numbers, booleans, strings and lists as TOML does, but for one character, which TOML wants escaped.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

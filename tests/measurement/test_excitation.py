@@ -192,6 +192,10 @@ def test_files_give_back_the_samples_the_seed_and_the_settings(tmp_path):
                                     ("no/such/u.csv", 1, "written"), ("no/such/u.mat", 1, "written")):
         with pytest.raises(InputError, match=expected):
             write_signals(signals, tmp_path / name, periods=periods)
+    with pytest.raises(InputError, match="fit into memory"):
+        NoiseSettings(("a",), 1000.0, 1e9, (1.0, 100.0), 10.0, 1.0)
+    with pytest.raises(InputError, match=r"write \.h5 instead"):
+        write_signals(signals, tmp_path / "u.mat", periods=10 ** 9)
     one = noise(NoiseSettings(("a",), 1000.0, 5.0, (1.0, 100.0), 10.0, 1.0))
     with pytest.raises(InputError, match="not periodic"):
         write_signals(one, tmp_path / "n.h5", periods=2)
@@ -204,7 +208,9 @@ WRONG = [({"inputs": ()}, "inputs"), ({"inputs": ("a", "a")}, "inputs"), ({"samp
          ({"band_Hz": (0.0, 10.0)}, "band_Hz"), ({"band_Hz": (20.0, 10.0)}, "band_Hz"),
          ({"band_Hz": (1.0, 250.0)}, "below half the sample rate"), ({"band_Hz": (1.1, 1.2)}, "at least 1 line"),
          ({"band_Hz": (1.0, 1.5), "scheme": "zippered"}, "at least 3 lines"), ({"lines": "even"}, "lines"),
-         ({"scheme": "none"}, "scheme"), ({"spacing": 0}, "spacing"), ({"dealt": -1}, "dealt"), ({"group": 1}, "group"),
+         ({"scheme": "none"}, "scheme"), ({"spacing": 0}, "spacing"), ({"dealt": -1}, "dealt"),
+         ({"period_s": 1e6}, "fit into memory"), ({"realisations": 10 ** 9}, "fit into memory"),
+         ({"group": 1}, "group"),
          ({"realisations": 1.5}, "realisations"), ({"seed": -1}, "seed"), ({"rms_V": 0.0}, "rms_V"),
          ({"limit_V": np.inf}, "limit_V"), ({"shape": np.zeros(119)}, "shape"), ({"shape": [1.0]}, "119 finite"),
          ({"shape": lambda f: f * np.nan}, "shape")]

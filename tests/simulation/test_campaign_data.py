@@ -220,6 +220,9 @@ def test_the_shipped_rigs_do_not_clip_by_default():
     ("avis", [{"excitation": "floor", "floor_rms_m_per_s": 1e-5}], {"band_Hz": [1.0, 600.0]}, r"record\[1\].band_Hz"),
     ("avis", [{"excitation": "floor", "floor_rms_m_per_s": 1e-5}], {"band_Hz": [1.01, 1.02]}, r"record\[1\].band_Hz"),
     ("avis", [{"excitation": "multisine"}], {"multisine": {"period_s": 1.00005}}, "period_s.*whole number"),
+    ("avis", [{"excitation": "floor", "floor_rms_m_per_s": 1e-5}], {"duration_s": 1e-4}, r"record\[1\].duration_s"),
+    ("avis", [{"excitation": "rest", "records": 200}], {"duration_s": 600.0}, r"record\[1\].duration_s.*in all"),
+    ("avis", [{"excitation": "rest"}], {"duration_s": 36000.0}, r"record\[1\].duration_s"),
     ("halcyonics", [{"excitation": "rest"}], {"ambient": {}}, "ambient.velocity_rms_m_per_s: missing"),
 ])
 def test_plans_that_a_rig_cannot_follow(name, records, changes, expected):
