@@ -10,11 +10,12 @@ factor rate, a move m leaves m rate/(1 - rate). Each result carries that distanc
 Beside the source (benchmarks/sequential_fit.py computes all of this; data simulated from the printed values): the
 loaded fit needs 6 rounds where the source needed 4. The rounds depend on the load's mass, which the source does not
 print: with 5 kg or less they are 4, with the 10 kg assumed in the rig file the rate is 0.83 and the 5 % rule leaves L7
-12 % and I_yy 4 % from the rest point. I_yy low, I_zz and k_r high is how the unfinished rounds err, and how the
-source's final values differ from its actual ones. Measurement noise explains none of the source's differences: it
-moves L7 by some 0.2 %. Small errors of what is taken as known move the rest point far more: e_1 high by 2 % moves L7 by
-11 %, d_3 changed by 10 % under the load moves L8 by 14 %. Which of these acted on the source's hardware cannot be said
-from what it prints.
+12 % and I_yy 4 % from the rest point. Unfinished rounds leave I_yy low, I_zz high and k_r above its unloaded value, as
+in the source's final column; but they leave L7 too large where the source's is too small, and L8 nearly right where
+the source's is a third too small, so they are not the whole of it. Measurement noise is no explanation: it moves L7 by
+some 0.2 %. Small errors of what is taken as known move the rest point far more: e_1 high by 2 % moves L7 by 11 %, in
+the source's direction, d_3 changed by 10 % under the load moves L8 by 14 %. Which of these acted on the source's
+hardware cannot be said from what it prints.
 
 What is compared is X/V, displacement per volt, for every test. The source divides the measured X/V by e_r and
 compares X/F_r (eq. 32). With e_r known both are the same but for a constant factor. Where e_r is what the test
@@ -213,8 +214,8 @@ def joint_fit(rig: Halcyonics, tests: Sequence[TestCase], measured: MeasuredTest
               band_Hz: tuple[float, float] = BAND_HZ) -> JointResult:
     """All parameters from all tests at once, weighted by the measured variances: what the sequential fit is judged by.
 
-    `rig` holds the starting values: take those of a sequential fit. From the printed start
-    of Table 2 the search ended in a wrong minimum or ran away in 2 of 30 noises, from the sequential fit in none. Raises as `sequential_fit`.
+    `rig` holds the starting values: take those of a sequential fit. From the printed start of Table 2 the search ended
+    in a wrong minimum or ran away in 2 of 30 noises, from the sequential fit in none. Raises as `sequential_fit`.
     """
     problem = Problem(rig, tests, measured.between(*band_Hz), "variance")
     theta = problem.minimise(problem.tests, problem.names, problem.start)
