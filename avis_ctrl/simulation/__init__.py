@@ -1,4 +1,4 @@
-"""The nonlinear table under its digital controller, the linear prediction beside it, and measurement campaigns on it."""
+"""The nonlinear table under its digital controller, the linear prediction beside it, and campaigns measured on it."""
 
 from avis_ctrl.simulation.campaign import PlantCheck, SimulationCheck, check_designs, judge
 from avis_ctrl.simulation.campaign_data import simulate_campaign
