@@ -1,31 +1,17 @@
-"""Gates that compare each channel with what the model expects of it: exchanged channels and polarity.
-
-Measured and expected responses pass through the same estimator (H1 over the same segments of the same u, the model's
-y computed in the frequency domain), so that leakage changes both alike. With a channel's row (or column) M of the
-measured
-and E of the expected response, similarity is the real correlation
-
-    c_ik = Re sum w E_k* M_i / sqrt(sum w |E_k|^2  sum w |M_i|^2),   w(f) = 1 / (|E(f)|^2 + noise(f)),  Frobenius norms
-
-so that each frequency counts alike where the model expects something above the noise. It feels magnitude and phase.
-"""
+"""Gates that compare each channel with what the model expects of it: exchanged channels and polarity."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.gates.channel_faults import MARGIN, Faults, compare, explain
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Response, Series, Severity
-from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.h1 import Spectra, segment_length, spectra, usable
 
-# The other channel must agree better than the own one by this much in correlation (of at most 1).
-MARGIN = 0.15
-# A sign counts where the correlation is at least this large.
-CLEAR = 0.3
 # Two channels are one where their difference is below this part of either, after scaling.
 COPY = 1e-3
 
@@ -38,37 +24,14 @@ class _Kept:
     copies: list[tuple[int, int, float, float]]
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """Inner products of measured entry (i, j) with expected entry (k, l), and what normalises them.
+class ChannelMap(Gate):
+    """`ChannelOrder` and `Polarity`, which look at the same."""
 
-    C : (n_y, n_y, n_u, n_u), index i, k, j, l; rows_M, rows_E : (n_y,) and columns_M, columns_E : (n_u,) norms.
-    standard : largest standard deviation that noise gives a correlation.
-    """
+    name = "channel map"
 
-    C: np.ndarray
-    rows_M: np.ndarray
-    rows_E: np.ndarray
-    columns_M: np.ndarray
-    columns_E: np.ndarray
-    measured: H1
-    standard: float
-
-    def rows(self, q: np.ndarray, c: np.ndarray | None = None) -> np.ndarray:
-        """(n_y, n_y) correlation of measured row i with expected row k, columns matched by q with signs c."""
-        j = np.arange(len(q))
-        own = self.C[:, :, j, q] @ (np.ones(len(q)) if c is None else c)
-        return own / (self.rows_M[:, None] * self.rows_E)
-
-    def columns(self, p: np.ndarray, r: np.ndarray | None = None) -> np.ndarray:
-        """(n_u, n_u), the same for columns, with rows matched by p with signs r."""
-        i = np.arange(len(p))
-        own = np.einsum("i,ijl->jl", np.ones(len(p)) if r is None else r, self.C[i, p])
-        return own / (self.columns_M[:, None] * self.columns_E)
-
-
-class _Compared(Gate):
-    """What both gates look at."""
+    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+        of = ChannelOrder(), Polarity()
+        return [finding for gate in of for finding in gate.conclude(kept, campaign, expectation)]
 
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
         copies = _copies(seen)
@@ -86,15 +49,14 @@ class _Compared(Gate):
         return _Kept(seen.header.name, measured, expected, copies)
 
 
-class ChannelOrder(_Compared):
+class ChannelOrder:
     """Exchanged or mislabelled channels, and copies of one channel under two names.
 
-    With a model: the assignment of measured to expected rows (sensors) and columns (drives) of largest summed
-    |correlation|,
-    alternating between the two. An alarm needs each exchanged channel to agree better with the other's expectation by
-    0.15 + 5 standard deviations of the correlation's noise, so that the noise's part of false alarms is below
-    1e-6 each; 0.15 is above what stiffness errors of 5 % and damping errors of 20 % do (measured:
-    tests/measurement/test_gates_channels.py).
+    With a model: the fewest exchanges and flips that explain the measured rows (sensors) and columns (drives), see
+    `explain`. An exchange needs a gain in correlation of 0.15 + 5 standard deviations of its noise for each of the two,
+    so
+    that noise alone raises less than 1e-5 alarms; 0.15 is above what stiffness errors of 5 % and damping errors of
+    20 % do (tests/measurement/test_gates_channels.py).
     Without one, copies only: a channel that equals another one times a constant within 0.1 % of its r.m.s.; independent
     sensor noise of more than that keeps true channels apart.
     """
@@ -103,7 +65,7 @@ class ChannelOrder(_Compared):
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         found = self._copied(kept, campaign)
-        comparison = compare(kept)
+        comparison = compare(_pairs(kept))
         if comparison is None:
             if not found:
                 why = "no model was given" if expectation.response is None else "too few driven samples"
@@ -116,11 +78,12 @@ class ChannelOrder(_Compared):
                     )
                 )
             return found
-        p, q = assignment(comparison)
         limit = MARGIN + 5 * comparison.standard
-        rows, columns = np.abs(comparison.rows(q)), np.abs(comparison.columns(p))
-        found += self._exchanged(rows, p, campaign.y_names, "Sensor", limit)
-        found += self._exchanged(columns, q, campaign.u_names, "Drive", limit)
+        faults = explain(comparison, limit)
+        rows, columns = comparison.rows(faults.q, faults.c), comparison.columns(faults.p, faults.r)
+        rows, columns = faults.r[:, None] * rows, faults.c[:, None] * columns
+        found += self._exchanged(rows, faults, "row", campaign.y_names, limit)
+        found += self._exchanged(columns, faults, "column", campaign.u_names, limit)
         if not found:
             own = np.diag(rows)
             worst = int(np.argmin(own))
@@ -137,16 +100,13 @@ class ChannelOrder(_Compared):
         return found
 
     def _exchanged(
-        self, c: np.ndarray, p: np.ndarray, names: tuple[str, ...], what: str, limit: float
+        self, c: np.ndarray, faults: Faults, kind: str, names: tuple[str, ...], limit: float
     ) -> list[Finding]:
-        clear = [i for i in range(len(p)) if p[i] != i and c[i, p[i]] - c[i, i] > limit]
+        p, what = (faults.p, "Sensor") if kind == "row" else (faults.q, "Drive")
         found: list[Finding] = []
-        if not clear:
-            return found
         done: set[int] = set()
-        picture = _picture(c, names, what, limit)
-        for i in clear:
-            if i in done:
+        for i in range(len(p)):
+            if p[i] == i or i in done:
                 continue
             cycle, k = [i], int(p[i])
             while k != i:
@@ -154,10 +114,10 @@ class ChannelOrder(_Compared):
                 k = int(p[k])
             done.update(cycle)
             pair = tuple(names[j] for j in cycle)
-            gain = min(c[j, p[j]] - c[j, j] for j in cycle)
+            gain = min(faults.after[kind, j] - faults.before[kind, j] for j in cycle)
             listed = "; ".join(
-                f"{names[j]!r} agrees with the model's {names[int(p[j])]!r} by {c[j, p[j]]:.2f}, with its own "
-                f"by {c[j, j]:.2f}"
+                f"{names[j]!r} agrees with the model's {names[int(p[j])]!r} by {faults.after[kind, j]:.2f}, with its"
+                f" own by {faults.before[kind, j]:.2f}"
                 for j in cycle
             )
             verb = "are exchanged" if len(pair) == 2 else "are mixed up"
@@ -170,7 +130,7 @@ class ChannelOrder(_Compared):
                     pair,
                     value=float(gain),
                     limit=limit,
-                    picture=picture,
+                    picture=_picture(c, names, what, limit),
                 )
             )
         return found
@@ -198,22 +158,19 @@ class ChannelOrder(_Compared):
         return found
 
 
-class Polarity(_Compared):
+class Polarity:
     """Flipped signs of drives (columns) and sensors (rows).
 
-    Signs r_i, c_j in {-1, 1} that maximise sum r_i c_j C_ij of the correlations of all entries with their own
-    expectation. The
-    solution with the fewest flips is named; flipping all sensors cannot be told from flipping all drives, and the
-    sentence says
-    so where the two are equally many. A sign counts where |correlation| exceeds 0.3 + 5 standard deviations of its
-    noise:
-    below 1e-6 false alarms each.
+    Found by `explain` with the exchanges: a channel counts as flipped where its correlation with its own expectation
+    is below -(0.15 + 5 standard deviations of its noise), which noise alone reaches less than once in 1e6. Flipping all
+    sensors cannot be told from flipping all drives: the explanation with fewer flips is named, and the sentence says so
+    where both have equally many.
     """
 
     name = "polarity"
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        comparison = compare(kept)
+        comparison = compare(_pairs(kept))
         if comparison is None:
             why = "no model was given" if expectation.response is None else "too few driven samples"
             x = np.arange(len(campaign.y_names))
@@ -231,12 +188,11 @@ class Polarity(_Compared):
                     picture=picture,
                 )
             ]
-        p, q = assignment(comparison)
-        own = comparison.C[np.arange(len(p)), p][:, np.arange(len(q)), q]
-        r, c = signs(own / (comparison.rows_M * comparison.rows_E[p])[:, None])
+        limit = MARGIN + 5 * comparison.standard
+        faults = explain(comparison, limit)
+        p, q, r, c = faults.p, faults.q, faults.r, faults.c
         row = np.diag(comparison.rows(q, c)[:, p])
         column = np.diag(comparison.columns(p, r)[:, q])
-        limit = CLEAR + 5 * comparison.standard
         picture = Picture(
             "Correlation of each channel with its expected response",
             "channel number (sensors, then drives)",
@@ -245,7 +201,7 @@ class Polarity(_Compared):
                 Series("sensors", np.arange(len(p)), row, "bars"),
                 Series("drives", len(p) + np.arange(len(q)), column, "bars"),
             ),
-            (Limit("clear", limit), Limit("clear", -limit)),
+            (Limit("opposite sign", -limit),),
         )
         found = []
         both = np.count_nonzero(r < 0) + np.count_nonzero(c < 0)
@@ -255,7 +211,7 @@ class Polarity(_Compared):
             (r, np.abs(row), campaign.y_names, "Sensor"),
             (c, np.abs(column), campaign.u_names, "Drive"),
         ):
-            for k in np.flatnonzero((flipped < 0) & (correlation > limit)):
+            for k in np.flatnonzero(flipped < 0):
                 severity: Severity = "stop"
                 found.append(
                     Finding(
@@ -289,9 +245,9 @@ def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str,
     n = len(u) if wrap else 2 * len(u)
     f = np.fft.rfftfreq(n, 1 / rate)
     U = np.fft.rfft(u, n, axis=0)
-    # Lines without power need no response of the model.
+    # Lines 60 dB down need no response of the model.
     power = np.sum(np.abs(U) ** 2, axis=1)
-    keep = power > 1e-10 * power.max(initial=0.0)
+    keep = power > 1e-6 * power.max(initial=0.0)
     keep[0] = False
     Y: np.ndarray | None = None
     lines = np.flatnonzero(keep)
@@ -307,67 +263,8 @@ def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str,
     return np.fft.irfft(Y, n, axis=0)[: len(u)]
 
 
-def compare(kept: list[_Kept]) -> Comparison | None:
-    """Correlations over all driven records of the commonest segment length."""
-    pairs = [(k.measured, k.expected) for k in kept if k.measured is not None and k.expected is not None]
-    if not pairs:
-        return None
-    lengths = [len(m.f) for m, _ in pairs]
-    common = max(set(lengths), key=lengths.count)
-    chosen = [(m, e) for m, e in pairs if len(m.f) == common]
-    measured, expected = h1([m for m, _ in chosen]), h1([e for _, e in chosen])
-    if measured is None or expected is None:
-        return None
-    M, E = measured.G, expected.G
-    size = np.linalg.norm(E, axis=(1, 2))
-    inverse = np.linalg.pinv(measured.gram, hermitian=True)
-    spread = np.sqrt(np.einsum("fi,fjj->fij", measured.noise, inverse).real.clip(0))
-    w = 1 / np.maximum(size**2 + np.sum(spread**2, axis=(1, 2)), 1e-300)
-    C = np.einsum("f,fij,fkl->ikjl", w, M, E.conj(), optimize=True).real
-    rows_M, rows_E, columns_M, columns_E = (
-        np.maximum(np.sqrt(np.einsum(to, w, np.abs(A) ** 2)), 1e-300) for to in ("f,fij->i", "f,fij->j") for A in (M, E)
-    )
-    variance = np.einsum("f,fij,fij->ij", w**2, spread**2, np.abs(E) ** 2, optimize=True) / 2
-    live = columns_M > 1e-200
-    standard = max(
-        float(np.max(np.sqrt(variance.sum(axis=1)) / (rows_M * rows_E))),
-        float(np.max((np.sqrt(variance.sum(axis=0)) / (columns_M * columns_E))[live], initial=0.0)),
-    )
-    return Comparison(C, rows_M, rows_E, columns_M, columns_E, measured, standard)
-
-
-def assignment(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
-    """p (n_y,), q (n_u,): measured row i is expected row p[i], measured column j is expected column q[j]."""
-    p, q = np.arange(len(comparison.rows_M)), np.arange(len(comparison.columns_M))
-    for _ in range(4):
-        before = p.copy(), q.copy()
-        p = _best(np.abs(comparison.rows(q)))
-        q = _best(np.abs(comparison.columns(p)))
-        if np.array_equal(p, before[0]) and np.array_equal(q, before[1]):
-            break
-    return p, q
-
-
-def _best(c: np.ndarray) -> np.ndarray:
-    return np.asarray(linear_sum_assignment(-c)[1])
-
-
-def signs(own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """r (n_y,), c (n_u,) of +-1 that maximise r own c, with the fewest -1; +1 where a channel has no say."""
-    best: tuple[float, int, np.ndarray, np.ndarray] | None = None
-    small = own if own.shape[0] <= own.shape[1] else own.T
-    n = min(small.shape[0], 14)
-    for code in range(1 << n):
-        a = np.ones(small.shape[0])
-        a[:n] = [-1.0 if code >> k & 1 else 1.0 for k in range(n)]
-        reach = a @ small
-        b = np.where(reach < 0, -1.0, 1.0)
-        score, flips = float(np.abs(reach).sum()), int(np.sum(a < 0) + np.sum(b < 0))
-        if best is None or score > best[0] * (1 + 1e-9) + 1e-12 or (score > best[0] * (1 - 1e-9) and flips < best[1]):
-            best = score, flips, a, b
-    assert best is not None
-    a, b = best[2], best[3]
-    return (a, b) if own.shape[0] <= own.shape[1] else (b, a)
+def _pairs(kept: list[_Kept]) -> list[tuple[Spectra, Spectra]]:
+    return [(k.measured, k.expected) for k in kept if k.measured is not None and k.expected is not None]
 
 
 def _order(names: tuple[str, ...], expected: tuple[str, ...] | None, rows: int) -> list[int] | None:

@@ -72,7 +72,17 @@ class DeadChannel(Gate):
         traces = {k: (t[(part := slice(max(0, at - n), at + 2 * n))], y[part, k]) for k, (n, at) in stuck.items()}
         codes = np.array([len(np.unique(y[: 1 << 14, k])) for k in range(y.shape[1])])
         spread = np.ptp(np.concatenate([p.u for p in seen.pieces]), axis=0)
-        return _Kept(seen.header.name, seen.driven, y.std(axis=0), spread, codes, longest, stuck, _excess(seen), traces)
+        return _Kept(
+            seen.header.name,
+            seen.driven,
+            np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0),
+            spread,
+            codes,
+            longest,
+            stuck,
+            _excess(seen),
+            traces,
+        )
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         names = campaign.y_names

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.measurement.gates.channel_map import ChannelOrder, Polarity
+from avis_ctrl.measurement.gates.channel_map import ChannelMap
 from avis_ctrl.measurement.gates.clipping import Clipping
 from avis_ctrl.measurement.gates.dead_channel import DeadChannel
 from avis_ctrl.measurement.gates.excerpt import LONGEST, Gate, excerpt
@@ -21,8 +21,7 @@ from avis_ctrl.measurement.gates.stepped_sine import SteppedSine
 GATES: tuple[type[Gate], ...] = (
     Clipping,
     DeadChannel,
-    ChannelOrder,
-    Polarity,
+    ChannelMap,
     SteppedSine,
     MissingSamples,
     Hum,

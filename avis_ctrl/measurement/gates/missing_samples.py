@@ -11,12 +11,14 @@ from scipy import stats
 from avis_ctrl.measurement.campaign import Campaign, RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series
-from avis_ctrl.measurement.gates.h1 import h1, segment_length, spectra
+from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, segment_length, spectra
 
 # A repeated block has at least this many rows, equal in every channel.
 BLOCK = 16
 # A jump of the delay smaller than this many samples is no lost sample.
 JUMP = 0.5
+# Delays are looked for up to so many samples either way.
+LONGEST_DELAY = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +27,6 @@ class _Kept:
     block: tuple[int, int, int] | None
     t: np.ndarray
     delay: np.ndarray
-    standard: np.ndarray
     clock: np.ndarray | None
 
 
@@ -35,7 +36,7 @@ class MissingSamples(Gate):
     Lost samples shift y against the commanded u. In each segment the delay of y behind H1 u is fitted to the phase of
     the driven lines, weighted by the residual; the largest step between means of the segments before and after any
     instant is
-    tested (normal distribution with the segments' own scatter, 1 % shared over instants and records; Student's t for
+    tested (Student's t with the segments' own scatter, 1 % shared over instants, records and the three estimates of H1;
     few segments), and must exceed half a sample. Where rows were lost from u and y together, a periodic u shows it:
     each
     period is compared with the first by circular correlation, exactly, for u is commanded.
@@ -46,14 +47,12 @@ class MissingSamples(Gate):
     name = "missing samples"
 
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
-        t, delay, standard = delays(seen)
-        return _Kept(
-            seen.header, repeated_block(seen.first.y, seen.header.period_samples), t, delay, standard, _clock(seen)
-        )
+        t, delay = delays(seen)
+        return _Kept(seen.header, repeated_block(seen.first.y, seen.header.period_samples), t, delay, _clock(seen))
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         found = self._overlaps(kept)
-        level = FALSE_ALARM / max(1, sum(len(k.t) for k in kept))
+        level = FALSE_ALARM / max(1, sum(k.delay.size for k in kept))
         for k in kept:
             picture = _picture(k)
             rate, name = k.header.sample_rate_Hz, k.header.name
@@ -78,9 +77,9 @@ class MissingSamples(Gate):
                     Finding(
                         self.name,
                         "stop",
-                        f"The commanded voltage of record {name} is {abs(k.clock[p]):g} samples off its period of"
-                        f" {k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, or the stated"
-                        " period is wrong. Check period_s, or repeat the record.",
+                        f"The commanded voltage of record {name} is {abs(k.clock[-1] or k.clock[p]):g} samples off its"
+                        f" period of {k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, or"
+                        " the stated period is wrong. Check period_s, or repeat the record.",
                         (),
                         (name,),
                         float(k.clock[p]),
@@ -88,7 +87,7 @@ class MissingSamples(Gate):
                         picture,
                     )
                 )
-            step = delay_step(k.delay, level)
+            step = largest_step(k.delay, level)
             if step is not None and abs(step[1]) > JUMP:
                 at, size = step
                 found.append(
@@ -109,7 +108,7 @@ class MissingSamples(Gate):
         if not found:
             longest = max(kept, key=lambda k: len(k.t))
             tested = sum(len(k.t) > 3 for k in kept)
-            scatter = float(np.std(longest.delay)) if len(longest.t) > 1 else None
+            scatter = float(np.std(longest.delay[0])) if len(longest.t) > 1 else None
             said = f"; the delay scatters by {scatter:.2g} samples r.m.s." if scatter is not None else ""
             found.append(
                 Finding(
@@ -148,33 +147,49 @@ class MissingSamples(Gate):
         return found[:3]
 
 
-def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """t (K,) s of segments' middles, delay (K,) of y behind H1 u in samples, standard (K,)."""
-    empty = (np.zeros(0),) * 3
+def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
+    """t (K,) s of segments' middles, delay (3, K) in samples of y behind H1 u, H1 from all, the first and the second
+    half.
+
+    A step in the middle spoils an H1 of all segments; of the halves one is whole.
+    """
     if not seen.driven or seen.header.excitation == "sine":
-        return empty
+        return np.zeros(0), np.zeros((1, 0))
     rate, n_u = seen.header.sample_rate_Hz, int(np.count_nonzero(np.ptp(seen.first.u, axis=0)))
     u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
     length = segment_length(len(u), n_u)
     of = spectra(u, y, rate, length, wrap=False)
-    estimate = h1([of])
-    if estimate is None:
-        return empty
-    keep = of.driven()
+    half = len(of.U) // 2
+    parts = [of, Spectra(of.f, of.U[:half], of.Y[:half]), Spectra(of.f, of.U[half:], of.Y[half:])]
+    estimates = [e for part in parts if (e := h1([part])) is not None]
+    if not estimates:
+        return np.zeros(0), np.zeros((1, 0))
+    t = seen.first.header.start_s + (np.arange(len(of.U)) * (length // 2) + length / 2) / rate
+    return t, np.array([_delay(of, estimate, rate) for estimate in estimates])
+
+
+def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
+    """(K,) samples by which each segment of y is behind H1 u."""
+    keep = np.isin(of.f, estimate.f)
     expected = np.einsum("fij,kfj->kfi", estimate.G, of.U[:, keep])
     cross = of.Y[:, keep] * expected.conj() / np.maximum(estimate.noise, 1e-300)
     weight = np.abs(expected) ** 2 / np.maximum(estimate.noise, 1e-300)
     omega = 2 * np.pi * estimate.f[None, :, None] / rate
     # Gauss-Newton of sum weight |Y / expected - exp(-j omega d)|^2, from the best of a scan over whole samples.
-    scan = np.arange(-32, 33)
-    power = np.array([np.sum(np.real(cross * np.exp(1j * omega * d)), axis=(1, 2)) for d in scan])
-    d = scan[np.argmax(power, axis=0)].astype(float)
+    scan = np.arange(-LONGEST_DELAY, LONGEST_DELAY + 1)
+    summed = np.sum(cross, axis=2)
+    power = np.real(summed @ np.exp(1j * omega[0] * scan))
+    d = scan[np.argmax(power, axis=1)].astype(float)
     for _ in range(4):
-        turned = cross * np.exp(1j * omega * d[:, None, None])
-        d = d - np.sum(omega * turned.imag, axis=(1, 2)) / np.maximum(np.sum(omega**2 * weight, axis=(1, 2)), 1e-300)
-    standard = 1 / np.sqrt(2 * np.maximum(np.sum(omega**2 * weight, axis=(1, 2)), 1e-300))
-    t = seen.first.header.start_s + (np.arange(len(d)) * (length // 2) + length / 2) / rate
-    return t, d, standard
+        turned = summed * np.exp(1j * omega[..., 0] * d[:, None])
+        d = d - np.sum(omega[..., 0] * turned.imag, axis=1) / np.maximum(np.sum(omega**2 * weight, axis=(1, 2)), 1e-300)
+    return np.asarray(d)
+
+
+def largest_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:
+    """The largest significant step among the estimates (m, K) of the delay; None where none is."""
+    steps = [step for one in delay if (step := delay_step(one, level)) is not None]
+    return max(steps, key=lambda step: abs(step[1]), default=None)
 
 
 def delay_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:
@@ -241,6 +256,6 @@ def _picture(kept: _Kept) -> Picture:
         f"Record {kept.header.name}: delay of y behind the response to u",
         "time [s]",
         "delay [samples]",
-        (Series("delay", t, kept.delay, "points"),),
+        (Series("delay", t, kept.delay[0], "points"),),
         (Limit("half a sample", JUMP), Limit("half a sample", -JUMP)),
     )

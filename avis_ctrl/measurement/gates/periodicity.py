@@ -84,7 +84,7 @@ class Periodicity(Gate):
                 y_scale="log",
             )
             drop = int(failed[-1]) + 1 if len(failed) else 0
-            if drop >= reference:
+            if drop > reference:
                 bad = tuple(n for j, n in enumerate(campaign.y_names) if (k.T[reference - 1 :, j] > limit).any())
                 found.append(
                     Finding(
@@ -161,7 +161,7 @@ def compared(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
     variance = smoothed(np.sum(np.abs(of) ** 2, axis=0) / (R - 1))
     rms = np.maximum((reference - reference.mean(axis=0)).std(axis=0), 1e-300)
     # A computed record without any noise repeats only to rounding.
-    variance = np.maximum(variance, (1e-9 * rms) ** 2 * y.shape[1])
+    variance = np.maximum(variance, (1e-9 * (rms + 1e-3 * np.abs(reference).max(axis=0))) ** 2 * y.shape[1] + 1e-300)
     T, relative = np.zeros((P, y.shape[2])), np.zeros((P, y.shape[2]))
     for p in range(P):
         others = reference if p < P - R else (reference * R - y[p]) / (R - 1)

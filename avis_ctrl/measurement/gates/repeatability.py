@@ -121,7 +121,7 @@ class Repeatability(_Records):
                     Finding(
                         self.name,
                         severity,
-                        f"Record {d.b} does not repeat record {d.a}: {quoted(names)} differ by up to"
+                        f"{d.b.capitalize()} does not repeat {d.a}: {quoted(names)} differ by up to"
                         f" {100 * d.relative[bad].max():.2g} % of the response, {d.T[bad].max():.1f} times the noise"
                         f" power (by chance up to {d.limit:.2f}). The rig drifted or was changed in between; treat its"
                         " parameters as uncertain by as much, or use one of the two.",
