@@ -59,9 +59,9 @@ def best_linear_approximation(campaign: Campaign, *, band_Hz: Band | None = None
     inputs : names of actuators; by default those that some record drives. The floor's motion is not periodic and
         counts as noise.
     transient : "drop" the periods that still settle (all but two at most); "remove" the transient by local polynomials
-        through the lines between harmonics; "none"; "auto": drop where that leaves half of the periods and these are
-        settled, otherwise drop half of them (none of two) and remove what is left. Removal needs modes that are wider
-        than some four lines of the kept record; a narrower one keeps part of its transient, which counts in C.
+        or rational functions through the lines between harmonics; "none"; "auto": drop where that leaves half of the
+        periods and these are settled, otherwise remove. Where a mode is narrower than some two lines of the record,
+        part of its transient stays and counts in C.
     drop : periods to drop, instead of the number found.
     smooth_lines : C is averaged over 2 smooth_lines + 1 excited lines; by default as few as leave 2 n_y + 4 degrees
         of freedom.
@@ -116,9 +116,11 @@ def chosen_treatment(records: Sequence[RecordSource], used: Channels, keep: slic
     found, settled = settled_after(records, used, keep) if transient in ("auto", "drop") else (0, False)
     if drop is not None or transient != "auto":
         return found if drop is None else drop, transient == "remove"
-    # A slow transient would cost most of the data; what half of the periods leaves of it is easily removed.
-    dropped = min(found, count // 2)
-    return dropped, (not settled or dropped < found) and count - dropped >= 2
+    # Dropping for a slow transient would cost most of the data. Removal then works on all periods: what is left of a
+    # transient after some are dropped hides in the noise of a single record, but not in the mean of many.
+    if settled and found <= count // 2:
+        return found, False
+    return 0, count >= 2
 
 
 def _experiments(means: Sequence[PeriodMean], n_u: int) -> _Experiments:

@@ -124,6 +124,24 @@ def test_transient_from_rest_is_removed_with_two_periods():
     assert 0.5 < np.median(diagonal) / noise ** 2 < 1.0
 
 
+def test_transient_of_a_sharp_mode_is_removed_as_a_rational_function():
+    """Table-like: 6 modes from 2 to 9 Hz of 2 % damping, the narrowest 1.7 lines of a record of two 10 s periods."""
+    rng = np.random.default_rng(0)
+    system = Modal(rng, 6, 3, [2.1, 2.4, 3.5, 4.8, 6.2, 9.5], 0.02, 200.0)
+    runs = []
+    for _ in range(2):
+        for period in multisine(rng, 2000, np.arange(5, 801), 3):
+            u = np.tile(period, (2, 1))
+            runs.append((u, system.simulate(u) + 0.002 * rng.standard_normal((4000, 6))))
+    data = campaign(runs, 200.0, "multisine", 10.0)
+    exact = system.response(np.arange(5, 801) / 10)
+    error = {t: np.abs(best_linear_approximation(data, transient=t).value - exact) for t in ("none", "auto")}
+    rms = {t: np.sqrt(np.mean(e ** 2)) for t, e in error.items()}
+    assert rms["auto"] < rms["none"] / 10, rms
+    got = best_linear_approximation(data)
+    assert np.mean(squared_error(got, exact)) < 1.3
+
+
 @pytest.mark.parametrize("damping", [0.3, 0.03, 0.01])
 def test_periods_that_still_settle_are_dropped(damping):
     """What remains of the transient in the mean of the kept periods hides in the noise; two periods fewer would not."""
