@@ -9,7 +9,7 @@ factor rate, a move m leaves m rate/(1 - rate). Each result carries that distanc
 
 Beside the source (benchmarks/sequential_fit.py computes all of this; data simulated from the printed values): the
 loaded fit needs 6 rounds where the source needed 4. The rounds depend on the load's mass, which the source does not
-print: with 5 kg or less they are 4, with the 10 kg assumed in the rig file the rate is 0.83 and the 5 % rule leaves L7
+print: with 2.5 or 5 kg they are 4, with the 10 kg assumed in the rig file the rate is 0.83 and the 5 % rule leaves L7
 12 % and I_yy 4 % from the rest point. Unfinished rounds leave I_yy low, I_zz high and k_r above its unloaded value, as
 in the source's final column; but they leave L7 too large where the source's is too small, and L8 nearly right where
 the source's is a third too small, so they are not the whole of it. Measurement noise is no explanation: it moves L7 by
