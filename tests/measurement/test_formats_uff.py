@@ -1,4 +1,4 @@
-"""Universal files: binary ones assembled here from the format's definition, ASCII ones written by pyuff, real samples."""
+"""Universal files: binary ones assembled here from the format, ASCII ones written by pyuff, real samples."""
 
 from __future__ import annotations
 
