@@ -143,11 +143,13 @@ def _roles(kind: str, columns: Mapping[str, str], scale: Mapping[str, float]) ->
 def _read(path: str | Path, columns: Mapping[str, str], driven: str, measured: Sequence[str],
           sample_rate_Hz: float | None) -> Campaign:
     mapping = {"y": [columns[role] for role in measured]}
+    hints: dict[str, Any] = {} if sample_rate_Hz is None else {"sample_rate_Hz": sample_rate_Hz}
     if driven:
         mapping["u"] = [columns[driven]]
+    else:
+        hints["excitation"] = "rest"  # released and left alone
     if "t" in columns:
         mapping["t"] = [columns["t"]]
-    hints: dict[str, Any] = {} if sample_rate_Hz is None else {"sample_rate_Hz": sample_rate_Hz}
     found = read_measurements(path, mapping, **hints)
     if not isinstance(found, Campaign):
         raise InputError("expected records over time, found a frequency response", file=path)
