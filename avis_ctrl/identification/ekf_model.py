@@ -88,9 +88,11 @@ class LinearModel:
         lower = np.linalg.solve(M, np.hstack([-K, -C, self.T]))
         return np.vstack([np.eye(n, 2 * n, n), lower[:, :2 * n]]), np.vstack([0 * self.T, lower[:, 2 * n:]])
 
-    def arrays(self) -> ModelArrays:
-        """For the compiled loop."""
-        return ModelArrays(self.M0, self.C0, self.K0, self.dM, self.dC, self.dK, self.T, self.H)
+    def arrays(self, G: np.ndarray | None = None, decay: float = 1.0) -> ModelArrays:
+        """For the compiled loop; G (n_q, n_f) and decay of a disturbance, by default none."""
+        G = np.zeros((self.n_q, 0)) if G is None else G
+        H = np.hstack([self.H, np.zeros((len(self.H), G.shape[1]))])
+        return ModelArrays(self.M0, self.C0, self.K0, self.dM, self.dC, self.dK, self.T, H, G, decay)
 
 
 def source_parameters(rig: Rig) -> tuple[str, ...]:
@@ -135,12 +137,13 @@ def linear_model(rig: Rig, names: Sequence[str], measurements: Sequence[str] | N
     slopes = np.zeros((3, 6, 6, len(names)))
     for j, name in enumerate(names):
         slopes[..., j] = _slope(rig, name, values[j])
-    base = np.array([eom.M, eom.C, eom.K]) - slopes @ values
+    M0, C0, K0 = np.array([eom.M, eom.C, eom.K]) - slopes @ values
+    dM, dC, dK = slopes
     H = np.zeros((len(picked), 12))
     H[:, 6:] = rows[picked]
     if motion == "displacement":
         H = np.roll(H, 6, axis=1)
-    return LinearModel(names, values, *base, *slopes, eom.T[:, driven], H)
+    return LinearModel(names, values, M0, C0, K0, dM, dC, dK, eom.T[:, driven], H)
 
 
 def _check_names(rig: Rig, names: tuple[str, ...]) -> None:

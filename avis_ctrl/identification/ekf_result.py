@@ -21,7 +21,7 @@ class Innovations:
     Attributes
     ----------
     nis : mean over time of the normalised innovation squared e^T S^-1 e; expected n_y.
-    nis_interval : where 95 % of such means lie (chi-square of n n_y degrees of freedom).
+    nis_interval : where 99.9 % of such means lie (chi-square of n n_y degrees of freedom).
     autocorrelation : (LAGS, n_y) at 1, 2, .. samples, each output by itself.
     bound : 1.96 / sqrt(n), within which 95 % of the autocorrelations of white noise lie.
     """
@@ -42,7 +42,7 @@ class Innovations:
 
     @property
     def consistent(self) -> bool:
-        """The mean of the normalised innovation squared lies in its interval, and at most 10 % of the lags stand out."""
+        """The mean normalised innovation squared lies in its interval, and at most 10 % of the lags stand out."""
         low, high = self.nis_interval
         return low <= self.nis <= high and self.outside <= 0.10
 
@@ -53,7 +53,7 @@ def innovation_statistics(innovation: np.ndarray) -> Innovations:
     Taken one by one, their squares sum to e^T S^-1 e of the whole sample.
     """
     n, n_y = innovation.shape
-    low, high = chi2.ppf((0.025, 0.975), n * n_y) / n
+    low, high = chi2.ppf((0.0005, 0.9995), n * n_y) / n
     power = np.sum(innovation ** 2, axis=0)
     lags = range(1, min(LAGS, n - 1) + 1)
     with np.errstate(invalid="ignore"):

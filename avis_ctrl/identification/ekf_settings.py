@@ -24,12 +24,14 @@ class EkfSettings:
     q_sigma, v_sigma : standard deviation of q [m, rad] and q' [m/s, rad/s] at the start of a record (eqs. 3.12, 3.13).
     prior_share : of a parameter, as a share of its starting value (eq. 3.14).
     Q : spectral density of the acceleration noise, E[W(t) W(t')] = Q delta(t - t'), a number, (6,) or (6, 6)
-        [(m/s^2)^2/Hz, two-sided] (eq. 3.16); None: the rig's ambient floor motion.
+        [(m/s^2)^2/Hz, two-sided] (eq. 3.16); None: the rig's ambient floor motion, as three more states.
     R : variance of a measurement [(m/s)^2], a number or (n_y,) (eq. 3.18); None: the rig's sensor noise and converter.
     highpass_Hz, highpass_order : prefilter of u and y (section 3.2).
     undo_chain : the prefilter also inverts the sensors' chain; False as the source, which biases the estimates.
     settle_s : dropped at the front of each record after the prefilter; 0 for records that start at rest.
     reset : start each record from the prior covariance about the last estimate (section 3.2); False keeps it.
+    warm_up : records filtered once beforehand, whose covariance is then forgotten: the filter proper starts from their
+        estimate, where its linearisation holds. Data count once all the same.
     parametrisation : "linear" (the source's; a guard holds parameters above `lowest`) or "log" (positive by nature).
     lowest : share of its starting value below which a linear parameter is not let.
     velocity_from_data : start q' from the first measurement, as the source does, instead of zero.
@@ -46,6 +48,7 @@ class EkfSettings:
     undo_chain: bool = True
     settle_s: float = 0.0
     reset: bool = True
+    warm_up: int = 0
     parametrisation: Literal["linear", "log"] = "linear"
     lowest: float = 0.05
     velocity_from_data: bool = True
@@ -58,6 +61,8 @@ class EkfSettings:
                 raise InputError("expected a finite positive number", field=field, value=value)
         if self.parametrisation not in ("linear", "log"):
             raise InputError("expected linear or log", field="parametrisation", value=self.parametrisation)
+        if not (isinstance(self.warm_up, int) and self.warm_up >= 0):
+            raise InputError("expected a number of records, zero or more", field="warm_up", value=self.warm_up)
         if not 0 < self.lowest < 1:
             raise InputError("expected a share of the starting value, between 0 and 1", field="lowest",
                              value=self.lowest)
@@ -70,16 +75,19 @@ that of the drives. The source raised R because the filter was unstable without.
 filter that distrusts its data: they are wide, and cover errors that the data would have shown. And of the 26 parameters
 only 20 combinations act on the payload: the bands of the others tell the prior, not the data."""
 
-HONEST_SETTINGS = EkfSettings(q_sigma=2.5e-6, v_sigma=1e-4, Q=None, R=None, reset=False)
-"""R from the rig's sensor noise and quantiser, Q from its ambient floor motion, covariance kept from record to record:
-the bands are what the data say, as far as floor motion is white acceleration, which it is only near the resonances."""
+HONEST_SETTINGS = EkfSettings(q_sigma=2.5e-6, v_sigma=1e-4, Q=None, R=None, reset=False, warm_up=1)
+"""R from the rig's sensor noise and quantiser, process noise from its ambient floor motion (white velocity through the
+isolators, which colours it: three more states), covariance kept from record to record, begun where the first record
+ends: the bands are what the data say. Without the first round, parameters 25 % off shape the floor's motion and the
+first corrections wrongly, and the filter never learns that its bands are then too narrow. The small R that the source
+could not use does no harm here once the sensors' chain is undone."""
 
 
 def measurement_variance(settings: EkfSettings, rig: Rig, y_names: Sequence[str], unit: str) -> np.ndarray:
     """R's diagonal, (n_y,) [(m/s)^2, or m^2 for displacements].
 
-    From the rig: ambient noise and rounding in volts over the passband gain. Undoing the chain raises it near the corner
-    of the high-pass; that is 1 % of the band of 0-500 Hz and left out.
+    From the rig: ambient noise and rounding in volts over the passband gain. Undoing the chain raises it near the
+    corner of the high-pass; that is 1 % of the band of 0-500 Hz and left out.
 
     Raises
     ------
@@ -100,26 +108,37 @@ def measurement_variance(settings: EkfSettings, rig: Rig, y_names: Sequence[str]
     return (rig.ambient.sensor_noise_rms_V ** 2 + rounding ** 2) / gain ** 2
 
 
-def process_density(settings: EkfSettings, rig: Rig) -> np.ndarray:
-    """Q, (6, 6): spectral density of the acceleration noise.
+@dataclass(frozen=True, eq=False)
+class FloorNoise:
+    """Floor motion as a disturbance: f' = -rate f + w, with f the floor's displacement (3,) behind the high-pass.
 
-    From the rig: floor velocity of `rig.ambient` in each direction, flat over 0.5-60 Hz, through
-    M^-1 (K_f / jw + C_f) at the geometric mean of the natural frequencies. There the motion is largest; below it the
-    floor's acceleration of the payload is stronger than this (as 1/w), above it weaker.
+    density : of the white velocity w [(m/s)^2/Hz, two-sided], each direction. rate : [1/s], half the corner of the
+    high-pass, so that f wanders no further than the filtered floor does. The payload feels M^-1 (K_f f + C_f f').
+    """
+
+    density: float
+    rate: float
+
+    def acceleration(self, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+        """Of the payload, by f (6, 3) and by w (6, 3)."""
+        eom = rig.equations_of_motion()
+        by_f = np.linalg.solve(eom.M, eom.K_floor[:, :3] - self.rate * eom.C_floor[:, :3])
+        return by_f, np.linalg.solve(eom.M, eom.C_floor[:, :3])
+
+
+def floor_noise(settings: EkfSettings, rig: Rig) -> FloorNoise | None:
+    """Floor velocity of `rig.ambient` in each direction, flat over 0.5-60 Hz, where settings.Q is None; else None.
 
     Raises
     ------
-    InputError : a matrix that is not symmetric and positive semidefinite; Q = None for a rig without ambient numbers.
+    InputError : Q = None for a rig without ambient numbers, or without floor motion in them.
     """
     if settings.Q is not None:
-        return density_matrix(settings.Q, 6)
-    if rig.ambient is None:
+        return None
+    if rig.ambient is None or not rig.ambient.floor_velocity_rms_m_per_s > 0:
         raise InputError("the rig file has no ambient floor motion; give Q", field="Q", value=None)
-    eom = rig.equations_of_motion()
-    omega = 2 * np.pi * np.exp(np.mean(np.log(np.abs(eom.natural_frequencies().frequencies_Hz))))
     density = rig.ambient.floor_velocity_rms_m_per_s ** 2 / (2 * (FLOOR_BAND_Hz[1] - FLOOR_BAND_Hz[0]))
-    b = np.linalg.solve(eom.M, eom.K_floor[:, :3] / (1j * omega) + eom.C_floor[:, :3])
-    return np.real(b @ b.conj().T) * density
+    return FloorNoise(density, np.pi * settings.highpass_Hz)
 
 
 def density_matrix(Q: float | Sequence[float] | np.ndarray, n: int) -> np.ndarray:

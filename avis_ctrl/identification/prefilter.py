@@ -1,4 +1,4 @@
-"""High-pass filter of voltages and measurements alike, with the sensors' chain undone on the way (Rademakers 2005, 3.2).
+"""High-pass filter of voltages and measurements alike, the sensors' chain undone on the way (Rademakers 2005, 3.2).
 
 A geophone's voltage is not proportional to velocity near its corner, which a Kalman filter with velocity measurements
 takes for dynamics of the table. The source filters its data with a sixth-order high-pass of 1 Hz and calls the problem
@@ -7,8 +7,8 @@ the high-pass its inverse is proper and stable: the double pole of 1/chain at ze
 zeros of the high-pass.
 
 The same discrete high-pass acts on u and on y, and filters that are alike commute with a sampled linear system: the
-filtered data obey the unfiltered model. The chain's inverse is discretised by Tustin's rule, whose error of
-(omega T)^2 / 12 (8e-5 at 5 Hz and 1 kHz) acts only on the small part in which 1/chain differs from a constant.
+filtered data obey the unfiltered model. The chain's inverse is discretised by Tustin's rule; what that leaves at
+1 kHz is some 1e-5 rad of phase between 2 and 10 Hz.
 """
 
 from __future__ import annotations

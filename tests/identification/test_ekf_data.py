@@ -1,0 +1,289 @@
+"""Prefilter, simulated campaign, figures, and input that the filter has to refuse."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.identification.ekf import identify_ekf
+from avis_ctrl.identification.ekf_campaign import flat_floor, logical_drive, sensor_volts, source_campaign
+from avis_ctrl.identification.ekf_model import linear_model, source_parameters
+from avis_ctrl.identification.ekf_result import innovation_statistics, parameter_curves
+from avis_ctrl.identification.ekf_settings import (
+    HONEST_SETTINGS,
+    SOURCE_SETTINGS,
+    EkfSettings,
+    density_matrix,
+    floor_noise,
+    measurement_variance,
+)
+from avis_ctrl.identification.prefilter import delayed, prefilter, sensor_inverse
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
+from avis_ctrl.rigs import load_rig
+from avis_ctrl.rigs.rigid_body import COORDINATES
+
+FEW = ("mass", "isolator3.k_z")
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return load_rig("avis")
+
+
+@pytest.fixture(scope="module")
+def campaign(rig):
+    return source_campaign(rig, sets=2, duration_s=2.0, seed=4)
+
+
+def record_of(rig, u, y, unit="V", rate=1000.0):
+    header = RecordHeader("00", rate, len(u), rig.equations_of_motion().actuators, rig.geophones.names, "noise",
+                          y_unit=unit)
+    return Record(header, u, y)
+
+
+# -- the simulated campaign ----------------------------------------------------------------------------------------
+
+def test_the_simulation_is_what_an_integrator_of_the_equations_finds(rig, rng):
+    """Held volts a sample late, floor velocity in ramps, geophone with its compensated corner in the time domain."""
+    n, h = 40, 1e-3
+    u, floor = rng.normal(size=(n, 8)), 1e-4 * rng.normal(size=(n + 1, 3))
+    eom, (_, rows), g = rig.equations_of_motion(), rig.sensor_rows(), rig.geophones
+    w = 2 * np.pi * g.compensated_Hz
+
+    def slope(t, x, k):
+        q, v, qf, sprung, moving = x[:6], x[6:12], x[12:15], x[15:21], x[21:27]
+        vf = floor[k] + (floor[k + 1] - floor[k]) * (t - k * h) / h
+        force = eom.K_floor[:, :3] @ qf + eom.C_floor[:, :3] @ vf - eom.K @ q - eom.C @ v
+        a = np.linalg.solve(eom.M, force + (eom.T @ u[k - 1] if k else 0))
+        # The compensated geophone: s^2/(s^2 + 2 zeta w s + w^2) of velocity is velocity less a damped spring's.
+        back = -2 * g.compensated_damping * w * moving - w ** 2 * sprung + rows @ v
+        return np.concatenate([v, a, vf, moving, back])
+    x, volts = np.zeros(27), []
+    for k in range(n):
+        back = slope(k * h, x, k)[21:27]
+        volts.append(back * np.array(g.sensitivity_Vs_per_m) * g.preamplifier_gain)
+        x = solve_ivp(slope, (k * h, (k + 1) * h), x, args=(k,), rtol=1e-11, atol=1e-18).y[:, -1]
+    found = sensor_volts(rig, u, floor)
+    assert np.max(np.abs(found - volts)) < 1e-8 * np.max(np.abs(volts))
+
+
+def test_drives_and_floor_have_the_variance_asked_for(rig, rng):
+    u = logical_drive(rig, 200_000, rng)
+    forces = u @ rig.equations_of_motion().T.T
+    share = np.corrcoef(forces.T) - np.eye(6)
+    assert np.max(np.abs(share)) < 0.02  # each axis by itself
+    # x is driven by Ax2 and Ax4 with one volt each: 4 N/V at 0.25 V^2.
+    assert np.var(forces[:, COORDINATES.index("x")]) == pytest.approx(16 * 0.25, rel=0.02)
+    floor = flat_floor(200_000, 1000.0, 2e-6, rng)
+    spectrum = np.abs(np.fft.rfft(floor, axis=0)) ** 2
+    f = np.fft.rfftfreq(200_000, 1e-3)
+    density = 2e-6 ** 2 / 59.5
+    assert 2 * np.mean(spectrum[(f > 1) & (f < 40)]) / (200_000 * 1000) == pytest.approx(density, rel=0.03)
+    assert np.allclose(np.std(floor, axis=0), 2e-6, rtol=0.05)
+
+
+def test_records_are_seeded_and_differ(rig, campaign):
+    again = source_campaign(rig, sets=1, duration_s=2.0, seed=4)
+    assert np.array_equal(again.records[0].y, campaign.records[0].y)
+    assert not np.allclose(campaign.records[0].u, campaign.records[1].u)
+
+
+# -- prefilter -----------------------------------------------------------------------------------------------------
+
+def velocities(rig, volts_per_motion, u):
+    """Exact velocities along the sensors: a rig whose geophones have no corner to speak of."""
+    ideal = replace(rig, geophones=replace(rig.geophones, compensated_Hz=1e-9))
+    return sensor_volts(ideal, u, np.zeros((len(u) + 1, 3))) / volts_per_motion
+
+
+@pytest.mark.parametrize("undo, low, high", [(True, 0.0, 5e-5), (False, 0.1, 0.5)])
+def test_the_chain_is_undone_behind_the_high_pass(rig, rng, undo, low, high):
+    """Against the exact velocity through the same high-pass; left in, the chain errs by a fifth."""
+    u = logical_drive(rig, 20_000, rng)
+    volts, gain = sensor_volts(rig, u, np.zeros((len(u) + 1, 3))), 3125.0
+    motion = velocities(rig, gain, u)
+    found = prefilter(record_of(rig, u, volts), sensor_inverse(rig, rig.geophones.names, "V", undo), 1e-3)
+    right = prefilter(record_of(rig, u, motion, "m/s"), sensor_inverse(rig, rig.geophones.names, "m/s"), 1e-3)
+    error = np.std(found.y - right.y) / np.std(right.y)
+    assert low < error < high
+    assert np.array_equal(found.u, right.u)
+
+
+def test_phase_of_what_is_left_in(rig):
+    """0.35 rad at 2 Hz, as the corner of 0.5 Hz and damping 0.7 give by hand; nothing of it once undone."""
+    t = np.arange(20_000) / 1000
+    s = 2j * np.pi * 2.0
+    w = 2 * np.pi * 0.5
+    chain = s ** 2 / (s ** 2 + 1.4 * w * s + w ** 2)
+    assert abs(np.angle(chain) - 0.35) < 0.02
+    motion = np.exp(s * t)[:, None] * np.ones(6)
+    u = np.zeros((len(t), 8))
+    late = slice(15_000, 20_000)
+    for undo, phase, size in ((True, 0.0, 1.0), (False, np.angle(chain), abs(chain))):
+        inverse = sensor_inverse(rig, rig.geophones.names, "V", undo)
+        plain = sensor_inverse(rig, rig.geophones.names, "m/s")
+        both = [prefilter(record_of(rig, u, part), inverse, 0.0).y for part in
+                (3125 * (chain * motion).real, 3125 * (chain * motion).imag)]
+        right = [prefilter(record_of(rig, u, part), plain, 0.0).y for part in (motion.real, motion.imag)]
+        ratio = (both[0] + 1j * both[1])[late] / (right[0] + 1j * right[1])[late]
+        assert np.allclose(np.angle(ratio), phase, atol=1e-4) and np.allclose(abs(ratio), size, rtol=1e-4)
+
+
+def test_units_of_y(rig, rng):
+    """A sine of 5 Hz as acceleration becomes velocity; displacement stays what it is."""
+    t, w = np.arange(20_000) / 1000, 2 * np.pi * 5
+    u, late = np.zeros((len(t), 8)), slice(15_000, None)
+    out = {}
+    for unit, y in (("m/s", np.sin(w * t)), ("m/s^2", w * np.cos(w * t)), ("m", -np.cos(w * t) / w)):
+        inverse = sensor_inverse(rig, rig.geophones.names, unit)
+        out[unit] = prefilter(record_of(rig, u, y[:, None] * np.ones(6), unit), inverse, 0.0).y[late, 0]
+        assert inverse.motion == ("displacement" if unit == "m" else "velocity")
+    # Tustin's integrator lags sin by less than (w h)^2 / 12 = 8e-5 of it.
+    assert np.max(np.abs(out["m/s^2"] - out["m/s"])) < 2e-4
+    assert np.std(out["m"]) == pytest.approx(np.std(out["m/s"]) / w, rel=1e-4)
+
+
+def test_delay():
+    u = np.arange(5.0)[:, None] + 1
+    assert np.array_equal(delayed(u, 2.0)[:, 0], [0, 0, 1, 2, 3])
+    assert np.array_equal(delayed(u, 0.0)[:, 0], u[:, 0])
+    assert np.allclose(delayed(u, 1.25)[:, 0], [0, 0.75, 1.75, 2.75, 3.75])
+    assert np.array_equal(delayed(u, 9.0), np.zeros((5, 1)))
+
+
+# -- settings and figures ------------------------------------------------------------------------------------------
+
+def test_the_sources_settings():
+    s = SOURCE_SETTINGS
+    assert (s.q_sigma, s.v_sigma, s.prior_share, s.Q, s.R) == (2.5e-6, 1e-8, 0.25, 1e-8, 1e-8)
+    assert (s.highpass_Hz, s.highpass_order, s.reset) == (1.0, 6, True)
+
+
+def test_honest_noise_is_the_rigs(rig):
+    names = rig.geophones.names
+    lsb = 20 / 2 ** 14
+    assert np.allclose(measurement_variance(HONEST_SETTINGS, rig, names, "V"), (1e-6 + lsb ** 2 / 12) / 3125 ** 2)
+    floor = floor_noise(HONEST_SETTINGS, rig)
+    assert floor.density == pytest.approx(4e-12 / (2 * 59.5)) and floor_noise(SOURCE_SETTINGS, rig) is None
+    by_f, by_w = floor.acceleration(rig)
+    # x by hand: four isolators of 84 kN/m and 375 N s/m in all on 500 kg.
+    assert by_w[0, 0] == pytest.approx(375 / 500) and by_f[0, 0] == pytest.approx((84e3 - np.pi * 375) / 500)
+
+
+def test_white_innovations_are_consistent_and_others_not(rng):
+    white = rng.normal(size=(20_000, 6))
+    assert innovation_statistics(white).consistent
+    assert not innovation_statistics(1.05 * white).consistent
+    coloured = (white[1:] + white[:-1]) / np.sqrt(2)
+    found = innovation_statistics(coloured)
+    assert not found.consistent and np.allclose(found.autocorrelation[0], 0.5, atol=0.03)
+
+
+def test_curves_of_the_sources_figures(rig, campaign):
+    names = source_parameters(rig)
+    true = {name: rig.parameters()[name].value for name in names}
+    result = identify_ekf(rig, campaign, names=names)
+    figures = parameter_curves(result, true)
+    assert [figure.title for figure in figures] == ["Mass and inertia", "Damping", "Stiffness"]
+    assert [len(figure.names) for figure in figures] == [4, 11, 11]
+    stiffness = figures[2]
+    assert stiffness.estimate.shape == stiffness.lower.shape == (4, 11) == (len(stiffness.time_s), 11)
+    assert np.all(stiffness.lower < stiffness.estimate) and np.all(stiffness.estimate < stiffness.upper)
+    assert np.array_equal(stiffness.true, [true[name] for name in stiffness.names])
+    # At the first sample nothing is known yet: the band is twice 25 % either way.
+    assert np.allclose(figures[0].upper[0] / figures[0].estimate[0], 1.5, rtol=1e-2)
+    with pytest.raises(InputError, match=r"true value of every .* parameter"):
+        parameter_curves(result, {"mass": 500.0})
+
+
+# -- input to refuse -----------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("names, message", [
+    (("mas",), "did you mean 'mass'"), (("mass", "mass"), "each parameter once"),
+    (("com_x",), "positive starting value"),
+    (("J12",), "positive starting value"), (("isolator2.p_x",), "moves actuators or sensors"),
+    (("actuator.Ay1",), "moves actuators or sensors"), (("isolator1.p_z",), "positive starting value")])
+def test_parameters_that_the_filter_cannot_take(rig, campaign, names, message):
+    with pytest.raises(InputError, match=message):
+        identify_ekf(rig, campaign, SOURCE_SETTINGS, names)
+
+
+def test_a_parameter_that_is_not_linear_is_refused(rig):
+    """The centre of mass enters the inertia by its square."""
+    with pytest.raises(InputError, match="must be linear"):
+        linear_model(rig.with_parameters({"com_x": 0.1}), ("com_x",))
+
+
+def test_parameters_of_another_rig(campaign):
+    with pytest.raises(InputError, match="name the parameters"):
+        source_parameters(load_rig("halcyonics"))
+    with pytest.raises(InputError):
+        identify_ekf(load_rig("halcyonics"), campaign, names=("mass",))
+
+
+@pytest.mark.parametrize("change, message", [
+    ({"R": -1e-8}, "R = "), ({"R": [1e-8] * 5}, "6"), ({"R": float("nan")}, "positive variance"),
+    ({"Q": -1.0}, "none negative"), ({"Q": [1e-8] * 3}, "6 numbers"), ({"Q": np.triu(np.ones((6, 6)))}, "symmetric"),
+    ({"highpass_Hz": 600.0}, "half the sample rate"), ({"highpass_order": 2}, "whole number from 3"),
+    ({"settle_s": 5.0}, "settle_s"), ({"settle_s": -1.0}, "settle_s")])
+def test_settings_that_make_no_sense(rig, campaign, change, message):
+    with pytest.raises(InputError, match=message):
+        identify_ekf(rig, campaign, EkfSettings(**change), FEW)
+
+
+@pytest.mark.parametrize("change", [{"prior_share": 0.0}, {"q_sigma": -1.0}, {"v_sigma": float("inf")},
+                                    {"parametrisation": "cubic"}, {"lowest": 1.5}, {"highpass_Hz": "1"},
+                                    {"history_s": 0.0}, {"warm_up": -1}])
+def test_settings_are_checked_by_name(change):
+    with pytest.raises(InputError, match=next(iter(change))):
+        EkfSettings(**change)
+
+
+def test_data_that_do_not_fit(rig, campaign):
+    record = campaign.records[0]
+    with pytest.raises(InputError, match="expected V, m"):
+        identify_ekf(rig, [replace(record, header=replace(record.header, y_unit="mm"))], names=FEW)
+    with pytest.raises(InputError, match="commanded voltages"):
+        identify_ekf(rig, [replace(record, header=replace(record.header, u_unit="N"))], names=FEW)
+    with pytest.raises(InputError, match="at least one record"):
+        identify_ekf(rig, [], names=FEW)
+    with pytest.raises(InputError, match="give R"):
+        identify_ekf(rig, [replace(record, header=replace(record.header, y_unit="m/s"))], HONEST_SETTINGS, FEW)
+    with pytest.raises(InputError, match="sensors of the rig"):
+        identify_ekf(rig, [replace(record, header=replace(record.header, y_names=tuple("abcdef")))], names=FEW)
+    with pytest.raises(InputError, match="u names"):
+        identify_ekf(rig, [replace(record, header=replace(record.header, u_names=tuple("abcdefgh")))], names=FEW)
+    other = replace(record, header=replace(record.header, name="01", sample_rate_Hz=500.0))
+    with pytest.raises(InputError, match="sample_rate_Hz"):
+        identify_ekf(rig, Campaign("avis", (record, other)), names=FEW)
+    with pytest.raises(InputError, match="ambient"):
+        source_campaign(replace(rig, ambient=None))
+    with pytest.raises(InputError, match="ambient floor motion"):
+        floor_noise(HONEST_SETTINGS, replace(rig, ambient=None))
+    with pytest.raises(InputError, match="at least one set"):
+        source_campaign(rig, sets=0)
+
+
+def test_a_filter_that_diverges_says_where(rig, campaign):
+    """Volts beyond all measure carry a mass below zero when nothing guards it."""
+    record = campaign.records[0]
+    loud = replace(record, y=record.y * 1e200)
+    with pytest.raises(ComputationError, match=r"diverged in record 00; measured: after .* s of 2 s"):
+        identify_ekf(rig, [loud], SOURCE_SETTINGS, FEW)
+
+
+def test_some_channels_are_enough(rig, campaign):
+    """Records of four geophones and the vertical motors."""
+    record = campaign.records[0]
+    header = replace(record.header, u_names=tuple(record.header.u_names[k] for k in (1, 3, 5, 7)),
+                     y_names=tuple(record.header.y_names[k] for k in (1, 3, 5)))
+    picked = Record(header, record.u[:, [1, 3, 5, 7]], record.y[:, [1, 3, 5]])
+    result = identify_ekf(rig, [picked], SOURCE_SETTINGS, FEW)
+    assert result.values.shape == (2,) and np.all(np.isfinite(result.sigma))
+
+
+def test_density_matrix():
+    assert np.array_equal(density_matrix(2.0, 2), 2 * np.eye(2))
+    assert np.array_equal(density_matrix([1.0, 3.0], 2), np.diag([1.0, 3.0]))
