@@ -157,6 +157,9 @@ def _excited_sets(data: _Experiments, used: Channels) -> list[tuple[list[int], n
         noise = _running_mean(raw, min(10, (len(raw) - 1) // 2))
     on = (power > EXCITED_POWER * power.max(axis=0)) & (power > EXCITED_OVER_NOISE * noise)
     if not np.any(on):
+        if np.any(power > 0):
+            raise InputError("expected inputs that repeat from period to period: they differ as much as they drive; "
+                             "is the period right?", field="period_s")
         raise InputError("expected at least one excited line in the band", field="inputs", value=used.inputs)
     sets: dict[tuple[int, ...], list[int]] = {}
     for line in np.flatnonzero(on.any(axis=1)):

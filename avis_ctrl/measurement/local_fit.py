@@ -86,8 +86,8 @@ class LocalFit:
 
     def __init__(self, frequency_Hz: np.ndarray, n_u: int, n_y: int, order: int, half_width: int, scale_Hz: float,
                  rational: bool = False):
-        if not 0 <= order <= 6:
-            raise InputError("expected an order from 0 to 6", field="order", value=order)
+        if order not in range(7):
+            raise InputError("expected a whole order from 0 to 6", field="order", value=order)
         if 2 * half_width <= order:
             raise InputError(f"expected more than {order / 2:g} lines for polynomials of order {order}",
                              field="half_width", value=half_width)
@@ -212,6 +212,8 @@ class LocalFit:
             slopes = [s * n_y + i for s in range(order)]
             columns = [*slopes, *range(order * n_y, self._lead + n_u), self._lead + n_u + i]
             q, r = np.linalg.qr(self._factor[:, :, columns])
+            # A dead channel has no slopes: their coefficients are then 0.
+            r += np.diag([1.0] * (len(columns) - 1) + [0.0]) * (np.einsum("nii->ni", r) == 0)[:, :, None]
             unknowns = np.linalg.solve(r[:, :-1, :-1], r[:, :-1, -1:])[:, :, 0]
             value[:, i] = unknowns[:, unknowns.shape[1] - n_u:]
             shrink = np.sqrt(np.mean(np.abs(1 - unknowns[:, :order] @ powers) ** 2, axis=1))

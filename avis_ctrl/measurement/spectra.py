@@ -53,7 +53,7 @@ def channels(campaign: Campaign, records: Sequence[RecordSource], inputs: Sequen
     ------
     InputError : an unknown input, a record without floor channels where they are asked for, different ones.
     """
-    names = campaign.u_names if inputs is None else tuple(inputs)
+    names = campaign.u_names if inputs is None else (inputs,) if isinstance(inputs, str) else tuple(inputs)
     for name in names:
         if name not in campaign.u_names:
             raise InputError(f"expected some of {list(campaign.u_names)}", field="inputs", value=name)

@@ -305,6 +305,7 @@ def test_an_input_silent_in_part_of_the_band_is_named_with_the_frequencies(rng):
 
 @pytest.mark.parametrize(("change", "words"), [
     ({"band_Hz": (50.0, 20.0)}, "band_Hz"), ({"band_Hz": (5.0, 120.0)}, "100 Hz"), ({"order": 9}, "order"),
+    ({"order": 2.5}, "whole order"),
     ({"half_width": 1}, "half_width"), ({"inputs": ("u7",)}, "u7"), ({"band_Hz": (5.0, 5.5)}, "longer records"),
     ({"half_width": 0}, "half_width"), ({"longest_piece": 0}, "longest_piece"),
     ({"frequency_Hz": np.array([5.0, 99.99])}, "frequency_Hz"), ({"half_width": 2, "order": 3}, "degrees of freedom")])
@@ -332,6 +333,16 @@ def test_odd_periodic_records_get_windows_that_hold_enough_lines(rng):
     got = local_polynomial(campaign(runs, RATE, "multisine", 5.0), band_Hz=(3.0, 78.0))
     exact = system.response(got.frequency_Hz)
     assert np.median(np.abs(got.value - exact) / np.abs(exact).max()) < 0.003
+
+
+def test_dead_channels_and_exact_data_are_no_error(rng):
+    """An output that is 0, an output that is an input: G is exact."""
+    u = rng.standard_normal((2000, 2))
+    data = campaign([(u, np.stack([0 * u[:, 0], u[:, 1]], axis=1))], RATE)
+    for method in (local_polynomial, local_rational):
+        got = method(data, frequency_Hz=np.linspace(5, 90, 20))
+        assert np.allclose(got.value, [[0, 0], [0, 1]], atol=1e-9), method
+        assert np.abs(got.noise).max() < 1e-18
 
 
 def test_a_campaign_of_the_rigs_size_takes_seconds():
