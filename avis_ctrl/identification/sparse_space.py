@@ -33,7 +33,8 @@ def reduced_rows(basis: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
         if size[i, j] == 0:
             rows = rows[:k]
             break
-        rows[[k, k + i]] = rows[[k + i, k]]
+        swapped = k + int(i)
+        rows[[k, swapped]] = rows[[swapped, k]]
         rows[k] /= rows[k, j]
         others = [m for m in range(n_rows) if m != k]
         rows[others] -= np.outer(rows[others, j], rows[k])

@@ -1,0 +1,293 @@
+"""Candidate experiments, ranked by what they would determine, and the fewest of them that determine everything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.linalg
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.experiments import (
+    AddedActuator,
+    AddedSensor,
+    Drive,
+    Noise,
+    Place,
+    changed,
+    predicted_information,
+)
+from avis_ctrl.identification.identifiability import IdentifiabilityReport, identifiability_report
+from avis_ctrl.identification.identifiability_words import listed, number
+from avis_ctrl.identification.information import Information
+from avis_ctrl.identification.response import FLOOR, ResponseModel
+from avis_ctrl.identification.structure import size_of, structural_null_space, structure_of
+
+_FLOOR_SHAKEN = 1e-4
+_BENCH = 0.02
+CAUTION = ("Predicted from noise alone: added masses, moved places and added channels count as known exactly, and the "
+           "model as right.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """Makes the changed rig's model."""
+
+    shifts: Mapping[str, float] = field(default_factory=dict)
+    masses: tuple[tuple[float, Place], ...] = ()
+    sensors: tuple[AddedSensor, ...] = ()
+    actuators: tuple[AddedActuator, ...] = ()
+
+    def __call__(self, model: ResponseModel) -> ResponseModel:
+        return changed(model, self.shifts, self.masses, self.sensors, self.actuators)
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """A further record or bench measurement.
+
+    words : what to do, as an order. drive : the record, None for none. change : the rig that it is taken on. bench :
+    relative standard deviations of parameters measured by themselves.
+    """
+
+    words: str
+    drive: Drive | None = None
+    change: Callable[[ResponseModel], ResponseModel] = field(default=lambda model: model)
+    bench: Mapping[str, float] = field(default_factory=dict)
+
+    def information(self, model: ResponseModel, noise: Noise) -> Information:
+        """What it would add for the model's free parameters."""
+        n = len(model.names)
+        found = Information(model.names, model.values, model.units, np.zeros((n, n)), size_of(model.values))
+        if self.drive is not None:
+            matrix = predicted_information(self.change(model), self.drive, noise).matrix
+            found = replace(found, matrix=matrix)
+        sizes = dict(zip(model.names, size_of(model.values).tolist(), strict=True))
+        return found.with_priors({name: share * sizes[name] for name, share in self.bench.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """An experiment added to the present information.
+
+    gained : further combinations determined. alone : parameters that become known by themselves, with their predicted
+    relative standard deviation. tighter : median over what was known before of old over new standard deviation.
+    """
+
+    experiment: Experiment
+    information: Information
+    rank: int
+    gained: int
+    alone: Mapping[str, float]
+    tighter: float
+
+    @property
+    def words(self) -> str:
+        if not self.gained:
+            sharper = f"what is known becomes {number(self.tighter)} times as precise" if self.tighter > 1.005 \
+                else "nothing becomes more precise"
+            return f"{self.experiment.words}: determines nothing new; {sharper}."
+        many = "combination" if self.gained == 1 else "combinations"
+        return f"{self.experiment.words}: determines {self.gained} more {many}{_alone_text(self.alone)}."
+
+
+def _alone_text(alone: Mapping[str, float]) -> str:
+    if not alone:
+        return ""
+    shown = [f"{name} to {number(100 * share)} %" for name, share in list(alone.items())[:6]]
+    if len(alone) > 6:
+        shown.append(f"{len(alone) - 6} more parameters (the worst to {number(100 * max(alone.values()))} %)")
+    return f", so that these become known by themselves: {listed(shown)}"
+
+
+Added = list[tuple[Experiment, Information]]
+
+
+def candidates(model: ResponseModel, drive: Drive) -> tuple[Experiment, ...]:
+    """What can usually be done with a table; `drive` is the present record.
+
+    Masses are 10 % of the payload, attachments move by 50 mm, the floor is shaken with 0.1 mm/s r.m.s. and measured,
+    a single mount on a test bench is known to 2 %. Sensors and actuators are added on the payload: one on the chassis
+    measures the floor, which is a candidate of its own.
+    """
+    low, high = drive.band_Hz
+    rate = 1 / model.period_s if model.period_s else 1000.0
+    found = [Experiment("Record four times as long", replace(drive, duration_s=3 * drive.duration_s))]
+    level = min(3 * drive.level_V, model.rig.drive_limit_V / 4)
+    if level > drive.level_V:
+        found.append(Experiment(f"Record once more with {number(level)} V r.m.s. at each actuator",
+                                replace(drive, level_V=level)))
+    found.append(Experiment(f"Record once more over {number(low / 5)}-{number(low)} Hz, below the present band",
+                            replace(drive, band_Hz=(low / 5, low))))
+    if 3 * high < 0.45 * rate:
+        found.append(Experiment(f"Record once more over {number(high)}-{number(3 * high)} Hz, above the present band",
+                                replace(drive, band_Hz=(high, 3 * high))))
+    for axis in FLOOR:
+        found.append(Experiment(f"Shake the floor along {axis[-1]} (0.1 mm/s r.m.s.) and measure its velocity",
+                                replace(drive, level_V=0.0, floor_m_per_s={axis: _FLOOR_SHAKEN})))
+    return (*found, *_changed_rigs(model, drive), *_more_channels(model, drive), *_bench(model))
+
+
+def _payload(model: ResponseModel) -> tuple[float, tuple[float, float, float]]:
+    """A tenth of the payload's mass, and the first mount's corner."""
+    corner = model.rig.mounted_body().mounts[0].position
+    return round(0.1 * model.rig.mounted_body().mass, 3), (float(corner[0]), float(corner[1]), float(corner[2]))
+
+
+def _changed_rigs(model: ResponseModel, drive: Drive) -> list[Experiment]:
+    kg, corner = _payload(model)
+    at = ", ".join(f"{v:g}" for v in corner)
+    found = [Experiment(f"Record once more with a known mass of {kg:g} kg fixed at ({at}) m", drive,
+                        _Change(masses=((kg, corner),)))]
+    numbers = sorted({int(name[8:-4]) for name in model.rig.parameters()
+                      if name.startswith("isolator") and name.endswith(".p_x")})
+    for axis in "xyz":
+        for picked in ([1], [1, 3]):
+            if not set(picked) <= set(numbers):
+                continue
+            shifts = {f"isolator{i}.p_{axis}": 0.05 for i in picked}
+            who = f"isolator{'s' if len(picked) > 1 else ''} {listed([str(i) for i in picked])}"
+            how = "raised by 50 mm" if axis == "z" else f"moved by 50 mm along {axis}"
+            found.append(Experiment(f"Record once more with {who} {how}, what is mounted in it included", drive,
+                                    _Change(shifts)))
+    return found
+
+
+def _more_channels(model: ResponseModel, drive: Drive) -> list[Experiment]:
+    _, corner = _payload(model)
+    top = (-corner[0], -corner[1], -corner[2])
+    found = []
+    for axis, unit in zip("xyz", np.eye(3), strict=True):
+        direction = (float(unit[0]), float(unit[1]), float(unit[2]))
+        sensor = AddedSensor(f"added sensor {axis}", top, direction)
+        found.append(Experiment(f"Add a calibrated sensor along {axis} on the payload at "
+                                f"({', '.join(f'{v:g}' for v in top)}) m and record once more", drive,
+                                _Change(sensors=(sensor,))))
+    constant = float(np.max(np.abs(model.matrices.T)))
+    motor = AddedActuator("added actuator", top, (0.0, 0.0, 1.0), constant)
+    found.append(Experiment("Add a calibrated vertical actuator at the same place and record once more", drive,
+                            _Change(actuators=(motor,))))
+    return found
+
+
+def _bench(model: ResponseModel) -> list[Experiment]:
+    """Single parameters that a bench or a balance can measure: of each group as many as make the rest known."""
+    null = structural_null_space(model)
+    structure = structure_of(null, model.values, model.units, model.names)
+    picked = [model.names[j] for group in structure.groups for j in _independent(group.unseen)]
+    mounts = [name for name in picked if name.rpartition(".")[2].startswith(("k_", "c_"))]
+    found = []
+    if mounts:
+        found.append(Experiment(f"Measure single mounts on a bench, to 2 % each: {listed(mounts)}",
+                                bench=dict.fromkeys(mounts, _BENCH)))
+    if "mass" in model.names:
+        found.append(Experiment("Weigh the payload to 0.5 %", bench={"mass": 0.005}))
+    sensors = [name for name in model.names if name.startswith("sensor.")]
+    if sensors:
+        found.append(Experiment(f"Calibrate {sensors[0]} to 1 %", bench={sensors[0]: 0.01}))
+    actuators = [name for name in model.names if name.startswith("actuator.")]
+    if actuators:
+        found.append(Experiment(f"Measure {actuators[0]} with a load cell to 1 %", bench={actuators[0]: 0.01}))
+    return found
+
+
+def _independent(rows: np.ndarray) -> list[int]:
+    """As many columns as there are rows, which a zero in makes any combination of the rows zero."""
+    scaled = rows / np.max(np.abs(rows), axis=1, keepdims=True)
+    return sorted(scipy.linalg.qr(scaled, mode="r", pivoting=True)[1][:len(rows)].tolist())
+
+
+def compare(information: Information, model: ResponseModel, experiments: Sequence[Experiment], noise: Noise
+            ) -> tuple[Outcome, ...]:
+    """What each experiment would add by itself, the best first: most combinations, then the smallest errors.
+
+    Raises InputError where the model's free parameters are not those of the information.
+    """
+    if model.names != information.names:
+        raise InputError(f"expected a model with the free parameters {', '.join(information.names)}", field="model",
+                         value=model.names)
+    return _compared(information, _added(model, experiments, noise))
+
+
+def _added(model: ResponseModel, experiments: Sequence[Experiment], noise: Noise) -> Added:
+    return [(one, one.information(model, noise)) for one in experiments]
+
+
+def _compared(information: Information, added: Added) -> tuple[Outcome, ...]:
+    found = [_outcome(information, one, extra) for one, extra in added]
+    return tuple(sorted(found, key=lambda one: (-one.gained, -len(one.alone), _worst(one), -one.tighter)))
+
+
+def _worst(outcome: Outcome) -> float:
+    """Predicted error of what is new."""
+    return float(np.median(list(outcome.alone.values()))) if outcome.alone else np.inf
+
+
+def _outcome(before: Information, experiment: Experiment, added: Information) -> Outcome:
+    after = before.plus(added)
+    new = after.known & ~before.known
+    alone = {name: float(sigma / size) for name, sigma, size, is_new
+             in zip(after.names, after.standard_deviation, after.scale, new, strict=True) if is_new}
+    V = before.directions[1][:, before.determined]
+    ratios = [before.of(row)[1] / after.of(row)[1] for row in (V / before.scale[:, None]).T
+              if np.isfinite(after.of(row)[1])]
+    tighter = float(np.median(ratios)) if ratios else 1.0
+    return Outcome(experiment, after, after.rank, after.rank - before.rank, alone, tighter)
+
+
+def plan(information: Information, model: ResponseModel, experiments: Sequence[Experiment], noise: Noise
+         ) -> tuple[Outcome, ...]:
+    """Experiments one after the other, each the one that adds most to those before; ends when nothing is gained."""
+    return _planned(information, _added(model, experiments, noise))
+
+
+def _planned(information: Information, added: Added) -> tuple[Outcome, ...]:
+    chosen: list[Outcome] = []
+    now = information
+    while now.rank < len(now.names):
+        outcomes = [_outcome(now, one, extra) for one, extra in added]
+        best = min(outcomes, key=lambda one: (-one.gained, -len(one.alone), _worst(one), -one.tighter))
+        if not best.gained:
+            break
+        chosen.append(best)
+        now = best.information
+    return tuple(chosen)
+
+
+def needed_experiment(information: Information, model: ResponseModel, drive: Drive, noise: Noise,
+                      experiments: Sequence[Experiment] | None = None,
+                      report: IdentifiabilityReport | None = None) -> tuple[str, ...]:
+    """Sentences: what determines what is missing, what does not, and the fewest experiments found for all of it."""
+    report = report or identifiability_report(information, model)
+    missing = len(information.names) - information.rank
+    if not missing:
+        return ("Every combination is determined; further records only make it more precise.",)
+    chosen = candidates(model, drive) if experiments is None else experiments
+    added = _added(model, chosen, noise)
+    outcomes = _compared(information, added)
+    said = [one.words for one in outcomes if one.gained]
+    useless = [_kind(one.experiment.words) for one in outcomes if not one.gained]
+    if useless:
+        said.append(f"These determine nothing new: {'; '.join(dict.fromkeys(useless))}.")
+    steps = _planned(information, added)
+    if steps:
+        after = steps[-1].information
+        order = " Then: ".join(one.experiment.words + "." for one in steps)
+        worst = np.max(after.standard_deviation / after.scale)
+        rest = len(after.names) - after.rank
+        said.append(f"Fewest found, in order: {order} "
+                    + (f"Every parameter is then known by itself, the worst to {number(100 * worst)} %." if not rest
+                       else f"{rest} combinations stay unknown."))
+        left = after
+    else:
+        left = information
+    if left.rank < len(left.names):
+        still = identifiability_report(left)
+        said.append("Nothing in the list determines: " + "; ".join(
+            " ".join(f"{weight:+g} {name}" for name, weight in row.items()) for row in still.unseen[:8]) + ".")
+    return (*said, CAUTION)
+
+
+def _kind(words: str) -> str:
+    return words[:1].lower() + words[1:]

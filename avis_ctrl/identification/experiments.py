@@ -1,0 +1,223 @@
+"""Which further record would determine what the present data do not, predicted from the model alone.
+
+A record of duration T with the spectra U at the inputs adds the information
+
+    H = 2 sum_k Re( dY_k^H inv(C_k) dY_k ),    dY_k = dG_k / dtheta U_k,
+
+with C_k the covariance of the noise on a line (Pintelon and Schoukens 2012, section 9.11). Lines are summed by an
+integral over frequency: a representative line stands for as many as the record has about it. The transient is left
+out, which matters for records of a few periods of the lowest mode.
+
+A changed rig (a mass on the payload, an isolator moved) shares its parameters with the present one; what was changed
+counts as known exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.information import Information
+from avis_ctrl.identification.response import FLOOR, Matrices, ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.structure import size_of
+from avis_ctrl.rigs.rigid_body import point_map
+
+_LINES = 120
+FLOOR_BAND_HZ = (0.5, 60.0)
+Place = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class AddedSensor:
+    """Calibrated sensor of the rig's own kind at a place [m] along a direction; it senses the payload."""
+
+    name: str
+    place: Place
+    direction: Place
+
+
+@dataclass(frozen=True)
+class AddedActuator:
+    """Calibrated actuator at a place [m] along a direction."""
+
+    name: str
+    place: Place
+    direction: Place
+    constant_N_per_V: float
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedModel(ResponseModel):
+    """A model with known masses, sensors and actuators added, and parameters moved by known amounts.
+
+    masses : (kg, place) each, a point mass. The parameters stay those of the rig without them.
+    """
+
+    masses: tuple[tuple[float, Place], ...] = ()
+    more_sensors: tuple[AddedSensor, ...] = ()
+    more_actuators: tuple[AddedActuator, ...] = ()
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return (*self.actuators, *FLOOR)
+
+    @cached_property
+    def matrices(self) -> Matrices:
+        own = self._plain().matrices
+        M = own.M + sum((kg * point_map(place).T @ point_map(place) for kg, place in self.masses), np.zeros((6, 6)))
+        R = np.vstack([own.R, *(np.array(one.direction) @ point_map(one.place) for one in self.more_sensors)])
+        T = np.column_stack([own.T, *(one.constant_N_per_V * point_map(one.place).T @ np.array(one.direction)
+                                      for one in self.more_actuators)])
+        return own._replace(M=M, R=R, T=T)
+
+    def _plain(self) -> ResponseModel:
+        n_y, n_u = len(self.more_sensors), len(self.more_actuators)
+        sensors = replace(self.sensors, names=self.sensors.names[:len(self.sensors.names) - n_y],
+                          sensitivity=self.sensors.sensitivity[:len(self.sensors.sensitivity) - n_y])
+        names = tuple(name for name in self.names if name in self.rig.parameters())
+        return ResponseModel(self.rig, names, sensors, self.actuators[:len(self.actuators) - n_u], self.period_s,
+                             self.delay_s, self.amplifier_corner_Hz)
+
+    def __post_init__(self) -> None:
+        self._plain()  # refuses what the rig does not have
+
+
+def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,
+            masses: Sequence[tuple[float, Place]] = (), sensors: Sequence[AddedSensor] = (),
+            actuators: Sequence[AddedActuator] = ()) -> ChangedModel:
+    """The model of the changed rig, with the same free parameters.
+
+    shifts : known changes of parameters of the rig, in their units (isolator1.p_z and so on). Raises InputError for
+    names that the rig does not have, and where no rig has the values.
+    """
+    known = model.rig.parameters()
+    if unknown := [name for name in (shifts or {}) if name not in known]:
+        raise InputError(f"expected parameters of the rig {model.rig.name}", field="shifts", value=unknown)
+    rig = model.rig.with_parameters({name: known[name].value + shift for name, shift in (shifts or {}).items()})
+    gain = float(np.mean(model.sensors.sensitivity)) if len(model.sensors.sensitivity) else 1.0
+    bank = replace(model.sensors, names=(*model.sensors.names, *(one.name for one in sensors)),
+                   sensitivity=np.concatenate([model.sensors.sensitivity, np.full(len(sensors), gain)]))
+    return ChangedModel(rig, model.names, bank, (*model.actuators, *(one.name for one in actuators)), model.period_s,
+                        model.delay_s, model.amplifier_corner_Hz, tuple(masses), tuple(sensors), tuple(actuators))
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Noise of a record on a line, for spectra scaled by 1/sqrt(samples).
+
+    sensor_V : r.m.s. of each channel, white, converter included. floor_m_per_s : r.m.s. of the floor that was not
+    measured, each direction, over 0.5-60 Hz. measured : (omega, covariance (n, n_y, n_y)) from a campaign, in place of
+    both. assumed : what no file said, in words.
+    """
+
+    sensor_V: float
+    floor_m_per_s: float = 0.0
+    measured: tuple[np.ndarray, np.ndarray] | None = None
+    assumed: str = ""
+
+    def covariance(self, model: ResponseModel, omega: np.ndarray, floor_known: bool) -> np.ndarray:
+        """(n, n_y, n_y); channels beyond those that were measured have the median channel's power, independent."""
+        n_y = len(model.sensors.names)
+        if self.measured is not None:
+            return self._interpolated(omega, n_y)
+        C = np.broadcast_to(self.sensor_V ** 2 * np.eye(n_y, dtype=complex), (len(omega), n_y, n_y)).copy()
+        if self.floor_m_per_s and not floor_known:
+            U = np.zeros((len(omega), len(model.inputs), 3), complex)
+            U[:, -3:] = np.eye(3)
+            G = model.driven(omega, U, False).Y
+            rate = 1 / model.period_s if model.period_s else 1000.0
+            low, high = (2 * np.pi * f for f in FLOOR_BAND_HZ)
+            power = self.floor_m_per_s ** 2 * rate / 2 / (FLOOR_BAND_HZ[1] - FLOOR_BAND_HZ[0])
+            inside = (omega >= low) & (omega <= high)
+            C += np.where(inside, power, 0.0)[:, None, None] * G @ np.conj(G.swapaxes(1, 2))
+        return C
+
+    def _interpolated(self, omega: np.ndarray, n_y: int) -> np.ndarray:
+        assert self.measured is not None
+        known, covariance = self.measured
+        nearest = np.clip(np.searchsorted(known, omega), 0, len(known) - 1)
+        C = np.zeros((len(omega), n_y, n_y), complex)
+        own = covariance[nearest]
+        n_own = own.shape[1]
+        C[:, :n_own, :n_own] = own
+        middle = np.median(np.real(np.einsum("nii->ni", own)), axis=1)
+        C[:, range(n_own, n_y), range(n_own, n_y)] = middle[:, None]
+        return C
+
+
+def site_noise(model: ResponseModel) -> Noise:
+    """From the rig's file: ambient floor, sensor noise, converter steps; for accelerometers their own noise."""
+    rig = model.rig
+    if model.sensors.unit == "V" and rig.ambient is not None and rig.acquisition is not None:
+        step = 2 * rig.acquisition.adc_range_V / 2 ** rig.acquisition.adc_bits
+        sigma = float(np.hypot(rig.ambient.sensor_noise_rms_V, step / np.sqrt(12)))
+        return Noise(sigma, rig.ambient.floor_velocity_rms_m_per_s)
+    if model.sensors.motion == "acceleration" and rig.accelerometers is not None:
+        density = rig.accelerometers.noise_m_per_s2_rtHz * float(np.mean(np.abs(model.sensors.sensitivity)))
+        floor = rig.ambient.floor_velocity_rms_m_per_s if rig.ambient else 2e-6
+        assumed = "" if rig.ambient else "the rig's file has no [ambient]: a floor of 2e-6 m/s r.m.s. is assumed"
+        return Noise(density * np.sqrt(rig.sample_rate_Hz / 2), floor, assumed=assumed)
+    raise InputError("expected a rig file with [ambient] and [acquisition], or the noise of a campaign", field="noise",
+                     value=rig.name)
+
+
+def campaign_noise(blocks: Sequence[SpectralBlock]) -> Noise:
+    """What a fit estimated, of the record that has most lines.
+
+    Raises InputError where there is no noise estimate of records.
+    """
+    records = [one for one in blocks if one.noise is not None and one.transient]
+    if not records:
+        raise InputError("expected records with an estimate of their noise", field="blocks", value=len(blocks))
+    longest = max(records, key=lambda one: len(one.omega))
+    assert longest.noise is not None
+    return Noise(float(np.sqrt(np.median(np.real(np.einsum("nkii->nki", longest.noise))))),
+                 measured=(longest.omega, longest.noise[:, 0]))
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A record: r.m.s. volts of each actuator and r.m.s. floor velocity by axis (measured), spread over a band."""
+
+    level_V: float
+    duration_s: float
+    band_Hz: tuple[float, float] = (0.5, 60.0)
+    floor_m_per_s: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.duration_s) and self.duration_s > 0 and np.isfinite(self.level_V)
+                and self.level_V >= 0):
+            raise InputError("expected a positive duration and a level of zero or more", field="drive",
+                             value=(self.level_V, self.duration_s))
+        if not 0 < self.band_Hz[0] < self.band_Hz[1] < np.inf:
+            raise InputError("expected increasing positive frequencies", field="drive: band_Hz", value=self.band_Hz)
+        if unknown := [axis for axis in self.floor_m_per_s if axis not in FLOOR]:
+            raise InputError(f"expected {', '.join(FLOOR)}", field="drive: floor", value=unknown)
+
+
+def predicted_information(model: ResponseModel, drive: Drive, noise: Noise) -> Information:
+    """What a record would tell of the model's free parameters."""
+    rate = 1 / model.period_s if model.period_s else 1000.0
+    low, high = drive.band_Hz[0], min(drive.band_Hz[1], 0.45 * rate)
+    if low >= high:
+        raise InputError(f"expected a band below {0.45 * rate:g} Hz", field="drive: band_Hz", value=drive.band_Hz)
+    edges = np.geomspace(low, high, _LINES + 1)
+    omega = 2 * np.pi * np.sqrt(edges[1:] * edges[:-1])
+    lines = np.diff(edges) * drive.duration_s
+    # White over the band: E|U|^2 of a spectrum scaled by 1/sqrt(samples).
+    spread = np.sqrt(rate / 2 / (high - low))
+    columns = [drive.level_V] * len(model.actuators) + [drive.floor_m_per_s.get(axis, 0.0) for axis in FLOOR]
+    U = np.broadcast_to(np.diag(columns).astype(complex) * spread, (_LINES, len(columns), len(columns)))
+    dY = model.driven(omega, U[:, :, np.array(columns) > 0]).dY if np.any(columns) else None
+    H = np.zeros((len(model.names), len(model.names)))
+    if dY is not None:
+        L = np.linalg.inv(np.linalg.cholesky(noise.covariance(model, omega, bool(drive.floor_m_per_s))))
+        white = (L @ dY) * np.sqrt(2 * lines)[:, None, None]
+        flat = white.reshape(len(white), -1)
+        H = np.real(np.conj(flat) @ flat.T)
+    return Information(model.names, model.values, model.units, H, size_of(model.values))
