@@ -191,7 +191,8 @@ def identify_ekf(rig0: Rig, records: Campaign | Sequence[RecordSource], settings
     n_p = len(names)
     units = tuple(rig0.parameters()[name].unit for name in names)
     return EkfResult(names, units, model.values, kalman.theta, kalman.covariance[:n_p, :n_p],
-                     kalman.scaling.logarithmic, settings.prior_share, history, tuple(statistics), kalman.state.guarded.copy(), settings)
+                     kalman.scaling.logarithmic, settings.prior_share, history, tuple(statistics),
+                     kalman.state.guarded.copy(), settings)
 
 
 def _check(name: str, done: int, samples: int, kalman: ParameterFilter) -> None:
