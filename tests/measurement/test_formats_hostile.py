@@ -10,6 +10,7 @@ import pytest
 import scipy.io
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from test_formats_matlab import Matlab73
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
@@ -63,13 +64,14 @@ def valid(tmp_path_factory):
               "u_names": np.array(["A1", "A2"], object), "y_names": np.array(["S1", "S2", "S3"], object)}
     scipy.io.savemat(folder / "mat", {"records": [fields, fields], "rig": "avis"})
     scipy.io.savemat(folder / "zip", {"u": u, "y": y, "fs": 100.0}, do_compression=True)
+    Matlab73(folder / "v73", {"records": [fields, fields], "rig": "avis"})
     (folder / "csv").write_bytes(CSV.encode())
     for name, binary in (("uff", False), ("58b", True)):
         (folder / name).write_bytes(time_function("A1", u[:, 0], binary) + time_function("S1", y[:, 0], binary))
     return Files({path.name: path.read_bytes() for path in folder.iterdir()})
 
 
-FORMATS_FUZZED = ["h5", "frf", "mat", "zip", "csv", "uff", "58b"]
+FORMATS_FUZZED = ["h5", "frf", "mat", "zip", "v73", "csv", "uff", "58b"]
 
 
 def read_whole(path, **hints):

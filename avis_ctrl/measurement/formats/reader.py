@@ -98,7 +98,8 @@ def _is_uff(head: bytes) -> bool:
 def _hdf5(path: Path, columns: Mapping[str, Any] | None, rig: str | None,
           hints: Mapping[str, Any]) -> Campaign | FrequencyResponse:
     with reading(path, "the HDF5 file"), open_hdf5(path) as file:
-        matlab_classes = "format" not in file.attrs and any("MATLAB_class" in item.attrs for item in file.values())
+        matlab_classes = "format" not in file.attrs and any(
+            "MATLAB_class" in getattr(item, "attrs", ()) for item in file.values())  # None: a broken link
         response = "frf" in file and "records" not in file
     if matlab_classes:  # a v7.3 file that lost its text header
         return matlab.read(path, columns, rig, hints_from(hints))
