@@ -94,9 +94,9 @@ class LocalFit:
         self.frequency_Hz = np.asarray(frequency_Hz, float)
         self.n_u, self.n_y, self.order, self.half_width, self.rational = n_u, n_y, order, half_width, rational
         self.scale_Hz, self._step_Hz = scale_Hz, scale_Hz / half_width
-        # Columns: [Y d^R .. Y d] where rational, [U d^R .. U d], U, Y: what G(f) needs stands in the last corner.
-        self._lead = order * (n_u + (n_y if rational else 0))
-        self._size = self._lead + n_u + n_y
+        # Columns: [U d^R .. U d], U, [Y d^R .. Y d] where rational, Y: what G(f) needs stands in the lower corner.
+        self._lead = order * n_u
+        self._size = self._lead + n_u + n_y * (order + 1 if rational else 1)
         self._factor = np.zeros((self.frequency_Hz.size, self._size, self._size), complex)
         self._unit: tuple[np.ndarray, np.ndarray] | None = None
         self.records = 0
@@ -146,8 +146,8 @@ class LocalFit:
 
     def _columns(self, U: np.ndarray, Y: np.ndarray, d: np.ndarray) -> np.ndarray:
         powers = [d[:, :, None] ** s for s in range(self.order, 0, -1)]
-        lead = [Y * p for p in powers] if self.rational else []
-        return np.concatenate([*lead, *(U * p for p in powers), U, Y], axis=-1)
+        slopes = [Y * p for p in powers] if self.rational else []
+        return np.concatenate([*(U * p for p in powers), U, *slopes, Y], axis=-1)
 
     def _check(self, U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray) -> None:
         shape = (U.shape[0], line_Hz.size)
@@ -182,10 +182,6 @@ class LocalFit:
     def _corner(self) -> tuple[np.ndarray, np.ndarray]:
         """Triangular factor of the inputs' own part (n, n_u, n_u) and the outputs along it (n, n_u, n_y)."""
         lead, first = self._lead, self._lead + self.n_u
-        if self.rational:  # the outputs' slopes come first, and each output has only its own: leave them out
-            part = _triangle(self._factor[:, :, self.order * self.n_y:])
-            lead, first = self.order * self.n_u, (self.order + 1) * self.n_u
-            return part[:, lead:first, lead:first], part[:, lead:first, first:]
         return self._factor[:, lead:first, lead:first], self._factor[:, lead:first, first:]
 
     def _polynomial(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -202,26 +198,28 @@ class LocalFit:
         this small rather than one that means something (1 - 5/3 d^2 for white noise, 4/9 of its power), so the
         residual is divided by the mean of |a|^2 over the window to give the covariance of V.
         """
-        n, n_u, n_y, order = self.frequency_Hz.size, self.n_u, self.n_y, self.order
-        value, residuals = np.empty((n, n_y, n_u), complex), []
-        inverse = np.zeros((n, n_u, n_u), complex)
+        n_y, order, first = self.n_y, self.order, self._lead + self.n_u
+        own, along = self._corner()
+        # Along the inputs' columns, and what of the outputs these leave.
+        along, left = np.linalg.solve(own, along), self._factor[:, first:, first:]
+        root = np.linalg.inv(own)
+        inverse = root @ np.swapaxes(root.conj(), 1, 2)
         d = np.arange(-self.half_width, self.half_width + 1) * self._step_Hz / self.scale_Hz
         powers = d ** np.arange(order, 0, -1)[:, None]
+        rows, residuals = [], []
         for i in range(n_y):
-            # The order of the columns keeps U last among the unknowns, as in the polynomial method.
-            slopes = [s * n_y + i for s in range(order)]
-            columns = [*slopes, *range(order * n_y, self._lead + n_u), self._lead + n_u + i]
-            q, r = np.linalg.qr(self._factor[:, :, columns])
+            slopes, here = [s * n_y + i for s in range(order)], order * n_y + i
+            q, r = np.linalg.qr(left[:, :, slopes])
             # A dead channel has no slopes: their coefficients are then 0.
-            r += np.diag([1.0] * (len(columns) - 1) + [0.0]) * (np.einsum("nii->ni", r) == 0)[:, :, None]
-            unknowns = np.linalg.solve(r[:, :-1, :-1], r[:, :-1, -1:])[:, :, 0]
-            value[:, i] = unknowns[:, unknowns.shape[1] - n_u:]
-            shrink = np.sqrt(np.mean(np.abs(1 - unknowns[:, :order] @ powers) ** 2, axis=1))
-            residuals.append(q[:, :, -1] * r[:, -1:, -1] / shrink[:, None])
-            root = np.linalg.inv(r[:, -1 - n_u:-1, -1 - n_u:-1])
-            inverse += root @ np.swapaxes(root.conj(), 1, 2) / n_y
+            r += np.eye(order) * (np.einsum("nii->ni", r) == 0)[:, :, None]
+            a = np.linalg.solve(r, np.swapaxes(q.conj(), 1, 2) @ left[:, :, here:here + 1])
+            rows.append((along[:, :, here:here + 1] - along[:, :, slopes] @ a)[:, :, 0])
+            shrink = np.sqrt(np.mean(np.abs(1 - a[:, :, 0] @ powers) ** 2, axis=1))
+            residuals.append((left[:, :, here:here + 1] - left[:, :, slopes] @ a)[:, :, 0] / shrink[:, None])
+            cost = along[:, :, slopes] @ np.linalg.inv(r)
+            inverse += cost @ np.swapaxes(cost.conj(), 1, 2) / n_y
         gram = np.swapaxes(np.linalg.inv(inverse), 1, 2)
-        return value, _covariance(np.stack(residuals, axis=-1)) / self.dof, gram
+        return np.stack(rows, axis=1), _covariance(np.stack(residuals, axis=-1)) / self.dof, gram
 
     def _check_rank(self, names: tuple[str, ...]) -> None:
         if not self.n_u:

@@ -66,6 +66,34 @@ def test_the_same_estimate_as_the_full_least_squares_of_the_book(rng):
     assert np.allclose(np.linalg.inv(found.gram[0]).T, inverse)
 
 
+def test_the_same_rational_estimate_as_lstsq_with_all_unknowns(rng):
+    """One line and output after the other, transients and denominators explicit."""
+    f, n_rec, order, w = np.arange(1, 40.0), 2, 2, 7
+    U = rng.standard_normal((n_rec, 39, 2)) + 1j * rng.standard_normal((n_rec, 39, 2))
+    Y = rng.standard_normal((n_rec, 39, 2)) + 1j * rng.standard_normal((n_rec, 39, 2))
+    found = local_model(U, Y, f, f[20:21], order, w, rational=True)
+    inverse = np.zeros((2, 2), complex)
+    for i in range(2):
+        rows = []
+        for r in range(n_rec):
+            for k in range(20 - w, 20 + w + 1):
+                d = (float(k - 20) / w) ** np.arange(order + 1)
+                own = np.zeros((n_rec, order + 1))
+                own[r] = d
+                rows.append(np.concatenate([np.kron(d, U[r, k]), own.ravel(), d[1:] * Y[r, k, i]]))
+        K = np.array(rows)
+        right = Y[:, 20 - w:20 + w + 1, i].ravel()
+        solution = np.linalg.lstsq(K, right)[0]
+        assert np.allclose(found.value[0, i], solution[:2])
+        d = np.arange(-w, w + 1) / w
+        a = 1 - solution[-2] * d - solution[-1] * d ** 2
+        power = np.sum(np.abs(right - K @ solution) ** 2) / (K.shape[0] - K.shape[1]) / np.mean(np.abs(a) ** 2)
+        assert found.noise[0, i, i] == pytest.approx(power)
+        inverse += np.linalg.inv(K.conj().T @ K)[:2, :2] / 2
+    assert found.dof == K.shape[0] - K.shape[1]
+    assert np.allclose(np.linalg.inv(found.gram[0]).T, inverse)
+
+
 def test_records_taken_in_one_by_one_give_the_same_as_together(rng):
     f = np.arange(1, 101.0)
     U = rng.standard_normal((5, 100, 2)) + 1j * rng.standard_normal((5, 100, 2))
