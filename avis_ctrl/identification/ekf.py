@@ -24,8 +24,8 @@ from avis_ctrl.identification.ekf_settings import (
     floor_noise,
     measurement_variance,
 )
-from avis_ctrl.identification.prefilter import prefilter, sensor_inverse
-from avis_ctrl.measurement.campaign import Campaign, RecordSource
+from avis_ctrl.identification.prefilter import SensorInverse, prefilter, sensor_inverse
+from avis_ctrl.measurement.campaign import Campaign, RecordHeader, RecordSource
 from avis_ctrl.rigs.rig import Rig
 
 
@@ -156,33 +156,19 @@ def identify_ekf(rig0: Rig, records: Campaign | Sequence[RecordSource], settings
     ComputationError : the filter diverged; it names record and time.
     """
     campaign = records if isinstance(records, Campaign) else Campaign(rig0.name, tuple(records))
-    first = campaign.records[0].header
-    if first.u_unit != "V":
-        raise InputError("expected commanded voltages in V", field=f"record {first.name}: u_unit", value=first.u_unit)
-    inverse = sensor_inverse(rig0, first.y_names, first.y_unit, settings.undo_chain)
+    header = campaign.records[0].header
     names = source_parameters(rig0) if names is None else tuple(names)
-    model = linear_model(rig0, names, first.y_names, first.u_names, inverse.motion)
-    R = measurement_variance(settings, rig0, first.y_names, first.y_unit)
-    kalman = ParameterFilter(model, settings, R, 1 / first.sample_rate_Hz, floor_noise(settings, rig0), rig0)
-    keep = max(1, round(settings.history_s * first.sample_rate_Hz))
-
-    def through(source: RecordSource) -> tuple[Trace, int]:
-        record = source.load()
-        data = prefilter(record, inverse, rig0.loop_delay_s, settings.highpass_Hz, settings.highpass_order,
-                         settings.settle_s)
-        kalman.begin(data.y[0])
-        trace, done = kalman.filter(data.u, data.y, keep)
-        _check(record.header.name, done, len(data.y), kalman)
-        return trace, done
+    kalman, inverse = _prepare(rig0, header, settings, names)
+    keep = max(1, round(settings.history_s * header.sample_rate_Hz))
     for source in campaign.records[:settings.warm_up]:
-        through(source)
+        _through(kalman, source, inverse, rig0.loop_delay_s, keep)
     kalman.forget()
     pieces, statistics, ends = [], [], [0.0]
     for source in campaign.records:
-        trace, done = through(source)
+        trace = _through(kalman, source, inverse, rig0.loop_delay_s, keep)
         pieces.append(_history(kalman, trace, ends[-1], keep))
         statistics.append(innovation_statistics(trace.innovation))
-        ends.append(ends[-1] + done * kalman.period_s)
+        ends.append(ends[-1] + len(trace.innovation) * kalman.period_s)
         if progress:
             progress(f"record {source.header.name}: normalised innovation squared "
                      f"{statistics[-1].nis_per_output:.3g} per output (1 expected)")
@@ -190,9 +176,30 @@ def identify_ekf(rig0: Rig, records: Campaign | Sequence[RecordSource], settings
     history = EkfHistory(time, theta, lower, upper, np.array(ends))
     n_p = len(names)
     units = tuple(rig0.parameters()[name].unit for name in names)
-    return EkfResult(names, units, model.values, kalman.theta, kalman.covariance[:n_p, :n_p],
+    return EkfResult(names, units, kalman.model.values, kalman.theta, kalman.covariance[:n_p, :n_p],
                      kalman.scaling.logarithmic, settings.prior_share, history, tuple(statistics),
                      kalman.state.guarded.copy(), settings)
+
+
+def _prepare(rig: Rig, header: RecordHeader, settings: EkfSettings, names: tuple[str, ...]
+             ) -> tuple[ParameterFilter, SensorInverse]:
+    """The filter for records like this one, and what makes motion of their y."""
+    if header.u_unit != "V":
+        raise InputError("expected commanded voltages in V", field=f"record {header.name}: u_unit", value=header.u_unit)
+    inverse = sensor_inverse(rig, header.y_names, header.y_unit, settings.undo_chain)
+    model = linear_model(rig, names, header.y_names, header.u_names, inverse.motion)
+    R = measurement_variance(settings, rig, header.y_names, header.y_unit)
+    return ParameterFilter(model, settings, R, 1 / header.sample_rate_Hz, floor_noise(settings, rig), rig), inverse
+
+
+def _through(kalman: ParameterFilter, source: RecordSource, inverse: SensorInverse, delay_s: float, keep: int) -> Trace:
+    """One record, prefiltered."""
+    record, settings = source.load(), kalman.settings
+    data = prefilter(record, inverse, delay_s, settings.highpass_Hz, settings.highpass_order, settings.settle_s)
+    kalman.begin(data.y[0])
+    trace, done = kalman.filter(data.u, data.y, keep)
+    _check(record.header.name, done, len(data.y), kalman)
+    return trace
 
 
 def _check(name: str, done: int, samples: int, kalman: ParameterFilter) -> None:

@@ -11,9 +11,10 @@ from scipy.stats import chi2
 
 from avis_ctrl.identification.ekf import ParameterFilter, identify_ekf, noise_root
 from avis_ctrl.identification.ekf_campaign import source_campaign
-from avis_ctrl.identification.ekf_kernel import Scaling, flow, propagate, step_room, update
+from avis_ctrl.identification.ekf_kernel import Scaling, flow, step_room
 from avis_ctrl.identification.ekf_model import LinearModel, linear_model, source_parameters
 from avis_ctrl.identification.ekf_settings import HONEST_SETTINGS, SOURCE_SETTINGS, EkfSettings
+from avis_ctrl.identification.ekf_square_root import propagate, update
 from avis_ctrl.rigs import load_rig
 
 H1 = 1e-3
@@ -187,6 +188,24 @@ def test_the_sampled_jacobian_is_the_complex_step_of_the_matrix_exponential(rig,
             for half, allowed in zip((slice(0, 6), slice(6, 12)), near, strict=True):
                 error = np.abs(room.Psi_t[j, half] - column[half])
                 assert np.max(error) < allowed * np.max(np.abs(column[half]))
+
+
+def test_a_disturbance_acts_as_a_held_acceleration(rig, rng):
+    """Against the matrix exponential: f accelerates the table by G f during the sample, and decays at its end."""
+    model, G = linear_model(rig, ("mass",)), rng.normal(size=(6, 3))
+    x0, u = np.concatenate([np.repeat([5e-6, 1e-4], 6), np.full(3, 1e-4)]) * rng.normal(size=15), rng.normal(size=8)
+    room, x = step_room(6, 1, 3), x0.copy()
+    assert flow(model.arrays(G, 0.9), Scaling(model.values, np.zeros(1), False), np.ones(1), x, u, H1, room)
+    A, B = model.system(model.values)
+    entry = np.hstack([B, np.vstack([np.zeros((6, 3)), G])])
+    block = la.expm(np.block([[A, entry], [np.zeros((11, 23))]]) * H1)
+    expected = block[:12, :12] @ x0[:12] + block[:12, 12:] @ np.concatenate([u, x0[12:]])
+    for half in (slice(0, 6), slice(6, 12)):
+        moved = np.max(np.abs(expected - x0[:12])[half])
+        assert np.max(np.abs(x[:12] - expected)[half]) < 1e-8 * moved
+        found = room.Phi_t[12:, half].T
+        assert np.max(np.abs(found - block[half, 20:])) < 1e-6 * np.max(np.abs(found))
+    assert np.array_equal(x[12:], 0.9 * x0[12:]) and np.array_equal(room.Phi_t[12:, 12:], 0.9 * np.eye(3))
 
 
 # -- covariance ----------------------------------------------------------------------------------------------------
