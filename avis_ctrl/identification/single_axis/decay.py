@@ -70,7 +70,9 @@ def _result(time: np.ndarray, y: np.ndarray, e: np.ndarray, theta: np.ndarray, J
     information = Information(("corner_Hz", "damping"), theta, ("Hz", ""), flat.T @ flat / white, np.abs(theta))
     return SingleAxisFit("free decay of a second-order oscillator", information, covariance,
                          f"Newey-West, {lags} lags by Andrews' rule; {statistics.inflation:.1f} times those of a white "
-                         "residual", float(dof), dof, "residual", statistics, time, y, y - e)
+                         "residual", float(dof), dof, "residual", statistics, time, y, y - e,
+                         ("at the amplitudes of this stretch; what moves with the amplitude, the deviations do not "
+                          "hold",))
 
 
 def _columns(t: np.ndarray, theta: np.ndarray, drift: int) -> np.ndarray:

@@ -32,8 +32,14 @@ ROLES: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "drive": ("force", ("position",), ("reference",)),
     "oscillator": ("u", ("y",), ()),
 }
-OPTIONS = {"seismometer": {"delay"}, "drive": {"cutoff_Hz", "coulomb", "offset"}, "oscillator": {"band_Hz"},
-           "decay": {"corner_Hz", "damping", "start_s", "end_s", "drift"}}
+OPTIONS: dict[str, dict[str, type]] = {
+    "seismometer": {"delay": bool},
+    "drive": {"cutoff_Hz": float, "coulomb": str, "offset": bool},
+    "oscillator": {"band_Hz": tuple},
+    "decay": {"corner_Hz": float, "damping": float, "start_s": float, "end_s": float, "drift": int},
+}
+IN_WORDS = {bool: "true or false", float: "a number", int: "a whole number", str: "a word",
+            tuple: "two numbers, low and high"}
 
 
 def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str], *,
@@ -59,10 +65,8 @@ def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str]
     """
     if kind not in ROLES:
         raise InputError(f"expected one of {', '.join(ROLES)}", field="kind", value=kind)
-    for name in options:
-        if name not in OPTIONS[kind]:
-            raise InputError(f"expected one of {', '.join(sorted(OPTIONS[kind]))}", field=f"option of {kind}",
-                             value=name)
+    for name, value in options.items():
+        _check_option(kind, name, value)
     scale = dict(scale or {})
     driven, measured = _roles(kind, columns, scale)
     campaign = _read(path, columns, driven, measured, sample_rate_Hz)
@@ -119,6 +123,23 @@ def stepped_sine(campaign: Campaign, driven: str, measured: Sequence[str], scale
     return Responses(np.array([record.frequency_Hz for record in records]),
                      {role: np.array([H for H, _ in pair]) for role, pair in pairs.items()},
                      {role: np.array([v for _, v in pair]) for role, pair in pairs.items()}), refused
+
+
+def _check_option(kind: str, name: str, value: Any) -> None:
+    if name not in OPTIONS[kind]:
+        raise InputError(f"expected one of {', '.join(sorted(OPTIONS[kind]))}", field=f"option of {kind}", value=name)
+    wanted = OPTIONS[kind][name]
+
+    def number(x: Any) -> bool:
+        return isinstance(x, (int, float)) and not isinstance(x, bool) and not np.isnan(x)
+    if wanted is tuple:
+        fits = isinstance(value, (tuple, list)) and len(value) == 2 and all(map(number, value))
+    elif wanted is float:
+        fits = number(value)
+    else:
+        fits = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
+    if not fits:
+        raise InputError(f"expected {IN_WORDS[wanted]}", field=name, value=value)
 
 
 def _roles(kind: str, columns: Mapping[str, str], scale: Mapping[str, float]) -> tuple[str, list[str]]:

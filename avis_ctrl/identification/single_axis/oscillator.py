@@ -96,7 +96,9 @@ def _result(f: np.ndarray, Y: np.ndarray, error: np.ndarray, theta: np.ndarray, 
     return SingleAxisFit("m y'' + d y' + k y = u", information, covariance,
                          f"noise from the residual's spectrum, neighbouring {CORRELATED_LINES} lines correlated",
                          float(e @ e), 2 * n - spent, "residual", statistics, f, Y, Y - error,
-                         ("figure data: spectrum of the output and of the model's, transient included",))
+                         ("of the best linear oscillator at the level of this record; another level has another, which "
+                          "the deviations do not hold",
+                          "figure data: spectrum of the output and of the model's, transient included"))
 
 
 def _lines(u: np.ndarray, y: np.ndarray, rate: float, band_Hz: tuple[float, float]
