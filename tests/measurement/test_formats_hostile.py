@@ -161,7 +161,7 @@ def test_the_content_tells_the_format_not_the_name(valid, tmp_path):
 
 def test_messages_of_cut_files(valid, tmp_path):
     path = tmp_path / "a"
-    parts = {"h5": (0.5, "the HDF5 file is cut short (Unable to"), "mat": (0.5, "the .mat file (v5) cannot be read;"),
+    parts = {"h5": (0.5, "the HDF5 file is cut short (Unable to"), "mat": (0.5, "its parts do not fit together;"),
              "uff": (0.7, "data set 2 (byte "), "58b": (0.3, "of 240 bytes of data are there"),
              "csv": (0.95, "expected 3 columns, as in the header; there are 1")}
     for kind, (share, message) in parts.items():
