@@ -63,7 +63,7 @@ class Comparison:
 
 
 def compare(pairs: list[tuple[Spectra, Spectra]]) -> Comparison | None:
-    """Of measured and expected spectra of records, those of the commonest segment length; None where they are too few."""
+    """Of measured and expected spectra of records (those of the commonest segment length); None where too few."""
     if not pairs:
         return None
     lengths = [len(m.f) for m, _ in pairs]

@@ -24,6 +24,8 @@ from avis_ctrl.measurement.gates.finding import (
 SINE_TOP = 2.42
 # An over-range level: its spread is at most this part of the jump into it.
 LEVEL_SPREAD = 0.05
+# ... and the jump at least so many times the median change over two samples.
+UNUSUAL = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +190,7 @@ def over_range(x: np.ndarray) -> np.ndarray:
     top, low = float(np.max(x)), float(np.min(x))
     if top == low:
         return mask
+    usual = float(np.median(np.abs(x[2:] - x[:-2]))) if len(x) > 2 else 0.0
     near = np.concatenate([[False], x > top - LEVEL_SPREAD * (top - low), [False]])
     edges = np.flatnonzero(np.diff(near.astype(int)))
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
@@ -196,6 +199,10 @@ def over_range(x: np.ndarray) -> np.ndarray:
             continue
         # One sample may fall within the jump itself.
         jump = min(run[0] - x[start - 2], run[-1] - x[min(stop + 1, len(x) - 1)])
-        if np.ptp(run) < LEVEL_SPREAD * jump and jump > 0.2 * (top - low) and np.ptp(x[start - 2 : start]) > 0:
+        if (
+            np.ptp(run) < LEVEL_SPREAD * jump
+            and jump > max(0.2 * (top - low), UNUSUAL * usual)
+            and np.ptp(x[start - 2 : start]) > 0
+        ):
             mask[start:stop] = True
     return mask

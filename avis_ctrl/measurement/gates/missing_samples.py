@@ -107,16 +107,18 @@ class MissingSamples(Gate):
                 )
         if not found:
             longest = max(kept, key=lambda k: len(k.t))
-            tested = sum(len(k.t) > 3 for k in kept)
-            scatter = float(np.std(longest.delay[0])) if len(longest.t) > 1 else None
-            said = f"; the delay scatters by {scatter:.2g} samples r.m.s." if scatter is not None else ""
+            told = [k for k in kept if len(k.t) > 3 and np.std(k.delay[0]) < JUMP]
+            vague = sum(len(k.t) > 3 for k in kept) - len(told)
+            scatter = float(max((np.std(k.delay[0]) for k in told), default=np.nan))
+            said = f"; the delay scatters by at most {scatter:.2g} samples r.m.s." if told else ""
+            said += f"; in {vague} y follows u too loosely to tell" if vague else ""
             found.append(
                 Finding(
                     self.name,
                     "ok",
-                    f"No lost or repeated samples ({tested} of {len(kept)} records could be compared with a moving "
-                    f"commanded voltage{said}).",
-                    value=scatter,
+                    f"No lost or repeated samples were found ({len(told)} of {len(kept)} records could be compared with"
+                    f" a moving commanded voltage{said}).",
+                    value=scatter if told else None,
                     limit=JUMP,
                     picture=_picture(longest),
                 )

@@ -1,0 +1,238 @@
+"""The gates on simulated campaigns of the AVIS: silent on clean ones, and each fault named by its gate."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from gates_rig import (
+    LSB,
+    RATE,
+    RIG,
+    U_NAMES,
+    Y_NAMES,
+    Simulator,
+    changed,
+    everywhere,
+    known,
+    multisine_campaign,
+    noise_campaign,
+    response_of,
+)
+
+from avis_ctrl.measurement.gates import GATES, examine
+from avis_ctrl.measurement.gates.channel_map import ChannelMap
+from avis_ctrl.measurement.gates.excerpt import excerpt
+
+SEVERE = ("warning", "stop")
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return multisine_campaign(1)
+
+
+def alarms(campaign, expectation=None):
+    return [f for f in examine(campaign, expectation or known()) if f.severity in SEVERE]
+
+
+def gates(found):
+    return {f.gate for f in found}
+
+
+def test_every_gate_speaks_and_has_a_picture(clean):
+    findings = examine(clean, known())
+    assert len({f.gate for f in findings}) == len(GATES) + 1  # the channel map speaks of order and of polarity
+    for f in findings:
+        assert f.sentence.endswith(".") and f.picture is not None
+        assert all(len(s.x) == len(s.y) for s in f.picture.series)
+
+
+@pytest.mark.parametrize("make", [multisine_campaign, lambda seed: noise_campaign(seed, 16000)])
+def test_clean_campaigns_pass(make):
+    for seed in (2, 3):
+        assert not alarms(make(seed))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [multisine_campaign, noise_campaign])
+def test_twenty_clean_campaigns_pass(make):
+    found = [(seed, f.sentence) for seed in range(20) for f in alarms(make(seed))]
+    assert not found
+
+
+def test_without_a_model_clean_campaigns_pass(clean):
+    assert not [f for f in examine(clean) if f.severity in SEVERE]
+
+
+def clipped(u, y):
+    y[:, 1] = np.clip(y[:, 1], -1.2, 1.2)
+    return u, y
+
+
+def constant(u, y):
+    y[:, 2] = 0.3
+    return u, y
+
+
+def noise_alone(u, y):
+    y[:, 2] = LSB * np.round(1e-3 * np.random.default_rng(5).standard_normal(len(y)) / LSB)
+    return u, y
+
+
+def stuck(u, y):
+    y[5000:5300, 2] = y[5000, 2]
+    return u, y
+
+
+def humming(u, y):
+    y[:, 4] += 0.01 * np.sin(2 * np.pi * 50.03 * np.arange(len(y)) / RATE)
+    return u, y
+
+
+def noisy(u, y):
+    y[:, 0] += 0.05 * np.random.default_rng(6).standard_normal(len(y))
+    return u, y
+
+
+def doubled(u, y):
+    y[:, 3] = 0.5 * y[:, 1]
+    return u, y
+
+
+FAULTS = [
+    (clipped, {"y_range_V": (-1.2, 1.2)}, "clipping", ("Sz1",), set()),
+    (clipped, {"y_range_V": None}, "clipping", ("Sz1",), set()),
+    (constant, {}, "dead channel", ("Sx2",), {"signal to noise", "coherence"}),
+    (noise_alone, {}, "dead channel", ("Sx2",), {"signal to noise", "coherence"}),
+    (stuck, {}, "dead channel", ("Sx2",), set()),
+    (humming, {}, "hum", ("Sy3",), set()),
+    (noisy, {}, "signal to noise", ("Sy1",), set()),
+    (doubled, {"response": None}, "channel order", ("Sz1", "Sz2"), set()),
+]
+
+
+@pytest.mark.parametrize(
+    ("fault", "expected", "gate", "channels", "others"),
+    FAULTS,
+    ids=[f"{f[0].__name__}-{k}" for k, f in enumerate(FAULTS)],
+)
+def test_a_fault_is_named_by_its_gate(clean, fault, expected, gate, channels, others):
+    found = alarms(everywhere(clean, fault), known(**expected))
+    assert gate in gates(found) and gates(found) <= {gate} | others
+    assert {f.channels for f in found} == {channels}
+
+
+def test_drive_at_its_limit():
+    campaign = multisine_campaign(1, levels=(0.2,))
+    limit = 0.9 * float(np.max(np.abs(campaign.records[0].u)))
+    clip = everywhere(campaign, lambda u, y: (np.clip(u, -limit, limit), y))
+    assert gates(alarms(clip, known(drive_limit_V=limit, response=None))) == {"clipping"}
+
+
+@pytest.mark.parametrize("count", [1, 3, 20])
+@pytest.mark.parametrize("make", [multisine_campaign, lambda seed: noise_campaign(seed, 24000)])
+def test_lost_samples_are_counted(make, count):
+    """From y alone, at 11.003 s: found within 0.3 samples, and the place within a segment."""
+    campaign = make(1)
+    y = np.delete(campaign.records[0].y, np.arange(11003, 11003 + count), axis=0)
+    found = [f for f in alarms(changed(campaign, 0, y=y), known(response=None)) if f.gate == "missing samples"]
+    assert [f.records for f in found] == [("00",)]
+    assert found[0].value == pytest.approx(-count, abs=0.3)
+
+
+def test_rows_lost_from_u_and_y(clean):
+    old, lost = clean.records[0], np.arange(11003, 11006)
+    broken = changed(clean, 0, u=np.delete(old.u, lost, axis=0), y=np.delete(old.y, lost, axis=0))
+    found = [f for f in alarms(broken) if f.gate == "missing samples"]
+    assert "3 samples off" in found[0].sentence and "period 3" in found[0].sentence
+
+
+def test_a_buffer_written_twice(clean):
+    y = clean.records[0].y.copy()
+    y[9000:9256] = y[8744:9000]
+    found = [f for f in alarms(changed(clean, 0, y=y)) if f.gate == "missing samples"]
+    assert "repeats 256 rows at 9 s" in found[0].sentence
+
+
+def test_records_that_overlap_in_time(clean):
+    found = alarms(changed(clean, 1, start_s=clean.records[0].header.start_s + 1))
+    assert gates(found) == {"missing samples"} and found[0].records == ("00", "01")
+
+
+def stiffer(part):
+    names = [n for n, p in RIG.parameters().items() if p.unit == "N/m"]
+    return Simulator(RIG.with_parameters({n: RIG.parameters()[n].value * (1 + part) for n in names}))
+
+
+@pytest.mark.parametrize("make", [multisine_campaign, lambda seed, sims: noise_campaign(seed, 24000, sims=sims)])
+def test_drift_between_records_of_one_level(make):
+    changed_rig = stiffer(0.05)
+    found = alarms(make(4, sims=(Simulator(), changed_rig, Simulator())))
+    assert "repeatability" in gates(found) and gates(found) <= {"repeatability", "level dependence"}
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_dependence_on_the_level(same):
+    soft = stiffer(-0.05)
+    found = alarms(multisine_campaign(4, sims=(soft, soft, Simulator()), same=same))
+    assert gates(found) == {"level dependence"}
+
+
+def test_the_transient_is_counted_in_periods(clean):
+    (note,) = [f for f in examine(clean, known()) if f.gate == "periodicity"]
+    assert note.severity == "note" and note.value in (1, 2, 3)
+
+
+def test_a_response_that_grows_has_not_settled(clean):
+    def growing(u, y):
+        return u, y * np.linspace(1, 1.1, len(y))[:, None]
+
+    assert "periodicity" in gates(alarms(everywhere(clean, growing), known(response=None)))
+
+
+def channel_alarms(campaign, expectation):
+    gate = ChannelMap()
+    kept = [gate.look(excerpt(r), expectation) for r in campaign.records]
+    return [f for f in gate.conclude(kept, campaign, expectation) if f.severity in SEVERE]
+
+
+SHORT = multisine_campaign(1, period=2048, periods=4)
+PAIRS = [("y", pair) for pair in combinations(range(6), 2)] + [("u", pair) for pair in combinations(range(8), 2)]
+
+
+@pytest.mark.parametrize(("which", "pair"), PAIRS)
+def test_every_exchanged_pair_is_named(which, pair):
+    i, k = pair
+
+    def exchange(u, y):
+        a = y if which == "y" else u
+        a[:, [i, k]] = a[:, [k, i]]
+        return u, y
+
+    names = Y_NAMES if which == "y" else U_NAMES
+    found = channel_alarms(everywhere(SHORT, exchange), known())
+    assert [(f.gate, set(f.channels)) for f in found] == [("channel order", {names[i], names[k]})]
+
+
+@pytest.mark.parametrize(("which", "k"), [("y", k) for k in range(6)] + [("u", k) for k in range(8)])
+def test_every_flipped_channel_is_named(which, k):
+    def flip(u, y):
+        (y if which == "y" else u)[:, k] *= -1
+        return u, y
+
+    found = channel_alarms(everywhere(SHORT, flip), known())
+    assert [(f.gate, f.channels) for f in found] == [("polarity", ((Y_NAMES if which == "y" else U_NAMES)[k],))]
+
+
+def test_parameter_errors_are_no_channel_faults():
+    """Stiffness wrong by 5 % and damping by 20 %, in any direction each."""
+    rng, parameters = np.random.default_rng(3), RIG.parameters()
+    for _ in range(10):
+        wrong = {}
+        for name, p in parameters.items():
+            if p.unit in ("N/m", "N s/m"):
+                wrong[name] = p.value * (1 + (0.05 if p.unit == "N/m" else 0.2) * rng.choice([-1, 1]))
+        assert len(wrong) == 24
+        assert not channel_alarms(SHORT, known(response=response_of(RIG.with_parameters(wrong))))

@@ -1,0 +1,208 @@
+"""The tests inside the gates against closed forms, and their false alarms counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import signal
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
+from avis_ctrl.measurement.gates import Expectation, examine
+from avis_ctrl.measurement.gates.channel_faults import compare, explain
+from avis_ctrl.measurement.gates.clipping import over_range, repeated_extreme
+from avis_ctrl.measurement.gates.dead_channel import equal_runs
+from avis_ctrl.measurement.gates.excerpt import excerpt
+from avis_ctrl.measurement.gates.h1 import Spectra, h1, spectra
+from avis_ctrl.measurement.gates.hum import Hum
+from avis_ctrl.measurement.gates.missing_samples import delay_step, repeated_block
+from avis_ctrl.measurement.gates.periodicity import compared
+from avis_ctrl.measurement.gates.sine_fit import fit_sine, second_order
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@given(seeds, st.integers(6, 14))
+def test_unclipped_signals_have_no_flat_tops(seed, bits):
+    """Sines and noises, rounded: below the 1 % that a campaign shares."""
+    rng = np.random.default_rng(seed)
+    step = 2.0**-bits
+    sine = np.sin(2 * np.pi * rng.uniform(0.001, 0.4) * np.arange(5000) + rng.uniform(0, 6))
+    for x in (sine, sine + step * rng.standard_normal(5000), rng.standard_normal(5000)):
+        rounded = step * np.round(x / step)
+        assert not over_range(rounded).any()
+    assert repeated_extreme(step * np.round(rng.standard_normal(5000) / step)) > 1e-4
+
+
+@given(seeds, st.floats(0.5, 0.95))
+def test_a_clipped_sine_is_found(seed, part):
+    rng = np.random.default_rng(seed)
+    x = np.sin(2 * np.pi * rng.uniform(0.003, 0.1) * np.arange(5000)) + 1e-3 * rng.standard_normal(5000)
+    assert repeated_extreme(np.round(1e4 * np.minimum(x, part))) < 1e-6
+
+
+def test_over_range_runs_are_marked_exactly():
+    x = np.sin(2 * np.pi * 0.01 * np.arange(1000))
+    want = np.zeros(1000, bool)
+    for start in (60, 260, 460):
+        want[start : start + 25] = True
+    assert np.array_equal(over_range(np.where(want, 3.0, x)), want)
+
+
+@given(st.lists(st.integers(0, 2), min_size=2, max_size=60))
+def test_longest_run_by_groupby(values):
+    from itertools import groupby
+
+    lengths = sorted((len(list(g)) for _, g in groupby(values)), reverse=True)
+    assert [n for n, _ in equal_runs(np.array(values, float))] == lengths[:2]
+
+
+@given(seeds, st.integers(20, 200), st.integers(0, 300))
+def test_a_repeated_block_is_found_where_it_is(seed, rows, at):
+    y = np.random.default_rng(seed).standard_normal((1000, 2))
+    assert repeated_block(y, None) is None
+    y[at + 300 : at + 300 + rows] = y[at : at + rows]
+    found = repeated_block(y, None)
+    assert found is not None and found[1] == 300 and found[0] == at + 300
+    assert found[2] == rows
+
+
+def test_periods_that_repeat_are_no_repeated_block(rng):
+    y = np.tile(rng.standard_normal((100, 2)), (5, 1))
+    assert repeated_block(y, 100) is None
+    assert repeated_block(y, None) is not None
+
+
+def test_false_alarms_of_the_delay_step(rng):
+    """300 records at 1 % each: more than 10 come in 0.03 % of such tests."""
+    hits = sum(delay_step(0.1 * rng.standard_normal(40), 0.01 / 40) is not None for _ in range(300))
+    assert hits <= 10
+
+
+def test_a_step_of_the_delay_has_its_place_and_size(rng):
+    delay = 0.1 * rng.standard_normal(40)
+    delay[25:] -= 2
+    where, size = delay_step(delay, 1e-4)
+    assert abs(where - 25) <= 1 and size == pytest.approx(-2, abs=0.2)
+
+
+@given(seeds)
+def test_fitted_sine(seed):
+    rng = np.random.default_rng(seed)
+    rate, f = 130.0, rng.uniform(0.3, 30)
+    t = np.arange(4000) / rate
+    X = rng.uniform(0.5, 2, 2) * np.exp(2j * np.pi * rng.random(2))
+    x = np.real(X * np.exp(2j * np.pi * f * t)[:, None]) + [3.0, -1.0] + 1e-3 * rng.standard_normal((4000, 2))
+    fit = fit_sine("a", x, 1, rate)
+    assert fit.f == pytest.approx(f, abs=1e-4)
+    np.testing.assert_allclose(fit.X, X, atol=2e-3)
+    np.testing.assert_allclose(fit.rest, 1e-3, rtol=0.1)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(0.3, 5), st.floats(0.2, 1.2), st.sampled_from([0, 1, 2]), st.sampled_from([-1.0, 1.0]))
+def test_second_order_response(corner, damping, k, gain):
+    f = np.geomspace(0.1, 10, 15)
+    s, w = 2j * np.pi * f, 2 * np.pi * corner
+    found = second_order(f, gain * 7 * s**k / (s * s + 2 * damping * w * s + w * w))
+    assert found.k == k and found.misfit < 1e-3
+    assert found.corner_Hz == pytest.approx(corner, rel=1e-3) and found.damping == pytest.approx(damping, rel=1e-3)
+
+
+def test_h1_of_white_noise_is_the_gain_with_its_stated_error(rng):
+    """G constant: no leakage; the residual is the noise, and the errors follow inv(gram)."""
+    G = np.array([[1.0, -2.0], [0.5, 0.0], [0.0, 3.0]])
+    u = rng.standard_normal((40000, 2))
+    y = u @ G.T + 0.1 * rng.standard_normal((40000, 3))
+    made = h1([spectra(u, y, 100.0, 256, wrap=False)])
+    np.testing.assert_allclose(made.G.mean(axis=0).real, G, atol=0.005)
+    variance = np.einsum("fi,fjj->fij", made.noise, np.linalg.inv(made.gram)).real
+    ratio = np.mean(np.abs(made.G - G) ** 2 / variance)
+    assert ratio == pytest.approx(1.0, abs=0.15)
+
+
+def spectra_of(rng, M, noise=0.02, K=60):
+    U = rng.standard_normal((K, 40, M.shape[2])) + 1j * rng.standard_normal((K, 40, M.shape[2]))
+    Y = np.einsum("fij,kfj->kfi", M, U)
+    return Spectra(np.arange(40.0), U, Y + noise * rng.standard_normal(Y.shape)), U
+
+
+@given(seeds)
+def test_faults_of_a_random_matrix_are_recovered(seed):
+    """Any permutation and any signs (fewer flips than half) of a generic response."""
+    rng = np.random.default_rng(seed)
+    E = rng.standard_normal((40, 4, 3)) + 1j * rng.standard_normal((40, 4, 3))
+    p, q = rng.permutation(4), np.arange(3)
+    r = np.ones(4)
+    r[rng.integers(4)] = -1
+    measured, U = spectra_of(rng, r[:, None] * E[:, p][:, :, q])
+    expected = Spectra(measured.f, U, np.einsum("fij,kfj->kfi", E, U))
+    faults = explain(compare([(measured, expected)]), 0.1)
+    assert np.array_equal(faults.p, p) and np.array_equal(faults.r, r)
+    assert np.array_equal(faults.q, q) and np.all(faults.c > 0)
+
+
+def rest(rng, samples=30000, rate=1000.0, channels=4, colour=(1.0,)):
+    y = signal.lfilter([1.0], colour, rng.standard_normal((samples, channels)), axis=0)
+    names = tuple(f"y{k}" for k in range(channels))
+    return Record(RecordHeader("00", rate, samples, ("u",), names, "rest"), np.zeros((samples, 1)), y)
+
+
+@pytest.mark.parametrize("colour", [(1.0,), (1.0, -0.95)])
+def test_false_alarms_of_hum(colour):
+    """100 campaigns of white and of red noise at 1 % each: 5 or more by chance in 0.4 % of such tests."""
+    hits = 0
+    for seed in range(100):
+        record = rest(np.random.default_rng(seed), colour=colour)
+        gate = Hum()
+        found = gate.conclude([gate.look(excerpt(record), Expectation())], Campaign("x", (record,)), Expectation())
+        hits += any(f.severity != "ok" for f in found)
+    assert hits <= 4
+
+
+@pytest.mark.parametrize("mains", [50.0, 60.0])
+def test_hum_names_mains_and_channel(rng, mains):
+    record = rest(rng)
+    y = record.y.copy()
+    y[:, 2] += 0.1 * np.sin(2 * np.pi * (mains * 1.001) * np.arange(len(y)) / 1000)
+    record = Record(record.header, record.u, y)
+    gate = Hum()
+    found = gate.conclude([gate.look(excerpt(record), Expectation())], Campaign("x", (record,)), Expectation())
+    assert [(f.channels, f.severity) for f in found] == [(("y2",), "warning")]
+    assert f"{mains:g} Hz" in found[0].sentence
+
+
+def test_false_alarms_of_periodicity(rng):
+    """T of pure noise is 1 on average, and its largest over periods stays under the F limit."""
+    from scipy import stats
+
+    hits = 0
+    for _ in range(200):
+        T, _, lines, R = compared(rng.standard_normal((8, 256, 2)))
+        assert T.mean() == pytest.approx(1.0, abs=0.25)
+        hits += T.max() > stats.f.isf(0.01 / T.size, lines, lines * (R - 1))
+    assert hits <= 7
+
+
+def test_long_records_are_looked_at_in_pieces_and_that_is_said(rng):
+    class Watched(Record):
+        sizes: tuple[int, ...] = ()
+
+        def load(self, start=0, stop=None):
+            stop = self.header.samples if stop is None else stop
+            Watched.sizes += (stop - start,)
+            return super().load(start, stop)
+
+    short = rest(rng, samples=30000)
+    record = Watched(short.header, short.u, short.y)
+    findings = examine(Campaign("x", (record,)), longest=8000)
+    assert sum(Watched.sizes) <= 8000
+    assert all("only pieces of 8000 samples" in f.sentence for f in findings)
+
+
+@pytest.mark.parametrize("field", [{"y_range_V": (1.0, -1.0)}, {"y_lsb_V": 0.0}, {"drive_limit_V": np.nan}])
+def test_expectation_refuses_what_cannot_be(field):
+    with pytest.raises(InputError, match=next(iter(field))):
+        Expectation(**field)
