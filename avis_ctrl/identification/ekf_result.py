@@ -96,9 +96,8 @@ class Directions:
             order = np.argsort(-np.abs(vector))
             count = int(np.searchsorted(np.cumsum(vector[order] ** 2), 0.9)) + 1
             sign = np.sign(vector[order[0]])
-            parts = [f"{'+' if sign * vector[j] > 0 else '-'} {self.names[j]}" for j in order[:count]]
-            lines.append(f"not determined: {' '.join(parts).removeprefix('+ ')} moved together "
-                         f"(variance {ratio:.2g} of the prior's)")
+            parts = [f"{self.names[j]} {'up' if sign * vector[j] > 0 else 'down'}" for j in order[:count]]
+            lines.append(f"not determined: {' with '.join(parts)} (variance {ratio:.2g} of the prior's)")
         return tuple(lines)
 
 

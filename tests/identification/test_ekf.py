@@ -202,7 +202,7 @@ def test_a_disturbance_acts_as_a_held_acceleration(rig, rng):
     expected = block[:12, :12] @ x0[:12] + block[:12, 12:] @ np.concatenate([u, x0[12:]])
     for half in (slice(0, 6), slice(6, 12)):
         moved = np.max(np.abs(expected - x0[:12])[half])
-        assert np.max(np.abs(x[:12] - expected)[half]) < 1e-8 * moved
+        assert np.max(np.abs(x[:12] - expected)[half]) < 1e-7 * moved
         found = room.Phi_t[12:, half].T
         assert np.max(np.abs(found - block[half, 20:])) < 1e-6 * np.max(np.abs(found))
     assert np.array_equal(x[12:], 0.9 * x0[12:]) and np.array_equal(room.Phi_t[12:, 12:], 0.9 * np.eye(3))
@@ -327,7 +327,11 @@ def test_identification_from_25_percent_off(rig, wrong, honest):
 def test_directions_that_kept_their_prior_are_those_that_move_nothing(wrong, honest):
     result = honest
     kept = result.directions.kept()
-    assert kept.shape == (26, 6) and len(result.directions.words()) == 6
+    words = result.directions.words()
+    assert kept.shape == (26, 6) and len(words) == 6
+    assert {tuple(sorted(word.split()[2::3][:2])) for word in words} == {
+        (f"isolator{i}.{kind}", f"isolator{j}.{kind}")
+        for i, j, kind in ((3, 4, "k_x"), (2, 3, "k_y"), (1, 4, "k_y"), (2, 3, "c_y"), (3, 4, "c_x"), (1, 4, "c_y"))}
     model = linear_model(wrong, result.names)
     for part, whole in zip((model.dM, model.dC, model.dK), model.matrices(model.values), strict=True):
         assert np.max(np.abs((part * model.values) @ kept)) < 1e-2 * np.max(np.abs(whole))
