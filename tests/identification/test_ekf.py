@@ -234,9 +234,9 @@ def test_square_root_propagation_and_update_are_those_of_the_covariance(seed, n_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("R", [1e-8, 1e-13])
+@pytest.mark.parametrize("R", [1e-8, 4e-16])
 def test_the_covariance_stays_definite_over_1e5_samples(rig, wrong, R):
-    """Smallest eigenvalue with every state at unit variance: above round-off at every 1e4th of 1e5 samples."""
+    """Smallest eigenvalue with every state at unit variance, at every 1e4th of 1e5 samples (seen: 3e-4)."""
     from avis_ctrl.identification.prefilter import prefilter, sensor_inverse
     record = source_campaign(rig, sets=1, duration_s=100.0).records[0].load()
     data = prefilter(record, sensor_inverse(rig, record.header.y_names, "V"), rig.loop_delay_s)
@@ -249,7 +249,7 @@ def test_the_covariance_stays_definite_over_1e5_samples(rig, wrong, R):
         P = kalman.covariance
         size = np.sqrt(np.diag(P))
         smallest.append(np.min(np.linalg.eigvalsh(P / np.outer(size, size))))
-    assert np.min(smallest) > 1e-9
+    assert np.min(smallest) > 1e-5
 
 
 # -- consistency ---------------------------------------------------------------------------------------------------
