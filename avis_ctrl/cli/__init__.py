@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import time
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import avis_ctrl
+from avis_ctrl.cli.design import design
+from avis_ctrl.cli.identify import identify, predict, single_axis
+from avis_ctrl.cli.measure import convert, excite, simulate_campaign
 from avis_ctrl.errors import AvisError
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
@@ -36,35 +37,6 @@ def _commands(version: Annotated[bool, typer.Option("--version", callback=_versi
 
 
 @app.command()
-def design(
-    file: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="what to design; start from designs/*.toml")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for controllers and report")],
-) -> None:
-    """From a rig to certified controllers, checks and a design report.
-
-    Writes report.html, report.pdf, controllers/NAME.json, plant.json and result.json into DIR.
-    """
-    from rich.console import Console
-
-    from avis_ctrl.study.design_file import read_study
-    from avis_ctrl.study.output import open_folder
-
-    console = Console(highlight=False)
-    design, rig = read_study(file)  # before anything is imported or written that takes time
-    folder = open_folder(out)
-    with _Progress(console) as progress:
-        from avis_ctrl.report import render_html, render_pdf
-        from avis_ctrl.study.output import write_study
-        from avis_ctrl.study.runner import run_design
-
-        result = run_design(design, rig, progress, source=file)
-        progress("report")
-        files = write_study(result, folder, render_html(result), render_pdf(result))
-    _verdict(console, result)
-    console.print(f"{len(files)} files in {folder}; open {folder / 'report.html'} or {folder / 'report.pdf'}")
-
-
-@app.command()
 def doctor() -> None:
     """Versions, solvers, threads: what works here and what does not."""
     from rich.console import Console
@@ -82,37 +54,9 @@ def doctor() -> None:
         raise typer.Exit(3)
 
 
-class _Progress:
-    """A line with the time at each step; on a terminal a spinner below says that work goes on."""
-
-    def __init__(self, console):
-        self.console, self.began = console, time.monotonic()
-        self.status = console.status("working") if console.is_terminal else None
-
-    def __enter__(self):
-        if self.status:
-            self.status.start()
-        return self
-
-    def __call__(self, text: str) -> None:
-        self.console.print(f"[dim]{time.monotonic() - self.began:6.1f} s[/]  {text}", soft_wrap=True)
-
-    def __exit__(self, kind, value, trace) -> None:
-        if self.status:
-            self.status.stop()
-
-
-def _verdict(console, result) -> None:
-    from rich.table import Table
-
-    table = Table("requirement", "asked", "measured", "", title=result.design.title)
-    for r in result.requirements:
-        unit = f" {r.unit}" if r.unit else ""
-        asked = "yes" if r.comparison == "is" else f"{r.comparison} {r.limit:.4g}{unit}"
-        table.add_row(r.name, asked, f"{r.value:.4g}{unit}", "[green]met[/]" if r.met else "[red]not met[/]")
-    console.print(table)
-    for note in result.notes:
-        console.print(note)
+for command, name in ((design, "design"), (identify, "identify"), (predict, "predict"), (excite, "excite"),
+                      (simulate_campaign, "simulate-campaign"), (convert, "convert"), (single_axis, "single-axis")):
+    app.command(name)(command)
 
 
 def main() -> None:

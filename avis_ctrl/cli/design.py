@@ -1,0 +1,51 @@
+"""`avis design`: from a rig to certified controllers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from avis_ctrl.cli.console import Progress
+
+
+def design(
+    file: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="what to design; start from designs/*.toml")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for controllers and report")],
+) -> None:
+    """From a rig to certified controllers, checks and a design report.
+
+    Writes report.html, report.pdf, controllers/NAME.json, plant.json and result.json into DIR.
+    """
+    from rich.console import Console
+
+    from avis_ctrl.study.design_file import read_study
+    from avis_ctrl.study.output import open_folder
+
+    console = Console(highlight=False)
+    design, rig = read_study(file)  # before anything is imported or written that takes time
+    folder = open_folder(out)
+    with Progress(console) as progress:
+        from avis_ctrl.report import render_html, render_pdf
+        from avis_ctrl.study.output import write_study
+        from avis_ctrl.study.runner import run_design
+
+        result = run_design(design, rig, progress, source=file)
+        progress("report")
+        files = write_study(result, folder, render_html(result), render_pdf(result))
+    _verdict(console, result)
+    console.print(f"{len(files)} files in {folder}; open {folder / 'report.html'} or {folder / 'report.pdf'}")
+
+
+def _verdict(console, result) -> None:
+    from rich.table import Table
+
+    table = Table("requirement", "asked", "measured", "", title=result.design.title)
+    for r in result.requirements:
+        unit = f" {r.unit}" if r.unit else ""
+        asked = "yes" if r.comparison == "is" else f"{r.comparison} {r.limit:.4g}{unit}"
+        table.add_row(r.name, asked, f"{r.value:.4g}{unit}", "[green]met[/]" if r.met else "[red]not met[/]")
+    console.print(table)
+    for note in result.notes:
+        console.print(note)

@@ -1,0 +1,150 @@
+"""`avis identify` and `avis predict`: from measurements to a rig, and what that rig would have measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from avis_ctrl.cli.console import Progress
+from avis_ctrl.errors import InputError
+
+
+def identify(
+    measurement: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="HDF5 campaign, .mat, UFF 58, CSV or a "
+                                                "folder of CSV; records or frequency responses")],
+    rig: Annotated[str, typer.Option("--rig", metavar="RIG", help="where to start: avis, halcyonics, "
+                                     "halcyonics_loaded or a rig.toml")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for rig, report and uncertainty")],
+    columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="which variable of the file "
+                                                "is what, such as u=V1+V2,y=S1,t=time")] = None,
+    parameters: Annotated[list[str] | None, typer.Option("--parameter", metavar="NAME", help="what is free, such as "
+                                                         "'isolator*.k_z' (repeatable); by default mass, inertia, "
+                                                         "stiffness, damping")] = None,
+    priors: Annotated[list[str] | None, typer.Option("--prior", metavar="NAME=MEAN+-STD", help="what is known of a "
+                                                     "parameter beforehand (repeatable)")] = None,
+    hold_out: Annotated[list[str] | None, typer.Option("--hold-out", metavar="RECORD", help="kept for validation "
+                                                       "(repeatable); chosen by default")] = None,
+    band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default "
+                                                                "what is excited")] = None,
+    starts: Annotated[int, typer.Option("--starts", help="starting points of the fit")] = 3,
+    kalman: Annotated[bool, typer.Option("--kalman", help="run the extended Kalman filter beside it")] = False,
+    design: Annotated[Path | None, typer.Option("--design", metavar="DESIGN.toml", help="design file whose rig and "
+                                                "uncertainty are replaced by what is identified; by default z and "
+                                                "phi_x")] = None,
+    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="go on where a gate says stop")] = False,
+    seed: Annotated[int, typer.Option("--seed")] = 1,
+) -> None:
+    """From measurements to an identified rig with known uncertainty, and a report.
+
+    Writes rig.toml, uncertainty.json, design.toml, report.html, report.pdf and result.json into DIR; then
+    `avis design DIR/design.toml --out DIR2` designs controllers for it.
+    """
+    from rich.console import Console
+
+    from avis_ctrl.measurement.formats import parse_columns, read_measurements
+    from avis_ctrl.rigs import load_rig
+    from avis_ctrl.study.output import open_folder
+
+    console = Console(highlight=False)
+    start = load_rig(rig)
+    measured = read_measurements(measurement, parse_columns(columns) if columns else None)
+    folder = open_folder(out)
+    with Progress(console) as progress:
+        from avis_ctrl.report import identification_html, identification_pdf
+        from avis_ctrl.study.identification import IdentifyOptions, identify
+        from avis_ctrl.study.identification_output import write_identification
+        from avis_ctrl.study.identified_uncertainty import design_files
+
+        options = IdentifyOptions(tuple(parameters or ()), dict(_prior(text) for text in priors or ()),
+                                  tuple(hold_out) if hold_out else None, band_Hz, starts, kalman, despite_gates, seed)
+        found = identify(measured, start, options, progress)
+        progress("uncertainty for design")
+        more = design_files(found, design)
+        progress("report")
+        files = write_identification(found, folder, identification_html(found), identification_pdf(found), more)
+    _summary(console, found)
+    console.print(f"{len(files)} files in {folder}; open {folder / 'report.html'} or {folder / 'report.pdf'}; next: "
+                  f"avis design {folder / 'design.toml'} --out {folder / 'design'}")
+
+
+def predict(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="output folder of avis identify")],
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="another campaign of the same rig")],
+    out: Annotated[Path, typer.Option("--out", metavar="PRED.h5", help="file to write")],
+) -> None:
+    """What the identified rig would have measured: /records/NN/y from the campaign's u and floor alone."""
+    from rich.console import Console
+
+    from avis_ctrl.measurement.campaign import Campaign
+    from avis_ctrl.measurement.formats import read_measurements
+    from avis_ctrl.study.identification_output import write_predictions
+
+    console = Console(highlight=False)
+    measured = read_measurements(campaign)
+    if not isinstance(measured, Campaign):
+        raise InputError("expected records, found frequency responses", file=campaign)
+    with Progress(console) as progress:
+        write_predictions(folder, measured, out, progress)
+    console.print(f"{out}: {len(measured.records)} records")
+
+
+def _prior(text: str) -> tuple[str, tuple[float, float]]:
+    name, _, rest = text.partition("=")
+    mean, _, sigma = rest.partition("+-")
+    try:
+        return name.strip(), (float(mean), float(sigma))
+    except ValueError:
+        raise InputError("expected NAME=MEAN+-STD such as mass=500+-5", field="--prior", value=text) from None
+
+
+def _summary(console, found) -> None:
+    from rich.table import Table
+
+    information = found.campaign_fit.fit.information
+    start = {name: one.value for name, one in found.campaign_fit.first.model.all_parameters().items()}
+    start |= {name: one.value for name, one in found.start.parameters().items()}
+    table = Table("parameter", "start", "identified", "+- 1 sigma", "unit", title=f"{found.rig.name}, identified")
+    for name, value, sigma, unit in zip(information.names, information.values, information.standard_deviation,
+                                        information.units, strict=True):
+        table.add_row(name, f"{start[name]:.6g}", f"{value:.6g}",
+                      f"{sigma:.2g}" if sigma < float("inf") else "only in combination", unit)
+    console.print(table)
+    for sentence in (*found.identifiability.sentences, *found.validation.sentences):
+        console.print(f"- {sentence}")
+
+
+def single_axis(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="seismometer, decay, drive or oscillator")],
+    path: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="a record; for a seismometer a folder with one "
+                                         "CSV per frequency")],
+    columns: Annotated[str, typer.Option("--columns", metavar="ROLE=NAME,..", help="seismometer: drive, coil and/or "
+                                         "displacement; decay: y; drive: force, position, reference; oscillator: u, "
+                                         "y; each also t")],
+    scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="to SI units")] = None,
+    sample_rate_Hz: Annotated[float | None, typer.Option("--sample-rate", help="Hz, where the file has none")] = None,
+) -> None:
+    """A small model of one axis: a seismometer, a drive with friction, an oscillator."""
+    from rich.console import Console
+
+    from avis_ctrl.identification.single_axis.identify import identify_single_axis
+
+    roles = dict(_pair(part, "--columns") for part in columns.split(","))
+    factors = {}
+    for part in (scale or "").split(",") if scale else []:
+        role, number = _pair(part, "--scale")
+        try:
+            factors[role] = float(number)
+        except ValueError:
+            raise InputError("expected ROLE=NUMBER", field="--scale", value=part) from None
+    found = identify_single_axis(kind, path, roles, scale=factors or None, sample_rate_Hz=sample_rate_Hz)
+    for line in found.lines():
+        Console(highlight=False).print(line)
+
+
+def _pair(text: str, option: str) -> tuple[str, str]:
+    role, equals, name = (part.strip() for part in text.partition("="))
+    if not (role and equals and name):
+        raise InputError("expected ROLE=NAME", field=option, value=text)
+    return role, name

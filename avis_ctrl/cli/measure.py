@@ -1,0 +1,127 @@
+"""`avis excite`, `avis simulate-campaign`, `avis convert`: signals to play, rehearsals, file formats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from avis_ctrl.cli.console import Progress
+from avis_ctrl.errors import InputError
+
+RIG = Annotated[str, typer.Option("--rig", metavar="RIG", help="avis, halcyonics, halcyonics_loaded or a rig.toml")]
+
+
+def excite(
+    rig: RIG,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="signals.h5, .csv or .mat")],
+    kind: Annotated[str, typer.Option("--kind", help="multisine or noise")] = "multisine",
+    band_Hz: Annotated[tuple[float, float], typer.Option("--band", metavar="LOW HIGH", help="Hz")] = (0.5, 60.0),
+    period_s: Annotated[float, typer.Option("--period", help="period of a multisine, length of noise [s]")] = 10.0,
+    periods: Annotated[int, typer.Option("--periods", help="how often a multisine is played; the first period holds "
+                                         "the transient")] = 6,
+    rms_V: Annotated[float | None, typer.Option("--rms", help="of each drive [V]; by default as the limit "
+                                                "allows")] = None,
+    lines: Annotated[str, typer.Option("--lines", help="full, odd or odd_detection")] = "full",
+    scheme: Annotated[str, typer.Option("--scheme", help="orthogonal (one record a drive, all lines) or zippered (one "
+                                        "record, lines dealt to the drives)")] = "orthogonal",
+    seed: Annotated[int, typer.Option("--seed")] = 1,
+) -> None:
+    """Signals to play on the rig: multisines of low crest factor, or noise, within its voltage limit."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from avis_ctrl.measurement.excitation import MultisineSettings, NoiseSettings, multisine, noise
+    from avis_ctrl.measurement.excitation_files import write_signals
+    from avis_ctrl.rigs import load_rig
+
+    console = Console(highlight=False)
+    table = load_rig(rig)
+    names = table.equations_of_motion().actuators
+    with Progress(console) as progress:
+        progress(f"{kind} for {len(names)} drives, {band_Hz[0]:g} to {band_Hz[1]:g} Hz")
+        if kind == "multisine":
+            signals = multisine(MultisineSettings(names, table.sample_rate_Hz, period_s, band_Hz, table.drive_limit_V,
+                                                  rms_V, lines, scheme=scheme, seed=seed))  # type: ignore[arg-type]
+        elif kind == "noise":
+            signals = noise(NoiseSettings(names, table.sample_rate_Hz, period_s, band_Hz, table.drive_limit_V, rms_V,
+                                          seed=seed))
+        else:
+            raise InputError("expected multisine or noise", field="--kind", value=kind)
+        write_signals(signals, out, periods if kind == "multisine" else 1, table.name)
+    shown = Table("record", "r.m.s. [V]", "peak [V]", "crest factor", "before", title="largest over the drives")
+    for k in range(len(signals.u)):
+        shown.add_row(str(k), *(f"{values[k].max():.3g}" for values in (signals.rms_V, signals.peak_V, signals.crest,
+                                                                        signals.crest_before)))
+    console.print(shown)
+    console.print(f"{out}: {len(signals.u)} records to play; limit {table.drive_limit_V:g} V")
+
+
+def simulate_campaign(
+    rig: RIG,
+    out: Annotated[Path, typer.Option("--out", metavar="CAMPAIGN.h5", help="file to write")],
+    plan: Annotated[Path | None, typer.Option("--plan", metavar="PLAN.toml", help="records, levels, floor; by default "
+                                              "multisines at three levels, noise, rest and a shaken floor")] = None,
+    write_plan: Annotated[Path | None, typer.Option("--write-plan", metavar="FILE", help="also write the plan used, to "
+                                                    "start from")] = None,
+    truth: Annotated[Path | None, typer.Option("--truth", metavar="FILE", help="also write the rig that was simulated "
+                                               "(perturbed if the plan says so)")] = None,
+    perturbed: Annotated[bool, typer.Option("--perturbed", help="default plan with parameters up to 5 % off, damping "
+                                            "20 %")] = False,
+    orthogonal: Annotated[bool, typer.Option("--orthogonal", help="default plan with orthogonal multisines")] = False,
+    duration_s: Annotated[float, typer.Option("--duration", help="of each record of the default plan [s]")] = 60.0,
+    seed: Annotated[int, typer.Option("--seed")] = 1,
+) -> None:
+    """A measurement campaign from the nonlinear model, to plan and rehearse an identification."""
+    from rich.console import Console
+
+    from avis_ctrl.measurement.formats.hdf5 import write_campaign
+    from avis_ctrl.rigs import load_rig
+    from avis_ctrl.simulation import rehearse
+    from avis_ctrl.study.campaign_plan import default_plan, plan_toml, read_plan
+    from avis_ctrl.study.output import write_whole
+
+    console = Console(highlight=False)
+    table = load_rig(rig)
+    chosen = read_plan(plan) if plan else default_plan(table, "orthogonal" if orthogonal else "zippered",
+                                                       perturbed=perturbed, duration_s=duration_s)
+    with Progress(console) as progress:
+        rehearsal = rehearse(table, chosen, seed, progress)
+        write_campaign(out, rehearsal.campaign)
+    for path, text in ((write_plan, plan_toml(chosen)), (truth, rehearsal.truth_toml())):
+        if path:
+            write_whole(path, text.encode())
+    for note in rehearsal.campaign.notes:
+        console.print(note)
+    console.print(f"{out}: {len(rehearsal.campaign.records)} records, seed {seed}")
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="HDF5, .mat, UFF 58, CSV or a folder of CSV")],
+    out: Annotated[Path, typer.Argument(metavar="CAMPAIGN.h5")],
+    columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="which variable is what, "
+                                                "such as u=vir,y=qm,t=t")] = None,
+    rig: Annotated[str | None, typer.Option("--rig", help="name of the rig, where the file has none")] = None,
+) -> None:
+    """Any measurement file as a campaign in HDF5, with what had to be assumed."""
+    from rich.console import Console
+
+    from avis_ctrl.measurement.campaign import Campaign
+    from avis_ctrl.measurement.formats import parse_columns, read_measurements
+    from avis_ctrl.measurement.formats.hdf5 import write_campaign
+    from avis_ctrl.measurement.formats.stored_response import write_frequency_response
+
+    console = Console(highlight=False)
+    measured = read_measurements(source, parse_columns(columns) if columns else None, rig)
+    if isinstance(measured, Campaign):
+        write_campaign(out, measured)
+        for note in measured.notes:
+            console.print(note)
+        console.print(f"{out}: {len(measured.records)} records of {len(measured.u_names)} inputs and "
+                      f"{len(measured.y_names)} outputs at {measured.sample_rate_Hz:g} Hz")
+    else:
+        write_frequency_response(out, measured)
+        console.print(f"{out}: frequency responses at {len(measured.frequency_Hz)} frequencies, {len(measured.inputs)} "
+                      f"inputs, {len(measured.outputs)} outputs")
+

@@ -1,0 +1,202 @@
+"""From measurements to an identified rig: gates, three ways of identification, identifiability, validation."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+import avis_ctrl
+from avis_ctrl.errors import AvisError, InputError
+from avis_ctrl.identification.campaign_fit import CampaignFit, Split, excited_band, fit_campaign, split_campaign
+from avis_ctrl.identification.ekf import identify_ekf
+from avis_ctrl.identification.ekf_result import EkfResult
+from avis_ctrl.identification.ekf_settings import HONEST_SETTINGS
+from avis_ctrl.identification.identifiability import IdentifiabilityReport, identifiability_report
+from avis_ctrl.identification.maximum_likelihood import Prior
+from avis_ctrl.identification.parameter_sets import default_parameters, named_parameters
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.validation import Validation, validate
+from avis_ctrl.measurement.campaign import Campaign, digest
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.gates import Expectation, Finding, examine
+from avis_ctrl.rigs.rig import Rig
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class IdentifyOptions:
+    """What a user may choose.
+
+    parameters : names or wildcards of what is free; the rig's usual ones by default.
+    priors : (mean, standard deviation) by parameter.
+    hold_out : records that no fit sees; chosen where None. band_Hz : of the fit; the excited one where None.
+    starts : of the maximum likelihood fit. kalman : run the extended Kalman filter beside it.
+    despite_gates : go on where a gate says stop.
+    """
+
+    parameters: tuple[str, ...] = ()
+    priors: Mapping[str, Prior] = field(default_factory=dict)
+    hold_out: tuple[str, ...] | None = None
+    band_Hz: tuple[float, float] | None = None
+    starts: int = 3
+    kalman: bool = False
+    despite_gates: bool = False
+    seed: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """Everything that `avis identify` found.
+
+    rig : with the identified values; start : as it came. split is None for frequency responses without records.
+    kalman : the extended Kalman filter's answer, where it was asked for; kalman_note why there is none.
+    """
+
+    start: Rig
+    rig: Rig
+    options: IdentifyOptions
+    measured: Campaign | FrequencyResponse
+    findings: tuple[Finding, ...]
+    split: Split | None
+    campaign_fit: CampaignFit
+    identifiability: IdentifiabilityReport
+    validation: Validation
+    kalman: EkfResult | None
+    kalman_note: str
+    provenance: Mapping[str, Any]
+    seconds: float
+
+    @property
+    def model(self) -> ResponseModel:
+        return self.campaign_fit.fit.model
+
+
+def expectation(model: ResponseModel) -> Expectation:
+    """What the gates may hold the records against."""
+    rig, acquisition = model.rig, model.rig.acquisition
+    volts = model.sensors.unit == "V" and acquisition is not None
+
+    def response(omega: np.ndarray, inputs: tuple[str, ...]) -> np.ndarray:
+        return model.response(omega)[:, :, [model.inputs.index(name) for name in inputs]]
+    return Expectation(
+        y_range_V=(-acquisition.adc_range_V, acquisition.adc_range_V * (1 - 2.0 ** (1 - acquisition.adc_bits)))
+        if volts and acquisition else None,
+        y_lsb_V=2 * acquisition.adc_range_V / 2 ** acquisition.adc_bits if volts and acquisition else None,
+        drive_limit_V=rig.drive_limit_V,
+        sensor_noise_rms_V=rig.ambient.sensor_noise_rms_V if volts and rig.ambient else None,
+        u_names=model.actuators, y_names=model.sensors.names, u_unit="V", y_unit=model.sensors.unit, response=response)
+
+
+def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions | None = None,
+             progress: Progress = lambda text: None) -> Identification:
+    """Identify a rig.
+
+    Raises
+    ------
+    InputError : records that are not of this rig, a gate that says stop, options that do not fit.
+    ComputationError : a fit that does not come to an end.
+    """
+    options, began = options or IdentifyOptions(), time.monotonic()
+    with threadpool_limits(1):
+        model = start_model(measured, rig, options)
+        findings = gates(measured, model, options, progress)
+        split, fitted, held_out, band = _divide(measured, options)
+        progress(f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
+                 + (f"; {split.how}" if split else ""))
+        found = fit_campaign(fitted, model, band, options.priors, options.starts, options.seed, progress=progress)
+        report = identifiability_report(found.fit.information)
+        progress(f"{found.fit.information.rank} of {len(model.names)} combinations of parameters are determined")
+        kalman, note = _kalman(fitted, rig, model.names, options, progress)
+        progress("validation on what no fit has seen")
+        validation = validate(found, fitted, held_out)
+    identified = found.fit.model.rig
+    seconds = time.monotonic() - began
+    return Identification(rig, identified, options, measured, findings, split, found, report, validation, kalman, note,
+                          provenance(measured, rig, options, seconds), seconds)
+
+
+def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions) -> ResponseModel:
+    """The rig as its file describes it, with the channels of the measurement.
+
+    Raises InputError where the channels, units or parameters are not the rig's.
+    """
+    if isinstance(measured, Campaign):
+        unit, sensors, actuators, sampled = measured.y_unit, measured.y_names, measured.u_names, True
+        if measured.records[0].header.u_unit != "V":
+            raise InputError("expected commanded voltages in V", field="unit of u",
+                             value=measured.records[0].header.u_unit)
+    else:
+        unit, sensors, sampled = measured.output_unit, measured.outputs, False
+        actuators = tuple(name for name in measured.inputs if name not in ("vx", "vy", "vz"))
+    names = named_parameters(rig, options.parameters, unit) if options.parameters else default_parameters(rig)
+    return ResponseModel.of(rig, names, unit, sensors, actuators, sampled)
+
+
+def gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options: IdentifyOptions,
+          progress: Progress) -> tuple[Finding, ...]:
+    """What the gates say; raises InputError where one says stop and the user did not ask to go on."""
+    if not isinstance(measured, Campaign):
+        return ()
+    kinds = ", ".join(sorted({record.header.excitation for record in measured.records}))
+    progress(f"gates: {len(measured.records)} records of {kinds}")
+    findings = examine(measured, expectation(model))
+    for finding in findings:
+        if finding.severity in ("warning", "stop"):
+            progress(f"  {finding.severity}: {finding.sentence}")
+    stops = [finding for finding in findings if finding.severity == "stop"]
+    if stops and not options.despite_gates:
+        more = f" (and {len(stops) - 1} more)" if len(stops) > 1 else ""
+        raise InputError(f"{stops[0].sentence}{more}; --despite-gates goes on all the same", field="measurement",
+                         value=stops[0].gate)
+    return findings
+
+
+def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions):
+    """Split, what is fitted, what is held out, and the band."""
+    if isinstance(measured, FrequencyResponse):
+        band = options.band_Hz or (float(measured.frequency_Hz[0]), float(measured.frequency_Hz[-1]))
+        inside = measured.between(*band)
+        third = np.arange(len(inside.frequency_Hz)) % 3 == 2
+        return None, inside.at(~third), inside.at(third), band
+    split = split_campaign(measured, options.hold_out)
+    return split, split.fitted, split.held_out, options.band_Hz or excited_band(split.fitted)
+
+
+def _kalman(fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str], options: IdentifyOptions,
+            progress: Progress) -> tuple[EkfResult | None, str]:
+    if not options.kalman:
+        return None, "the extended Kalman filter was not asked for"
+    if not isinstance(fitted, Campaign):
+        return None, "the extended Kalman filter needs records; these are frequency responses"
+    progress("extended Kalman filter over the same records")
+    try:
+        return identify_ekf(rig, fitted, HONEST_SETTINGS, names, progress), ""
+    except AvisError as error:
+        return None, f"the extended Kalman filter gave no answer: {error}"
+
+
+def provenance(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions, seconds: float
+               ) -> dict[str, Any]:
+    """What made this result: versions, hash of the inputs, seed, time."""
+    if isinstance(measured, Campaign):
+        data, source = digest(measured), measured.source
+    else:
+        data = hashlib.sha256(measured.frequency_Hz.tobytes() + measured.value.tobytes()).hexdigest()
+        source = measured.method
+    text = repr(sorted((k, v.value) for k, v in rig.parameters().items())) + repr(replace(options, priors={})) + repr(
+        sorted(options.priors.items()))
+    return {"avis_ctrl": avis_ctrl.__version__, "measurement": source, "measurement_sha256": data,
+            "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(), "seed": options.seed,
+            "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
+            "python": platform.python_version(),
+            **{name: metadata.version(name) for name in ("numpy", "scipy", "numba", "h5py")}}

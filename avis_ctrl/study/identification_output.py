@@ -1,0 +1,161 @@
+"""Files of an identification: rig.toml, result.json, and predictions of other campaigns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.prediction import Predictor, model_inputs
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.formats.hdf5 import ranges, replacing
+from avis_ctrl.rigs.avis import AvisTable
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.rigs.rig_writer import rig_toml
+from avis_ctrl.study.identification import Identification
+from avis_ctrl.study.output import write_json, write_whole
+
+RIG_FILE, RESULT_FILE = "rig.toml", "result.json"
+PIECE = 1 << 17
+
+
+def identified_rig(model: ResponseModel) -> Rig:
+    """The rig of a fit, sensitivities of its sensors and loop delay included.
+
+    Raises InputError where the rig's file has no place for what was found.
+    """
+    rig = model.rig
+    sensitive = [name for name in model.names if name.startswith("sensor.")]
+    if not sensitive and "loop_delay_s" not in model.names:
+        return rig
+    if not isinstance(rig, AvisTable):
+        raise InputError("a rig file of this kind has one sensitivity and one delay for all; leave them out",
+                         field="parameters", value=sensitive or ["loop_delay_s"])
+    g = rig.geophones
+    found = dict(zip(model.sensors.names, model.sensors.sensitivity / g.preamplifier_gain, strict=True))
+    volts = tuple(float(found.get(name, old)) for name, old in zip(g.names, g.sensitivity_Vs_per_m, strict=True))
+    return replace(rig, geophones=replace(g, sensitivity_Vs_per_m=volts),
+                   acquisition=replace(rig.acquisition, loop_delay_s=model.delay_s))
+
+
+def identified_toml(found: Identification) -> str:
+    """The rig file of an identification: each identified value with its standard deviation beside it."""
+    information = found.campaign_fit.fit.information
+    known = found.rig.parameters()
+    comments = {}
+    for name, value, sigma in zip(information.names, information.values, information.standard_deviation, strict=True):
+        if name in known:
+            comments[name] = (f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}" if np.isfinite(sigma)
+                              else f"{name.rpartition('.')[2]} not determined by itself, near its start {value:.4g}")
+    p = found.provenance
+    header = [f"{found.rig.name}, identified by avis_ctrl {p['avis_ctrl']} on {p['date']}",
+              f"from {p['measurement'] or 'a measurement'}, SHA-256 {p['measurement_sha256'][:16]}",
+              f"{information.rank} of {len(information.names)} combinations of parameters are determined; standard "
+              "deviations (1 sigma) beside the values",
+              "what the combinations are stands in the report and in result.json"]
+    return rig_toml(identified_rig(found.model), comments, "\n".join(header))
+
+
+def result_dict(found: Identification) -> dict[str, Any]:
+    """What programs read: numbers without a report."""
+    fit, information = found.campaign_fit.fit, found.campaign_fit.fit.information
+    start = found.start.parameters()
+    rows = {}
+    for name, value, sigma, unit in zip(information.names, information.values, information.standard_deviation,
+                                        information.units, strict=True):
+        rows[name] = {"value": float(value), "std": float(sigma) if np.isfinite(sigma) else None, "unit": unit,
+                      "start": float(start[name].value) if name in start else None}
+    return {
+        "format": "avis-identification", "version": 1, "rig": found.rig.name,
+        "loaded": getattr(found.rig, "load", None) is not None,
+        "parameters": rows,
+        "covariance": {"names": list(information.names), "matrix": information.covariance.tolist()},
+        "rank": information.rank, "condition": information.condition,
+        "identifiability": list(found.identifiability.sentences),
+        "fit": {"chi2_per_dof": found.campaign_fit.first.chi2_per_dof, "dof": fit.dof, "band_Hz": list(
+            found.campaign_fit.band_Hz), "converged": fit.converged, "starts_chi2": list(fit.starts),
+            "notes": list(found.campaign_fit.notes)},
+        "validation": found.validation.as_dict(),
+        "gates": [{"gate": f.gate, "severity": f.severity, "sentence": f.sentence, "channels": list(f.channels),
+                   "records": list(f.records)} for f in found.findings],
+        "unit_of_y": found.model.sensors.unit, "amplifier_corner_Hz": found.model.amplifier_corner_Hz,
+        "provenance": dict(found.provenance), "seconds": found.seconds}
+
+
+def write_identification(found: Identification, folder: Path, html: bytes | None = None, pdf: bytes | None = None,
+                         more: dict[str, str] | None = None) -> list[Path]:
+    """All files; result.json last, so that its presence says that the others are complete."""
+    names = [RESULT_FILE, RIG_FILE, "report.html", "report.pdf", *(more or {})]
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
+    texts = {RIG_FILE: identified_toml(found).encode(), **{name: text.encode() for name, text in (more or {}).items()},
+             "report.html": html, "report.pdf": pdf}
+    written = []
+    for name, content in texts.items():
+        if content is not None:
+            write_whole(folder / name, content)
+            written.append(folder / name)
+    write_json(folder / RESULT_FILE, result_dict(found))
+    return [*written, folder / RESULT_FILE]
+
+
+def read_identified(folder: Path) -> tuple[Rig, float | None]:
+    """Rig of an identification's folder, and the corner of its amplifiers.
+
+    Raises InputError where the folder holds no identification, or half of one.
+    """
+    path = folder / RESULT_FILE
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"expected the folder of an identification ({error.strerror or error})", file=path) from None
+    except ValueError as error:
+        raise InputError(f"expected JSON; {error}", file=path) from None
+    if not isinstance(result, dict) or result.get("format") != "avis-identification":
+        raise InputError("expected the result of avis identify", file=path, field="format",
+                         value=result.get("format") if isinstance(result, dict) else type(result).__name__)
+    return load_rig(folder / RIG_FILE, bool(result.get("loaded"))), result.get("amplifier_corner_Hz")
+
+
+def write_predictions(folder: Path, campaign: Campaign, out: Path,
+                      progress: Callable[[str], None] = lambda text: None) -> None:
+    """/records/NN/y of a campaign, simulated from its u and floor alone, in the unit of its y.
+
+    Raises
+    ------
+    InputError : a folder or campaign that does not fit, a place that cannot be written.
+    """
+    rig, corner = read_identified(folder)
+    model = ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner)
+    limits = _converter_limits(rig) if campaign.y_unit == "V" else None
+    with replacing(out) as file:
+        file.attrs.update({"format": "avis-prediction", "version": 1, "rig": rig.name})
+        for record in campaign.records:
+            h = record.header
+            progress(f"record {h.name}: {h.duration_s:.4g} s")
+            if abs(h.sample_rate_Hz * model.period_s - 1) > 1e-6:
+                raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
+                                 field=f"record {h.name}: sample_rate_Hz")
+            group = file.create_group(f"records/{h.name}")
+            data = group.create_dataset("y", (h.samples, len(h.y_names)), np.float64)
+            data.attrs.update({"names": np.array(h.y_names, dtype=object).astype("S"), "unit": h.y_unit})
+            group.attrs["sample_rate_Hz"] = h.sample_rate_Hz
+            predictor, done = Predictor(model), 0
+            for start, stop in ranges(h.samples, PIECE):
+                u, floor = model_inputs(model, record.load(start, stop))
+                y = predictor.read(u[done - start:], None if floor is None else floor[done - start:])
+                data[done:stop] = y if limits is None else np.clip(y, *limits)
+                done = stop
+
+
+def _converter_limits(rig: Rig) -> tuple[float, float] | None:
+    if rig.acquisition is None:
+        return None
+    return -rig.acquisition.adc_range_V, rig.acquisition.adc_range_V * (1 - 2.0 ** (1 - rig.acquisition.adc_bits))
