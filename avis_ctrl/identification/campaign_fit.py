@@ -150,21 +150,23 @@ def weighted(blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple
     """The blocks with the noise that a local model measures, whatever the rig's model; and a sentence on it."""
     if all(block.noise is not None for block in blocks):
         return list(blocks), "noise as estimated with the frequency responses"
-    found: list[SpectralBlock] = []
     try:
-        for block in blocks:
-            known = block.kind == "floor measured"
-            alike = campaign.only(tuple(r.header.name for r in campaign.records
-                                        if (len(r.header.floor_names) > 0) == known))
-            noise = _measured_noise(alike, block, band_Hz, known)
-            found.append(noise)
+        found = [measured_noise(campaign, block, band_Hz) for block in blocks]
     except AvisError as error:
         return relative_noise(blocks), f"no measured noise covariance ({error}); lines weigh alike at first"
     return found, (f"noise covariance measured by a local polynomial model, {found[0].dof:.0f} degrees of freedom a "
                    "line")
 
 
-def _measured_noise(alike: Campaign, block: SpectralBlock, band_Hz: tuple[float, float], floor: bool) -> SpectralBlock:
+def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:
+    """A block with the noise covariance of a local polynomial model of the campaign's records of its kind.
+
+    Raises
+    ------
+    InputError, ComputationError : records that do not allow it.
+    """
+    floor = block.kind == "floor measured"
+    alike = campaign.only(tuple(r.header.name for r in campaign.records if (len(r.header.floor_names) > 0) == floor))
     frequency = block.omega / (2 * np.pi)
     at = np.unique(np.clip(np.linspace(frequency[0], frequency[-1], min(len(frequency), 1500)), *band_Hz))
     noise = noise_covariance(alike, at, band_Hz=band_Hz, floor=floor, smooth_Hz=0.3, longest_piece=LONGEST_PIECE)
@@ -177,13 +179,15 @@ class CampaignFit:
     """A fit to a campaign.
 
     fit : with the noise of its own residuals. first : with the noise that was measured without a model of the rig;
-    its chi-square per degree of freedom is 1 where the model leaves nothing but noise. notes : sentences.
+    its chi-square per degree of freedom is 1 where the model leaves nothing but noise. start : the model before the
+    fit. notes : sentences.
     """
 
     fit: LikelihoodFit
     first: LikelihoodFit
     band_Hz: tuple[float, float]
     notes: tuple[str, ...]
+    start: ResponseModel
 
 
 def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, band_Hz: tuple[float, float],
@@ -204,9 +208,9 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     found = fit(model, blocks, priors, starts, seed=seed, progress=progress)
     first = found
     if isinstance(campaign, FrequencyResponse) or not blocks[0].transient:
-        return CampaignFit(found, first, band_Hz, tuple(notes))
+        return CampaignFit(found, first, band_Hz, tuple(notes), model)
     for k in range(reweights):
         found = fit(found.model, residual_noise(found.residuals), priors, seed=seed)
         if progress:
             progress(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
-    return CampaignFit(replace(found, starts=first.starts), first, band_Hz, tuple(notes))
+    return CampaignFit(replace(found, starts=first.starts), first, band_Hz, tuple(notes), model)

@@ -15,8 +15,11 @@ Cramer-Rao bound. Directions that the data do not determine keep their starting 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -102,7 +105,7 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
     priors = dict(priors or {})
     _check(model, blocks, priors, starts)
     rng = np.random.default_rng(seed)
-    whiteners = [_whitener(block) for block in blocks]
+    whiteners = [whitener(block) for block in blocks]
     reached: list[tuple[float, _Descent | None]] = []
     for k in range(starts):
         begin = model if k == 0 else _moved(model, spread, rng)
@@ -142,8 +145,12 @@ class _Descent:
         """chi2 at a model, with its expansion if asked for."""
         n_p = len(model.names)
         chi2, g, H, kept = 0.0, np.zeros(n_p), np.zeros((n_p, n_p)), []
-        for block, L in zip(self.blocks, self.whiteners, strict=True):
-            e, J, residual = _block_residual(model, block, L, derivative)
+        _ = model.matrices, derivative and model.derivative_matrices  # formed once, before the threads ask for them
+        work = partial(_block_residual, model, derivative=derivative)
+        # Large arrays in few calls, which leave the interpreter free: threads serve, and keep the order of the sums.
+        with ThreadPoolExecutor(min(len(self.blocks), os.cpu_count() or 1)) as threads:
+            parts = list(threads.map(work, self.blocks, self.whiteners))
+        for e, J, residual in parts:
             chi2 += float(e @ e)
             if derivative:
                 J *= self.scale[:, None]
@@ -223,35 +230,35 @@ def positive(name: str) -> bool:
     return last.startswith(("k_", "c_")) or (len(last) == 2 and last[0] in "de" and last[1].isdigit())
 
 
-def _block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, derivative: bool
+def _block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
                     ) -> tuple[np.ndarray, np.ndarray, Residual]:
     """Real residual e (N,) of unit variance, its negative Jacobian J (n_p, N), both free of the transient."""
     U = block.U
     if not block.transient:
         found = model.driven(block.omega, U, derivative)
         error = block.Y - found.Y
-        white = _whitened(L, error)
-        J = _real(_whitened(L, found.dY)) if derivative else np.empty(0)
-        return _real(white[None])[0], J, Residual(block, error, white / np.sqrt(2), np.zeros_like(error))
+        white = whitened(L, error)
+        J = as_real(whitened(L, found.dY)) if derivative else np.empty(0)
+        return as_real(white[None])[0], J, Residual(block, error, white / np.sqrt(2), np.zeros_like(error))
     columns, norms = transient_columns(block, model)
     plain = block.Y - model.driven(block.omega, U, False).Y
-    T = _real(np.moveaxis(_whitened(L, columns), -1, 0))
+    T = as_real(np.moveaxis(whitened(L, columns), -1, 0))
     Q, R = np.linalg.qr(T.T)
-    e = _real(_whitened(L, plain)[None])[0]
+    e = as_real(whitened(L, plain)[None])[0]
     x = np.linalg.lstsq(R, Q.T @ e, rcond=1e-12)[0]
     transient = (columns @ x)[:, :, None]
-    white = _whitened(L, plain - transient)
-    e = _real(white[None])[0]
+    white = whitened(L, plain - transient)
+    e = as_real(white[None])[0]
     J = np.empty(0)
     if derivative:
         n_b = 2 * N_Q
         body = np.broadcast_to((x[:n_b] / norms[:n_b])[None, :, None], (len(block.omega), n_b, 1))
-        J = _real(_whitened(L, model.driven(block.omega, np.concatenate([U, body], axis=1)).dY))
+        J = as_real(whitened(L, model.driven(block.omega, np.concatenate([U, body], axis=1)).dY))
         J = J - (J @ Q) @ Q.T
     return e, J, Residual(block, plain - transient, white / np.sqrt(2), transient)
 
 
-def _whitener(block: SpectralBlock) -> np.ndarray:
+def whitener(block: SpectralBlock) -> np.ndarray:
     """(n, 1 or m, n_y, n_y) sqrt(2) inv(chol(C)), with the correction for a covariance that was itself estimated.
 
     The inverse of a Wishart matrix of n_y outputs and dof degrees of freedom is too large by dof/(dof - n_y).
@@ -271,14 +278,14 @@ def _whitener(block: SpectralBlock) -> np.ndarray:
     return np.sqrt(2 * correction) * np.linalg.inv(factor)
 
 
-def _whitened(L: np.ndarray, error: np.ndarray) -> np.ndarray:
+def whitened(L: np.ndarray, error: np.ndarray) -> np.ndarray:
     """L (n, 1 or m, n_y, n_y) applied to (..., n, n_y, m)."""
     if L.shape[1] == 1:
         return L[:, 0] @ error
     return np.moveaxis((L @ np.moveaxis(error, -1, -2)[..., None])[..., 0], -1, -2)
 
 
-def _real(white: np.ndarray) -> np.ndarray:
+def as_real(white: np.ndarray) -> np.ndarray:
     """(p, ...) complex to (p, N) real."""
     flat = white.reshape(len(white), -1)
     return np.concatenate([flat.real, flat.imag], axis=1)

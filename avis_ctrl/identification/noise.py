@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from avis_ctrl.errors import InputError
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.spectra import SpectralBlock
 
@@ -30,11 +31,23 @@ def residual_noise(residuals: Sequence[Residual], half_width_Hz: float = 0.15, l
 
     The window grows until the covariance has least_dof degrees of freedom and three for each output.
     """
-    blocks = [one.block for one in residuals]
-    least = max(least_dof, 3 * blocks[0].Y.shape[1])
+    return noise_from_residuals(residuals, [one.block for one in residuals], half_width_Hz, least_dof)
+
+
+def noise_from_residuals(residuals: Sequence[Residual], blocks: Sequence[SpectralBlock], half_width_Hz: float = 0.15,
+                         least_dof: int = 30) -> list[SpectralBlock]:
+    """Blocks, which may be other ones, with the covariance that residuals of their kind have near their lines.
+
+    Raises
+    ------
+    InputError : a block of a kind that no residual is of.
+    """
     found = []
     for own in blocks:
         pool = [one for one in residuals if one.block.kind == own.kind]
+        if not pool:
+            raise InputError(f"expected residuals of its kind, {own.kind}", field=f"block {own.name}")
+        least = max(least_dof, 3 * own.Y.shape[1])
         per_Hz = sum(len(one.block.omega) * one.error.shape[2] / np.ptp(one.block.omega) * 2 * np.pi
                      if len(one.block.omega) > 1 else 0 for one in pool)
         half = max(half_width_Hz, least / max(per_Hz, 1e-9) / 2)

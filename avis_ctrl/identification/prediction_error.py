@@ -1,0 +1,126 @@
+"""What a model leaves of data that it was not fitted to: error by frequency, whitened, with what it should be.
+
+The transient of a record's ends is projected out as in the fit. The error that remains of pure noise of covariance
+C_k is then (I - Q Q^T) w in whitened real numbers, with Q an orthonormal basis of the whitened transients: it has
+2 n n_y less the rank of Q degrees of freedom. An uncertain model adds J P J^T to the covariance of the whitened error,
+P the covariance of its parameters (Pintelon and Schoukens, System Identification, 2nd ed., 2012, section 11.3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock, transient_columns
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionError:
+    """Of one block.
+
+    Attributes
+    ----------
+    block : with the noise that the error is held against.
+    plain : (n, n_y, m) Y - G U. error : the same without the transient of the record's ends.
+    white : (n, n_y, m) the error whitened, E|white|^2 = 1 where it is noise only.
+    derivative : (n_p, n, n_y, m) of the whitened model output by the parameters, transients projected out; unit as
+        `white`. Empty where it was not asked for.
+    dof : real degrees of freedom of the error. output_dof : (n_y,) of each output's own error.
+    """
+
+    block: SpectralBlock
+    plain: np.ndarray
+    error: np.ndarray
+    white: np.ndarray
+    derivative: np.ndarray
+    dof: int
+    output_dof: np.ndarray
+
+    @property
+    def chi2(self) -> float:
+        """Sum of `dof` squares that should be standard normal."""
+        return float(2 * np.sum(np.abs(self.white) ** 2))
+
+    @property
+    def output_chi2(self) -> np.ndarray:
+        """(n_y,) the same for each output by itself, held against its own variance."""
+        return np.sum(2 * np.abs(self.error) ** 2 / self._variance, axis=(0, 2))
+
+    @property
+    def _variance(self) -> np.ndarray:
+        """(n, n_y, 1 or m) of each output's noise; 1/variance of an estimate is too large by dof/(dof - 1)."""
+        assert self.block.noise is not None
+        variance = np.real(np.einsum("kmii->kim", self.block.noise))
+        return variance if np.isinf(self.block.dof) else variance * self.block.dof / (self.block.dof - 1)
+
+    def noise_share(self) -> np.ndarray:
+        """(n_y,) sum of |noise|^2 that each output's error holds on the average where it is noise only."""
+        assert self.block.noise is not None
+        variance = np.real(np.einsum("kmii->kim", self.block.noise))
+        whole = np.sum(np.broadcast_to(variance, self.error.shape), axis=(0, 2))
+        return whole * self.output_dof / (2 * self.error.shape[0] * self.error.shape[2])
+
+    def expected(self, covariance: np.ndarray) -> float:
+        """Mean of chi2 where the model errs by no more than its parameters' covariance (n_p, n_p) says."""
+        J = np.sqrt(2) * self.derivative.reshape(len(covariance), -1)
+        return self.dof + float(np.real(np.einsum("ik,ij,jk->", J.conj(), covariance, J, optimize=True)))
+
+
+def prediction_error(model: ResponseModel, block: SpectralBlock, derivative: bool = True) -> PredictionError:
+    """The error of a model on a block whose noise is known.
+
+    Raises
+    ------
+    InputError : a noise covariance that is missing or singular.
+    """
+    L = whitener(block)
+    n, n_y, m = block.Y.shape
+    found = model.driven(block.omega, block.U, derivative)
+    plain = block.Y - found.Y
+    e = as_real(whitened(L, plain)[None])[0]
+    J = as_real(whitened(L, found.dY)) if derivative else np.empty((0, e.size))
+    lost, rank = np.zeros(n_y), 0
+    if block.transient:
+        columns, _ = transient_columns(block, model)
+        basis = _orthonormal(as_real(np.moveaxis(whitened(L, columns), -1, 0)).T)
+        rank = basis.shape[1]
+        e, J = e - basis @ (basis.T @ e), J - (J @ basis) @ basis.T
+        lost = _lost(L, basis, block)
+    error = np.linalg.solve(L, _complex(e, (n, n_y, m)).swapaxes(1, 2)[..., None])[..., 0].swapaxes(1, 2) if m > 1 \
+        else np.linalg.solve(L[:, 0], _complex(e, (n, n_y, m)))
+    return PredictionError(block, plain, error, _complex(e, (n, n_y, m)) / np.sqrt(2),
+                           _complex(J, (n, n_y, m)) / np.sqrt(2), 2 * n * n_y * m - rank, 2 * n * m - lost)
+
+
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Basis of the span, without directions that are round-off."""
+    U, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return U[:, s > 1e-12 * s[0]]
+
+
+def _lost(L: np.ndarray, basis: np.ndarray, block: SpectralBlock) -> np.ndarray:
+    """(n_y,) degrees of freedom of each output that went with the transient."""
+    assert block.noise is not None
+    n, n_y = block.Y.shape[:2]
+    columns = np.linalg.solve(L[:, 0], np.moveaxis(_complex(basis.T, (n, n_y, 1))[..., 0], 0, -1))
+    return np.sum(2 * np.abs(columns) ** 2 / np.real(np.einsum("kii->ki", block.noise[:, 0]))[..., None], axis=(0, 2))
+
+
+def _complex(real: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """(..., 2 N) real numbers back to (..., *shape) complex ones."""
+    half = real.shape[-1] // 2
+    return (real[..., :half] + 1j * real[..., half:]).reshape(*real.shape[:-1], *shape)
+
+
+def interval(expected: float, dof: float, noise_dof: float, level: float = 0.95) -> tuple[float, float]:
+    """Where chi2 / dof lies with probability `level`, when the noise was estimated with noise_dof real numbers.
+
+    Numerator and denominator of a ratio of variances: Fisher's F, moved to its mean `expected` (of chi2 / dof).
+    """
+    law = stats.f(dof, noise_dof) if np.isfinite(noise_dof) else stats.chi2(dof, scale=1 / dof)
+    low, high = law.ppf([(1 - level) / 2, (1 + level) / 2]) / law.mean() * expected
+    return float(low), float(high)
