@@ -10,6 +10,8 @@ import typer
 from avis_ctrl.cli.console import Progress
 from avis_ctrl.errors import InputError
 
+# A rig is stiffer or better damped than its file says, but not twice.
+LEVEL_SHARE = 0.5
 RIG = Annotated[str, typer.Option("--rig", metavar="RIG", help="avis, halcyonics, halcyonics_loaded or a rig.toml")]
 
 
@@ -21,8 +23,8 @@ def excite(
     period_s: Annotated[float, typer.Option("--period", help="period of a multisine, length of noise [s]")] = 10.0,
     periods: Annotated[int, typer.Option("--periods", help="how often a multisine is played; the first period holds "
                                          "the transient")] = 6,
-    rms_V: Annotated[float | None, typer.Option("--rms", help="of each drive [V]; by default as the limit "
-                                                "allows")] = None,
+    rms_V: Annotated[float | None, typer.Option("--rms", help="of each drive [V]; by default half of the largest at "
+                                                "which neither drives nor converter clip on the rig's file")] = None,
     lines: Annotated[str, typer.Option("--lines", help="full, odd or odd_detection")] = "full",
     scheme: Annotated[str, typer.Option("--scheme", help="orthogonal (one record a drive, all lines) or zippered (one "
                                         "record, lines dealt to the drives)")] = "orthogonal",
@@ -35,6 +37,8 @@ def excite(
     from avis_ctrl.measurement.excitation import MultisineSettings, NoiseSettings, multisine, noise
     from avis_ctrl.measurement.excitation_files import write_signals
     from avis_ctrl.rigs import load_rig
+    from avis_ctrl.simulation.campaign_data import largest_level, open_loop
+    from avis_ctrl.study.campaign_plan import plan_from_table
 
     console = Console(highlight=False)
     table = load_rig(rig)
@@ -49,6 +53,11 @@ def excite(
                                           seed=seed))
         else:
             raise InputError("expected multisine or noise", field="--kind", value=kind)
+        if rms_V is None:
+            progress("level: a noise-free run of the rig, so that its sensors do not clip")
+            plan = plan_from_table({"title": "level", "duration_s": period_s, "record": [{"excitation": "rest"}]})
+            most = largest_level(open_loop(table, plan), signals, signals.u.shape[1] * (periods if periods < 4 else 4))
+            signals = signals.scaled_to(LEVEL_SHARE * most)
         write_signals(signals, out, periods if kind == "multisine" else 1, table.name)
     shown = Table("record", "r.m.s. [V]", "peak [V]", "crest factor", "before", title="largest over the drives")
     for k in range(len(signals.u)):
@@ -87,7 +96,8 @@ def simulate_campaign(
     chosen = read_plan(plan) if plan else default_plan(table, "orthogonal" if orthogonal else "zippered",
                                                        perturbed=perturbed, duration_s=duration_s)
     with Progress(console) as progress:
-        rehearsal = rehearse(table, chosen, seed, progress)
+        rehearsal = rehearse(table, chosen, seed,
+                             lambda k, total, name: progress(f"record {name}, {k} of {total}"))
         write_campaign(out, rehearsal.campaign)
     for path, text in ((write_plan, plan_toml(chosen)), (truth, rehearsal.truth_toml())):
         if path:
