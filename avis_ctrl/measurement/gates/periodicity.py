@@ -13,6 +13,8 @@ from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Findin
 
 # Lines over which the noise level is averaged, and lines looked at: those that carry most of the power.
 SMOOTH = 9
+# A steady drift over the last half of the record below this part of the signal is passed.
+DRIFT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +28,7 @@ class _Kept:
     relative: np.ndarray | None
     lines: int
     dof: int
+    drift: tuple[np.ndarray, np.ndarray] | None = None
 
 
 class Periodicity(Gate):
@@ -38,7 +41,8 @@ class Periodicity(Gate):
     shared over periods, channels and records. Periods up to the last one before the reference that fails are to be
     dropped: a note, for a rig that starts at rest always has a transient. Where the reference's first period itself
     fails against the
-    others, the response drifts: a warning.
+    others, or where the reference's periods change steadily (slope against what it leaves, F(L, L (R - 2)), and more
+    than 1 % of the signal), the response drifts: a warning.
     """
 
     name = "periodicity"
@@ -53,7 +57,8 @@ class Periodicity(Gate):
         if P < 4:
             return none
         T, relative, lines, R = compared(y)
-        return _Kept(seen.header.name, period_s, seen.whole, T, relative, lines, R - 1)
+        drift = trend(y[P - R :]) if R > 2 else None
+        return _Kept(seen.header.name, period_s, seen.whole, T, relative, lines, R - 1, drift)
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         judged = [k for k in kept if k.T is not None]
@@ -83,6 +88,9 @@ class Periodicity(Gate):
                 (Limit("1 % by chance", limit),),
                 y_scale="log",
             )
+            if (drifting := self._drifting(k, tests, campaign, picture)) is not None:
+                found.append(drifting)
+                continue
             drop = int(failed[-1]) + 1 if len(failed) else 0
             if drop > reference:
                 bad = tuple(n for j, n in enumerate(campaign.y_names) if (k.T[reference - 1 :, j] > limit).any())
@@ -137,6 +145,29 @@ class Periodicity(Gate):
             )
         return found
 
+    def _drifting(self, k: _Kept, tests: int, campaign: Campaign, picture: Picture) -> Finding | None:
+        if k.drift is None or k.T is None:
+            return None
+        T, drift = k.drift
+        limit = float(stats.f.isf(FALSE_ALARM / tests, k.lines, k.lines * (k.dof - 1)))
+        bad = (limit < T) & (drift > DRIFT)
+        if not bad.any():
+            return None
+        names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
+        return Finding(
+            self.name,
+            "warning",
+            f"Record {k.record} drifts: over its last {len(k.T) // 2} periods of {k.period_s:g} s {quoted(names)}"
+            f" change by {100 * drift[bad].max():.2g} % of the signal, steadily ({T[bad].max():.1f} times the noise"
+            f" power, by chance up to {limit:.2f}). The rig drifts, or the transient is longer than the record. Wait"
+            " longer before recording, or look for what changes.",
+            names,
+            (k.record,),
+            float(T[bad].max()),
+            limit,
+            picture,
+        )
+
 
 def windowed(difference: np.ndarray) -> np.ndarray:
     """(..., lines, n_y) spectra of Hann-windowed differences (..., samples, n_y), every second line, no mean."""
@@ -169,3 +200,21 @@ def compared(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
         T[p] = np.mean(np.abs(windowed(y[p] - others)) ** 2 / (variance * (1 + 1 / n)), axis=0)
         relative[p] = (y[p] - others).std(axis=0) / rms
     return T, relative, len(variance), R
+
+
+def trend(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Linear drift over periods y (R, samples, n_y): T (n_y,) of its lines by the variance left, relative size (n_y,).
+
+    T is F(L, L (R - 2)) distributed without drift; the size is from the first period to the last, free of noise.
+    """
+    R = len(y)
+    x = np.arange(R) - (R - 1) / 2
+    slope = np.tensordot(x, y, 1) / np.sum(x * x)
+    left = windowed(y - y.mean(axis=0) - x[:, None, None] * slope)
+    rms = np.maximum(y.mean(axis=0).std(axis=0), 1e-300)
+    floor = (1e-9 * (rms + 1e-3 * np.abs(y).max(axis=(0, 1)))) ** 2 * y.shape[1] + 1e-300
+    variance = np.maximum(smoothed(np.sum(np.abs(left) ** 2, axis=0) / (R - 2)), floor) / np.sum(x * x)
+    power = np.abs(windowed(slope)) ** 2
+    size = np.sum(np.abs(windowed(y.mean(axis=0))) ** 2, axis=0)
+    drift = np.sqrt(np.maximum(np.sum(power - variance, axis=0), 0) / np.maximum(size, 1e-300)) * (R - 1)
+    return np.mean(power / variance, axis=0), drift
