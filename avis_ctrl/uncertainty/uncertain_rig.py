@@ -16,7 +16,7 @@ displacements, so transmissibility is read from v_f to v.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -62,11 +62,64 @@ class UncertainParameter:
                              field=self.name, value=nominal)
         return self.spread if self.absolute else self.spread * abs(nominal)
 
+    def half_ranges(self, nominal: Mapping[str, float]) -> dict[str, float]:
+        """What delta = 1 adds to each parameter that it moves, in the parameters' units."""
+        return {self.name: self.half_range(nominal[self.name])}
+
     def describe(self, delta: float, nominal: float, unit: str = "") -> str:
         """A value of delta in physical words: "isolator2.k_z at +15 %"."""
         if self.absolute:
             return f"{self.name} at {nominal + delta * self.spread:.4g} {unit}".rstrip()
         return f"{self.name} at {100 * delta * self.spread:+.3g} %"
+
+    def words(self, delta: float, nominal: Mapping[str, float], units: Mapping[str, str]) -> str:
+        """`describe`, with the rig's values and units by name."""
+        return self.describe(delta, nominal[self.name], units[self.name])
+
+
+# Parameters that a direction moves least are left out of its words; the numbers keep all of them.
+WORDS = 4
+
+
+@dataclass(frozen=True)
+class UncertainDirection:
+    """Several parameters that one delta in [-1, 1] moves together: a principal axis of correlated parameters.
+
+    changes : (parameter, half-range in its unit, with sign) of each parameter that moves.
+    """
+
+    name: str
+    changes: tuple[tuple[str, float], ...]
+
+    def __post_init__(self) -> None:
+        if not self.changes or not all(np.isfinite(change) for _, change in self.changes) \
+                or not any(change for _, change in self.changes):
+            raise InputError("expected finite changes, not all zero", field=f"direction {self.name}",
+                             value=self.changes)
+        if len({name for name, _ in self.changes}) != len(self.changes):
+            raise InputError("expected each parameter once", field=f"direction {self.name}", value=self.changes)
+
+    def half_ranges(self, nominal: Mapping[str, float]) -> dict[str, float]:
+        """What delta = 1 adds to each parameter that it moves, in the parameters' units."""
+        return dict(self.changes)
+
+    def words(self, delta: float, nominal: Mapping[str, float], units: Mapping[str, str]) -> str:
+        """Such as "identified direction 1 at +0.8: isolator1.k_z +0.3 %, mass -0.02 %, and 5 less"."""
+        sizes = {name: change / abs(nominal[name]) if nominal[name] else np.inf for name, change in self.changes}
+        most = sorted(self.changes, key=lambda one: -abs(sizes[one[0]]))
+        told = [f"{name} {100 * delta * sizes[name]:+.2g} %" if nominal[name] else
+                f"{name} {delta * change:+.2g} {units[name]}" for name, change in most[:WORDS]]
+        if len(most) > WORDS:
+            told.append(f"and {len(most) - WORDS} parameters less")
+        return f"{self.name} at {delta:+.2g}: {', '.join(told)}"
+
+    def stretch(self, nominal: Mapping[str, float], share: float) -> float:
+        """Factor, at least 1, that makes the largest relative change `share`: tiny changes would lose digits."""
+        largest = max(abs(change) / (abs(nominal[name]) or 0.1) for name, change in self.changes)
+        return max(1.0, share / largest)
+
+
+Uncertain = UncertainParameter | UncertainDirection
 
 
 @dataclass(frozen=True)
@@ -78,27 +131,34 @@ class UncertainRig:
     system : inputs "w:NAME", actuators [V], "floor_COORD_dot" [m/s], "force_COORD" [N]; outputs "z:NAME",
         "COORD_rel" relative to the floor [m], "COORD_dot" [m/s], "COORD_ddot" [m/s^2] absolute, and
         "SENSOR_dot", "SENSOR_ddot" along each sensor.
-    blocks : one real repeated scalar a parameter, in the order of w_delta.
-    parameters, nominal, units : what each delta means.
+    blocks : one real repeated scalar a parameter or direction, in the order of w_delta.
+    parameters : what each delta means. nominal, units : of every parameter that some delta moves.
     coordinates : names kept; rotations are displacements of the edge [m] and end in "_edge".
     """
 
     system: StateSpace
     blocks: BlockStructure
-    parameters: tuple[UncertainParameter, ...]
+    parameters: tuple[Uncertain, ...]
     nominal: dict[str, float]
     units: dict[str, str]
     coordinates: tuple[str, ...]
 
     def describe(self, deltas: Sequence[float]) -> list[str]:
-        """Each parameter's perturbation in physical words."""
-        return [p.describe(float(d), self.nominal[p.name], self.units[p.name])
-                for p, d in zip(self.parameters, deltas, strict=True)]
+        """Each perturbation in physical words."""
+        return [p.words(float(d), self.nominal, self.units) for p, d in zip(self.parameters, deltas, strict=True)]
 
     def values(self, deltas: Sequence[float]) -> dict[str, float]:
-        """Physical values at normalised deltas, for `rig.with_parameters`."""
-        return {p.name: self.nominal[p.name] + float(d) * p.half_range(self.nominal[p.name])
-                for p, d in zip(self.parameters, deltas, strict=True)}
+        """Physical values at normalised deltas, for `rig.with_parameters`; what several deltas move adds up."""
+        return _moved(self.parameters, deltas, self.nominal)
+
+
+def _moved(parameters: Sequence[Uncertain], deltas: Sequence[float] | np.ndarray, nominal: Mapping[str, float]
+           ) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for parameter, delta in zip(parameters, deltas, strict=True):
+        for name, half in parameter.half_ranges(nominal).items():
+            found[name] = found.get(name, nominal[name]) + float(delta) * half
+    return found
 
 
 def edge_name(coordinate: str) -> str:
@@ -106,13 +166,13 @@ def edge_name(coordinate: str) -> str:
     return f"{coordinate}_edge" if coordinate.startswith("phi") else coordinate
 
 
-def uncertain_rig(rig: Rig, parameters: Sequence[UncertainParameter], keep: Sequence[str] = ("z", "phi_x"),
+def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str] = ("z", "phi_x"),
                   sensor_names: Sequence[str] | None = None) -> UncertainRig:
     """Pull uncertain parameters out of a rig; coordinates not kept are locked at rest.
 
     Parameters
     ----------
-    parameters : uncertain ones, by the rig's own names (`rig.parameters()`).
+    parameters : uncertain ones and directions, by the rig's own names (`rig.parameters()`); a parameter may be both.
     keep : coordinates that move.
     sensor_names : sensors along which velocity and acceleration are brought out.
 
@@ -121,10 +181,11 @@ def uncertain_rig(rig: Rig, parameters: Sequence[UncertainParameter], keep: Sequ
     InputError : unknown parameter or coordinate, a parameter twice.
     """
     known = rig.parameters()
-    for parameter in parameters:
-        if parameter.name not in known:
+    moved = list(dict.fromkeys(name for p in parameters for name in _names(p)))
+    for name in moved:
+        if name not in known:
             raise InputError(f"the rig has no such parameter; it has {sorted(known)}", field="uncertain parameter",
-                             value=parameter.name)
+                             value=name)
     if len({p.name for p in parameters}) != len(parameters):
         raise InputError("a parameter is listed twice", field="uncertain parameters",
                          value=[p.name for p in parameters])
@@ -135,15 +196,18 @@ def uncertain_rig(rig: Rig, parameters: Sequence[UncertainParameter], keep: Sequ
         raise InputError("expected chassis points equal to payload points, so that relative motion is q - q_floor",
                          field="chassis points")
     kept = [equations.coordinates.index(name) for name in keep]
-    nominal = {p.name: float(known[p.name].value) for p in parameters}
-    half = np.array([p.half_range(nominal[p.name]) for p in parameters])
+    nominal = {name: float(known[name].value) for name in moved}
+    for parameter in parameters:
+        parameter.half_ranges(nominal)  # refuses a relative range about zero
     scale = np.array([1.0 / rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
+    stretch = _stretches(parameters, nominal)
 
     def N(delta: np.ndarray) -> np.ndarray:
-        values = {p.name: nominal[p.name] + d * h for p, d, h in zip(parameters, delta, half, strict=True)}
+        values = _moved(parameters, delta * stretch, nominal)
         return _stacked(rig.with_parameters(values).equations_of_motion() if values else equations, kept, scale)
 
-    coefficients = polynomial_coefficients(N, len(parameters))
+    coefficients = {exponents: matrix / np.prod(stretch ** np.array(exponents, float))
+                    for exponents, matrix in polynomial_coefficients(N, len(parameters)).items()}
     rows = _sensor_rows(rig, sensor_names, kept, scale)
     names = tuple(edge_name(name) for name in keep)
     lft = _pull_out(coefficients, len(parameters))
@@ -152,7 +216,17 @@ def uncertain_rig(rig: Rig, parameters: Sequence[UncertainParameter], keep: Sequ
     felt = [(p, copies) for p, copies in zip(parameters, lft.copies, strict=True) if copies]
     blocks = BlockStructure(tuple(RealScalar(copies, p.name) for p, copies in felt))
     moving = tuple(p for p, _ in felt)
-    return UncertainRig(system, blocks, moving, nominal, {p.name: known[p.name].unit for p in parameters}, names)
+    return UncertainRig(system, blocks, moving, nominal, {name: known[name].unit for name in moved}, names)
+
+
+def _names(parameter: Uncertain) -> list[str]:
+    return [name for name, _ in parameter.changes] if isinstance(parameter, UncertainDirection) else [parameter.name]
+
+
+def _stretches(parameters: Sequence[Uncertain], nominal: Mapping[str, float]) -> np.ndarray:
+    """Factors by which each delta is enlarged while the polynomial is read off; together they stay below a half."""
+    share = 0.4 / max(sum(isinstance(p, UncertainDirection) for p in parameters), 1)
+    return np.array([p.stretch(nominal, share) if isinstance(p, UncertainDirection) else 1.0 for p in parameters])
 
 
 def _stacked(equations: Any, kept: list[int], scale: np.ndarray) -> np.ndarray:
