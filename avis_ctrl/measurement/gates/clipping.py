@@ -52,7 +52,7 @@ class Clipping(Gate):
     are
     an alarm. At an unknown range: the extreme value comes more often than a sine's top would (2.42 times as often
     as any of the next five values), by a binomial test at 1 % shared over ends, channels and records; it needs
-    about 25 clipped samples. And, in either case, levels outside the signal: runs entered and left by jumps of opposite
+    about 50 clipped samples. And, in either case, levels outside the signal: runs entered and left by jumps of opposite
     sign,
     larger than 20 times the spread within, at the record's very end of range (an instrument's "out of range" output);
     3 samples suffice, an unclipped signal has no such runs.

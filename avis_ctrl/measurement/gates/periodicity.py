@@ -199,7 +199,12 @@ def compared(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
         n = R if p < P - R else R - 1
         T[p] = np.mean(np.abs(windowed(y[p] - others)) ** 2 / (variance * (1 + 1 / n)), axis=0)
         relative[p] = (y[p] - others).std(axis=0) / rms
-    return T, relative, len(variance), R
+    return unbiased(R - 1) * T, relative, len(variance), R
+
+
+def unbiased(dof: int) -> float:
+    """Mean of a power by its smoothed variance is 1 / (1 - 1 / m), m = dof times lines smoothed over: F's mean."""
+    return 1 - 1 / (SMOOTH * dof)
 
 
 def trend(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -217,4 +222,4 @@ def trend(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     power = np.abs(windowed(slope)) ** 2
     size = np.sum(np.abs(windowed(y.mean(axis=0))) ** 2, axis=0)
     drift = np.sqrt(np.maximum(np.sum(power - variance, axis=0), 0) / np.maximum(size, 1e-300)) * (R - 1)
-    return np.mean(power / variance, axis=0), drift
+    return unbiased(R - 2) * np.mean(power / variance, axis=0), drift
