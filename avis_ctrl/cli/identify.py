@@ -111,7 +111,7 @@ def _summary(console, found) -> None:
         table.add_row(name, f"{start[name]:.6g}", f"{value:.6g}",
                       f"{sigma:.2g}" if sigma < float("inf") else "only in combination", unit)
     console.print(table)
-    for sentence in (*found.identifiability.sentences, *found.validation.sentences):
+    for sentence in (*found.identifiability.sentences, found.validation.verdict):
         console.print(f"- {sentence}")
 
 

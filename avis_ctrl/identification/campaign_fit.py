@@ -24,6 +24,8 @@ LONGEST_PIECE = 1 << 18
 MOST_LINES = 60_000
 # Where no input says what band is excited.
 QUIET_BAND_Hz = (0.5, 60.0)
+# Share of an input's power that may lie below, and above, the band of the fit.
+TAIL = 5e-4
 Progress = Callable[[str], None]
 
 
@@ -103,18 +105,18 @@ class Portion(RecordSource):
 def excited_band(campaign: Campaign) -> tuple[float, float]:
     """Lowest and highest frequency [Hz] that some record drives, within 0.2 Hz and a quarter of the sample rate.
 
-    A line counts where its power is above a thousandth of the strongest ones of its record.
+    Of each record the band that holds its input's power but for 0.05 % at either end.
     """
     ends: list[tuple[float, float]] = []
     for record in campaign.records:
         piece = record.load(0, min(record.header.samples, LONGEST_PIECE))
         drive = piece.u if np.any(piece.u) else piece.floor
-        if drive is None or not np.any(drive):
+        if drive is None or not np.any(drive) or record.header.excitation == "rest":
             continue
-        power = np.sum(np.abs(scipy.fft.rfft(drive - drive.mean(0), axis=0)) ** 2, axis=1)
+        power = np.cumsum(np.sum(np.abs(scipy.fft.rfft(drive - drive.mean(0), axis=0)) ** 2, axis=1))
         frequency = scipy.fft.rfftfreq(piece.header.samples, 1 / piece.header.sample_rate_Hz)
-        strong = frequency[power > 1e-3 * np.sort(power)[-max(1, len(power) // 1000):].mean()]
-        ends.append((float(strong[0]), float(strong[-1])))
+        low, high = np.searchsorted(power, np.array([TAIL, 1 - TAIL]) * power[-1])
+        ends.append((float(frequency[low]), float(frequency[high])))
     low, high = (min(e[0] for e in ends), max(e[1] for e in ends)) if ends else QUIET_BAND_Hz
     return max(low, 0.2), min(high, campaign.sample_rate_Hz / 4)
 
@@ -161,15 +163,20 @@ def weighted(blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple
 def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:
     """A block with the noise covariance of a local polynomial model of the campaign's records of its kind.
 
+    Records at rest where there are some, otherwise all of them.
+
     Raises
     ------
     InputError, ComputationError : records that do not allow it.
     """
     floor = block.kind == "floor measured"
-    alike = campaign.only(tuple(r.header.name for r in campaign.records if (len(r.header.floor_names) > 0) == floor))
+    alike = [record.header for record in campaign.records if (len(record.header.floor_names) > 0) == floor]
+    # A record at rest holds the noise alone; any other one needs all its inputs told apart first.
+    rest = [header for header in alike if header.excitation == "rest"]
+    campaign = campaign.only(tuple(header.name for header in rest or alike))
     frequency = block.omega / (2 * np.pi)
     at = np.unique(np.clip(np.linspace(frequency[0], frequency[-1], min(len(frequency), 1500)), *band_Hz))
-    noise = noise_covariance(alike, at, band_Hz=band_Hz, floor=floor, smooth_Hz=0.3, longest_piece=LONGEST_PIECE)
+    noise = noise_covariance(campaign, at, band_Hz=band_Hz, floor=floor, smooth_Hz=0.3, longest_piece=LONGEST_PIECE)
     nearest = np.clip(np.searchsorted(at, frequency), 0, len(at) - 1)
     return block.with_noise(noise.covariance[nearest], float(np.median(noise.dof)))
 

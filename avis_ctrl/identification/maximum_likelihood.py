@@ -110,6 +110,8 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
     for k in range(starts):
         begin = model if k == 0 else _moved(model, spread, rng)
         if begin is not None:
+            if k > 0:
+                begin = _thinned_descent(begin, blocks, priors, model.values, max_iterations)
             descent = _Descent(begin, blocks, whiteners, priors, model.values)
             descent.run(max_iterations)
             reached.append((descent.now.chi2, descent))
@@ -129,6 +131,16 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
     information = Information(model.names, best.model.values, model.units, last.H / np.outer(scale, scale), scale)
     return LikelihoodFit(best.model, information, last.chi2, dof, best.iterations, best.converged,
                          tuple(best.history), last.residuals, tuple(value for value, _ in reached), priors)
+
+
+def _thinned_descent(begin: ResponseModel, blocks, priors, scale_values, max_iterations: int) -> ResponseModel:
+    """A first descent on some of the lines, drawn at random: from afar it leads to the same place, in less time."""
+    rng = np.random.default_rng(0)
+    few = [block.lines(np.sort(rng.choice(len(block.omega), max(min(len(block.omega), 200), len(block.omega) // 8),
+                                          replace=False))) for block in blocks]
+    descent = _Descent(begin, few, [_whitener(block) for block in few], priors, scale_values)
+    descent.run(max_iterations)
+    return descent.model
 
 
 class _Descent:

@@ -20,6 +20,8 @@ from avis_ctrl.identification.campaign_fit import CampaignFit, Split, excited_ba
 from avis_ctrl.identification.ekf import identify_ekf
 from avis_ctrl.identification.ekf_result import EkfResult
 from avis_ctrl.identification.ekf_settings import HONEST_SETTINGS
+from avis_ctrl.identification.experiment_plan import needed_experiment
+from avis_ctrl.identification.experiments import Drive, campaign_noise
 from avis_ctrl.identification.identifiability import IdentifiabilityReport, identifiability_report
 from avis_ctrl.identification.maximum_likelihood import Prior
 from avis_ctrl.identification.parameter_sets import default_parameters, named_parameters
@@ -59,6 +61,7 @@ class Identification:
     """Everything that `avis identify` found.
 
     rig : with the identified values; start : as it came. split is None for frequency responses without records.
+    advice : which added records would determine what is missing, with predicted standard deviations.
     kalman : the extended Kalman filter's answer, where it was asked for; kalman_note why there is none.
     """
 
@@ -70,6 +73,7 @@ class Identification:
     split: Split | None
     campaign_fit: CampaignFit
     identifiability: IdentifiabilityReport
+    advice: tuple[str, ...]
     validation: Validation
     kalman: EkfResult | None
     kalman_note: str
@@ -114,15 +118,18 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
         progress(f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
                  + (f"; {split.how}" if split else ""))
         found = fit_campaign(fitted, model, band, options.priors, options.starts, options.seed, progress=progress)
-        report = identifiability_report(found.fit.information)
+        floor = any(block.block.kind == "floor measured" for block in found.fit.residuals)
+        report = identifiability_report(found.fit.information, found.fit.model, floor,
+                                        {name: sigma for name, (_, sigma) in found.fit.priors.items()})
         progress(f"{found.fit.information.rank} of {len(model.names)} combinations of parameters are determined")
+        advice = _advice(found, fitted, report, progress)
         kalman, note = _kalman(fitted, rig, model.names, options, progress)
         progress("validation on what no fit has seen")
         validation = validate(found, fitted, held_out)
     identified = found.fit.model.rig
     seconds = time.monotonic() - began
-    return Identification(rig, identified, options, measured, findings, split, found, report, validation, kalman, note,
-                          provenance(measured, rig, options, seconds), seconds)
+    return Identification(rig, identified, options, measured, findings, split, found, report, advice, validation,
+                          kalman, note, provenance(measured, rig, options, seconds), seconds)
 
 
 def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions) -> ResponseModel:
@@ -170,6 +177,25 @@ def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions):
         return None, inside.at(~third), inside.at(third), band
     split = split_campaign(measured, options.hold_out)
     return split, split.fitted, split.held_out, options.band_Hz or excited_band(split.fitted)
+
+
+def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, report: IdentifiabilityReport,
+            progress: Progress) -> tuple[str, ...]:
+    """What another record like the fitted ones would bring, or one of another kind."""
+    model = found.fit.model
+    if found.fit.information.rank == len(model.names) or not isinstance(fitted, Campaign):
+        return ()
+    progress("which further record would determine the rest")
+    driven = [record.header for record in fitted.records if record.header.level_V > 0]
+    if not driven:
+        return ("No record drives the actuators; such a record is the first thing to add.",)
+    level = float(np.mean([h.level_V for h in driven]))
+    try:
+        drive = Drive(level, sum(h.duration_s for h in driven), found.band_Hz)
+        return needed_experiment(found.fit.information, model, drive, campaign_noise(
+            [one.block for one in found.fit.residuals]), report=report)
+    except AvisError as error:
+        return (f"No advice on further records: {error}",)
 
 
 def _kalman(fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str], options: IdentifyOptions,
