@@ -138,7 +138,7 @@ def _thinned_descent(begin: ResponseModel, blocks, priors, scale_values, max_ite
     rng = np.random.default_rng(0)
     few = [block.lines(np.sort(rng.choice(len(block.omega), max(min(len(block.omega), 200), len(block.omega) // 8),
                                           replace=False))) for block in blocks]
-    descent = _Descent(begin, few, [_whitener(block) for block in few], priors, scale_values)
+    descent = _Descent(begin, few, [whitener(block) for block in few], priors, scale_values)
     descent.run(max_iterations)
     return descent.model
 
