@@ -45,12 +45,13 @@ def identify(
 
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.rigs import load_rig
-    from avis_ctrl.study.output import open_folder
+    from avis_ctrl.study.files import open_folder
+    from avis_ctrl.study.identification_files import FILES
 
     console = Console(highlight=False)
     start = load_rig(rig)
     measured = read_measurements(measurement, parse_columns(columns) if columns else None)
-    folder = open_folder(out)
+    folder = open_folder(out, FILES)
     with Progress(console) as progress:
         from avis_ctrl.report import identification_html, identification_pdf
         from avis_ctrl.study.identification import IdentifyOptions, identify

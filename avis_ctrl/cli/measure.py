@@ -89,7 +89,7 @@ def simulate_campaign(
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.simulation import rehearse
     from avis_ctrl.study.campaign_plan import default_plan, plan_toml, read_plan
-    from avis_ctrl.study.output import write_whole
+    from avis_ctrl.study.files import write_whole
 
     console = Console(highlight=False)
     table = load_rig(rig)

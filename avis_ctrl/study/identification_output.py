@@ -19,10 +19,10 @@ from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rig_writer import rig_toml
+from avis_ctrl.study.files import write_json, write_whole
 from avis_ctrl.study.identification import Identification
-from avis_ctrl.study.output import write_json, write_whole
+from avis_ctrl.study.identification_files import FILES, RESULT_FILE, RIG_FILE
 
-RIG_FILE, RESULT_FILE = "rig.toml", "result.json"
 PIECE = 1 << 17
 
 
@@ -92,8 +92,7 @@ def result_dict(found: Identification) -> dict[str, Any]:
 def write_identification(found: Identification, folder: Path, html: bytes | None = None, pdf: bytes | None = None,
                          more: dict[str, str] | None = None) -> list[Path]:
     """All files; result.json last, so that its presence says that the others are complete."""
-    names = [RESULT_FILE, RIG_FILE, "report.html", "report.pdf", *(more or {})]
-    for name in names:
+    for name in FILES:
         (folder / name).unlink(missing_ok=True)
     texts = {RIG_FILE: identified_toml(found).encode(), **{name: text.encode() for name, text in (more or {}).items()},
              "report.html": html, "report.pdf": pdf}

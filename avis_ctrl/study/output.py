@@ -1,110 +1,23 @@
-"""Files of a study: each is whole or absent, also when the disk fills or the process is killed."""
+"""Files of a design study."""
 
 from __future__ import annotations
 
-import contextlib
-import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.errors import InputError
+from avis_ctrl.study import files
+from avis_ctrl.study.files import not_written, write_json, write_whole
 from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
 
 FILES = ("plant.json", "report.html", "report.pdf", "result.json")
 
 
-FILES = ("result.json", "report.html", "report.pdf", "plant.json")
-
-
 def open_folder(folder: str | Path) -> Path:
-    """Create the output folder and make sure, before hours of computing, that it can be written.
-
-    Raises InputError where it is a file, read-only, below something that is, or holds a folder in place of a file.
-    """
-    path = Path(folder)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    except OSError as error:
-        raise InputError(f"expected a folder that can be written ({error.strerror or error})", field="--out",
-                         value=str(path)) from None
-    for name, is_folder in (("controllers", True), *((name, False) for name in FILES)):
-        if (path / name).exists() and (path / name).is_dir() != is_folder:
-            raise InputError(f"expected a {'folder' if is_folder else 'file'} at {path / name}, or nothing",
-                             field="--out", value=str(path))
-    return path
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that nobody ever sees half of it.
-
-    The bytes go into a file without a name in the same folder (it vanishes with the process), are synced, and only
-    then get the name. Raises ComputationError where the disk refuses.
-    """
-    try:
-        if hasattr(os, "O_TMPFILE"):
-            with contextlib.suppress(OSError):
-                _write_nameless(path, content)
-                return
-        _write_renamed(path, content)
-    except OSError as error:
-        raise _not_written(path, error) from None
-
-
-def _not_written(path: Path, error: OSError) -> ComputationError:
-    return ComputationError(f"{path} was not written; what was there before is untouched",
-                            cause=str(error.strerror or error),
-                            next_step="free some space or choose another --out folder")
-
-
-def _write_nameless(path: Path, content: bytes) -> None:
-    with open(os.open(path.parent, os.O_TMPFILE | os.O_WRONLY, 0o644), "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".") as private:
-            named = Path(private) / path.name
-            os.link(f"/proc/self/fd/{file.fileno()}", named, follow_symlinks=True)
-            os.replace(named, path)
-
-
-def _write_renamed(path: Path, content: bytes) -> None:
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with open(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(name)
-        raise
-
-
-def write_json(path: Path, value: dict[str, Any]) -> None:
-    """JSON, floats as they are, infinities and nan as null (JSON has neither)."""
-    write_whole(path, json.dumps(_plain(value), indent=1, allow_nan=False).encode())
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return int(value) if isinstance(value, np.integer) else value
+    """The output folder of a design study; raises as `files.open_folder`."""
+    return files.open_folder(folder, FILES, ("controllers",))
 
 
 def controller_dict(result: ControllerResult, units_in: str = "m/s", units_out: str = "N") -> dict[str, Any]:
@@ -161,7 +74,7 @@ def write_study(result: DesignResult, folder: Path, html: bytes | None = None, p
         for old in (*(folder / name for name in FILES), *(folder / "controllers").glob("*.json")):
             old.unlink(missing_ok=True)
     except OSError as error:
-        raise _not_written(folder, error) from None
+        raise not_written(folder, error) from None
     written = []
     for c in result.controllers:
         if c.K is not None:

@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.study import output
-from avis_ctrl.study.output import open_folder, write_json, write_whole
+from avis_ctrl.study.files import write_json, write_whole
+from avis_ctrl.study.output import open_folder
 
 SIZE = 300_000
 
