@@ -82,8 +82,12 @@ def linear_part(loop: SampledLoop) -> StateSpace:
     eom = loop.plant.mounted_body().equations_of_motion()
     sensor_names, H = loop.plant.sensor_rows()
     parts = {"table": _table(eom, H, sensor_names, loop.sensors.quantity)}
-    for name, drive in zip(eom.actuators, loop.drives(), strict=True):
-        parts[f"drive {name}"] = drive.renamed([f"{name}_dac"], [name])
+    # Where drives couple, what leaves an amplifier is not yet what acts.
+    made = eom.actuators if loop.drive_coupling is None else tuple(f"{name}_alone" for name in eom.actuators)
+    for name, alone, drive in zip(eom.actuators, made, loop.drives(), strict=True):
+        parts[f"drive {name}"] = drive.renamed([f"{name}_dac"], [alone])
+    if loop.drive_coupling is not None:
+        parts["drive coupling"] = loop.drive_coupling.renamed(list(made), list(eom.actuators))
     for name, chain in zip(sensor_names, loop.sensors.chains, strict=True):
         parts[f"sensor {name}"] = chain.renamed([f"{name}_motion"], [f"{name}_volt"])
     inputs = [f"{name}_dac" for name in eom.actuators]

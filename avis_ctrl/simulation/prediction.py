@@ -107,8 +107,9 @@ def _image(loop: SampledLoop, image: np.ndarray) -> list[np.ndarray]:
     drive = _diagonal(loop.drives(), image) * (sinc * np.exp(-1j * image * (loop.loop_delay_s + T / 2)))[:, None]
     # s^2 M q + s C q + K q = (C_f + K_f / s) w + T u, and v = s q
     dynamic = s * eom.M + eom.C + eom.K / s
+    acting = eom.T if loop.drive_coupling is None else eom.T @ loop.drive_coupling.frequency_response(image)
     pushed = np.concatenate([(eom.C_floor + eom.K_floor / s) * (sinc ** 2)[:, None, None],
-                             eom.T * drive[:, None, :]], axis=2)
+                             acting * drive[:, None, :]], axis=2)
     velocity = np.linalg.solve(dynamic, pushed)
     _, H = loop.plant.sensor_rows()
     sensed = H @ velocity * _diagonal(loop.sensors.chains, image)[:, :, None]

@@ -114,6 +114,8 @@ class SampledLoop:
     plant : the table that moves; `rig` by default.
     drive_errors : one system a drive, volts to volts (1 + W Delta of neglected dynamics), None where nominal;
         empty when all are.
+    drive_coupling : volts of all drives to volts that act (I + what couples them), behind amplifiers and errors;
+        None where each drive acts by itself.
     amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
     sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage.
 
@@ -130,6 +132,7 @@ class SampledLoop:
     floor: Mapping[str, SpectrumModel]
     plant: Rig = _AS_RIG
     drive_errors: tuple[StateSpace | None, ...] = ()
+    drive_coupling: StateSpace | None = None
     amplifier_corner_Hz: float | None = None
     sample_rate_Hz: float = _AS_RIG
     loop_delay_s: float = _AS_RIG
@@ -170,6 +173,9 @@ class SampledLoop:
                              *((f"sensor {k}", s) for k, s in enumerate(self.sensors.chains))):
             if system.D.shape != (1, 1):
                 raise InputError("one input and one output", field=name, value=system.D.shape)
+        if self.drive_coupling is not None and self.drive_coupling.D.shape != (self.n_drives,) * 2:
+            raise InputError(f"a system of {self.n_drives} inputs and outputs", field="drive_coupling",
+                             value=self.drive_coupling.D.shape)
         if self.sensors.quantity == "acceleration" and any(drive.D[0, 0] for drive in self.drives()):
             # Acceleration would jump with the voltage, at the very instant of the next sample.
             raise InputError("a corner for the amplifiers: accelerometers need drives without direct feedthrough",
@@ -195,7 +201,8 @@ class SampledLoop:
 
     def with_plant(self, name: str, plant: Rig | None = None,
                    drive_errors: Sequence[StateSpace | None] | None = None,
-                   sensor_errors: Sequence[StateSpace | None] | None = None) -> SampledLoop:
+                   sensor_errors: Sequence[StateSpace | None] | None = None,
+                   drive_coupling: StateSpace | None = None) -> SampledLoop:
         """The same controller around another table; errors are volts to volts, None where nominal."""
         sensors = self.sensors
         if sensor_errors is not None:
@@ -203,7 +210,8 @@ class SampledLoop:
                            for chain, error in zip(sensors.chains, sensor_errors, strict=True))
             sensors = replace(sensors, chains=chains)
         return replace(self, name=name, plant=plant or self.rig, sensors=sensors,
-                       drive_errors=self.drive_errors if drive_errors is None else tuple(drive_errors))
+                       drive_errors=self.drive_errors if drive_errors is None else tuple(drive_errors),
+                       drive_coupling=self.drive_coupling if drive_coupling is None else drive_coupling)
 
 
 def lever_arms(rig: Rig) -> np.ndarray:

@@ -72,8 +72,7 @@ def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> t
     for value, block in zip(blocks.values(part), blocks.blocks, strict=True):
         if block.name in real:
             parameter = real[block.name]
-            words = parameter.describe(float(np.real(value)), plant.rig.nominal[block.name],
-                                       plant.rig.units[block.name]).removeprefix(block.name)
+            words = parameter.words(float(np.real(value)), plant.rig.nominal, plant.rig.units).removeprefix(block.name)
         else:
             number = complex(np.asarray(value).ravel()[0]) if np.size(value) == 1 else None
             size = abs(number) if number is not None else float(np.linalg.norm(np.asarray(value), 2))

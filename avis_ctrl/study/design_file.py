@@ -10,7 +10,7 @@ import difflib
 import tomllib
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
@@ -19,6 +19,7 @@ from avis_ctrl.rigs.file_errors import first_complaint
 from avis_ctrl.rigs.floor_spectrum import shipped_spectra
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import LIMIT, SHIPPED, load_rig
+from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty
 from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter
 
 
@@ -67,6 +68,24 @@ class UncertaintySection(_Section):
     parameters_absolute: dict[str, Positive] = {}
     actuator_chains: ChainUncertainty | None = None
     sensor_chains: ChainUncertainty | None = None
+    identified: str | UncertaintyFile | None = None
+    confidence_percent: Percent = 95.0
+
+    @field_validator("identified", mode="plain")
+    @classmethod
+    def _file_or_content(cls, identified: Any) -> str | UncertaintyFile | None:
+        """In a design file the name of a file beside it; `read_study` puts the content in its place."""
+        if identified is not None and not isinstance(identified, (str, UncertaintyFile)):
+            raise ValueError("expected the name of an uncertainty file")
+        return identified
+
+    @property
+    def identification(self) -> UncertaintyFile | None:
+        """The content of the uncertainty file. Raises InputError where it was not read yet."""
+        if isinstance(self.identified, str):
+            raise InputError("expected the file's content: read_uncertainty(...), or a design that read_study read",
+                             field="uncertainty.identified", value=self.identified)
+        return self.identified
 
     def of(self, rig: Rig) -> list[UncertainParameter]:
         """The uncertain parameters, wildcards ("isolator*.k_z") expanded over the rig's names."""
@@ -248,7 +267,13 @@ def read_study(path: str | Path) -> tuple[Design, Rig]:
         raise InputError(f"expected a rig file beside the design or one of {', '.join(SHIPPED)}", file=path,
                          field="rig", value=design.rig)
     rig = load_rig(design.rig if design.rig in SHIPPED else beside)
+    if isinstance(named := design.uncertainty.identified, str):
+        content = read_uncertainty(path.parent / named)
+        design = design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
+            update={"identified": content})})
     try:
+        if (known := design.uncertainty.identification) is not None:
+            known.check_rig(rig)
         for parameter in design.uncertainty.of(rig):
             parameter.half_range(rig.parameters()[parameter.name].value)
     except InputError as error:

@@ -9,6 +9,7 @@ compliance, volts, noise) that analysis reports, so that both speak of one plant
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,7 @@ from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.study.design_file import ChainUncertainty, Design
+from avis_ctrl.study.identified_uncertainty import RESPONSE, InDesign, in_design
 from avis_ctrl.uncertainty.blocks import ComplexFull
 from avis_ctrl.uncertainty.generalized_plant import Diagram, GeneralizedPlant
 from avis_ctrl.uncertainty.performance_weights import Band, ComplianceBound, ControlEffort, TransmissibilityBound
@@ -50,6 +52,7 @@ class DesignPlant:
     floor_density : mean velocity density of the floor [m/s/sqrt(Hz)]: the unit of the noise inputs.
     floor : spectrum of the floor's motion, each kept axis alike.
     weights : the weighting filters by name, with their meaning, for the report.
+    identified : what comes from an identification, where the design names one.
     """
 
     full: GeneralizedPlant
@@ -65,6 +68,7 @@ class DesignPlant:
     floor_density: float
     floor: SpectrumModel
     weights: dict[str, Weight]
+    identified: InDesign | None = None
 
     @property
     def floor_velocities(self) -> list[str]:
@@ -85,9 +89,11 @@ def build_plant(design: Design, rig: Rig) -> DesignPlant:
     Raises
     ------
     InputError : parameters or axes that the rig does not have, axes that its actuators cannot push or its
-        sensors cannot tell apart.
+        sensors cannot tell apart; an identification of another rig or other coordinates.
     """
-    uncertain = uncertain_rig(rig, design.uncertainty.of(rig), design.keep)
+    identified = _identified(design, rig)
+    directions = identified.directions if identified else ()
+    uncertain = uncertain_rig(rig, [*design.uncertainty.of(rig), *directions], design.keep)
     axes = uncertain.coordinates
     lever = np.array([rig.edge_m if name != axis else 1.0 for name, axis in zip(axes, design.keep, strict=True)])
     allocation = actuator_axes(rig, design.keep)
@@ -102,7 +108,7 @@ def build_plant(design: Design, rig: Rig) -> DesignPlant:
     chain, noise = sensor_chain(design, rig)
     weights: dict[str, Weight] = {}
     _rig_part(diagram, uncertain, actuators)
-    _actuator_side(diagram, design, rig, axes, actuators, matrix[used], weights)
+    _actuator_side(diagram, design, rig, axes, actuators, matrix[used], weights, identified)
     floor = floor_spectrum(design, rig)
     low, high = design.floor.band_Hz
     reference = floor.rms(low, high) / np.sqrt(high - low)
@@ -121,7 +127,32 @@ def build_plant(design: Design, rig: Rig) -> DesignPlant:
     full = diagram.plant(w, [*weighted, *compliance, *physical], u, y)
     asked = w if design.compliance else w[:2 * len(axes)]
     return DesignPlant(full, full.restricted(asked, [*weighted, *compliance]), uncertain, axes, actuators,
-                       decoder.sensors, matrix[used], decoding, chain, noise, reference, floor, weights)
+                       decoder.sensors, matrix[used], decoding, chain, noise, reference, floor, weights, identified)
+
+
+def _identified(design: Design, rig: Rig) -> InDesign | None:
+    """The identification's directions and filter; what the design declares of its drives goes into the filter."""
+    content = design.uncertainty.identification
+    if content is None:
+        return None
+    declared, factor = None, 1.0
+    if (chains := design.uncertainty.actuator_chains) is not None:
+        declared = _neglected(chains)
+        factor = channels_gain(rig, design.keep)
+    return in_design(content, rig, design.keep, design.uncertainty.confidence_percent / 100, declared, factor)
+
+
+def channels_gain(rig: Rig, keep: Sequence[str]) -> float:
+    """Largest error of the axes' forces together for an error of 1 in the channels, each by itself: |T| |A|.
+
+    With T A = I, any errors E = diag(e_k), |e_k| <= 1, give |T E A| <= |T| |A|; 1 where every channel serves the axes
+    alike.
+    """
+    lever = np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
+    found = actuator_axes(rig, keep)
+    used = np.any(np.abs(found.allocation) > 1e-9 * np.abs(found.allocation).max(), axis=1)
+    T = found.matrix[[COORDINATES.index(name) for name in keep]][:, used] / lever[:, None]
+    return float(np.linalg.norm(T, 2) * np.linalg.norm((found.allocation * lever)[used], 2))
 
 
 def floor_spectrum(design: Design, rig: Rig) -> SpectrumModel:
@@ -157,7 +188,7 @@ def _rig_part(diagram: Diagram, uncertain: UncertainRig, actuators: tuple[str, .
 
 
 def _actuator_side(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, ...], actuators: tuple[str, ...],
-                   allocation: np.ndarray, weights: dict[str, Weight]) -> None:
+                   allocation: np.ndarray, weights: dict[str, Weight], identified: InDesign | None) -> None:
     """Delay with the hold of the converter, amplifier, allocation, neglected dynamics."""
     corner = 2 * np.pi * design.loop.amplifier_corner_Hz
     # A zero-order hold delays by half a sample on average.
@@ -172,7 +203,35 @@ def _actuator_side(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, 
                 "allocation")
     for name in actuators:
         diagram.means(f"{name}_command", "voltage of the channel", "V")
-    _chains(diagram, design.uncertainty.actuator_chains, actuators, "{}_command", "{}", "actuator chain {}", weights)
+    if identified is not None:
+        _response_error(diagram, identified, axes, actuators, allocation, weights)
+    else:
+        _chains(diagram, design.uncertainty.actuator_chains, actuators, "{}_command", "{}", "actuator chain {}",
+                weights)
+
+
+def _response_error(diagram: Diagram, identified: InDesign, axes: tuple[str, ...], actuators: tuple[str, ...],
+                    allocation: np.ndarray, weights: dict[str, Weight]) -> None:
+    """(I + W Delta) on the axes' forces, Delta full: what the identified model leaves of the measured response.
+
+    Per channel it would not do: an error of one axis by the force of another need not be an error of channels.
+    """
+    weights[RESPONSE] = identified.weight
+    tags = [f"{RESPONSE}[{k}]" if len(axes) > 1 else RESPONSE for k in range(len(axes))]
+    for axis, tag in zip(axes, tags, strict=True):
+        diagram.add(f"W {RESPONSE} {axis}", identified.weight.system(f"drive_{axis}", f"z:{tag}"), "weight")
+        diagram.means(f"w:{tag}", "force by which the response differs from the identified one", "N")
+    diagram.add("identified response error", gain(allocation, [f"w:{tag}" for tag in tags],
+                                                  [f"{name}_error" for name in actuators]), "allocation")
+    for name in actuators:
+        diagram.add(f"actuator chain {name}", summing_junction(name, [f"{name}_command", f"{name}_error"]), "actuator")
+        diagram.means(f"{name}_error", "voltage that would make the difference", "V")
+    diagram.uncertain(ComplexFull(len(axes), len(axes), RESPONSE), [f"w:{tag}" for tag in tags],
+                      [f"z:{tag}" for tag in tags])
+
+
+def _neglected(chains: ChainUncertainty) -> NeglectedDynamics:
+    return NeglectedDynamics(chains.low_percent / 100, chains.crossover_Hz, chains.high_percent / 100)
 
 
 def _chains(diagram: Diagram, uncertainty: ChainUncertainty | None, names: tuple[str, ...], before: str, after: str,
@@ -183,8 +242,7 @@ def _chains(diagram: Diagram, uncertainty: ChainUncertainty | None, names: tuple
         if uncertainty is None:
             diagram.add(label, gain([[1.0]], [read], [made]), "actuator")
             continue
-        weight = NeglectedDynamics(uncertainty.low_percent / 100, uncertainty.crossover_Hz,
-                                   uncertainty.high_percent / 100)
+        weight = _neglected(uncertainty)
         weights.setdefault(title.format("*"), weight)
         diagram.add(f"W {label}", weight.system(read, f"z:{label}"), "weight")
         diagram.add(label, gain([[1.0, 1.0]], [read, f"w:{label}"], [made]), "actuator")
@@ -242,7 +300,7 @@ def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty, axes: tuple[
                    rows: np.ndarray, decoding: np.ndarray, weights: dict[str, Weight]) -> None:
     """What the neglected dynamics of each sensor chain add to the decoded velocities: decoding (W Delta) rows."""
     used = [k for k in range(len(sensors)) if np.any(np.abs(rows[k]) > 1e-9) and np.any(np.abs(decoding[:, k]) > 1e-9)]
-    weight = NeglectedDynamics(uncertainty.low_percent / 100, uncertainty.crossover_Hz, uncertainty.high_percent / 100)
+    weight = _neglected(uncertainty)
     weights["sensor chain *"] = weight
     labels = [f"sensor chain {sensors[k]}" for k in used]
     for k, label in zip(used, labels, strict=True):

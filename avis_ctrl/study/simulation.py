@@ -8,8 +8,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.classical.skyhook import Skyhook
-from avis_ctrl.lti.statespace import StateSpace, gain
+from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel
+from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.robust.mu_realise import realise_delta
@@ -18,6 +19,7 @@ from avis_ctrl.simulation.prediction import predict_transmissibility_6dof
 from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, accelerometer_bank, geophone_bank
 from avis_ctrl.study.controllers import CUSTOMARY_CORNERS_HZ, critical_gains
 from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.model import ControllerResult, SixDofCheck
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.study.sampling import random_perturbations
@@ -98,9 +100,30 @@ def with_delta(rig: Rig, plant: DesignPlant, nominal: SampledLoop, name: str, de
     chains = {block.name: (value, block) for value, block in zip(blocks.values(delta), blocks.blocks, strict=True)
               if block.kind != "real"}
     actuators = rig.equations_of_motion().actuators
+    coupling = _response_error(rig, plant, nominal.axes, chains, omega)
     drives = [_chain(plant, chains, "actuator chain", one, omega) for one in actuators]
     sensors = [_chain(plant, chains, "sensor chain", one, omega) for one in plant.sensors]
-    return nominal.with_plant(name, changed, drives, sensors)
+    return nominal.with_plant(name, changed, drives, sensors, coupling)
+
+
+def _response_error(rig: Rig, plant: DesignPlant, keep: tuple[str, ...], chains: dict, omega: float
+                    ) -> StateSpace | None:
+    """I + A W(s) Delta(s) T from all drives to all drives, None where the plant has no such error.
+
+    T takes volts to the axes' forces, A the forces that make the difference back to volts.
+    """
+    if RESPONSE not in chains:
+        return None
+    value, block = chains[RESPONSE]
+    delta = realise_delta(np.asarray(value), omega, [block])
+    n = len(keep)
+    W = append(*[plant.weights[RESPONSE].system(f"f{k}", f"z{k}") for k in range(n)])
+    axes = actuator_axes(rig, keep)
+    lever = np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
+    T = axes.matrix[[COORDINATES.index(name) for name in keep]] / lever[:, None]
+    error = delta.renamed([f"z{k}" for k in range(n)], [f"w{k}" for k in range(n)]) @ W
+    volts = list(axes.actuators)
+    return gain(np.eye(len(volts)), volts, volts) + gain(axes.allocation * lever) @ error @ gain(T)
 
 
 def _chain(plant: DesignPlant, chains: dict, kind: str, name: str, omega: float) -> StateSpace | None:

@@ -1,0 +1,71 @@
+"""The response that an identified model leaves unexplained, measured on the records themselves.
+
+What the sensors read less what the model predicts is regressed on the inputs (model error modelling; Ljung, Model
+validation and model error modelling, 1999). Near a sharp resonance this is far better than comparing two responses:
+the prediction carries the resonance and the transient of the start, so that what is left is smooth over frequency,
+which the local polynomial asks for, and small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.prediction import Predictor, model_inputs
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.local_polynomial import local_polynomial
+
+
+class Unexplained(RecordSource):
+    """A record with what the model predicts, from rest at the record's start, taken off y.
+
+    Pieces in order cost one run; a piece out of order starts the prediction anew.
+    """
+
+    def __init__(self, record: RecordSource, model: ResponseModel):
+        self.record, self.model, self.header = record, model, record.header
+        h = record.header
+        if missing := [name for name in model.sensors.names if name not in h.y_names]:
+            raise InputError(f"the record has {', '.join(h.y_names)}", field=f"record {h.name}: y names", value=missing)
+        if abs(h.sample_rate_Hz * model.period_s - 1) > 1e-6:
+            raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
+                             field=f"record {h.name}: sample_rate_Hz")
+        self.predictor, self.at = Predictor(model), 0
+
+    def load(self, start: int = 0, stop: int | None = None) -> Record:
+        stop = self.header.samples if stop is None else stop
+        if start < self.at:
+            self.predictor, self.at = Predictor(self.model), 0
+        piece = self.record.load(self.at, stop)
+        read = self.predictor.read(*model_inputs(self.model, piece))
+        keep, self.at = slice(start - self.at, None), stop
+        y = piece.y.copy()
+        y[:, [self.header.y_names.index(name) for name in self.model.sensors.names]] -= read
+        header = replace(piece.header, samples=stop - start,
+                         start_s=self.header.start_s + start / self.header.sample_rate_Hz)
+        return Record(header, piece.u[keep], y[keep], None if piece.floor is None else piece.floor[keep])
+
+
+def unexplained(campaign: Campaign, model: ResponseModel) -> Campaign:
+    """The campaign with the model's prediction taken off. Raises InputError for channels that are not the model's."""
+    return replace(campaign, records=tuple(Unexplained(record, model) for record in campaign.records))
+
+
+def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float],
+                      longest_piece: int | None = None) -> FrequencyResponse:
+    """The frequency response as the records have it: the model's, and what it leaves unexplained.
+
+    Raises
+    ------
+    InputError : as `unexplained` and `local_polynomial`.
+    ComputationError : inputs that cannot be told apart.
+    """
+    left = local_polynomial(unexplained(campaign, model), band_Hz=band_Hz, longest_piece=longest_piece)
+    response = model.response(left.omega)[:, :, [model.inputs.index(name) for name in left.inputs]]
+    rows = [left.outputs.index(name) for name in model.sensors.names]
+    value = left.value.copy()
+    value[:, rows] += response
+    return replace(left, value=value, method=f"response of the model with what it leaves: {left.method}")
+

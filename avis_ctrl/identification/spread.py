@@ -1,0 +1,172 @@
+r"""How far a measured frequency response may lie from an identified rig, in the coordinates of a design.
+
+With A (volts per axis force) and D (axis velocities from sensors), both from geometry, the kept coordinates see
+
+    G_k = D G A    and    L = inv(G_k) D (G_measured - G) A,    so that D G_measured A = G_k (I + L),
+
+an input-multiplicative error, rotations as displacement and force at the edge. The measured response has an error of
+its own, N with vec(N) of known covariance, so that the true L is L_measured - inv(G_k) D N A and
+
+    sigma_max(L) <= sigma_max(L_measured) + q,
+
+q the quantile of the largest singular value of that noise. The bound holds line by line with at least the confidence
+asked for; it counts the noise twice, for L_measured contains it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
+from avis_ctrl.rigs.rig import Rig
+
+# Random draws behind the quantiles; that of 99 % then rests on the 20 largest.
+DRAWS = 2000
+CONFIDENCES = (0.8, 0.9, 0.95, 0.99)
+# Lines worked on at once, which bounds the memory.
+CHUNK = 200
+
+
+@dataclass(frozen=True, eq=False)
+class FrfSpread:
+    """Relative error of a model against a measurement, at frequency_Hz (n,).
+
+    Attributes
+    ----------
+    keep : coordinates.
+    measured : (n,) largest singular value of L as measured, noise included.
+    noise : (c, n) q, quantiles of what noise alone makes, at each of confidences (c,).
+    """
+
+    keep: tuple[str, ...]
+    frequency_Hz: np.ndarray
+    measured: np.ndarray
+    noise: np.ndarray
+    confidences: tuple[float, ...]
+
+    def bound(self, confidence: float = 0.95) -> np.ndarray:
+        """(n,) what the largest singular value of the true L stays below, with that confidence at each line, or the
+        next larger one that was computed.
+
+        Raises InputError for one above all that were.
+        """
+        able = [k for k, one in enumerate(self.confidences) if one >= confidence - 1e-9]
+        if not able:
+            raise InputError(f"expected at most {100 * max(self.confidences):g} %, the largest that the spread was "
+                             "computed for", field="confidence", value=confidence)
+        return self.measured + self.noise[min(able, key=lambda k: self.confidences[k])]
+
+    def thinned(self, per_octave: int = 24, confidence: float = 0.95) -> FrfSpread:
+        """Of each part of an octave the line with the largest bound."""
+        place = np.floor(per_octave * np.log2(self.frequency_Hz / self.frequency_Hz[0]) + 1e-9).astype(int)
+        bound = self.bound(confidence)
+        largest = np.array([np.flatnonzero(place == one)[np.argmax(bound[place == one])] for one in np.unique(place)])
+        return replace(self, frequency_Hz=self.frequency_Hz[largest], measured=self.measured[largest],
+                       noise=self.noise[:, largest])
+
+
+def kept_axes(rig: Rig, keep: Sequence[str], actuators: Sequence[str], sensors: Sequence[str]
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """A (n_u, n_axes) volts per newton and D (n_axes, n_s) velocities from velocities along the sensors.
+
+    Raises
+    ------
+    InputError : coordinates that these actuators cannot push or these sensors cannot tell apart.
+    """
+    lever = np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
+    return (actuator_axes(rig, keep, actuators).allocation * lever,
+            sensor_axes(rig, keep, sensors).decoding * lever[:, None])
+
+
+def frf_spread(measured: FrequencyResponse, model: ResponseModel, keep: Sequence[str] = ("z", "phi_x"),
+               confidences: Sequence[float] = CONFIDENCES, seed: int = 1) -> FrfSpread:
+    """The spread of a measured frequency response about an identified model.
+
+    Parameters
+    ----------
+    measured : from the model's actuators to its sensors; columns of a measured floor are passed over.
+    model : at the identified parameters.
+    confidences : shares of repeated measurements in which a bound holds at a line.
+
+    Raises
+    ------
+    InputError : a confidence outside 0 .. 1, channels or units that are not the model's, coordinates that the
+        channels cannot push or tell apart.
+    """
+    if not confidences or not all(0 < one < 1 for one in confidences):
+        raise InputError("expected shares between 0 and 1", field="confidences", value=list(confidences))
+    rows, columns = _channels(measured, model)
+    A, D = kept_axes(model.rig, keep, model.actuators, model.sensors.names)
+    D = D / model.sensors.sensitivity
+    response = model.response(measured.omega)[:, :, :len(model.actuators)]
+    G_k = D @ response @ A
+    L = np.linalg.solve(G_k, D @ (measured.value[:, rows][:, :, columns] - response) @ A)
+    left = np.linalg.solve(G_k, np.broadcast_to(D, (len(G_k), *D.shape)))
+    noise = _noise_quantile(_covariance(measured, rows, columns, left, A), len(keep), measured.dof, confidences,
+                            seed)
+    return FrfSpread(tuple(keep), measured.frequency_Hz, largest_singular_value(L), noise, tuple(confidences))
+
+
+def largest_singular_value(L: np.ndarray) -> np.ndarray:
+    """Of matrices (..., k, k); for k up to 2 in closed form."""
+    if L.shape[-1] == 1:
+        return np.abs(L[..., 0, 0])
+    if L.shape[-1] == 2:
+        total = np.sum(np.abs(L) ** 2, axis=(-2, -1))
+        determinant = np.abs(L[..., 0, 0] * L[..., 1, 1] - L[..., 0, 1] * L[..., 1, 0])
+        return np.sqrt((total + np.sqrt(np.maximum(total ** 2 - 4 * determinant ** 2, 0.0))) / 2)
+    return np.linalg.norm(L, ord=2, axis=(-2, -1))
+
+
+def _channels(measured: FrequencyResponse, model: ResponseModel) -> tuple[list[int], list[int]]:
+    if measured.output_unit != model.sensors.unit:
+        raise InputError(f"expected {model.sensors.unit}", field="unit of the response's outputs",
+                         value=measured.output_unit)
+    for field, wanted, given in (("outputs", model.sensors.names, measured.outputs),
+                                 ("inputs", model.actuators, measured.inputs)):
+        if missing := [name for name in wanted if name not in given]:
+            raise InputError(f"expected a response with {', '.join(wanted)}; {', '.join(missing)} missing",
+                             field=field, value=list(given))
+    return ([measured.outputs.index(name) for name in model.sensors.names],
+            [measured.inputs.index(name) for name in model.actuators])
+
+
+def _covariance(measured: FrequencyResponse, rows: list[int], columns: list[int], left: np.ndarray,
+                A: np.ndarray) -> np.ndarray:
+    """(n, k k, k k) covariance of vec(left N A), the columns of the error stacked."""
+    if measured.entry_variance is None:
+        assert measured.gram is not None and measured.noise is not None
+        inverse = np.linalg.inv(measured.gram)[:, columns][:, :, columns]
+        row = left @ measured.noise[:, rows][:, :, rows] @ np.conj(np.swapaxes(left, 1, 2))
+        column = A.T @ np.swapaxes(inverse, 1, 2) @ A
+        n, k = row.shape[:2]
+        return np.einsum("nij,nkl->nikjl", column, row).reshape(n, k * k, k * k)
+    variance = measured.entry_variance[:, rows][:, :, columns]
+    # Independent entries N_rc: E[E_ai conj(E_bj)] = sum left_ar A_ci v_rc conj(left_br) A_cj.
+    found = np.einsum("nar,ci,nrc,nbr,cj->niajb", left, A, variance, np.conj(left), A, optimize=True)
+    n, k = left.shape[:2]
+    return found.reshape(n, k * k, k * k)
+
+
+def _noise_quantile(covariance: np.ndarray, k: int, dof: float, confidences: Sequence[float],
+                    seed: int) -> np.ndarray:
+    """(c, n) quantiles of the largest singular value of (k, k) matrices of that covariance, estimated with `dof`."""
+    rng = np.random.default_rng(seed)
+    Z = (rng.standard_normal((DRAWS, k * k)) + 1j * rng.standard_normal((DRAWS, k * k))) / np.sqrt(2)
+    if np.isfinite(dof):
+        # The covariance was estimated: the ratio follows F in place of chi-square.
+        Z /= np.sqrt(rng.gamma(dof, 1 / dof, (DRAWS, 1)))
+    values, vectors = np.linalg.eigh((covariance + np.conj(np.swapaxes(covariance, 1, 2))) / 2)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    found = []
+    for start in range(0, len(root), CHUNK):
+        # (n, draws, column, row) of the error.
+        N = (Z @ np.swapaxes(root[start:start + CHUNK], 1, 2)).reshape(-1, DRAWS, k, k)
+        found.append(np.quantile(largest_singular_value(N), confidences, axis=1))
+    return np.concatenate(found, axis=1)

@@ -1,0 +1,70 @@
+"""What a design makes of an identification: bounded directions of parameters, and a filter over the spread."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.directions import Directions, directions_that_matter
+from avis_ctrl.identification.spread import FrfSpread
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.study.uncertainty_file import UncertaintyFile
+from avis_ctrl.uncertainty.identified_spread import IdentifiedSpread
+from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection
+from avis_ctrl.uncertainty.weights import NeglectedDynamics
+
+# Names of the uncertainty's blocks.
+RESPONSE, DIRECTION = "identified response", "identified direction {}"
+# Where directions are judged: the range of transmissibility, whatever was measured.
+JUDGED_HZ = np.geomspace(0.1, 100.0, 200)
+
+
+@dataclass(frozen=True, eq=False)
+class InDesign:
+    """What a design makes of an identification.
+
+    directions : bounded, for the rig's LFT. found : with their effects and what they leave.
+    spread : measured, with its confidence. weight : covers spread, what the directions leave, and what is declared.
+    """
+
+    directions: tuple[UncertainDirection, ...]
+    found: Directions
+    spread: FrfSpread
+    confidence: float
+    weight: IdentifiedSpread
+
+
+def in_design(content: UncertaintyFile, rig: Rig, keep: Sequence[str], confidence: float = 0.95,
+              declared: NeglectedDynamics | None = None, factor: float = 1.0) -> InDesign:
+    """The bounded directions and the covering filter of an identification, for a design's coordinates.
+
+    Parameters
+    ----------
+    declared, factor : the design's own relative uncertainty of its drives, and by how much it is multiplied to hold
+        for the coordinates together.
+
+    Raises
+    ------
+    InputError : another rig than the identified one, coordinates or a confidence that the file does not have.
+    """
+    content.check_rig(rig)
+    spread = next((one for one in content.spread if sorted(one.keep) == sorted(keep)), None)
+    if spread is None:
+        known = "; ".join(", ".join(one.keep) for one in content.spread)
+        raise InputError(f"the uncertainty file holds the spread for {known}; identify again for these coordinates",
+                         field="keep", value=list(keep))
+    values, own = spread.values(), [name in rig.parameters() for name in content.names]
+    names = [name for name, here in zip(content.names, own, strict=True) if here]
+    # Sensors and delay are no parameters of the rig's equations: the measured spread covers their errors.
+    found = directions_that_matter(rig, names, content.factor()[own], keep, 2 * np.pi * JUDGED_HZ, confidence)
+    directions = tuple(UncertainDirection(DIRECTION.format(k), tuple(
+        (name, float(change)) for name, change in zip(names, row, strict=True) if change))
+        for k, row in enumerate(found.changes, 1))
+    omega = 2 * np.pi * values.frequency_Hz
+    left = np.interp(np.log(omega), np.log(found.omega), found.rest)
+    # A spread of exactly zero has no logarithm; a part in a thousand million is none.
+    data = np.maximum(values.bound(confidence) + left, 1e-9)
+    return InDesign(directions, found, values, confidence, IdentifiedSpread(omega, data, declared, factor))

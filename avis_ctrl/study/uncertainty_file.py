@@ -1,0 +1,170 @@
+"""The file of what an identification leaves uncertain: covariance of parameters, spread of responses.
+
+It holds what depends on the measurement only. Which directions a design keeps, and how its filter covers the spread,
+follows from the design's coordinates, its confidence and what it declares itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.spread import FrfSpread
+from avis_ctrl.rigs.file_errors import first_complaint
+from avis_ctrl.rigs.rig import Rig
+
+# An isolation table has a few dozen parameters; more in a file is no uncertainty of a rig.
+MOST_PARAMETERS, MOST_POINTS = 500, 20_000
+
+LARGEST = 1e12
+Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST)]
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+Share = Annotated[float, Field(gt=0, lt=1)]
+Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class ParameterSection(_Section):
+    """An identified parameter; scale is what one relative unit of it is."""
+
+    name: str
+    unit: str
+    value: Finite
+    scale: Positive
+
+
+class DirectionSection(_Section):
+    """A determined combination: relative standard deviation and its unit vector in relative parameters."""
+
+    standard_deviation: NotNegative
+    vector: list[Finite]
+
+
+class WeightSection(_Section):
+    """The filter of lowest order that covers the spread alone, for a reader of the file; roots in rad/s."""
+
+    zeros: list[Pair]
+    poles: list[Pair]
+    gain: Positive
+    order: Annotated[int, Field(ge=0)]
+    slack_dB: NotNegative
+
+
+class SpreadSection(_Section):
+    """Largest singular value of the relative error in the kept coordinates: as measured, and quantiles of its noise."""
+
+    keep: Annotated[list[str], Field(min_length=1)]
+    frequency_Hz: Annotated[list[Positive], Field(min_length=2, max_length=MOST_POINTS)]
+    measured: list[NotNegative]
+    confidence: Annotated[list[Share], Field(min_length=1, max_length=50)]
+    noise: list[list[NotNegative]]
+    weight: WeightSection | None = None
+
+    @model_validator(mode="after")
+    def _shapes(self) -> SpreadSection:
+        n = len(self.frequency_Hz)
+        if len(self.measured) != n or [len(row) for row in self.noise] != [n] * len(self.confidence):
+            raise ValueError(f"expected measured and one row of noise a confidence, at {n} frequencies each")
+        if np.any(np.diff(self.frequency_Hz) <= 0):
+            raise ValueError("expected increasing frequencies")
+        return self
+
+    def values(self) -> FrfSpread:
+        """As arrays."""
+        return FrfSpread(tuple(self.keep), np.array(self.frequency_Hz), np.array(self.measured), np.array(self.noise),
+                         tuple(self.confidence))
+
+
+class UncertaintyFile(_Section):
+    """The content of uncertainty.json."""
+
+    format: Literal["avis-uncertainty"]
+    version: Literal[1]
+    rig: str
+    rig_sha256: str
+    parameter: Annotated[list[ParameterSection], Field(max_length=MOST_PARAMETERS)]
+    covariance: list[list[Finite]]
+    direction: list[DirectionSection]
+    undetermined: Annotated[int, Field(ge=0)] = 0
+    spread: Annotated[list[SpreadSection], Field(min_length=1)]
+    provenance: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _consistent(self) -> UncertaintyFile:
+        n = len(self.parameter)
+        if len({one.name for one in self.parameter}) != n:
+            raise ValueError("expected each parameter once")
+        if [len(one.vector) for one in self.direction] != [n] * len(self.direction) or len(self.direction) > n:
+            raise ValueError(f"expected at most {n} directions with a number for each of the {n} parameters")
+        if [len(row) for row in self.covariance] != [n] * n:
+            raise ValueError(f"expected a covariance of {n} rows and columns")
+        made, told = self.factor() @ self.factor().T, np.reshape(np.array(self.covariance, float), (n, n))
+        size = np.sqrt(np.outer(np.diag(made), np.diag(made)))
+        if np.any(np.abs(made - told) > 1e-6 * size + 1e-30):
+            raise ValueError("expected a covariance that is that of the directions")
+        return self
+
+    def factor(self) -> np.ndarray:
+        """S (n_p, r) with the covariance S S^T, in the parameters' units."""
+        V = np.reshape(np.array([one.vector for one in self.direction], float), (-1, len(self.parameter))).T
+        return V * np.array([one.standard_deviation for one in self.direction]) * self.scale[:, None]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(one.name for one in self.parameter)
+
+    @property
+    def scale(self) -> np.ndarray:
+        return np.array([one.scale for one in self.parameter])
+
+    def check_rig(self, rig: Rig) -> None:
+        """Raises InputError unless the rig has the identified values, and what was not identified is unchanged too."""
+        known = rig.parameters()
+        for one in self.parameter:
+            if one.name in known and abs(known[one.name].value - one.value) > 1e-9 * one.scale:
+                raise InputError(f"the identification found {one.value:.9g} {one.unit}; expected the rig file that was "
+                                 "written with it", field=f"{one.name} of the rig {rig.name}",
+                                 value=known[one.name].value)
+        if rig.name != self.rig or rig_sha256(rig) != self.rig_sha256:
+            raise InputError(f"the uncertainty was identified on {self.rig} with other parameters than this rig file "
+                             "has; expected the rig file that was written with it", field="rig", value=rig.name)
+
+
+def rig_sha256(rig: Rig) -> str:
+    """Hash of the rig's parameters to ten digits: a file that was written and read back is the same rig."""
+    text = ";".join(f"{name}={one.value:.10g}" for name, one in sorted(rig.parameters().items()))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def read_uncertainty(path: str | Path) -> UncertaintyFile:
+    """Read and check an uncertainty file.
+
+    Raises
+    ------
+    InputError : one line naming file, field, value and what was expected.
+    """
+    path = Path(path)
+    try:
+        table = json.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError("no such file; expected the uncertainty.json of an identification", file=path) from None
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"expected a JSON file in UTF-8; {' '.join(str(error).split())}", file=path) from None
+    if not isinstance(table, dict):
+        raise InputError("expected a JSON file with the keys of an uncertainty", file=path)
+    try:
+        return UncertaintyFile.model_validate(table)
+    except ValidationError as error:
+        raise first_complaint(error, UncertaintyFile).in_file(path) from None

@@ -1,0 +1,96 @@
+"""A weight that covers the spread of a measured frequency response about an identified model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.rational import Rational
+from avis_ctrl.uncertainty.weight_base import Role, Weight, require, smallest_cover
+from avis_ctrl.uncertainty.weights import NeglectedDynamics
+
+POINTS_PER_OCTAVE = 8
+# How far beyond the data (and a declared crossover) the filter is asked to follow.
+REACH = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedSpread(Weight):
+    """Relative error of a model's response: covers the data, and what is declared beyond them.
+
+    The envelope is the smallest curve above the data that changes by no more than `slope` decades a decade, and above
+    `declared`; outside the measured band it keeps the value at the band's end. The filter is the one of
+    lowest order that lies above the envelope by no more than `tolerance_dB`.
+
+    Parameters
+    ----------
+    omega, data : (n,) rad/s and the relative spread there.
+    declared : the user's own relative uncertainty at every frequency, times `factor`; None for none.
+
+    Raises
+    ------
+    InputError : data that are not positive, finite and increasing in frequency.
+    """
+
+    omega: np.ndarray
+    data: np.ndarray
+    declared: NeglectedDynamics | None = None
+    factor: float = 1.0
+    slope: float = 1.0
+    tolerance_dB: float = 1.0
+    max_order: int = 10
+
+    role: ClassVar[Role] = "level"
+    unit: ClassVar[str] = "relative"
+
+    def __post_init__(self) -> None:
+        for name in ("factor", "slope", "tolerance_dB"):
+            require(getattr(self, name), name)
+        omega, data = np.asarray(self.omega, float), np.asarray(self.data, float)
+        if omega.ndim != 1 or omega.shape != data.shape or omega.size < 2:
+            raise InputError(f"expected two vectors of one length, got {omega.shape} and {data.shape}", field="data")
+        for name, values, rising in (("omega", omega, True), ("data", data, False)):
+            if not (np.all(np.isfinite(values)) and np.all(values > 0)) or (rising and np.any(np.diff(values) <= 0)):
+                raise InputError(f"expected finite positive numbers{', increasing' if rising else ''}", field=name)
+
+    @cached_property
+    def grid(self) -> np.ndarray:
+        """Frequencies [rad/s] of the fit: the data's own, and a decade on either side, further to a crossover."""
+        low, high = self.omega[0] / REACH, self.omega[-1] * REACH
+        if self.declared is not None:
+            high = max(high, 2 * np.pi * self.declared.crossover_Hz * REACH)
+        even = np.geomspace(low, high, int(POINTS_PER_OCTAVE * np.log2(high / low)) + 1)
+        apart = np.min(np.abs(np.log(even[:, None] / self.omega)), axis=1) > 0.25 * np.log(2) / POINTS_PER_OCTAVE
+        return np.sort(np.concatenate([even[apart], self.omega]))
+
+    def envelope(self, omega: np.ndarray) -> np.ndarray:
+        """What the filter has to cover, at any frequencies [rad/s]."""
+        omega = np.asarray(omega, float)
+        inside = np.log(np.clip(omega, self.omega[0], self.omega[-1]))
+        fall = self.slope * np.abs(inside[:, None] - np.log(self.omega))
+        covered = np.exp(np.max(np.log(self.data) - fall, axis=1))
+        return covered if self.declared is None else np.maximum(covered, self.factor * self.declared.magnitude(omega))
+
+    @cached_property
+    def shape(self) -> Rational:
+        curve = self.envelope(self.grid)
+        return smallest_cover(self.grid, curve, curve, self.tolerance_dB, self.max_order, "the identified spread")
+
+    @cached_property
+    def slack_dB(self) -> float:
+        """Largest excess of the filter over the envelope."""
+        return float(20 * np.max(np.log10(self.shape.magnitude(self.grid) / self.envelope(self.grid))))
+
+    @property
+    def meaning(self) -> str:
+        low, high = (self.omega[k] / (2 * np.pi) for k in (0, -1))
+        text = (f"relative uncertainty of the response as measured: {100 * np.min(self.data):.2g} to "
+                f"{100 * np.max(self.data):.2g} % from {low:.3g} to {high:.3g} Hz, covered by order {self.shape.order} "
+                f"with at most {self.slack_dB:.2f} dB to spare over an envelope of at most {20 * self.slope:g} dB a "
+                f"decade; beyond the band as at its ends")
+        return text if self.declared is None else f"{text}; the larger of this and of what is declared: " \
+                                                  f"{self.declared.meaning}"
