@@ -1,18 +1,28 @@
-"""An identified rig against data that no fit has seen."""
+"""An identified rig against data that no fit has seen.
+
+The noise that errors are held against comes from the fitted records, never from the held-out ones: the covariance of
+the fit's own residuals, pooled over records of a kind (records share their noise when the floor was measured in all of
+them, or in none). The local polynomial model's covariance gives a second figure.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification.campaign_fit import LONGEST_PIECE, CampaignFit, Portion, measured_noise
+from avis_ctrl.identification.modes import MeasuredModes, ModeRow, measured_modes, mode_table
 from avis_ctrl.identification.noise import noise_from_residuals
+from avis_ctrl.identification.overlays import ResponseOverlay, measured_response, overlay
 from avis_ctrl.identification.prediction import predict
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
+from avis_ctrl.identification.whiteness import Whiteness, whiteness
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
@@ -37,6 +47,7 @@ class HeldOut:
     nrms_time, nrms_time_start : (n_y,) of the prediction from rest in time, its error and the output filtered to the
         band; None where the record does not start at rest. nrms_time_whole : (n_y,) without the filter.
     time_note : why there is no prediction in time, or what it covers.
+    whiteness : correlations of the residual; None where there are too few lines.
     """
 
     name: str
@@ -58,6 +69,7 @@ class HeldOut:
     nrms_time_start: np.ndarray | None = None
     nrms_time_whole: np.ndarray | None = None
     time_note: str = ""
+    whiteness: Whiteness | None = None
 
     @property
     def consistent(self) -> bool:
@@ -69,15 +81,53 @@ class HeldOut:
 class Validation:
     """Report-ready figures of an identified model on held-out data.
 
-    outputs, band_Hz : of all figures. held_out : one a record. verdict : one sentence with the numbers. notes :
-    sentences on what was used and what could not be computed.
+    Attributes
+    ----------
+    outputs, band_Hz : of all figures. held_out : one a record, or piece of a long one.
+    overlay : measured and model responses for figures, of all records; None where they allow none.
+    modes : the model's beside the start's and those measured in the held-out data without the rig's equations.
+    mode_note : where the measured ones come from, or why there are none.
+    verdict : one sentence with the numbers. sentences : the verdict, whiteness, time, modes and responses in words.
+    notes : what was used, and what could not be computed.
     """
 
     outputs: tuple[str, ...]
     band_Hz: tuple[float, float]
     held_out: tuple[HeldOut, ...]
+    overlay: ResponseOverlay | None
+    modes: tuple[ModeRow, ...]
+    mode_note: str
     verdict: str
+    sentences: tuple[str, ...]
     notes: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Chi-square inside its interval and residuals white in every held-out record."""
+        return all(one.consistent and (one.whiteness is None or one.whiteness.white) for one in self.held_out)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for a file, without the arrays of figures."""
+        return {"verdict": self.verdict, "passed": self.passed, "sentences": list(self.sentences),
+                "notes": list(self.notes), "outputs": list(self.outputs), "band_Hz": list(self.band_Hz),
+                "held_out": [_plain(one) for one in self.held_out],
+                "modes": [{f.name: _number(getattr(row, f.name)) for f in fields(row)} for row in self.modes]}
+
+
+def _plain(one: HeldOut) -> dict[str, Any]:
+    found = {f.name: _number(getattr(one, f.name)) for f in fields(one) if f.name != "whiteness"}
+    if one.whiteness is not None:
+        found["whiteness"] = {"white": one.whiteness.white, "sentences": list(one.whiteness.sentences)}
+    return found
+
+
+def _number(value: Any) -> Any:
+    """Arrays as lists; what is not a number as None, which JSON knows."""
+    if isinstance(value, np.ndarray):
+        return [_number(one) for one in value.tolist()]
+    if isinstance(value, (tuple, list)):
+        return [_number(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def validate(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse
@@ -93,11 +143,14 @@ def validate(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
     if isinstance(fitted, FrequencyResponse) != isinstance(held_out, FrequencyResponse):
         raise InputError("expected held-out data of the same kind as the fitted ones", field="held out",
                          value=type(held_out).__name__)
-    figures = []
-    for block, record in _blocks(found, held_out):
-        figures.append(_figures(found, fitted, block, record, notes))
-    model = found.fit.model
-    return Validation(model.sensors.names, found.band_Hz, tuple(figures), _verdict(figures), tuple(notes))
+    blocks = [(*_with_noise(found, fitted, block), block, record) for block, record in _blocks(found, held_out)]
+    figures = [_figures(found, fitted, *one, len(blocks), notes) for one in blocks]
+    modes, mode_note = _modes(found, [one[0] for one in blocks])
+    drawn = _overlay(found, fitted, held_out, notes)
+    verdict = _verdict(figures)
+    said = (verdict, *_sentences(figures), *_mode_sentence(modes), mode_note, *_overlay_sentence(drawn))
+    return Validation(found.fit.model.sensors.names, found.band_Hz, tuple(figures), drawn, modes, mode_note, verdict,
+                      said, tuple(notes))
 
 
 def _blocks(found: CampaignFit, held_out: Campaign | FrequencyResponse
@@ -137,28 +190,36 @@ def _with_noise(found: CampaignFit, fitted: Campaign | FrequencyResponse, block:
     # The fit bent the model to its own residuals: its free numbers are missing in them.
     share = found.fit.dof / sum(one.block.numbers for one in residuals)
     assert noisy.noise is not None
-    return (noisy.with_noise(noisy.noise / share, noisy.dof), pool * share,
+    return (noisy.with_noise(noisy.noise / share, noisy.dof), pool * share * _inverse_dof(noisy.dof, len(noisy.Y[0])),
             f"covariance of the fit's residuals in the fitted records ({block.kind}), {noisy.dof:.0f} degrees of "
             "freedom a line; it holds for all lines, resonances included, where a local model is biased")
 
 
-def _figures(found: CampaignFit, fitted: Campaign | FrequencyResponse, raw: SpectralBlock, record: RecordSource | None,
-             notes: list[str]) -> HeldOut:
-    block, noise_dof, words = _with_noise(found, fitted, raw)
-    model = found.fit.model
+def _inverse_dof(dof: float, n_y: int) -> float:
+    """How much less an inverse is known than the estimated covariance itself, as a share of the real numbers.
+
+    The trace of the inverse of a complex Wishart matrix of n_y outputs and dof degrees of freedom has the relative
+    variance dof / (n_y ((dof - n_y)^2 - 1)) (moments of Maiwald and Kraus, IEE Proc. Radar 147, 2000).
+    """
+    return max((dof - n_y) ** 2 - 1, 1.0) / dof ** 2
+
+
+def _figures(found: CampaignFit, fitted: Campaign | FrequencyResponse, block: SpectralBlock, noise_dof: float,
+             words: str, raw: SpectralBlock, record: RecordSource | None, families: int, notes: list[str]) -> HeldOut:
+    model, covariance = found.fit.model, found.fit.information.covariance
     error, before = prediction_error(model, block), prediction_error(found.start, block, derivative=False)
-    expected = error.expected(found.fit.information.covariance) / error.dof
+    expected = error.expected(covariance) / error.dof
     power = np.sum(np.abs(block.Y) ** 2, axis=(0, 2))
     if not np.all(power > 0):
         raise InputError("expected outputs that move", field=f"held-out record {block.name}", value=power.tolist())
     of_output = [interval(expected, dof, noise_dof / len(power), LEVEL) for dof in error.output_dof]
     floor = error.noise_share()
-    in_time = _in_time(found, record, notes)
+    white = whiteness(error, model.sensors.names, model.inputs, covariance, noise_dof / (2 * len(power)), families)
     return HeldOut(
         block.name, len(block.omega), words, error.chi2 / error.dof, interval(expected, error.dof, noise_dof, LEVEL),
         before.chi2 / before.dof, _local_chi2(found, fitted, raw, notes), error.output_chi2 / error.output_dof,
         np.array(of_output), _root(error.error, power), _root(before.error, power), np.sqrt(floor / power),
-        _root_all(error), _root_all(before), float(np.sqrt(floor.sum() / power.sum())), *in_time)
+        _root_all(error), _root_all(before), float(np.sqrt(floor.sum() / power.sum())), *_in_time(found, record), white)
 
 
 def _root(error: np.ndarray, power: np.ndarray) -> np.ndarray:
@@ -182,7 +243,7 @@ def _local_chi2(found: CampaignFit, fitted: Campaign | FrequencyResponse, raw: S
     return error.chi2 / error.dof
 
 
-def _in_time(found: CampaignFit, record: RecordSource | None, notes: list[str]
+def _in_time(found: CampaignFit, record: RecordSource | None
              ) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None, str]:
     """n.r.m.s. of the prediction in time: in the band, of the start model, and without a filter."""
     if record is None:
@@ -208,12 +269,76 @@ def _band_power(x: np.ndarray, rate: float, band_Hz: tuple[float, float]) -> np.
     return np.mean(np.fft.irfft(spectrum, len(x), axis=0) ** 2, axis=0)
 
 
+def _modes(found: CampaignFit, blocks: list[SpectralBlock]) -> tuple[tuple[ModeRow, ...], str]:
+    """The table, and a sentence on the measured ones."""
+    model, covariance = found.fit.model, found.fit.information.covariance
+    measured: MeasuredModes | None = None
+    try:
+        measured = measured_modes(blocks, model)
+        note = (f"modes measured in the held-out data by common poles with free residues, {measured.lines} lines from "
+                f"{measured.band_Hz[0]:.3g} to {measured.band_Hz[1]:.3g} Hz, mean square of the whitened residual "
+                f"{measured.misfit:.3g}")
+    except AvisError as failed:
+        note = f"no measured modes: {failed}"
+    try:
+        return mode_table(model, covariance, found.start, measured), note
+    except AvisError as failed:
+        return (), f"no table of modes: {failed}"
+
+
+def _overlay(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse,
+             notes: list[str]) -> ResponseOverlay | None:
+    """Responses of everything that was measured: a single record seldom tells all inputs apart."""
+    if isinstance(fitted, Campaign) and isinstance(held_out, Campaign):
+        data: Campaign | FrequencyResponse = replace(fitted, records=(*fitted.records, *held_out.records))
+    else:
+        data = held_out
+    try:
+        return overlay(measured_response(data, found.band_Hz), found.fit.model, found.start,
+                       found.fit.information.covariance)
+    except AvisError as failed:
+        notes.append(f"no measured response to draw ({failed})")
+        return None
+
+
 def _verdict(figures: list[HeldOut]) -> str:
+    """Of the record that fits worst."""
     worst = max(figures, key=lambda one: one.chi2_per_dof / one.chi2_interval[1])
     return (f"the identified model leaves {_percent(worst.nrms_all)} on held-out record {worst.name} where noise alone "
             f"leaves {_percent(worst.nrms_all_floor)} and the start model left {_percent(worst.nrms_all_start)}; "
             f"chi-square per degree of freedom {worst.chi2_per_dof:.4g} ({worst.chi2_interval[0]:.4g} to "
             f"{worst.chi2_interval[1]:.4g} expected)")
+
+
+def _sentences(figures: list[HeldOut]) -> list[str]:
+    said = []
+    for one in figures:
+        if one.nrms_time is not None and one.nrms_time_start is not None:
+            said.append(f"record {one.name} {one.time_note}: normalised r.m.s. error in the band "
+                        f"{_percent(one.nrms_time.min())} to {_percent(one.nrms_time.max())} over the outputs, start "
+                        f"model {_percent(one.nrms_time_start.min())} to {_percent(one.nrms_time_start.max())}")
+        if one.whiteness is not None:
+            said += [f"record {one.name}: {sentence}" for sentence in one.whiteness.sentences]
+    return said
+
+
+def _mode_sentence(modes: tuple[ModeRow, ...]) -> list[str]:
+    """The largest difference between model and measured modes."""
+    known: list[Mapping[str, Any]] = [{"what": what, "mode": row.frequency_Hz, "sigma": sigma} for row in modes
+                                      for what, sigma in (("frequency", row.frequency_sigma),
+                                                          ("damping", row.damping_sigma)) if np.isfinite(sigma)]
+    if not known:
+        return []
+    far = max(known, key=lambda one: abs(one["sigma"]))
+    return [f"model and measured modes differ by {abs(far['sigma']):.2g} standard deviations at most, in the "
+            f"{far['what']} of the mode at {far['mode']:.4g} Hz"]
+
+
+def _overlay_sentence(drawn: ResponseOverlay | None) -> list[str]:
+    if drawn is None:
+        return []
+    return [f"{100 * drawn.inside:.3g} % of the measured response's entries lie within their 95 % region about the "
+            f"model ({drawn.method})"]
 
 
 def _percent(share: float) -> str:

@@ -1,0 +1,284 @@
+"""Modes of an identified rig, with their uncertainty, beside modes measured without its equations.
+
+Model: complex eigenvalues of lambda^2 M + lambda C + K. With right and left eigenvectors x, y, by any parameter
+
+    d lambda = - y^T (lambda^2 dM + lambda dC + dK) x / (y^T (2 lambda M + C) x)
+
+(Lancaster, Lambda-matrices and Vibrating Systems, 1966, chapter 7), and the parameters' covariance gives the standard
+deviations of frequency and damping (delta method).
+
+Measured: the same number of common poles and free residues from every input to every output,
+
+    y_i = s_i(w) (jw)^p sum_k (b_ijk + jw c_ijk) / (w_k^2 - w^2 + 2 j zeta_k w_k w) u_j,
+
+behind the known sensor chains and the hold: 2 numbers a mode to search for, the rest linear (variable projection, with
+Kaufman's Jacobian). Masses, stiffnesses and geometry do not enter, but for the start of the search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import scipy.linalg as la
+from scipy.optimize import least_squares
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.identification.response import N_Q, ResponseModel
+from avis_ctrl.identification.sampling import aliases, hold
+from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.rigs.rigid_body import COORDINATES
+
+# A coordinate is named where it holds this share of the mode's kinetic energy.
+NAMED_SHARE = 0.05
+# The fit runs from this part of the lowest mode to this multiple of the highest, over this many lines at most.
+REACH, MOST_LINES = (0.5, 3.0), 30_000
+# Real data needed for each unknown.
+FEWEST_PER_UNKNOWN = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class ModelModes:
+    """frequency_Hz (undamped), damping : (n,), ascending; covariance : (2 n, 2 n) of frequencies, then dampings.
+
+    shapes : (6, n) complex. words : each shape by the shares of kinetic energy of its coordinates.
+    """
+
+    frequency_Hz: np.ndarray
+    damping: np.ndarray
+    covariance: np.ndarray
+    shapes: np.ndarray
+    words: tuple[str, ...]
+
+    @property
+    def frequency_std_Hz(self) -> np.ndarray:
+        return np.sqrt(np.diag(self.covariance)[:len(self.damping)])
+
+    @property
+    def damping_std(self) -> np.ndarray:
+        return np.sqrt(np.diag(self.covariance)[len(self.damping):])
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredModes:
+    """As `ModelModes`, of the poles that the data have by themselves; misfit : mean square of the whitened residual,
+    1 where the poles explain all but the noise (standard deviations are multiplied by its root where it is larger).
+    """
+
+    frequency_Hz: np.ndarray
+    damping: np.ndarray
+    covariance: np.ndarray
+    misfit: float
+    lines: int
+    band_Hz: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class ModeRow:
+    """A line of the mode table; *_sigma : difference, model less measured, over its standard deviation."""
+
+    shape: str
+    frequency_Hz: float
+    frequency_std_Hz: float
+    damping: float
+    damping_std: float
+    start_frequency_Hz: float
+    start_damping: float
+    measured_frequency_Hz: float = float("nan")
+    measured_frequency_std_Hz: float = float("nan")
+    measured_damping: float = float("nan")
+    measured_damping_std: float = float("nan")
+    frequency_sigma: float = float("nan")
+    damping_sigma: float = float("nan")
+
+
+def model_modes(model: ResponseModel, covariance: np.ndarray | None = None) -> ModelModes:
+    """Oscillating modes; covariance (n_p, n_p) of the model's parameters, without uncertainty where None.
+
+    Raises
+    ------
+    ComputationError : a rig with modes that do not oscillate.
+    """
+    M, C, K = model.matrices.M, model.matrices.C, model.matrices.K
+    A = np.block([[np.zeros((N_Q, N_Q)), np.eye(N_Q)], [-la.solve(M, K), -la.solve(M, C)]])
+    poles, vectors = la.eig(A)
+    keep = np.flatnonzero(poles.imag > 1e-9 * np.abs(poles))
+    if len(keep) < N_Q:
+        raise ComputationError("not every mode of the rig oscillates", measured=f"{len(keep)} of {N_Q} modes do",
+                               cause="damping above critical, or a stiffness that is not positive",
+                               next_step="look at damping and stiffness of the rig")
+    keep = keep[np.argsort(np.abs(poles[keep]))]
+    poles, X = poles[keep], vectors[:N_Q, keep]
+    d = model.derivative_matrices
+    dpoles = np.zeros((len(model.names), N_Q), complex)
+    for k, (pole, x) in enumerate(zip(poles, X.T, strict=True)):
+        D = pole ** 2 * M + pole * C + K
+        y = la.svd(D)[0][:, -1].conj()  # y^T D = 0
+        dD = pole ** 2 * d.M + pole * d.C + d.K
+        dpoles[:, k] = -np.einsum("i,pij,j->p", y, dD, x) / (y @ (2 * pole * M + C) @ x)
+    size = np.abs(poles)
+    dsize = np.real(np.conj(poles) * dpoles) / size
+    ddamping = -dpoles.real / size + poles.real * dsize / size ** 2
+    gradient = np.concatenate([dsize / (2 * np.pi), ddamping], axis=1)
+    P = np.zeros((len(model.names),) * 2) if covariance is None else covariance
+    return ModelModes(size / (2 * np.pi), -poles.real / size, gradient.T @ P @ gradient, X,
+                      tuple(_in_words(M, x) for x in X.T))
+
+
+def _in_words(M: np.ndarray, x: np.ndarray) -> str:
+    """Coordinates by their share of the kinetic energy."""
+    share = np.real(np.conj(x) * (M @ x))
+    share = share / share.sum()
+    order = np.argsort(-share)
+    others = [f"{COORDINATES[i]} {100 * share[i]:.0f} %" for i in order[1:] if share[i] >= NAMED_SHARE]
+    return COORDINATES[order[0]] + (f" with {', '.join(others)}" if others else "")
+
+
+def mode_table(model: ResponseModel, covariance: np.ndarray, start: ResponseModel,
+               measured: MeasuredModes | None) -> tuple[ModeRow, ...]:
+    """The model's modes beside the start's and the measured ones, lowest first."""
+    found, before = model_modes(model, covariance), model_modes(start)
+    n, rows = len(found.damping), []
+    for k in range(n):
+        row: dict[str, float] = {}
+        if measured is not None:
+            total = np.sqrt(np.diag(found.covariance) + np.diag(measured.covariance))
+            own = np.sqrt(np.diag(measured.covariance))
+            row = {"measured_frequency_Hz": float(measured.frequency_Hz[k]), "measured_frequency_std_Hz": float(own[k]),
+                   "measured_damping": float(measured.damping[k]), "measured_damping_std": float(own[n + k]),
+                   "frequency_sigma": float((found.frequency_Hz - measured.frequency_Hz)[k] / total[k]),
+                   "damping_sigma": float((found.damping - measured.damping)[k] / total[n + k])}
+        rows.append(ModeRow(found.words[k], float(found.frequency_Hz[k]), float(found.frequency_std_Hz[k]),
+                            float(found.damping[k]), float(found.damping_std[k]), float(before.frequency_Hz[k]),
+                            float(before.damping[k]), **row))
+    return tuple(rows)
+
+
+def measured_modes(blocks: Sequence[SpectralBlock], model: ResponseModel) -> MeasuredModes:
+    """Poles of data with known noise, as many as the model has, searched from the model's.
+
+    Raises
+    ------
+    ComputationError : too few lines for free residues, or a search that ends at no oscillating modes.
+    """
+    start = model_modes(model)
+    low, high = REACH[0] * start.frequency_Hz[0], REACH[1] * start.frequency_Hz[-1]
+    kept: list[SpectralBlock] = []
+    for block in blocks:
+        near = (block.omega >= 2 * np.pi * low) & (block.omega <= 2 * np.pi * high)
+        if np.any(near) and sum(len(b.omega) for b in kept) + near.sum() <= MOST_LINES:
+            kept.append(block.lines(near))
+    problem = _Poles(kept, model, len(start.damping))
+    x = np.concatenate([np.log(start.frequency_Hz), np.log(np.maximum(start.damping, 1e-4))])
+    n = len(start.damping)
+    reach = np.concatenate([np.full(n, 0.2), np.full(n, 2.0)])
+    best = least_squares(lambda z: problem.evaluate(tuple(z))[0], x, lambda z: problem.evaluate(tuple(z))[1],
+                         bounds=(x - reach, x + reach), x_scale="jac", ftol=1e-10, xtol=1e-8, max_nfev=40)
+    if np.any(np.abs(best.x - x) > 0.99 * reach) or not best.success:
+        raise ComputationError("the search for the measured modes did not come to an end",
+                               measured=f"modes at {np.round(np.exp(best.x[:n]), 3).tolist()} Hz",
+                               cause="modes hidden by noise, or not excited", next_step="look at the responses")
+    frequency, damping = np.exp(best.x[:n]), np.exp(best.x[n:])
+    misfit = 2 * best.cost / (best.fun.size - problem.unknowns - 2 * n)
+    scale = np.concatenate([frequency, damping])
+    covariance = problem.covariance(tuple(best.x)) * max(misfit, 1.0) * np.outer(scale, scale)
+    f = np.concatenate([block.omega for block in kept]) / (2 * np.pi)
+    return MeasuredModes(frequency, damping, covariance, float(misfit), f.size, (float(f.min()), float(f.max())))
+
+
+class _Poles:
+    """Residual of common poles with the best residues, output by output, each weighted by its own noise.
+
+    Rows are the lines of all blocks and experiments. weight, Y : (n_y, rows). correlation : (rows, n_y, n_y) of the
+    noise. through : (rows, columns) what the poles filter, inputs and one impulse a record, behind the sensors' chain;
+    beside : (rows, columns) regressors without poles.
+    """
+
+    def __init__(self, blocks: Sequence[SpectralBlock], model: ResponseModel, modes: int):
+        self.modes, self.n_y = modes, len(model.sensors.names)
+        if not blocks:
+            raise ComputationError("the modes cannot be measured", measured="no lines near them",
+                                   cause="a band that leaves the modes out", next_step="give a wider band")
+        total = np.sum([np.sum(np.abs(block.U) ** 2, axis=(0, 2)) for block in blocks], axis=0)
+        driven = np.flatnonzero(total > 1e-12 * total.max())
+        parts = [_rows(block, model, driven) for block in blocks]
+        self.omega, self.Y, self.weight, self.correlation = (
+            np.concatenate([part[k] for part in parts], axis=axis) for k, axis in ((0, 0), (1, 1), (2, 1), (3, 0)))
+        self.through = np.hstack([np.concatenate([part[4] for part in parts]), la.block_diag(*[p[5] for p in parts])])
+        self.beside = np.hstack([np.concatenate([part[6] for part in parts]), la.block_diag(*[p[7] for p in parts])])
+        columns = 2 * modes * self.through.shape[1] + self.beside.shape[1]
+        if 2 * len(self.omega) < FEWEST_PER_UNKNOWN * columns:
+            raise ComputationError("the modes cannot be measured without the rig's equations",
+                                   measured=f"{2 * len(self.omega)} numbers an output for {columns} unknown residues",
+                                   cause="too few lines near the modes for so many inputs", next_step="longer records")
+        self.unknowns = columns * self.n_y
+        self.evaluate = lru_cache(maxsize=2)(self._evaluate)
+
+    def _evaluate(self, x: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Residual (N,) of unit variance and its Jacobian (N, 2 modes) by log w, log zeta."""
+        n, s = self.modes, 1j * self.omega[:, None]
+        w, zeta = 2 * np.pi * np.exp(x[:n]), np.exp(x[n:])
+        den = s ** 2 + 2 * zeta * w * s + w ** 2
+        slopes = np.hstack([-(2 * zeta * w * s + 2 * w ** 2) / den ** 2, -(2 * zeta * w * s) / den ** 2])
+        # Columns: residue or its slope, mode, what is filtered.
+        powers = np.stack([np.ones_like(s), s / np.abs(s).max()])
+        poles = powers[..., None] / den[None, :, :, None] * self.through[:, None, :]
+        Phi = np.hstack([np.moveaxis(poles, 1, 0).reshape(len(s), -1), self.beside])
+        left, J = [], []
+        for weight, y in zip(self.weight, self.Y, strict=True):
+            A = _real(weight[:, None] * Phi)
+            size = np.linalg.norm(A, axis=0) + np.finfo(float).tiny
+            Q, R = np.linalg.qr(A / size)
+            b = _real(weight * y)
+            c = (np.linalg.lstsq(R, Q.T @ b, rcond=1e-12)[0] / size)[:poles.shape[0] * n * self.through.shape[1]]
+            filtered = np.einsum("akc,amc->km", powers * self.through, c.reshape(2, n, -1))
+            slope = _real(weight[:, None] * np.tile(filtered, 2) * slopes)
+            left.append(b - Q @ (Q.T @ b))
+            J.append(Q @ (Q.T @ slope) - slope)
+        return np.concatenate(left), np.concatenate(J)
+
+    def covariance(self, x: tuple[float, ...]) -> np.ndarray:
+        """(2 modes, 2 modes): each output was weighted by itself, but the noise of all belongs together."""
+        _, J = self.evaluate(x)
+        by_output = J.reshape(self.n_y, 2, len(self.omega), -1)
+        own = by_output[:, 0] + 1j * by_output[:, 1]
+        middle = np.real(np.einsum("ikp,kij,jkq->pq", np.conj(own), self.correlation, own, optimize=True))
+        inverse = np.linalg.inv(J.T @ J)
+        return inverse @ middle @ inverse
+
+
+def _rows(block: SpectralBlock, model: ResponseModel, driven: np.ndarray) -> tuple[np.ndarray, ...]:
+    """omega, Y, weight, correlation, inputs, impulse, aliases, own regressors of a block, experiment by experiment."""
+    assert block.noise is not None
+    n, n_y, m = block.Y.shape
+    omega, n_u = np.tile(block.omega, m), len(model.actuators)
+    s = 1j * omega
+    power = {"displacement": 0, "velocity": 1, "acceleration": 2}[model.sensors.motion]
+    chain = s ** power * (1.0 if model.sensors.chain is None
+                          else model.sensors.chain.frequency_response(omega)[:, 0, 0])
+    if model.period_s:
+        drive = hold(omega, model.period_s, model.delay_s)
+        folded = aliases(omega, model.period_s, model.delay_s, model.sensors.motion, model.amplifier_corner_Hz)
+    else:
+        drive, folded = np.exp(-s * model.delay_s), np.zeros(len(omega), complex)
+    if model.amplifier_corner_Hz:
+        drive = drive / (1 + s / (2 * np.pi * model.amplifier_corner_Hz))
+    U = np.moveaxis(block.U[:, driven], 2, 0).reshape(m * n, -1)
+    volts = driven < n_u
+    # Of a floor's velocity the springs take the integral.
+    inputs = U * np.where(volts, (chain * drive)[:, None], (chain / s)[:, None])
+    noise = np.moveaxis(np.broadcast_to(block.noise, (n, m, n_y, n_y)), 1, 0).reshape(m * n, n_y, n_y)
+    sigma = np.sqrt(np.real(np.einsum("kii->ki", noise)))
+    impulse, own = np.zeros((m * n, 0), complex), np.zeros((m * n, 0), complex)
+    if block.transient:
+        poles = np.asarray(model.sensors.transient_poles)
+        states = [s ** k / np.polyval(poles[::-1], s) for k in range(len(poles) - 1)]
+        impulse, own = chain[:, None], np.stack([*states, np.ones(m * n), s], axis=1)
+    return (omega, np.moveaxis(block.Y, (1, 2), (0, 1)).reshape(n_y, m * n), np.sqrt(2) / sigma.T,
+            noise / (sigma[:, :, None] * sigma[:, None, :]), inputs, impulse, folded[:, None] * U[:, volts], own)
+
+
+def _real(x: np.ndarray) -> np.ndarray:
+    return np.concatenate([x.real, x.imag])

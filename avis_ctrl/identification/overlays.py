@@ -1,0 +1,124 @@
+"""Measured responses with their scatter beside those of the start and of the identified model, for figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import AvisError, ComputationError, InputError
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.measurement.best_linear import best_linear_approximation
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.local_polynomial import local_polynomial
+
+# Frequencies of a figure.
+POINTS = 400
+# Samples; longer records are used in pieces.
+LONGEST_PIECE = 1 << 18
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseOverlay:
+    """From each driven input to each output.
+
+    Attributes
+    ----------
+    frequency_Hz : (n,). inputs, outputs : names. unit : of an entry.
+    measured, start, model : (n, n_y, n_u) complex.
+    measured_std : (n, n_y, n_u) standard deviation of real part, imaginary part and, where it is small, magnitude of
+        the measured entry: root of E|error|^2 / 2.
+    model_magnitude_std, model_phase_std : (n, n_y, n_u) of the identified model's magnitude and phase [rad], from the
+        covariance of its parameters; 1.96 of them to each side hold 95 %.
+    method : how the response was measured, in words.
+    """
+
+    frequency_Hz: np.ndarray
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    unit: str
+    measured: np.ndarray
+    measured_std: np.ndarray
+    start: np.ndarray
+    model: np.ndarray
+    model_magnitude_std: np.ndarray
+    model_phase_std: np.ndarray
+    method: str
+
+    @property
+    def inside(self) -> float:
+        """Share of the measured entries within two standard deviations (95 % of a circular normal error) of the
+        model; a bias of the measured response counts against it too."""
+        # P(|e|^2 < r s^2) = 1 - exp(-r/2) for real and imaginary variance s^2.
+        return float(np.mean(np.abs(self.measured - self.model) ** 2 < -2 * np.log(0.05) * self.measured_std ** 2))
+
+
+def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseModel, covariance: np.ndarray
+            ) -> ResponseOverlay:
+    """Plain arrays for figures at the response's own frequencies.
+
+    Raises
+    ------
+    InputError : inputs or outputs that the model does not have.
+    """
+    if missing := [name for name in measured.inputs if name not in model.inputs]:
+        raise InputError(f"the model's inputs are {', '.join(model.inputs)}", field="inputs", value=missing)
+    if missing := [name for name in model.sensors.names if name not in measured.outputs]:
+        raise InputError(f"the response has {', '.join(measured.outputs)}", field="outputs", value=missing)
+    columns = [model.inputs.index(name) for name in measured.inputs]
+    rows = [measured.outputs.index(name) for name in model.sensors.names]
+    U = np.broadcast_to(np.eye(len(model.inputs), dtype=complex)[:, columns],
+                        (len(measured.omega), len(model.inputs), len(columns)))
+    found = model.driven(measured.omega, U)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # d log G = d|G| / |G| + j d phase
+        relative = found.dY / found.Y
+    spread = [np.sqrt(np.einsum("pkij,pq,qkij->kij", part, covariance, part, optimize=True))
+              for part in (relative.real, relative.imag)]
+    return ResponseOverlay(
+        measured.frequency_Hz, measured.inputs, model.sensors.names,
+        f"{measured.output_unit} per {measured.input_unit}", measured.value[:, rows],
+        measured.standard_deviation[:, rows] / np.sqrt(2), start.driven(measured.omega, U, False).Y, found.Y,
+        spread[0] * np.abs(found.Y), spread[1], measured.method)
+
+
+def measured_response(data: Campaign | FrequencyResponse, band_Hz: tuple[float, float]) -> FrequencyResponse:
+    """The response as given; of records the best linear approximation where they allow it, or a local polynomial one.
+
+    Raises
+    ------
+    InputError, ComputationError : records that allow neither.
+    """
+    if isinstance(data, FrequencyResponse):
+        return _thinned(data.between(*band_Hz))
+    try:
+        return _thinned(best_linear_approximation(data, band_Hz=band_Hz))
+    except AvisError:
+        # Not periodic, several levels, or different lines for different inputs: the local model asks for none of that.
+        driven = [r.header for r in data.records if r.header.excitation not in ("rest", "sine")]
+        step = data.sample_rate_Hz / min((header.samples for header in driven), default=2)
+        low, high = np.ceil(band_Hz[0] / step - 1e-9) * step, np.floor(band_Hz[1] / step + 1e-9) * step
+        if not 0 < low < high:
+            raise InputError("expected a band with lines of every record", field="band_Hz", value=band_Hz) from None
+        points = min(POINTS, round((high - low) / step) + 1)
+        return _local(data, band_Hz, np.clip(np.geomspace(low, high, points), low, high))
+
+
+def _local(data: Campaign, band_Hz: tuple[float, float], frequency_Hz: np.ndarray) -> FrequencyResponse:
+    """Local polynomials over windows that grow until the inputs can be told apart in each."""
+    for half_width in (None, 16, 24, 36):
+        try:
+            return local_polynomial(data, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=half_width,
+                                    longest_piece=LONGEST_PIECE)
+        except ComputationError as failed:
+            last = failed
+    raise last
+
+
+def _thinned(response: FrequencyResponse) -> FrequencyResponse:
+    """Few enough lines for a figure, evenly in logarithm."""
+    f = response.frequency_Hz
+    if f.size <= POINTS:
+        return response
+    return response.at(np.unique(np.clip(np.searchsorted(f, np.geomspace(f[0], f[-1], POINTS)), 0, f.size - 1)))

@@ -1,0 +1,149 @@
+"""Is what a model leaves no more than noise: correlations of the whitened residual, with limits on false alarms.
+
+The whitened residual w of a line has E|w|^2 = 1 and is independent from line to line and of the inputs, if model and
+noise are right. With n lines over a band of width B three things are looked at, each complex normal with variance 1/n
+under that hypothesis (so that n |r|^2 is exponential with mean 1):
+
+    over frequency    r(l) = 1/n sum_k w_{k+l} conj(w_k)                          transients, leakage
+    over time         r(tau) = 1/n sum_k (|w_k|^2 - 1) e^{j w_k tau}              a spectrum that is not the noise's
+    with an input     r(tau) = 1/n sum_k w_k conj(u_k) e^{j w_k tau} / rms(u)     dynamics that the model lacks
+
+tau runs in steps of 1/B. The last one adds g P g^H to its variance, g its derivative by the parameters and P their
+covariance; the second one adds what the noise's own estimate scatters. Limits are Sidak's: with all tests of a
+validation together, white data exceed one of them in 1 % of the cases (Ljung, System Identification, 2nd ed., 1999,
+section 16.6, has the same tests one by one).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.identification.prediction_error import PredictionError
+
+# Chance of one false alarm or more, and how far the lags go: lines; steps of 1/bandwidth.
+FAMILY = 0.01
+LINE_LAGS, TIME_LAGS, NEGATIVE_LAGS = 20, 100, 10
+# Part of the power of the strongest input below which one counts as silent.
+SILENT = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Of one kind, for figures.
+
+    what : in words. rows : labels, "Sz1" or "Sz1 with Ax2". lags : (n_l,) in lag_unit ("lines" or "s").
+    value, limit : (rows, n_l) modulus of the normalised correlation, and the limit it should stay below.
+    """
+
+    what: str
+    rows: tuple[str, ...]
+    lags: np.ndarray
+    lag_unit: str
+    value: np.ndarray
+    limit: np.ndarray
+
+    @property
+    def beyond(self) -> int:
+        """Values above their limit."""
+        return int(np.count_nonzero(self.value > self.limit))
+
+    @property
+    def sentence(self) -> str:
+        ratio = self.value / self.limit
+        row, lag = np.unravel_index(np.argmax(ratio), ratio.shape)
+        at = f"{self.lags[lag]:.3g} {self.lag_unit}"
+        largest = f"{self.value[row, lag]:.3g} against a limit of {self.limit[row, lag]:.3g}, {self.rows[row]} at {at}"
+        if self.beyond:
+            return (f"{self.what}: {self.beyond} of {ratio.size} values are beyond limits that noise alone exceeds "
+                    f"anywhere in 1 % of validations; the farthest is {largest}")
+        return f"{self.what}: none of {ratio.size} values is beyond its limit; the nearest is {largest}"
+
+
+@dataclass(frozen=True, eq=False)
+class Whiteness:
+    """The three kinds; with_inputs is None where no input is driven. sentences : one each."""
+
+    over_frequency: Correlation
+    over_time: Correlation
+    with_inputs: Correlation | None
+
+    @property
+    def correlations(self) -> tuple[Correlation, ...]:
+        found = (self.over_frequency, self.over_time, self.with_inputs)
+        return tuple(one for one in found if one is not None)
+
+    @property
+    def white(self) -> bool:
+        return not any(one.beyond for one in self.correlations)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        return tuple(one.sentence for one in self.correlations)
+
+
+def whiteness(error: PredictionError, outputs: Sequence[str], inputs: Sequence[str], covariance: np.ndarray,
+              noise_lines: float = np.inf, families: int = 1) -> Whiteness | None:
+    """Correlations of the residual of one block; None where it has too few lines for any.
+
+    Parameters
+    ----------
+    error : with its derivative. covariance : (n_p, n_p) of the parameters.
+    noise_lines : lines that the noise covariance was estimated from, in all.
+    families : blocks that are tested, which share the chance of a false alarm.
+    """
+    omega, n = error.block.omega, len(error.block.omega)
+    lines, steps = min(LINE_LAGS, n // 4), min(TIME_LAGS, n // 4)
+    if lines < 1 or omega[-1] <= omega[0]:
+        return None
+    power = np.sum(np.abs(error.block.U) ** 2, axis=(0, 2))
+    driven = np.flatnonzero(power > SILENT * power.max()) if power.max() > 0 else np.empty(0, int)
+    lags = np.arange(-min(NEGATIVE_LAGS, steps), steps + 1)
+    n_y = len(outputs)
+    tests = n_y * (lines + steps + len(driven) * len(lags))
+    level = -np.log(-np.expm1(np.log1p(-FAMILY / families) / tests))
+    step = 2 * np.pi / (omega[-1] - omega[0])
+    over_frequency = _over_frequency(error, outputs, lines, level)
+    over_time = _over_time(error, outputs, np.arange(1, steps + 1) * step, level, noise_lines)
+    return Whiteness(over_frequency, over_time, _with_inputs(error, outputs, inputs, driven, lags * step, level,
+                                                             covariance) if driven.size else None)
+
+
+def _over_frequency(error: PredictionError, outputs: Sequence[str], lines: int, level: float) -> Correlation:
+    w = error.white
+    value = np.stack([np.abs(np.mean(w[lag:] * np.conj(w[:-lag]), axis=(0, 2))) for lag in range(1, lines + 1)], axis=1)
+    counts = np.array([(len(w) - lag) * w.shape[2] for lag in range(1, lines + 1)])
+    return Correlation("correlation of the residual from line to line", tuple(outputs), np.arange(1.0, lines + 1),
+                       "lines", value, np.broadcast_to(np.sqrt(level / counts), value.shape))
+
+
+def _over_time(error: PredictionError, outputs: Sequence[str], tau: np.ndarray, level: float, noise_lines: float
+               ) -> Correlation:
+    count = error.white.shape[0] * error.white.shape[2]
+    excess = np.mean(np.abs(error.white) ** 2, axis=2)
+    # Its mean is the business of chi-square.
+    excess = excess - excess.mean(axis=0)
+    value = np.abs(excess.T @ np.exp(1j * np.outer(error.block.omega, tau))) / len(excess)
+    limit = np.sqrt(level / count * (1 + count / noise_lines))
+    return Correlation("correlation of the residual over time", tuple(outputs), tau, "s", value,
+                       np.full(value.shape, limit))
+
+
+def _with_inputs(error: PredictionError, outputs: Sequence[str], inputs: Sequence[str], driven: np.ndarray,
+                 tau: np.ndarray, level: float, covariance: np.ndarray) -> Correlation:
+    turn = np.exp(1j * np.outer(error.block.omega, tau))
+    rows, values, limits = [], [], []
+    for j in driven:
+        u = error.block.U[:, j]
+        size = np.linalg.norm(u)
+        r = np.einsum("kim,km,kl->il", error.white, np.conj(u), turn, optimize=True) / size
+        g = np.einsum("pkim,km,kl->pil", error.derivative, np.conj(u), turn, optimize=True) / size
+        spread = 1 + np.real(np.einsum("pil,pq,qil->il", np.conj(g), covariance, g, optimize=True))
+        root = np.sqrt(u.size)
+        values.append(np.abs(r) / root)
+        limits.append(np.sqrt(level * spread) / root)
+        rows += [f"{output} with {inputs[j]}" for output in outputs]
+    return Correlation("correlation of the residual with the inputs", tuple(rows), tau, "s", np.concatenate(values),
+                       np.concatenate(limits))
