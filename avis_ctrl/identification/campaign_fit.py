@@ -138,6 +138,8 @@ def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[flo
         for piece in record.pieces(max(LONGEST_PIECE, record.header.period_samples or 0)):
             if piece.header.duration_s * (band_Hz[1] - band_Hz[0]) > 10:
                 blocks.append(record_block(piece, model, band_Hz))
+    if not blocks:
+        raise InputError("expected a band that holds more than 10 lines of a record", field="band_Hz", value=band_Hz)
     # A record without input or measured floor says nothing of the response.
     useful = [block for block in blocks if np.any(block.U)]
     if not useful:

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.study import output
+from avis_ctrl.study import files
 from avis_ctrl.study.files import write_json, write_whole
 from avis_ctrl.study.output import open_folder
 
@@ -26,12 +26,12 @@ SIZE = 300_000
 WRITER = f"SIZE = {SIZE}" + """
 import sys
 from pathlib import Path
-from avis_ctrl.study import output
+from avis_ctrl.study import files
 if sys.argv[2] == "renamed":
-    del output.os.O_TMPFILE
+    del files.os.O_TMPFILE
 k = 0
 while True:
-    output.write_whole(Path(sys.argv[1]) / "report.html", bytes([65 + k % 26]) * SIZE)
+    files.write_whole(Path(sys.argv[1]) / "report.html", bytes([65 + k % 26]) * SIZE)
     if not k:
         print("writing", flush=True)
     k += 1
@@ -65,13 +65,13 @@ FULL = """
 import resource, signal, sys
 from pathlib import Path
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.study import output
+from avis_ctrl.study import files
 if sys.argv[2] == "renamed":
-    del output.os.O_TMPFILE
+    del files.os.O_TMPFILE
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 try:
-    output.write_whole(Path(sys.argv[1]) / "result.json", b"x" * 100_000)
+    files.write_whole(Path(sys.argv[1]) / "result.json", b"x" * 100_000)
 except ComputationError as error:
     print(error)
     sys.exit(error.exit_code)
@@ -96,10 +96,10 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(step, tmp_path, monkeypatch
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     (tmp_path / "report.pdf").write_bytes(b"old")
     if step == "write":
-        monkeypatch.setattr(output.os, "open", full)
-        monkeypatch.setattr(output.tempfile, "mkstemp", full)
+        monkeypatch.setattr(files.os, "open", full)
+        monkeypatch.setattr(files.tempfile, "mkstemp", full)
     else:
-        monkeypatch.setattr(output.os, step, full)
+        monkeypatch.setattr(files.os, step, full)
     with pytest.raises(ComputationError, match="No space left on device") as refused:
         write_whole(tmp_path / "report.pdf", b"new" * 1000)
     monkeypatch.undo()

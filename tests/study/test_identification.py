@@ -1,0 +1,136 @@
+"""`avis identify` as a whole on a rehearsed campaign: truth found, files written, another campaign predicted."""
+
+from __future__ import annotations
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.formats import read_measurements, write_campaign
+from avis_ctrl.measurement.local_polynomial import local_polynomial
+from avis_ctrl.rigs import load_rig
+from avis_ctrl.simulation import rehearse
+from avis_ctrl.study.campaign_plan import default_plan
+from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
+from avis_ctrl.study.identification_output import read_identified, write_identification, write_predictions
+
+FEW = IdentifyOptions(starts=1)
+
+
+@pytest.fixture(scope="module")
+def rehearsal():
+    rig = load_rig("avis")
+    return rehearse(rig, default_plan(rig, perturbed=True, duration_s=20.0), seed=3)
+
+
+@pytest.fixture(scope="module")
+def found(rehearsal) -> Identification:
+    return identify(rehearsal.campaign, load_rig("avis"), FEW)
+
+
+def test_the_truth_lies_within_the_standard_deviations(rehearsal, found):
+    """Every determined direction, and each parameter that is known by itself."""
+    information = found.campaign_fit.fit.information
+    truth = np.array([rehearsal.truth.parameters()[name].value for name in information.names])
+    sigma, V = information.directions
+    z = (V.T @ ((information.values - truth) / information.scale) / sigma)[information.determined]
+    assert information.rank == 20
+    assert np.mean(z ** 2) < 2.5 and np.max(np.abs(z)) < 4.5
+    alone = information.known
+    assert np.all(np.abs(information.values - truth)[alone] < 5 * information.standard_deviation[alone])
+    start = np.array([found.start.parameters()[name].value for name in information.names])
+    assert np.max(np.abs(start / truth - 1)) > 0.04
+
+
+def test_a_result_says_what_it_is_made_of(found):
+    p = found.provenance
+    assert len(p["measurement_sha256"]) == 64 and p["seed"] == 1 and p["avis_ctrl"]
+    assert found.split is not None and "held out" in found.split.how
+    assert "%" in found.validation.verdict
+
+
+def test_files_and_predictions(rehearsal, found, tmp_path):
+    """The folder is read back, and predicts the records that it was made from down to their noise."""
+    write_identification(found, tmp_path)
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["format"] == "avis-identification" and result["rank"] == 20
+    assert result["parameters"]["mass"]["std"] > 0 and result["parameters"]["isolator1.k_x"]["std"] is None
+    rig, corner = read_identified(tmp_path)
+    assert corner is None
+    assert rig.parameters()["mass"].value == pytest.approx(found.rig.parameters()["mass"].value, rel=1e-14)
+    assert "+-" in (tmp_path / "rig.toml").read_text()
+    one = rehearsal.campaign.only(("02",))
+    write_predictions(tmp_path, one, tmp_path / "pred.h5")
+    record = one.records[0].load()
+    with h5py.File(tmp_path / "pred.h5") as file:
+        y = file["records/02/y"][:]
+        assert file["records/02/y"].attrs["unit"] == "V"
+    left = np.std(y - record.y, axis=0) / np.std(record.y, axis=0)
+    assert np.all(left < 0.02)
+
+
+def test_frequency_responses_serve_as_well_as_records(rehearsal):
+    """The campaign reduced to frequency responses: a third of the lines is held out."""
+    rig = load_rig("avis")
+    plan = default_plan(rig, "orthogonal", perturbed=True, duration_s=20.0)
+    campaign = rehearse(rig, plan, seed=5).campaign
+    driven = tuple(r.header.name for r in campaign.records if r.header.excitation == "multisine")[-8:]
+    measured = local_polynomial(campaign.only(driven), band_Hz=(1.0, 40.0), floor=False)
+    found = identify(measured, rig, FEW)
+    assert found.campaign_fit.fit.information.rank == 20
+    assert found.findings == () and found.split is None
+
+
+def test_hold_out_and_parameters_as_asked(rehearsal):
+    options = IdentifyOptions(starts=1, hold_out=("03",), parameters=("mass", "J?"), band_Hz=(1.0, 20.0))
+    found = identify(rehearsal.campaign.only(("02", "03", "04")), rehearsal.truth, options)
+    assert [one.header.name for one in found.split.held_out.records] == ["03"]
+    assert found.model.names == ("mass", "J1", "J2", "J3")
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    ({"hold_out": ("09",)}, "09"), ({"hold_out": ("00", "01", "02", "03", "04", "05", "06")}, "not all"),
+    ({"parameters": ("weight*",)}, "weight"), ({"priors": {"weight": (1.0, 1.0)}}, "weight"),
+    ({"band_Hz": (300.0, 300.001)}, "band")])
+def test_options_that_do_not_fit_are_answered(rehearsal, change, said):
+    with pytest.raises(InputError, match=said) as error:
+        identify(rehearsal.campaign, load_rig("avis"), IdentifyOptions(**({"starts": 1} | change)))
+    assert "\n" not in str(error.value)
+
+
+def test_another_rig_is_refused_by_name(rehearsal):
+    with pytest.raises(InputError, match="sensors of the rig halcyonics"):
+        identify(rehearsal.campaign, load_rig("halcyonics"), FEW)
+
+
+def test_a_gate_that_says_stop_stops(rehearsal):
+    """A dead channel; and going on all the same is possible only as far as the data allow."""
+    record = rehearsal.campaign.named("02").load()
+    y = record.y.copy()
+    y[:, 1] = 0.5
+    broken = Campaign("avis", (type(record)(record.header, record.u, y, record.floor),))
+    with pytest.raises(InputError, match="Sz1"):
+        identify(broken, load_rig("avis"), FEW)
+
+
+def test_a_campaign_through_a_file_gives_the_same(rehearsal, found, tmp_path):
+    write_campaign(tmp_path / "c.h5", rehearsal.campaign)
+    again = identify(read_measurements(tmp_path / "c.h5"), load_rig("avis"), FEW)
+    assert np.array_equal(again.campaign_fit.fit.values, found.campaign_fit.fit.values)
+    assert again.provenance["measurement_sha256"] == found.provenance["measurement_sha256"]
+
+
+@pytest.mark.parametrize(("name", "content", "said"), [
+    ("result.json", None, "identification"), ("result.json", "{", "JSON"), ("result.json", "[]", "identify"),
+    ("rig.toml", None, "rig.toml")])
+def test_a_folder_that_is_none_is_answered(found, tmp_path, name, content, said):
+    write_identification(found, tmp_path)
+    (tmp_path / name).unlink()
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=said):
+        read_identified(tmp_path)
