@@ -113,7 +113,7 @@ def test_without_nameless_files_the_renamed_way_is_taken(tmp_path, monkeypatch):
     """Some file systems (NFS, old overlays) refuse O_TMPFILE."""
     def unsupported(*args):
         raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
-    monkeypatch.setattr(output, "_write_nameless", unsupported)
+    monkeypatch.setattr(files, "_write_nameless", unsupported)
     write_whole(tmp_path / "plant.json", b"{}")
     assert (tmp_path / "plant.json").read_bytes() == b"{}"
     assert list(tmp_path.iterdir()) == [tmp_path / "plant.json"]
