@@ -43,6 +43,7 @@ def identify(
     """
     from rich.console import Console
 
+    from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.files import open_folder
@@ -51,6 +52,8 @@ def identify(
     console = Console(highlight=False)
     start = load_rig(rig)
     measured = read_measurements(measurement, parse_columns(columns) if columns else None)
+    for note in in_short(measured.notes) if isinstance(measured, Campaign) else ():
+        console.print(f"[dim]{note}[/]")
     folder = open_folder(out, FILES)
     with Progress(console) as progress:
         from avis_ctrl.report import identification_html, identification_pdf

@@ -117,7 +117,7 @@ def convert(
     """Any measurement file as a campaign in HDF5, with what had to be assumed."""
     from rich.console import Console
 
-    from avis_ctrl.measurement.campaign import Campaign
+    from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.measurement.formats.hdf5 import write_campaign
     from avis_ctrl.measurement.formats.stored_response import write_frequency_response
@@ -126,7 +126,7 @@ def convert(
     measured = read_measurements(source, parse_columns(columns) if columns else None, rig)
     if isinstance(measured, Campaign):
         write_campaign(out, measured)
-        for note in measured.notes:
+        for note in in_short(measured.notes):
             console.print(note)
         console.print(f"{out}: {len(measured.records)} records of {len(measured.u_names)} inputs and "
                       f"{len(measured.y_names)} outputs at {measured.sample_rate_Hz:g} Hz")

@@ -96,6 +96,18 @@ class RecordHeader:
         return self.samples // self.period_samples if self.period_samples else 0
 
 
+def ranges(samples: int, longest: int) -> Iterator[tuple[int, int]]:
+    """(start, stop) of consecutive pieces, each sample once.
+
+    longest : 2 or more; the last piece takes one more where a single sample, which is no record, would be left.
+    """
+    if longest < 2:
+        raise InputError("expected pieces of at least two samples", field="longest", value=longest)
+    for start in range(0, max(samples - 1, 1), longest):
+        left = samples - start
+        yield start, samples if left <= longest + 1 else start + longest
+
+
 class RecordSource(ABC):
     """A record, wherever it lies."""
 
@@ -111,16 +123,18 @@ class RecordSource(ABC):
         """
 
     def pieces(self, longest: int) -> Iterator[Record]:
-        """The record in consecutive pieces of at most `longest` samples; periodic ones are cut between periods."""
+        """The record in consecutive pieces; periodic ones are cut between periods.
+
+        longest : samples of a piece; the last one takes one more where a single sample would be left.
+        """
         step = longest
         if period := self.header.period_samples:
             if period > longest:
                 raise InputError(f"expected periods of at most {longest} samples, to be read in pieces",
                                  field=f"record {self.header.name}: period_s", value=self.header.period_s)
             step = longest // period * period
-        for start in range(0, self.header.samples, step):
-            if self.header.samples - start >= 2:
-                yield self.load(start, min(start + step, self.header.samples))
+        for start, stop in ranges(self.header.samples, step):
+            yield self.load(start, stop)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,15 +237,26 @@ class Campaign:
         return replace(self, records=tuple(self.named(name) for name in names))
 
 
+def in_short(notes: tuple[str, ...]) -> tuple[str, ...]:
+    """Notes of a campaign, those that say the same of several records as one line."""
+    of: dict[str, list[str]] = {}
+    for note in notes:
+        head, colon, text = note.partition(": ")
+        named = colon and head.startswith("record ")
+        of.setdefault(text if named else note, []).append(head.removeprefix("record ") if named else "")
+    return tuple(text if names == [""] else f"record{'s' if len(names) > 1 else ''} {', '.join(names)}: {text}"
+                 for text, names in of.items())
+
+
 def digest(campaign: Campaign, longest: int = 1 << 20) -> str:
-    """SHA-256 of all headers and samples, for provenance: independent of the file format they came in."""
+    """SHA-256 of all headers and samples, for provenance: independent of the file format they came in.
+
+    longest : samples that are loaded at once; more than that many are hashed piece by piece, so that it enters.
+    """
     total = hashlib.sha256(campaign.rig.encode())
     for record in campaign.records:
         total.update(repr(record.header).encode())
-        for start in range(0, record.header.samples, longest):
-            stop = min(start + longest, record.header.samples)
-            if stop - start < 2:
-                start -= 1
+        for start, stop in ranges(record.header.samples, longest):
             piece = record.load(start, stop)
             for array in (piece.u, piece.y, piece.floor):
                 if array is not None:
