@@ -13,8 +13,8 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.prediction import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.measurement.formats.hdf5 import ranges, replacing
+from avis_ctrl.measurement.campaign import Campaign, ranges
+from avis_ctrl.measurement.formats.hdf5 import replacing
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig

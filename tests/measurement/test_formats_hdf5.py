@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader, digest
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader, digest, ranges
 from avis_ctrl.measurement.formats import read_measurements, write_campaign, write_frequency_response
-from avis_ctrl.measurement.formats.hdf5 import ranges
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
@@ -65,9 +64,43 @@ def test_what_is_written_is_read(tmp_path_factory, campaign, longest):
 def test_pieces_cover_every_sample(samples, longest):
     covered = np.zeros(samples, int)
     for start, stop in ranges(samples, longest):
-        assert stop - start >= 2
+        assert 2 <= stop - start <= longest + 1
         covered[start:stop] += 1
-    assert covered.min() == 1 and covered.sum() <= samples + 1
+    assert np.all(covered == 1)
+
+
+@given(st.integers(2, 40), st.integers(2, 12), st.sampled_from([None, 2, 3, 4]))
+def test_pieces_put_together_are_the_record(samples, longest, period):
+    header = RecordHeader("00", 10.0, samples, ("A",), ("S",), "noise", period_s=period and period / 10)
+    whole = Record(header, np.arange(samples)[:, None], -np.arange(samples)[:, None])
+    if period and period > longest:
+        with pytest.raises(InputError, match="expected periods of at most"):
+            list(whole.pieces(longest))
+        return
+    pieces = list(whole.pieces(longest))
+    np.testing.assert_array_equal(np.vstack([piece.u for piece in pieces]), whole.u)
+    np.testing.assert_array_equal(np.vstack([piece.y for piece in pieces]), whole.y)
+    assert all(piece.header.samples % (period or longest) == 0 for piece in pieces[:-1])
+    for piece in pieces:
+        assert 2 <= piece.header.samples <= longest + 1
+        assert piece.time[0] == pytest.approx(piece.u[0, 0] / 10)
+
+
+def test_every_sample_enters_the_digest_once_however_long_the_pieces_are():
+    header = RecordHeader("00", 10.0, 7, ("A",), ("S",), "noise")
+    loaded = []
+
+    class Watched(Record):
+        def load(self, start=0, stop=None):
+            loaded.append((start, stop))
+            return super().load(start, stop)
+    u, y = np.arange(7.0)[:, None], np.ones((7, 1))
+    digest(Campaign("avis", (Watched(header, u, y),)), longest=3)
+    assert loaded == [(0, 3), (3, 7)]
+    changed = u.copy()
+    changed[6] = 8.0
+    one, other = (Campaign("avis", (Record(header, samples, y),)) for samples in (u, changed))
+    assert digest(one, 3) != digest(other, 3)
 
 
 def plain_file(path, **changes):

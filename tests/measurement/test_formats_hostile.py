@@ -16,6 +16,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.formats import (
     FORMATS,
+    common,
     parse_columns,
     read_measurements,
     write_campaign,
@@ -161,7 +162,8 @@ def test_the_content_tells_the_format_not_the_name(valid, tmp_path):
 
 def test_messages_of_cut_files(valid, tmp_path):
     path = tmp_path / "a"
-    parts = {"h5": (0.5, "the HDF5 file is cut short (Unable to"), "mat": (0.5, "its parts do not fit together;"),
+    parts = {"h5": (0.5, "the HDF5 file is cut short (Unable to"),
+             "mat": (0.5, "variable at byte 128: it states 6704 bytes; 3312 are left"),
              "uff": (0.7, "data set 2 (byte "), "58b": (0.3, "of 240 bytes of data are there"),
              "csv": (0.95, "expected 3 columns, as in the header; there are 1")}
     for kind, (share, message) in parts.items():
@@ -211,3 +213,40 @@ def test_a_uff_that_states_a_huge_number_of_values(tmp_path):
     path.write_bytes(content.replace(struct.pack("<f", 1.0), struct.pack("<f", np.nan), 1))
     assert "expected finite numbers; 1 are not, the first at sample 0 of channel A1" in refusal(path, excitation="rest",
                                                                                               columns={"y": "A1"})
+
+
+@pytest.mark.parametrize("kind", ["mat", "zip", "csv", "uff", "58b"])
+def test_formats_that_are_read_whole_are_refused_beyond_memory_by_the_size_on_disk(valid, tmp_path, kind):
+    path = tmp_path / "a"
+    path.write_bytes(valid[kind] + b"\n" * 5000 if kind == "csv" else valid[kind])
+    with path.open("r+b") as stream:
+        stream.truncate(3_000_000_000)  # a hole: takes no place on disk
+    assert refusal(path) == (f"{path}: holds 3 GB, and this format is read whole, up to 1.5 GB; convert it in pieces "
+                             "to an HDF5 campaign (/records/00/u and y), which is read in pieces")
+
+
+def test_what_is_large_only_when_it_is_unpacked_is_refused_too(tmp_path, monkeypatch):
+    """Small on disk: flat variables of 2 GB in a v7.3 file, and compressed zeros in a v5 file."""
+    path, samples = tmp_path / "a", 125_000_000
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name in "uy":
+            file.create_dataset(name, (1, samples), float, chunks=(1, 1 << 14))
+            file[name].attrs["MATLAB_class"] = np.bytes_("double")
+        file["fs"] = np.array([[100.0]])
+        file["fs"].attrs["MATLAB_class"] = np.bytes_("double")
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+    assert path.stat().st_size < 1e6 and "holds 2 GB, and this format is read whole" in refusal(path)
+    monkeypatch.setattr(common, "LARGEST_IN_MEMORY", 5000)
+    scipy.io.savemat(path, {"u": np.zeros(400), "y": np.zeros(400), "fs": 1.0}, do_compression=True)
+    assert path.stat().st_size < 1000 and "holds 6.5e-06 GB, and this format is read whole" in refusal(path)
+    scipy.io.savemat(path, {"u": np.zeros(200), "y": np.zeros(200), "fs": 1.0}, do_compression=True)
+    assert not isinstance(read_whole(path), str)
+
+
+def test_csv_files_of_a_directory_count_together(valid, tmp_path):
+    for name in "abc":
+        (tmp_path / f"{name}.csv").write_bytes(valid["csv"])
+        with (tmp_path / f"{name}.csv").open("r+b") as stream:
+            stream.truncate(600_000_000)
+    assert refusal(tmp_path).startswith(f"{tmp_path}: holds 1.8 GB, and this format is read whole")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,9 +26,8 @@ UNITS: dict[str, tuple[str, float]] = {
 INPUT_UNITS, OUTPUT_UNITS, FLOOR_UNITS = ("V", "N"), ("V", "m/s", "m/s^2", "m"), ("m/s",)
 ALLOWED = {"u": INPUT_UNITS, "y": OUTPUT_UNITS, "floor": FLOOR_UNITS}
 
-# What a library may raise over a damaged file; anything else is our own mistake and must be seen.
-DAMAGE = (OSError, EOFError, KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError, struct.error,
-          zlib.error)
+# A file that is held in memory whole; text and compressed numbers take about as much again while they are converted.
+LARGEST_IN_MEMORY = 1_500_000_000  # bytes
 
 
 def short(error: BaseException) -> str:
@@ -42,9 +39,14 @@ def short(error: BaseException) -> str:
 
 @contextmanager
 def reading(path: object, what: str = "the file") -> Iterator[None]:
-    """Every failure inside as one InputError that names the file."""
+    """Refusals inside name the file; so do the failures of the disk and of memory.
+
+    What h5py raises over damage is turned into an InputError where h5py is called (`stored.access`), so that a mistake
+    of our own is not taken for a damaged file. Results of huge numbers are refused as not finite, without a warning.
+    """
     try:
-        yield
+        with np.errstate(over="ignore", invalid="ignore"):
+            yield
     except InputError as error:
         if error.file is not None:
             raise
@@ -52,8 +54,8 @@ def reading(path: object, what: str = "the file") -> Iterator[None]:
     except MemoryError:
         raise InputError("the sizes it states do not fit in memory; damaged, or to be read in smaller pieces",
                          file=path) from None
-    except DAMAGE as error:
-        raise InputError(f"{what} cannot be read; damaged or cut short? ({short(error)})", file=path) from error
+    except OSError as error:
+        raise InputError(f"{what} cannot be read ({short(error)})", file=path) from error
 
 
 def existing_file(path: str | Path) -> Path:
@@ -77,6 +79,26 @@ def existing_file(path: str | Path) -> Path:
             raise
         raise InputError(f"cannot be opened ({short(error)})", file=path) from None
     return path
+
+
+def require_small(path: Path, size: int | None = None) -> int:
+    """Size in bytes of a file (or of what it holds, where that is known) that is read whole.
+
+    Raises
+    ------
+    InputError : more than `LARGEST_IN_MEMORY`; only HDF5 campaigns are read in pieces.
+    """
+    size = path.stat().st_size if size is None else size
+    if size > LARGEST_IN_MEMORY:
+        raise InputError(f"holds {size / 1e9:.3g} GB, and this format is read whole, up to "
+                         f"{LARGEST_IN_MEMORY / 1e9:.3g} GB; convert it in pieces to an HDF5 campaign (/records/00/u "
+                         "and y), which is read in pieces", file=path)
+    return size
+
+
+def printable(text: str) -> str:
+    """A name out of a file as one line of a message can show it."""
+    return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def _single(value: Any) -> Any:
@@ -132,8 +154,8 @@ def as_names(value: Any, field: str, count: int | None = None) -> tuple[str, ...
     else:
         text = as_text(value, field)
         names = (text,) if count == 1 else tuple(part.strip() for part in text.split(","))
-    if not all(names):
-        raise InputError("expected no empty name", field=field, value=names)
+    if not all(name and name.isprintable() for name in names):
+        raise InputError("expected names that are not empty and can be printed", field=field, value=brief(names))
     if count is not None and len(names) != count:
         raise InputError(f"expected {count} names, one per channel; there are {len(names)}", field=field,
                          value=brief(names))

@@ -23,7 +23,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record
-from avis_ctrl.measurement.formats.common import as_number, existing_file, reading
+from avis_ctrl.measurement.formats.common import as_number, existing_file, reading, require_small
 from avis_ctrl.measurement.formats.flat import Hints, Mapped, flat_record, mapped, one_clock, pick
 from avis_ctrl.measurement.formats.time_axis import sample_rate_from
 
@@ -63,6 +63,8 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
                        if file.suffix.lower() == ".csv" and file.is_file() and not file.name.startswith("."))
         if not files:
             raise InputError("expected CSV files (*.csv) in the directory; there is none", file=path)
+    with reading(path):
+        require_small(path, sum(file.stat().st_size for file in files))
     records, notes, rigs = [], [], []
     for file in files:
         with reading(file, "the CSV file"):

@@ -111,13 +111,19 @@ def flat_header(name: str, samples: int, rate_Hz: float, start_s: float, channel
         raise InputError("missing; expected the period in s of a multisine", field=f"record {name}: period_s")
     level = hints.level_V
     if level is None:
-        level = 0.0 if u is None or not u.size else float(np.sqrt(np.mean(np.square(u))))
+        level = 0.0 if u is None or not u.size else _root_mean_square(u)
         if u is not None and u.size:
             notes.append(f"record {name}: level_V not stated; taken as the r.m.s. of u, {level:.4g}")
     header = RecordHeader(name, rate_Hz, samples, channels["u"], channels["y"], excitation, level,
                           start_s if hints.start_s is None else hints.start_s, period, units["u"], units["y"],
                           channels.get("floor", ()), units.get("floor", "m/s"))
     return header, notes
+
+
+def _root_mean_square(u: np.ndarray) -> float:
+    """Scaled by a power of two, so that no square overflows."""
+    exponent = np.frexp(np.max(np.abs(u)))[1]
+    return float(np.ldexp(np.sqrt(np.mean(np.square(np.ldexp(u, -exponent)))), exponent))
 
 
 def flat_units(role: str, labels: Sequence[str | None], hints: Hints, where: str) -> tuple[str, np.ndarray, list[str]]:

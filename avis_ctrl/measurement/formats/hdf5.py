@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import Campaign, RecordHeader, RecordSource
+from avis_ctrl.measurement.campaign import Campaign, RecordHeader, RecordSource, ranges
 from avis_ctrl.measurement.formats.common import (
     as_names,
     as_number,
@@ -26,12 +26,23 @@ from avis_ctrl.measurement.formats.common import (
     existing_file,
     header_from,
     kind_of,
+    printable,
     reading,
     require,
     short,
     units_of,
 )
-from avis_ctrl.measurement.formats.stored import Columns, StoredRecord, open_hdf5
+from avis_ctrl.measurement.formats.stored import (
+    Columns,
+    StoredRecord,
+    access,
+    attributes,
+    full_name,
+    layout,
+    member,
+    members,
+    open_hdf5,
+)
 
 FORMAT, VERSION = "avis-campaign", 1
 ROLES = ("u", "y", "floor")
@@ -50,9 +61,9 @@ def read(path: str | Path, rig: str | None = None) -> Campaign:
     path = existing_file(path)
     with reading(path, "the HDF5 file"), open_hdf5(path) as file:
         stated = check_root(file)
-        if "records" not in file:
+        group = member(file, "records")
+        if group is None:
             raise InputError(f"missing; the file holds {listed(file)}", field="/records")
-        group = file["records"]
         if not isinstance(group, h5py.Group):
             raise InputError("expected a group, found a data set", field="/records")
         records = tuple(_record(group, name, str(path)) for name in _in_order(group))
@@ -63,30 +74,33 @@ def read(path: str | Path, rig: str | None = None) -> Campaign:
 
 def listed(group: h5py.Group) -> str:
     """What a group holds, in words."""
-    return ", ".join(sorted(str(name) for name in group)) or "nothing"
+    return ", ".join(sorted(map(printable, members(group)))) or "nothing"
 
 
 def check_root(file: h5py.File) -> str:
     """Name of the rig, after format and version were checked."""
-    stated = as_text(require(file.attrs, "format", "attributes of the file", f"{FORMAT!r}"), "attribute format")
+    found = attributes(file, "format", "version", "rig")
+    stated = as_text(require(found, "format", "attributes of the file", f"{FORMAT!r}"), "attribute format")
     if stated != FORMAT:
         raise InputError(f"expected {FORMAT!r}", field="attribute format", value=stated)
-    version = as_number(require(file.attrs, "version", "attributes of the file", f"{VERSION}"), "attribute version")
+    version = as_number(require(found, "version", "attributes of the file", f"{VERSION}"), "attribute version")
     if version != VERSION:
         raise InputError(f"this release reads version {VERSION}", field="attribute version", value=version)
-    return as_text(require(file.attrs, "rig", "attributes of the file", "the name of the rig"), "attribute rig")
+    return as_text(require(found, "rig", "attributes of the file", "the name of the rig"), "attribute rig")
 
 
 def _in_order(group: h5py.Group) -> list[str]:
     """Names in the order they were written, where the file kept it; otherwise "2" before "10"."""
-    if group.id.get_create_plist().get_link_creation_order():
-        return list(group)
-    return sorted(group, key=lambda name: [(part.isdigit(), int(part) if part.isdecimal() else 0, part)
+    with access("/records"):
+        in_order = group.id.get_create_plist().get_link_creation_order()
+    if in_order:
+        return members(group)
+    return sorted(members(group), key=lambda name: [(part.isdigit(), int(part) if part.isdecimal() else 0, part)
                                            for part in re.split(r"(\d+)", name)])
 
 
 def _record(group: h5py.Group, name: str, path: str) -> StoredRecord:
-    where, record = f"record {name}", group[name]
+    where, record = f"record {printable(name)}", member(group, name)
     if not isinstance(record, h5py.Group):
         raise InputError("expected a group with u and y, found a data set", field=where)
     channels: dict[str, tuple[str, ...]] = {}
@@ -94,19 +108,21 @@ def _record(group: h5py.Group, name: str, path: str) -> StoredRecord:
     columns: dict[str, tuple[Columns, ...]] = {}
     samples = {}
     for role in ROLES:
-        if role not in record:
+        dataset = member(record, role)
+        if dataset is None:
             if role == "floor":
                 continue
             raise InputError(f"missing; the record holds {listed(record)}", field=f"{where}: {role}")
-        dataset = record[role]
         samples[role], count = _shape(dataset, f"{where}: {role}")
-        channels[role] = as_names(require(dataset.attrs, "names", f"{where}: {role}", "the channels' names"),
+        stated = attributes(dataset, "names", "unit")
+        channels[role] = as_names(require(stated, "names", f"{where}: {role}", "the channels' names"),
                                   f"{where}: {role} names", count)
-        units[role], factors = units_of(require(dataset.attrs, "unit", f"{where}: {role}", "such as 'V'"), role, where,
+        units[role], factors = units_of(require(stated, "unit", f"{where}: {role}", "such as 'V'"), role, where,
                                         count)
-        columns[role] = (Columns(str(dataset.name), factors),)
+        columns[role] = (Columns(full_name(dataset), factors),)
     require_one_length(samples, where)
-    return StoredRecord(header_from(record.attrs, name, samples["u"], channels, units), path, columns)
+    stated = attributes(record, "sample_rate_Hz", "excitation", "level_V", "start_s", "period_s")
+    return StoredRecord(header_from(stated, name, samples["u"], channels, units), path, columns)
 
 
 def require_one_length(samples: dict[str, int], where: str) -> None:
@@ -120,9 +136,9 @@ def _shape(dataset: Any, field: str) -> tuple[int, int]:
     """(samples, channels) of a data set of real numbers."""
     if not isinstance(dataset, h5py.Dataset):
         raise InputError("expected a data set, found a group", field=field)
-    if dataset.dtype.kind not in "fiu":
-        raise InputError("expected real numbers", field=field, value=f"data set of {kind_of(dataset.dtype)}")
-    shape = dataset.shape
+    shape, dtype = layout(dataset)
+    if dtype.kind not in "fiu":
+        raise InputError("expected real numbers", field=field, value=f"data set of {kind_of(dtype)}")
     if shape is None or len(shape) not in (1, 2):
         raise InputError("expected shape (samples, channels)", field=field, value=shape)
     samples, count = shape[0], shape[1] if len(shape) == 2 else 1
@@ -200,10 +216,3 @@ def _write_record(group: h5py.Group, record: RecordSource, longest: int) -> None
 def _roles(header: RecordHeader) -> list[tuple[str, tuple[str, ...], str]]:
     roles = [("u", header.u_names, header.u_unit), ("y", header.y_names, header.y_unit)]
     return roles + ([("floor", header.floor_names, header.floor_unit)] if header.floor_names else [])
-
-
-def ranges(samples: int, longest: int) -> Iterator[tuple[int, int]]:
-    """(start, stop) of consecutive pieces; the last one overlaps where a single sample would be left."""
-    for start in range(0, samples, longest):
-        stop = min(start + longest, samples)
-        yield max(min(start, stop - 2), 0), stop

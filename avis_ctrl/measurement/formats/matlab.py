@@ -12,6 +12,8 @@ Rows or columns may be the samples; what cannot be told apart is refused.
 
 from __future__ import annotations
 
+import math
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +23,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordSource
+from avis_ctrl.measurement.formats import matlab_v5, matlab_v73
 from avis_ctrl.measurement.formats.common import (
     as_names,
     as_number,
@@ -30,12 +33,13 @@ from avis_ctrl.measurement.formats.common import (
     numbers,
     reading,
     require_finite,
+    require_small,
     units_of,
 )
 from avis_ctrl.measurement.formats.flat import Hints, Mapped, flat_record, mapped, pick
 from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION
 from avis_ctrl.measurement.formats.matlab_response import response
-from avis_ctrl.measurement.formats.matlab_variables import Matrix, Unreadable, describe, overview, variables
+from avis_ctrl.measurement.formats.matlab_tree import Matrix, Unreadable, describe, overview
 from avis_ctrl.measurement.formats.stored import Columns, StoredRecord
 from avis_ctrl.measurement.formats.time_axis import sample_rate_from
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -44,6 +48,9 @@ MUCH_LONGER = 10  # a record has at least that many times more samples than chan
 USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output"), "t": ("t", "time"), "floor": ("floor",),
          "sample_rate_Hz": ("sample_rate_Hz", "fs", "Fs", "FS"), "u_names": ("u_names",), "y_names": ("y_names",)}
 PERIODS = ("Ts", "dt")
+# "MAT-File Format", level 4: thousands are the byte order (0 little, 1 big endian), tens the type of the numbers, ones
+# the kind of matrix (full, text, sparse).
+MATRICES_V4 = {1000 * order + 10 * number + kind for order in (0, 1) for number in range(6) for kind in range(3)}
 
 
 def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None,
@@ -55,16 +62,42 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
     InputError : names file, record or variable, and what was expected.
     """
     path, hints = existing_file(path), hints or Hints()
-    tree = variables(path)
     with reading(path, "the .mat file"):
+        tree = variables(path)
         if len(tree) == 1 and isinstance(only := next(iter(tree.values())), dict) and "records" not in tree:
             tree = only  # everything in one struct
         if "records" in tree and columns is None:
             return _campaign(path, tree, rig)
         if "frequency_Hz" in tree and "H" in tree and columns is None:
             return response(tree, hints)
-        record, notes = _flat(tree, columns, hints)
+        record, notes = _flat(path, tree, columns, hints)
         return Campaign(_rig(tree, rig), (record,), str(path), tuple(notes))
+
+
+def variables(path: Path) -> dict[str, Any]:
+    """The variables of a .mat file by name, see `matlab_tree`.
+
+    Raises
+    ------
+    InputError : not of version 5 to 7.3, damaged, cut short, too large.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(128)
+    if head.startswith((b"MATLAB 7.3 MAT-file", b"\x89HDF\r\n\x1a\n")):
+        return matlab_v73.variables(path)
+    if head.startswith(b"MATLAB 5.0 MAT-file") and len(head) == 128:
+        return matlab_v5.variables(path)
+    raise InputError("expected a .mat file of version 5 to 7.3", file=path)
+
+
+def is_version_4(head: bytes) -> bool:
+    """Whether a file begins with the header of a v4 matrix: type, rows, columns, imaginary, length of name, name."""
+    for order in "<>" if len(head) > 20 else "":
+        kind, rows, columns, imaginary, length = struct.unpack(order + "5i", head[:20])
+        name = head[20:20 + length] if 1 < length <= 64 else b""
+        if kind in MATRICES_V4 and min(rows, columns) >= 0 and imaginary in (0, 1) and name.endswith(b"\0"):
+            return name[:-1].decode("latin-1").isidentifier()
+    return False
 
 
 def _rig(tree: Mapping[str, Any], rig: str | None) -> str:
@@ -99,7 +132,7 @@ def _campaign(path: Path, tree: Mapping[str, Any], rig: str | None) -> Campaign:
 
 def _plain(value: Any) -> Any:
     """A small matrix as an array."""
-    return value.read() if isinstance(value, Matrix) and np.prod(value.shape) <= 1000 else value
+    return value.read() if isinstance(value, Matrix) and math.prod(value.shape) <= 1000 else value
 
 
 def _record(path: Path, name: str, fields: Mapping[str, Any]) -> tuple[RecordSource, list[str]]:
@@ -192,7 +225,8 @@ def oriented(item: Matrix, samples: int, field: str) -> np.ndarray:
     return array if array.shape[0] == samples else array.T
 
 
-def _flat(tree: Mapping[str, Any], columns: Mapped | None, hints: Hints) -> tuple[Record, list[str]]:
+def _flat(path: Path, tree: Mapping[str, Any], columns: Mapped | None,
+          hints: Hints) -> tuple[Record, list[str]]:
     """Layout B."""
     chosen = {}
     for role, usual in USUAL.items():
@@ -208,6 +242,7 @@ def _flat(tree: Mapping[str, Any], columns: Mapped | None, hints: Hints) -> tupl
     hints = _with_stated(hints, tree)
     matrices = {role: [matrix(tree[name], name) for name in chosen[role]] for role in ("u", "y", "floor")
                 if chosen[role] or role == "u"}
+    require_small(path, 8 * sum(math.prod(item.shape) for items in matrices.values() for item in items))
     rate, start, note, known = _clock(tree, chosen, hints)
     stated = {role: as_names(_plain(tree[chosen[f"{role}_names"][0]]), f"{role}_names",
                              1 if len(matrices[role]) == 1 and 1 in matrices[role][0].shape else None)

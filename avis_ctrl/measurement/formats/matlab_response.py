@@ -10,7 +10,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.formats.common import INPUT_UNITS, OUTPUT_UNITS, as_names, as_number, as_text, unit_of
 from avis_ctrl.measurement.formats.flat import Hints
-from avis_ctrl.measurement.formats.matlab_variables import Matrix, describe
+from avis_ctrl.measurement.formats.matlab_tree import Matrix, describe
 from avis_ctrl.measurement.formats.response import response_from
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 

@@ -14,7 +14,7 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import csv, hdf5, matlab, uff
 from avis_ctrl.measurement.formats.common import existing_file, reading
 from avis_ctrl.measurement.formats.flat import ROLES, hints_from
-from avis_ctrl.measurement.formats.stored import open_hdf5
+from avis_ctrl.measurement.formats.stored import attributes, member, members, open_hdf5
 from avis_ctrl.measurement.formats.stored_response import read_frequency_response
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
@@ -71,6 +71,9 @@ def read_measurements(path: str | Path, columns: Mapping[str, Any] | None = None
             head = stream.read(4096)
     if head.startswith(b"MATLAB "):
         return matlab.read(path, columns, rig, known)
+    if matlab.is_version_4(head):
+        raise InputError("a MATLAB v4 file; expected version 5 to 7.3: load it in MATLAB and save it with -v7",
+                         file=path)
     if _is_hdf5(path, head):
         return _hdf5(path, columns, rig, hints)
     if _is_uff(head):
@@ -98,9 +101,11 @@ def _is_uff(head: bytes) -> bool:
 def _hdf5(path: Path, columns: Mapping[str, Any] | None, rig: str | None,
           hints: Mapping[str, Any]) -> Campaign | FrequencyResponse:
     with reading(path, "the HDF5 file"), open_hdf5(path) as file:
-        matlab_classes = "format" not in file.attrs and any(
-            "MATLAB_class" in getattr(item, "attrs", ()) for item in file.values())  # None: a broken link
-        response = "frf" in file and "records" not in file
+        names = members(file)
+        matlab_classes = not attributes(file, "format") and any(
+            item is not None and attributes(item, "MATLAB_class")
+            for item in (member(file, name) for name in names))  # None: a broken link
+        response = "frf" in names and "records" not in names
     if matlab_classes:  # a v7.3 file that lost its text header
         return matlab.read(path, columns, rig, hints_from(hints))
     used = ("averages", "relative_standard_deviation") if response else ()

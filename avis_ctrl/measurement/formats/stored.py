@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Record, RecordHeader, RecordSource
-from avis_ctrl.measurement.formats.common import existing_file, numbers, reading, require_finite, short
+from avis_ctrl.measurement.formats.common import existing_file, numbers, printable, reading, require_finite, short
+
+# What h5py raises over a damaged file.
+DAMAGE = (OSError, KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError)
 
 
 def open_hdf5(path: Path) -> h5py.File:
@@ -22,6 +27,71 @@ def open_hdf5(path: Path) -> h5py.File:
         if "truncated" in str(error):
             raise InputError(f"the HDF5 file is cut short ({short(error)})", file=path) from None
         raise InputError(f"not a readable HDF5 file ({short(error)})", file=path) from None
+
+
+@contextmanager
+def access(what: object) -> Iterator[None]:
+    """What h5py raises as one InputError; nothing but calls into h5py stands inside."""
+    try:
+        yield
+    except DAMAGE as error:
+        raise InputError(f"cannot be read; damaged or cut short? ({short(error)})",
+                         field=printable(str(what))) from error
+
+
+def members(group: h5py.Group) -> list[str]:
+    """Names in a group."""
+    with access("a group"):
+        return [str(name) for name in group]
+
+
+def member(group: h5py.Group, name: Any) -> Any:
+    """The group or data set of that name (or reference), None if there is none."""
+    with access(name if isinstance(name, str) else "a reference"):
+        if isinstance(name, str) and name not in group:
+            return None
+        return group[name]
+
+
+def dataset_of(file: h5py.File, name: str) -> h5py.Dataset:
+    """The data set of that name.
+
+    Raises
+    ------
+    InputError : there is none, in a file that is damaged or changed since it was opened first.
+    """
+    found = member(file, name)
+    if not isinstance(found, h5py.Dataset):
+        raise InputError("expected a data set; damaged, or changed since it was opened?", field=printable(name))
+    return found
+
+
+def attributes(item: h5py.Group | h5py.Dataset, *names: str) -> dict[str, Any]:
+    """Those of the named attributes that are there."""
+    found = {}
+    for name in names:
+        with access(f"attribute {name}"):
+            if name in item.attrs:
+                found[name] = item.attrs[name]
+    return found
+
+
+def layout(dataset: h5py.Dataset) -> tuple[tuple[int, ...] | None, np.dtype]:
+    """Shape (None if the data set is empty) and type."""
+    with access("a data set"):
+        return dataset.shape, dataset.dtype
+
+
+def full_name(item: h5py.Group | h5py.Dataset) -> str:
+    """Path of an item in its file."""
+    with access("a name"):
+        return str(item.name)
+
+
+def values(dataset: h5py.Dataset, selection: Any = ()) -> np.ndarray:
+    """Stored values, all or a selection of them."""
+    with access(full_name(dataset)):
+        return np.asarray(dataset[selection])
 
 
 @dataclass(frozen=True)
@@ -38,11 +108,16 @@ class Columns:
 
     def rows(self, file: h5py.File, start: int, stop: int) -> np.ndarray:
         """(stop - start, channels) in SI units; only these rows are read."""
-        stored = file[self.dataset]
-        if stored.ndim == 1:
-            block = stored[start:stop][:, None]
+        stored = dataset_of(file, self.dataset)
+        shape = layout(stored)[0]
+        if shape is None or len(shape) not in (1, 2):
+            raise InputError("expected a data set of samples by channels", field=self.dataset, value=shape)
+        if len(shape) == 1:
+            block = values(stored, slice(start, stop))[:, None]
+        elif self.channels_first:
+            block = values(stored, (slice(None), slice(start, stop))).T
         else:
-            block = stored[:, start:stop].T if self.channels_first else stored[start:stop]
+            block = values(stored, slice(start, stop))
         array = numbers(block, self.dataset)
         if array.shape != (stop - start, len(self.factors)):
             raise InputError(f"expected {stop - start} samples of {len(self.factors)} channels", field=self.dataset,

@@ -7,6 +7,7 @@ outputs, input_unit, output_unit; optional method, dof, and data sets measuremen
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,13 +26,15 @@ from avis_ctrl.measurement.formats.common import (
     kind_of,
     reading,
     require,
+    require_small,
     unit_of,
 )
 from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_root, listed, replacing
 from avis_ctrl.measurement.formats.response import response_from
-from avis_ctrl.measurement.formats.stored import open_hdf5
+from avis_ctrl.measurement.formats.stored import attributes, layout, member, open_hdf5, values
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
+ATTRIBUTES = ("inputs", "outputs", "input_unit", "output_unit", "method", "dof", "averages")
 COVARIANCES = ("noise", "gram", "measurement_noise", "distortion")
 
 
@@ -70,35 +73,37 @@ def read_frequency_response(path: str | Path, averages: float | None = None,
     path = existing_file(path)
     with reading(path, "the HDF5 file"), open_hdf5(path) as file:
         check_root(file)
-        if not isinstance(file.get("frf"), h5py.Group):
+        group = member(file, "frf")
+        if not isinstance(group, h5py.Group):
             raise InputError(f"missing; the file holds {listed(file)}", field="/frf")
-        return _response(file["frf"], averages, relative_standard_deviation)
+        return _response(path, group, averages, relative_standard_deviation)
 
 
-def _response(group: h5py.Group, averages: float | None, relative: float | None) -> FrequencyResponse:
-    frequency, value = _numbers(group, "frequency_Hz", "fiu"), _numbers(group, "value", "fiuc")
+def _response(path: Path, group: h5py.Group, averages: float | None, relative: float | None) -> FrequencyResponse:
+    frequency, value = _numbers(path, group, "frequency_Hz", "fiu"), _numbers(path, group, "value", "fiuc")
     if frequency is None or value is None:
         raise InputError(f"expected frequency_Hz and value; the group holds {listed(group)}", field="/frf")
-    names = {field: as_names(require(group.attrs, field, "/frf", "the channels' names"), f"/frf: {field}")
+    stated = attributes(group, *ATTRIBUTES)
+    names = {field: as_names(require(stated, field, "/frf", "the channels' names"), f"/frf: {field}")
              for field in ("inputs", "outputs")}
-    units = {field: unit_of(as_text(require(group.attrs, field, "/frf", "such as 'V'"), f"/frf: {field}"),
+    units = {field: unit_of(as_text(require(stated, field, "/frf", "such as 'V'"), f"/frf: {field}"),
                             f"/frf: {field}", allowed)
              for field, allowed in (("input_unit", INPUT_UNITS), ("output_unit", OUTPUT_UNITS))}
     factor = units["output_unit"].factor / units["input_unit"].factor
-    method = as_text(group.attrs.get("method", ""), "/frf: method")
+    method = as_text(stated.get("method", ""), "/frf: method")
     common = {"input_unit": units["input_unit"].si, "output_unit": units["output_unit"].si, "method": method}
-    covariances = {field: _numbers(group, field, "fiuc") for field in COVARIANCES}
-    coherence, variance = _numbers(group, "coherence", "fiu"), _numbers(group, "variance", "fiu")
+    covariances = {field: _numbers(path, group, field, "fiuc") for field in COVARIANCES}
+    coherence, variance = _numbers(path, group, "coherence", "fiu"), _numbers(path, group, "variance", "fiu")
     if covariances["noise"] is not None and covariances["gram"] is not None:
         if factor != 1.0:
             raise InputError("expected SI units beside noise and gram", field="/frf: units",
-                             value=str(group.attrs["output_unit"]))
-        stated = group.attrs.get("dof", np.inf)
-        dof = np.inf if np.array_equal(stated, np.inf) else as_number(stated, "/frf: dof")
+                             value=str(stated["output_unit"]))
+        dof = stated.get("dof", np.inf)
+        dof = np.inf if np.array_equal(dof, np.inf) else as_number(dof, "/frf: dof")
         return FrequencyResponse(frequency, value, inputs=names["inputs"], outputs=names["outputs"], dof=dof,
                                  coherence=coherence, **covariances, **common)  # type: ignore[arg-type]
-    if "averages" in group.attrs:
-        averages = as_number(group.attrs["averages"], "/frf: averages")
+    if "averages" in stated:
+        averages = as_number(stated["averages"], "/frf: averages")
     response = response_from(frequency, value * factor, names["inputs"], names["outputs"], coherence=coherence,
                              variance=None if variance is None else variance * factor ** 2, averages=averages,
                              relative_standard_deviation=relative, **common)
@@ -107,12 +112,15 @@ def _response(group: h5py.Group, averages: float | None, relative: float | None)
     return response
 
 
-def _numbers(group: h5py.Group, name: str, kinds: str) -> Any:
+def _numbers(path: Path, group: h5py.Group, name: str, kinds: str) -> Any:
     """The data set of that name, None if there is none."""
-    dataset = group.get(name)
+    dataset = member(group, name)
     if dataset is None:
         return None
-    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in kinds:
-        found = kind_of(dataset.dtype) if isinstance(dataset, h5py.Dataset) else "a group"
-        raise InputError(f"expected numbers, found {found}", field=f"/frf/{name}")
-    return dataset[()]
+    if not isinstance(dataset, h5py.Dataset):
+        raise InputError("expected numbers, found a group", field=f"/frf/{name}")
+    shape, dtype = layout(dataset)
+    if dtype.kind not in kinds:
+        raise InputError(f"expected numbers, found {kind_of(dtype)}", field=f"/frf/{name}")
+    require_small(path, math.prod(shape or ()) * dtype.itemsize)
+    return values(dataset)

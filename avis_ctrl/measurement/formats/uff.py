@@ -17,7 +17,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record
-from avis_ctrl.measurement.formats.common import ALLOWED, Unit, existing_file, reading, unit_of
+from avis_ctrl.measurement.formats.common import ALLOWED, Unit, existing_file, reading, require_small, unit_of
 from avis_ctrl.measurement.formats.flat import Hints, Mapped, flat_record, mapped, one_clock, pick
 from avis_ctrl.measurement.formats.response import response_from
 from avis_ctrl.measurement.formats.time_axis import rounded, sample_rate_from
@@ -50,6 +50,7 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
     """
     path, hints = existing_file(path), hints or Hints()
     with reading(path, "the universal file"):
+        require_small(path)
         found = functions(path)
         kinds = sorted({function.kind for function in found})
         if TIME in kinds:
