@@ -12,7 +12,16 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_serializer,
+    field_validator,
+)
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.file_errors import first_complaint
@@ -78,6 +87,10 @@ class UncertaintySection(_Section):
         if identified is not None and not isinstance(identified, (str, UncertaintyFile)):
             raise ValueError("expected the name of an uncertainty file")
         return identified
+
+    @field_serializer("identified")
+    def _plain(self, identified: str | UncertaintyFile | None) -> Any:
+        return identified.model_dump() if isinstance(identified, UncertaintyFile) else identified
 
     @property
     def identification(self) -> UncertaintyFile | None:

@@ -1,4 +1,4 @@
-"""From an identification to the files that a design starts from: uncertainty.json and design.toml."""
+"""From an identification to uncertainty.json."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.spread import FrfSpread
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.study.output import write_json
+from avis_ctrl.study.files import write_whole
 from avis_ctrl.study.uncertainty_file import (
     DirectionSection,
     ParameterSection,
@@ -60,5 +60,10 @@ def write_uncertainty(path: str | Path, rig: Rig, information: Information, spre
                       provenance: Mapping[str, Any] | None = None) -> UncertaintyFile:
     """Write uncertainty.json, whole or not at all; its content is returned."""
     content = uncertainty_content(rig, information, spreads, provenance)
-    write_json(Path(path), content.model_dump())
+    write_whole(Path(path), uncertainty_json(content).encode())
     return content
+
+
+def uncertainty_json(content: UncertaintyFile) -> str:
+    """The file's text."""
+    return content.model_dump_json(indent=1) + "\n"

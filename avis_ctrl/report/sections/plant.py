@@ -9,9 +9,12 @@ from avis_ctrl.report.block_diagram import block_diagram
 from avis_ctrl.report.families import EXTERNAL, Families
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, decibels, hertz, level, numbered
 from avis_ctrl.report.pieces import Bullets, Drawing, Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.sections.identified import identified
 from avis_ctrl.report.sections.transmissibility import asked_dB, upper_bound
+from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.model import ControllerResult, DesignResult
 from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
 ROLES = {"w": "disturbance", "z": "judged", "u": "command", "y": "measurement", "internal": "internal",
@@ -32,9 +35,10 @@ def generalized_plant(result: DesignResult) -> Section:
                         f"measurements, {len(P.w)} disturbances, {len(P.z)} weighted outputs and "
                         f"{len(P.blocks.blocks)} blocks of uncertainty. The axes are "
                         f"{words.joined([words.axis(a) for a in plant.axes])}.")
+    meanings = Bullets(tuple(f"{n}: {w.meaning}" for n, w in plant.weights.items()))
     pieces: list[Piece] = [summary, drawing, _signals(plant), Heading("Uncertainty"), _blocks(result),
-                           Heading("Weights"), Bullets(tuple(f"{n}: {w.meaning}" for n, w in plant.weights.items())),
-                           _transmissibility_weight(result), _effort(result)]
+                           *identified(result), Heading("Weights"), meanings, _transmissibility_weight(result),
+                           _effort(result)]
     pieces += [*_chains(plant), _noise(result), *_compliance(result)]
     return Section("Generalized plant", "plant", tuple(pieces))
 
@@ -62,8 +66,13 @@ def _blocks(result: DesignResult) -> Table:
     rows = []
     for block in plant.synthesis.blocks.blocks:
         size = f"{block.rows}" if block.is_scalar_delta else f"{block.rows} × {block.cols}"
-        if block.name in real:
-            half = real[block.name].half_range(plant.rig.nominal[block.name])
+        if isinstance(one := real.get(block.name), UncertainDirection):
+            spread = f"{len(one.changes)} parameters together, see the table"
+            meaning = "direction in which the identified parameters are uncertain"
+        elif block.name == RESPONSE:
+            spread, meaning = "|W| of the weight", "what the identified model leaves of the response, of any phase"
+        elif one is not None:
+            half = one.half_range(plant.rig.nominal[block.name])
             nominal, unit = plant.rig.nominal[block.name], words.unit(plant.rig.units[block.name])
             spread = f"{nominal:.6g} ± {half:.4g} {unit}".replace("-", "−")
             meaning = described.get(block.name, "parameter of the rig")

@@ -1,0 +1,90 @@
+"""What a design takes from an identification: directions of parameters, and the spread of the measured response."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, numbered
+from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Table, table
+from avis_ctrl.study.identified_uncertainty import InDesign
+from avis_ctrl.study.model import DesignResult
+
+# Parameters shown for each direction.
+SHOWN = 5
+
+
+def identified(result: DesignResult) -> list[Piece]:
+    """Directions, what they leave, and the spread with its weight; nothing where the design names no identification."""
+    found, content = result.plant.identified, result.design.uncertainty.identification
+    if found is None or content is None:
+        return []
+    pieces: list[Piece] = [Heading("Uncertainty from the identification"), _origin(result, found)]
+    if found.directions:
+        pieces.append(_directions(result, found))
+    return [*pieces, _spread(found)]
+
+
+def _origin(result: DesignResult, found: InDesign) -> Paragraph:
+    content = result.design.uncertainty.identification
+    assert content is not None
+    d = found.found
+    source = content.provenance.get("measurement")
+    determined, kept = len(content.direction), len(found.directions)
+    text = (f"The identification{f' from {source}' if source else ''} determined {determined} combinations of "
+            f"{len(content.parameter)} parameters; {content.undetermined} change nothing that was measured and stay "
+            f"where they were. ")
+    if kept:
+        text += (f"{kept} of them are bounded directions here, within {words.number(d.box)} standard deviations; the "
+                 f"rest together changes the response by at most {_percent(d.rest)} and the transmissibility by at "
+                 f"most {_percent(d.rest_floor)}. ")
+    else:
+        text += (f"All of them together, within {words.number(d.ball)} standard deviations, change the response by at "
+                 f"most {_percent(d.rest)} and the transmissibility by at most {_percent(d.rest_floor)}: none is worth "
+                 "a block of its own. ")
+    text += (f"What is not a direction is added to the spread of the response, which acts on the actuators' side; the "
+             f"floor's side of it is not covered. Directions and rest hold together with a probability of "
+             f"{words.number(100 * d.coverage)} %, if the errors are normal; the spread holds with "
+             f"{words.number(100 * found.confidence)} % at each frequency.")
+    return Paragraph(text)
+
+
+def _percent(share: np.ndarray) -> str:
+    return f"{words.number(100 * float(np.max(share, initial=0.0)), 2)} %"
+
+
+def _directions(result: DesignResult, found: InDesign) -> Table:
+    nominal, units = result.plant.rig.nominal, result.plant.rig.units
+    rows = []
+    for direction, effect in zip(found.directions, found.found.effect, strict=True):
+        sizes = sorted(direction.changes, key=lambda one: -abs(one[1] / (nominal[one[0]] or 1.0)))
+        told = [f"{name} {100 * change / abs(nominal[name]):+.2g} %" if nominal[name] else
+                f"{name} {change:+.2g} {words.unit(units[name])}" for name, change in sizes[:SHOWN]]
+        more = f" and {len(sizes) - SHOWN} parameters less" if len(sizes) > SHOWN else ""
+        rows.append((direction.name, f"{words.number(100 * float(effect), 2)} %",
+                     (", ".join(told) + more).replace("-", "−")))
+    return table("Directions of the identified parameters: each is one real number between −1 and 1 that moves all of "
+                 "them together. The effect is the largest relative change of the response at 1.",
+                 ("direction", "effect", "what +1 does"), rows, "lrl")
+
+
+def _spread(found: InDesign) -> Figure:
+    weight, spread = found.weight, found.spread
+    f = np.geomspace(weight.grid[0], weight.grid[-1], 400) / (2 * np.pi)
+    omega = 2 * np.pi * f
+    confidence = words.number(100 * found.confidence)
+    curves = [Curve(spread.frequency_Hz, 100 * spread.measured, "as measured", Style("#999999", "dot", 1.0)),
+              Curve(spread.frequency_Hz, 100 * spread.bound(found.confidence), f"bound at {confidence} %",
+                    numbered(0)),
+              Curve(f, 100 * weight.envelope(omega), "envelope", STYLES["limit"]),
+              Curve(f, 100 * weight.magnitude(omega), f"|W|, order {weight.shape.order}", STYLES["filter"])]
+    low = 10 ** np.floor(np.log10(100 * np.min(weight.data) / 3))
+    high = 10 ** np.ceil(np.log10(100 * np.max(weight.magnitude(omega))))
+    declared = (" Where the design declares more of its drives, the envelope follows that." if weight.declared else
+                " Beyond the measured band it keeps the value of the band's end.")
+    return Figure("identified_spread", "Relative difference between the measured response and the identified model in "
+                  "the kept coordinates (largest singular value), its bound with the measurement's noise, the envelope "
+                  f"and the filter of lowest order within 1 dB above it: order {weight.shape.order}, at most "
+                  f"{weight.slack_dB:.2f} dB above.{declared}",
+                  (Panel(hertz(float(f[0]), float(f[-1])), Axis("relative difference [%]", "log",
+                                                                (float(low), float(high))), tuple(curves)),))

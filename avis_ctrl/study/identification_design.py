@@ -1,0 +1,140 @@
+"""From an identification to what `avis design` starts from: uncertainty.json and a design.toml beside rig.toml."""
+
+from __future__ import annotations
+
+import json
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.campaign_fit import LONGEST_PIECE
+from avis_ctrl.identification.model_error import measured_response
+from avis_ctrl.identification.spread import FrfSpread, frf_spread
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.study.design_file import ChainUncertainty, Design, design_from_table, read_design
+from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE, UNCERTAINTY_FILE
+from avis_ctrl.study.uncertainty_file import UncertaintyFile
+from avis_ctrl.study.uncertainty_writer import uncertainty_content, uncertainty_json
+
+if TYPE_CHECKING:
+    from avis_ctrl.study.identification import Identification
+
+# Below this nothing is claimed of drives: what drifts between a campaign and its use is not in the measurement.
+LEAST_PERCENT = 1.0
+# Designs of z and phi_x by the kind of rig, as designs/*.toml has them; the rig and the uncertainty are filled in.
+_COMMON: dict[str, Any] = {"keep": ["z", "phi_x"], "simulation": {"duration_s": 40.0, "random_plants": 20, "seed": 1}}
+_AVIS: dict[str, Any] = _COMMON | {
+    "loop": {"amplifier_corner_Hz": 300.0},
+    "uncertainty": {"actuator_chains": {"low_percent": 10.0, "crossover_Hz": 80.0, "high_percent": 400.0}},
+    "transmissibility": {"peak_dB": 3.5, "band_dB": -7.0, "band_Hz": [1.0, 10.0], "transition_octaves": 0.8,
+                         "tolerance_dB": 1.0},
+    "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0, "reduction": 30.0},
+    "synthesis": {"max_iterations": 8, "target_mu": 0.9},
+    "requirement": [{"quantity": "mu_upper", "at_most": 1.0}, {"quantity": "mu_gap_percent", "at_most": 5.0},
+                    {"quantity": "worst_case_peak_transmissibility_dB", "at_most": 4.0},
+                    {"quantity": "worst_case_band_transmissibility_dB", "at_most": -6.0},
+                    {"quantity": "fastest_controller_pole_Hz", "at_most": 250.0}]}
+
+
+def design_files(found: Identification, template: Path | Design | None = None) -> dict[str, str]:
+    """Contents of uncertainty.json and design.toml by name; with rig.toml in one folder, `avis design` runs on them.
+
+    Parameters
+    ----------
+    template : design whose rig and uncertainty are replaced; by default z and phi_x of the AVIS.
+
+    Raises
+    ------
+    InputError : a template that is wrong; coordinates that the measured channels cannot push or tell apart.
+    ComputationError : records that do not tell the actuators apart, so that no spread can be measured.
+    """
+    design = _template(found, template)
+    spread = measured_spread(found, tuple(design.keep))
+    content = uncertainty_content(found.rig, found.campaign_fit.fit.information, [spread], found.provenance)
+    return {UNCERTAINTY_FILE: uncertainty_json(content), DESIGN_FILE: identification_design(content, design)}
+
+
+def measured_spread(found: Identification, keep: tuple[str, ...]) -> FrfSpread:
+    """What the measurement leaves between its response and the identified model's, in some coordinates."""
+    measured, band, model = found.measured, found.campaign_fit.band_Hz, found.model
+    response = (measured.between(*band) if isinstance(measured, FrequencyResponse)
+                else measured_response(measured, model, band, LONGEST_PIECE))
+    return frf_spread(response, model, keep)
+
+
+def identification_design(content: UncertaintyFile, template: Design) -> str:
+    """The text of a design file for an identified rig, from a design with uncertainty set by hand.
+
+    Ranges of parameters that were identified give way to the identification. Of the actuators' chains the frequency
+    of 100 % and the value above it stay, for there nothing was measured; their value at low frequency
+    becomes the median of the measured spread, rounded up, or 1 % where that is less.
+    """
+    asked = template.uncertainty
+    uncertainty: dict[str, Any] = {
+        "parameters_percent": _not_identified(asked.parameters_percent, content),
+        "parameters_absolute": _not_identified(asked.parameters_absolute, content)}
+    if asked.actuator_chains is not None:
+        uncertainty["actuator_chains"] = _chains(asked.actuator_chains, content, template).model_dump()
+    if asked.sensor_chains is not None:
+        uncertainty["sensor_chains"] = asked.sensor_chains.model_dump()
+    uncertainty |= {"identified": UNCERTAINTY_FILE, "confidence_percent": asked.confidence_percent}
+    table = template.model_dump(exclude_none=True) | {"rig": RIG_FILE, "uncertainty": uncertainty}
+    return design_toml(design_from_table(table))
+
+
+def design_toml(design: Design) -> str:
+    """A design as a file that `read_design` reads back."""
+    table = design.model_dump(exclude_none=True)
+    return "\n".join("\n".join(lines) + "\n" for lines in _sections("", table))
+
+
+def _sections(title: str, table: dict[str, Any]) -> list[list[str]]:
+    """Lines of a section and of those inside it; a section without keys of its own is left out."""
+    inner = {key: value for key, value in table.items() if isinstance(value, dict)}
+    many = {key: value for key, value in table.items() if value and isinstance(value, list)
+            and isinstance(value[0], dict)}
+    plain = [f"{_key(key)} = {_value(value)}" for key, value in table.items() if key not in inner and key not in many]
+    found = [[f"[{title}]", *plain] if title else plain] if plain else []
+    before = f"{title}." if title else ""
+    for key, value in inner.items():
+        found += _sections(before + _key(key), value)
+    return found + [[f"[[{before}{_key(key)}]]", *(f"{_key(k)} = {_value(v)}" for k, v in one.items())]
+                    for key, value in many.items() for one in value]
+
+
+def _key(key: str) -> str:
+    return key if key.replace("_", "").isalnum() and key.isascii() else _value(key)
+
+
+def _value(value: Any) -> str:
+    # JSON writes numbers, booleans, strings and lists as TOML does, but for one character, which TOML wants escaped.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _template(found: Identification, template: Path | Design | None) -> Design:
+    if isinstance(template, Design):
+        return template
+    if template is not None:
+        return read_design(template)
+    if "isolator1.k_z" not in found.rig.parameters():
+        raise InputError(f"there is no default design for the rig {found.rig.name}: name a design file",
+                         field="--design")
+    title = f"{found.rig.name}, identified: z and phi_x under one controller"
+    return design_from_table(_AVIS | {"title": title, "rig": RIG_FILE})
+
+
+def _not_identified(ranges: dict[str, float], content: UncertaintyFile) -> dict[str, float]:
+    return {pattern: value for pattern, value in ranges.items()
+            if not any(fnmatchcase(name, pattern) for name in content.names)}
+
+
+def _chains(asked: ChainUncertainty, content: UncertaintyFile, template: Design) -> ChainUncertainty:
+    keep = sorted(template.keep)
+    spread = next(one for one in content.spread if sorted(one.keep) == keep).values()
+    median = 100 * float(np.median(spread.bound(template.uncertainty.confidence_percent / 100)))
+    digit = 10 ** np.floor(np.log10(max(median, 1e-9)))
+    low = float(max(np.ceil(median / digit - 1e-9) * digit, LEAST_PERCENT))
+    return asked.model_copy(update={"low_percent": round(min(low, asked.low_percent), 12)})
