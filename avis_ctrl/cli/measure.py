@@ -35,7 +35,7 @@ def excite(
     from rich.table import Table
 
     from avis_ctrl.measurement.excitation import MultisineSettings, NoiseSettings, multisine, noise
-    from avis_ctrl.measurement.excitation_files import write_signals
+    from avis_ctrl.measurement.excitation.files import write_signals
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.simulation.campaign_data import largest_level, open_loop
     from avis_ctrl.study.campaign_plan import plan_from_table

@@ -16,7 +16,7 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.local_polynomial import local_polynomial, noise_covariance
+from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial, noise_covariance
 
 # Longer records are cut: their spectra would fill the memory and their lines say the same.
 LONGEST_PIECE = 1 << 18

@@ -15,7 +15,7 @@ from avis_ctrl.identification.prediction import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.local_polynomial import local_polynomial
+from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 
 
 class Unexplained(RecordSource):

@@ -8,10 +8,10 @@ import numpy as np
 
 from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.measurement.best_linear import best_linear_approximation
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.local_polynomial import local_polynomial
+from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
+from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 
 # Frequencies of a figure.
 POINTS = 400

@@ -8,8 +8,8 @@ from known_systems import Modal, campaign, multisine, squared_error
 from scipy import stats
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.measurement.best_linear import best_linear_approximation, best_linear_approximations
 from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation, best_linear_approximations
 
 RATE, N = 256.0, 512
 LINES = np.arange(4, 201)

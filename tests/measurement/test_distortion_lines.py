@@ -7,7 +7,7 @@ import pytest
 from known_systems import Modal, campaign
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.distortion_lines import distortion_levels
+from avis_ctrl.measurement.frequency_response.distortion_lines import distortion_levels
 
 RATE, N = 256.0, 1024
 ODD = np.arange(9, 401, 2)

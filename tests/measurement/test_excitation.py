@@ -13,7 +13,6 @@ from scipy import signal, stats
 from scipy.io import loadmat
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.crest_factor import crest_factor, low_crest_phases, schroeder_phases, synthesise
 from avis_ctrl.measurement.excitation import (
     MultisineSettings,
     NoiseSettings,
@@ -22,7 +21,8 @@ from avis_ctrl.measurement.excitation import (
     noise,
     orthogonal_matrix,
 )
-from avis_ctrl.measurement.excitation_files import write_signals
+from avis_ctrl.measurement.excitation.crest_factor import crest_factor, low_crest_phases, schroeder_phases, synthesise
+from avis_ctrl.measurement.excitation.files import write_signals
 
 
 def wanted(n_u=3, **changes) -> MultisineSettings:

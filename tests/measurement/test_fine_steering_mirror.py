@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from fine_steering_mirror import mirror
 
-from avis_ctrl.measurement.best_linear import best_linear_approximation
-from avis_ctrl.measurement.local_polynomial import local_polynomial
-from avis_ctrl.measurement.resonance import resonance
+from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
+from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
+from avis_ctrl.measurement.frequency_response.resonance import resonance
 
 MODES_HZ = (805.0, 921.0, 1315.0, 1671.0, 2274.0)
 

@@ -13,9 +13,9 @@ from scipy import stats
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
-from avis_ctrl.measurement.local_fit import LocalFit, local_model
-from avis_ctrl.measurement.local_polynomial import local_polynomial, local_rational, noise_covariance
-from avis_ctrl.measurement.pooling import pool
+from avis_ctrl.measurement.frequency_response.local_fit import LocalFit, local_model
+from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial, local_rational, noise_covariance
+from avis_ctrl.measurement.frequency_response.pooling import pool
 
 RATE = 200.0
 

@@ -7,7 +7,7 @@ import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.resonance import resonance
+from avis_ctrl.measurement.frequency_response.resonance import resonance
 
 
 def modes(f, parameters, rng, n_y=2, n_u=2):

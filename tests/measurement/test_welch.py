@@ -8,7 +8,7 @@ from known_systems import Modal, campaign, squared_error
 from scipy import signal, stats
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.measurement.welch import effective_averages, spectral_average
+from avis_ctrl.measurement.frequency_response.welch import effective_averages, spectral_average
 
 RATE = 200.0
 

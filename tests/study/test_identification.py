@@ -11,7 +11,7 @@ import pytest
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import read_measurements, write_campaign
-from avis_ctrl.measurement.local_polynomial import local_polynomial
+from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation import rehearse
 from avis_ctrl.study.campaign_plan import default_plan

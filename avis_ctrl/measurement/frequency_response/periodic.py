@@ -18,7 +18,7 @@ from scipy import fft, stats
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
-from avis_ctrl.measurement.spectra import Channels
+from avis_ctrl.measurement.frequency_response.spectra import Channels
 
 # Lines over which powers are added before they are compared, and the chance of dropping a settled period.
 BLOCK, FALSE_ALARM = 8, 1e-3

@@ -32,7 +32,7 @@ SILENT = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class LocalEstimate:
-    """Local estimates on lines; the covariance is that of measurement.frequency_response.FrequencyResponse.
+    """Local estimates on lines; the covariance is that of `FrequencyResponse`.
 
     frequency_Hz : (n,); value : (n, n_y, n_u); noise : (n, n_y, n_y) covariance of V on one line of one record;
     gram : (n, n_u, n_u) Gram matrix of the inputs' part that neither slopes nor transients explain;

@@ -8,7 +8,7 @@ With averaged spectra S_uu = mean u u^H, S_yu = mean y u^H, S_yy:
 
 (Bendat and Piersol, Random Data, 4th ed., 2010, chapter 7; Vold, Crowley and Rocklin, Sound and Vibration 18, 1984.)
 Windows leave a bias from leakage and from the curvature of G over the window's main lobe, which no covariance here
-includes: measurement.local_polynomial is the better method for resonances; this one is what other tools compute.
+includes: `local_polynomial` is the better method for resonances; this one is what other tools compute.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from scipy import fft, signal
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
-from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.spectra import (
+from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
+from avis_ctrl.measurement.frequency_response.spectra import (
     Band,
     Channels,
     channels,

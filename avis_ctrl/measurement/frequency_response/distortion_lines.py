@@ -14,10 +14,10 @@ from typing import Literal
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.best_linear import Transient, chosen_treatment
 from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.measurement.periodic import average
-from avis_ctrl.measurement.spectra import Band, channels, checked_band, lines
+from avis_ctrl.measurement.frequency_response.best_linear import Transient, chosen_treatment
+from avis_ctrl.measurement.frequency_response.periodic import average
+from avis_ctrl.measurement.frequency_response.spectra import Band, channels, checked_band, lines
 
 Kind = Literal["excited", "odd", "even"]
 # Amplitude of an input relative to its largest line, above which a line counts as excited.

@@ -1,8 +1,8 @@
 """Frequency responses and noise covariances of campaigns by local models, for any excitation.
 
-Every record, or piece of a long one, has its own transient; G is shared (measurement.local_fit). Nothing is assumed
-periodic, so records of noise, multisines from rest and floor motion can be pooled; with a periodic excitation
-measurement.best_linear separates nonlinear distortion as well.
+Every record, or piece of a long one, has its own transient; G is shared (`local_fit`). Nothing is assumed periodic, so
+records of noise, multisines from rest and floor motion can be pooled; with a periodic excitation `best_linear`
+separates nonlinear distortion as well.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
-from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.local_fit import LocalFit, least_half_width
-from avis_ctrl.measurement.spectra import (
+from avis_ctrl.measurement.frequency_response.local_fit import LocalFit, least_half_width
+from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
+from avis_ctrl.measurement.frequency_response.spectra import (
     Band,
     Channels,
     channels,

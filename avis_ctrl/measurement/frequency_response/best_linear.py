@@ -25,9 +25,16 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
-from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.periodic import PeriodMean, average, periodic_records, settled_after
-from avis_ctrl.measurement.spectra import Band, Channels, channels, checked_band, hermitian_solve, lines
+from avis_ctrl.measurement.frequency_response.periodic import PeriodMean, average, periodic_records, settled_after
+from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
+from avis_ctrl.measurement.frequency_response.spectra import (
+    Band,
+    Channels,
+    channels,
+    checked_band,
+    hermitian_solve,
+    lines,
+)
 
 Transient = Literal["auto", "drop", "remove", "none"]
 # A line is excited where the mean power of an input exceeds this part of its largest, and this many times its noise.

@@ -18,7 +18,7 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
 
 # Half-power bandwidths to each side that the fit tries, narrow first: the wider one is kept while the misfit says that
 # the background is still a straight line there. Fewest lines of a fit.

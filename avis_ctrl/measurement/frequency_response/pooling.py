@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.spectra import hermitian_solve
+from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
+from avis_ctrl.measurement.frequency_response.spectra import hermitian_solve
 
 
 def pool(responses: Sequence[FrequencyResponse], method: str = "") -> FrequencyResponse:

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.linalg import dft, hadamard
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.crest_factor import crest_factor, low_crest_phases, synthesise
+from avis_ctrl.measurement.excitation.crest_factor import crest_factor, low_crest_phases, synthesise
 
 Lines = Literal["full", "odd", "odd_detection"]
 Scheme = Literal["orthogonal", "zippered"]

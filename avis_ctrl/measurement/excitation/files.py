@@ -10,7 +10,7 @@ import numpy as np
 from scipy.io import savemat
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.excitation import ExcitationSignals
+from avis_ctrl.measurement.excitation.design import ExcitationSignals
 
 SUFFIXES = (".h5", ".hdf5", ".csv", ".mat")
 # A variable of a .mat file of version 5 holds less than 2^31 bytes.
