@@ -121,18 +121,23 @@ def excited_band(campaign: Campaign) -> tuple[float, float]:
     return max(low, 0.2), min(high, campaign.sample_rate_Hz / 4)
 
 
-def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float],
-                    progress: Progress | None = None) -> tuple[list[SpectralBlock], list[str]]:
-    """Spectral blocks of every record, long ones in pieces, and sentences on what was done to keep memory bounded."""
-    lines = sum(record.header.duration_s * (band_Hz[1] - band_Hz[0]) for record in campaign.records)
-    if lines > MOST_LINES:
-        if progress:
-            progress(f"{lines:.3g} lines: averaging the records into frequency responses, piece by piece")
-        grid = np.geomspace(*band_Hz, 1000)
-        measured = local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=grid, longest_piece=LONGEST_PIECE)
-        averaged = (f"the records hold {lines:.3g} lines in the band; they were averaged into frequency responses at "
-                    f"{len(measured.frequency_Hz)} frequencies ({measured.method})")
-        return [response_block(measured, model)], [averaged]
+def averaged(campaign: Campaign, band_Hz: tuple[float, float]) -> FrequencyResponse | None:
+    """Frequency responses in the place of records that hold more lines than are fitted one by one; None otherwise.
+
+    Made piece by piece: of records of any length only one piece is in memory.
+    """
+    if sum(record.header.duration_s * (band_Hz[1] - band_Hz[0]) for record in campaign.records) <= MOST_LINES:
+        return None
+    # No closer than two lines of a piece, and off the ends of the band.
+    step = 2 * campaign.sample_rate_Hz / LONGEST_PIECE
+    multiples = np.unique(np.round(np.geomspace(band_Hz[0] + step, band_Hz[1] - step, 1000) / step))
+    grid = multiples[(multiples * step > band_Hz[0] + step) & (multiples * step < band_Hz[1] - step)] * step
+    return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=grid, longest_piece=LONGEST_PIECE)
+
+
+def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float]
+                    ) -> tuple[list[SpectralBlock], list[str]]:
+    """Spectral blocks of every record, long ones in pieces, and sentences on what was left out."""
     blocks = []
     for record in campaign.records:
         for piece in record.pieces(max(LONGEST_PIECE, record.header.period_samples or 0)):
@@ -209,9 +214,10 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     InputError, ComputationError : as `fit`, `record_block`, `response_block`.
     """
     if isinstance(campaign, FrequencyResponse):
-        blocks, notes = [response_block(campaign.between(*band_Hz), model)], ["frequency responses as measured"]
+        blocks = [response_block(campaign.between(*band_Hz), model)]
+        notes = [f"frequency responses: {campaign.method or 'as measured'}"]
     else:
-        raw, notes = campaign_blocks(campaign, model, band_Hz, progress)
+        raw, notes = campaign_blocks(campaign, model, band_Hz)
         blocks, said = weighted(raw, campaign, band_Hz)
         notes = [*notes, said]
     found = fit(model, blocks, priors, starts, seed=seed, progress=progress)
@@ -219,7 +225,7 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     if isinstance(campaign, FrequencyResponse) or not blocks[0].transient:
         return CampaignFit(found, first, band_Hz, tuple(notes), model)
     for k in range(reweights):
-        found = fit(found.model, residual_noise(found.residuals), priors, seed=seed)
+        found = fit(found.model, residual_noise(found.residuals, model=found.model), priors, seed=seed)
         if progress:
             progress(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
     return CampaignFit(replace(found, starts=first.starts), first, band_Hz, tuple(notes), model)

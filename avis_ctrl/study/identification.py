@@ -16,7 +16,14 @@ from threadpoolctl import threadpool_limits
 
 import avis_ctrl
 from avis_ctrl.errors import AvisError, InputError
-from avis_ctrl.identification.campaign_fit import CampaignFit, Split, excited_band, fit_campaign, split_campaign
+from avis_ctrl.identification.campaign_fit import (
+    CampaignFit,
+    Split,
+    averaged,
+    excited_band,
+    fit_campaign,
+    split_campaign,
+)
 from avis_ctrl.identification.ekf import identify_ekf
 from avis_ctrl.identification.ekf_result import EkfResult
 from avis_ctrl.identification.ekf_settings import HONEST_SETTINGS
@@ -29,6 +36,7 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.validation import Validation, validate
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 from avis_ctrl.measurement.gates import Expectation, Finding, examine
 from avis_ctrl.rigs.rig import Rig
 
@@ -114,6 +122,7 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
     with threadpool_limits(1):
         model = start_model(measured, rig, options)
         findings = gates(measured, model, options, progress)
+        progress("which records to fit, which to hold out, and the band")
         split, fitted, held_out, band = _divide(measured, options)
         progress(f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
                  + (f"; {split.how}" if split else ""))
@@ -123,7 +132,7 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
                                         {name: sigma for name, (_, sigma) in found.fit.priors.items()})
         progress(f"{found.fit.information.rank} of {len(model.names)} combinations of parameters are determined")
         advice = _advice(found, fitted, report, progress)
-        kalman, note = _kalman(fitted, rig, model.names, options, progress)
+        kalman, note = _kalman(split.fitted if split else measured, rig, model.names, options, progress)
         progress("validation on what no fit has seen")
         validation = validate(found, fitted, held_out)
     identified = found.fit.model.rig
@@ -176,7 +185,13 @@ def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions):
         third = np.arange(len(inside.frequency_Hz)) % 3 == 2
         return None, inside.at(~third), inside.at(third), band
     split = split_campaign(measured, options.hold_out)
-    return split, split.fitted, split.held_out, options.band_Hz or excited_band(split.fitted)
+    band = options.band_Hz or excited_band(split.fitted)
+    fitted = averaged(split.fitted, band)
+    if fitted is None:
+        return split, split.fitted, split.held_out, band
+    # The records of the other side may be short: their responses are what can be compared.
+    held_out = averaged(split.held_out, band) or local_polynomial(split.held_out, band_Hz=band)
+    return split, fitted, held_out, band
 
 
 def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, report: IdentifiabilityReport,
