@@ -59,7 +59,7 @@ def identify(
         from avis_ctrl.report import identification_html, identification_pdf
         from avis_ctrl.study.identification import IdentifyOptions, identify
         from avis_ctrl.study.identification_output import write_identification
-        from avis_ctrl.study.identified_uncertainty import design_files
+        from avis_ctrl.study.identification_design import design_files
 
         options = IdentifyOptions(tuple(parameters or ()), dict(_prior(text) for text in priors or ()),
                                   tuple(hold_out) if hold_out else None, band_Hz, starts, kalman, despite_gates, seed)
