@@ -1,10 +1,16 @@
-"""The design report: one source of content, an HTML and a PDF renderer."""
+"""The reports of a design and of an identification: one source of content each, an HTML and a PDF renderer."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from avis_ctrl.report import html, pdf
 from avis_ctrl.report.content import document
 from avis_ctrl.study.model import DesignResult
+
+if TYPE_CHECKING:
+    from avis_ctrl.study.identification import Identification
+    from avis_ctrl.study.identified_uncertainty import InDesign
 
 
 def render_html(result: DesignResult) -> bytes:
@@ -22,4 +28,23 @@ def render_pdf(result: DesignResult) -> bytes:
     return pdf.render(document(result))
 
 
-__all__ = ["render_html", "render_pdf"]
+def identification_html(found: Identification, in_design: InDesign | None = None) -> bytes:
+    """The report of an identification as one self-contained HTML file."""
+    from avis_ctrl.report.identification.content import document as content
+
+    return html.render(content(found, in_design))
+
+
+def identification_pdf(found: Identification, in_design: InDesign | None = None) -> bytes:
+    """The same as PDF.
+
+    Raises
+    ------
+    ComputationError : the typesetter refuses.
+    """
+    from avis_ctrl.report.identification.content import document as content
+
+    return pdf.render(content(found, in_design))
+
+
+__all__ = ["identification_html", "identification_pdf", "render_html", "render_pdf"]

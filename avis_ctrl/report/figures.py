@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 Dash = Literal["solid", "dash", "dot", "dashdot"]
+Scale = Literal["linear", "log"]
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,16 @@ def numbered(k: int) -> Style:
 
 @dataclass(frozen=True)
 class Axis:
-    """Label with its unit, scale and range (None: as the data asks)."""
+    """Label with its unit, scale and range (None: as the data asks).
+
+    ticks : places with words, instead of numbers. silent : grid lines only; a neighbour's numbers serve.
+    """
 
     label: str
-    scale: Literal["linear", "log"] = "linear"
+    scale: Scale = "linear"
     range: tuple[float, float] | None = None
+    ticks: tuple[tuple[float, str], ...] = ()
+    silent: bool = False
 
 
 HERTZ = Axis("frequency [Hz]", "log", (0.1, 100.0))
@@ -61,7 +67,10 @@ HERTZ = Axis("frequency [Hz]", "log", (0.1, 100.0))
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """x, y (n,); a value that is not finite leaves a gap. Without a label it is not in the legend."""
+    """x, y (n,); a value that is not finite leaves a gap. Without a label it is not in the legend.
+
+    error : (n,) half lengths of error bars along `along`. bars : width of bars drawn from the axis, 0 for none.
+    """
 
     x: np.ndarray
     y: np.ndarray
@@ -69,6 +78,9 @@ class Curve:
     style: Style
     points: bool = False
     line: bool = True
+    error: np.ndarray | None = None
+    along: Literal["x", "y"] = "y"
+    bars: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +107,18 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """Panels under each other, one legend and a caption that says what is seen."""
+    """Panels under each other, or row by row in columns; one legend and a caption that says what is seen.
+
+    height : of a panel, relative to the usual one. shared : the panels of a row or column have the same scales, and
+    stand close together.
+    """
 
     name: str
     caption: str
     panels: tuple[Panel, ...]
+    columns: int = 1
+    height: float = 1.0
+    shared: bool = False
 
     def legend(self) -> list[Curve | Band]:
         """What the legend shows: each label once, in order."""
@@ -145,6 +164,7 @@ def log_range(panel: Panel) -> tuple[float, float]:
         return panel.y.range
     values = [np.asarray(v, float) for v in (*(c.y for c in panel.curves), *(b.low for b in panel.bands),
                                              *(b.high for b in panel.bands))]
+    values += [c.y + sign * c.error for c in panel.curves if c.error is not None and c.along == "y" for sign in (1, -1)]
     kept = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values] or [np.array([])])
     if not kept.size:
         return 0.1, 10.0

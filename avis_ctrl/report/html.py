@@ -20,7 +20,7 @@ def render(document: Document) -> bytes:
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True,
                                      undefined=jinja2.StrictUndefined)
     template = environment.from_string((files / "report.html.j2").read_text(encoding="utf-8"))
-    formulas = [p for section in document.sections for p in section.pieces if isinstance(p, Formula)]
+    formulas = [p for section in document.sections for p in section.flat() if isinstance(p, Formula)]
     graphs = {f.name: plotly_backend.graph(f) for f in document.figures() if isinstance(f, Figure)}
     text = template.render(
         document=document, kind=lambda piece: type(piece).__name__, Markup=Markup,

@@ -30,21 +30,39 @@ def svg(figure: Figure) -> str:
         entries = figure.legend()
         # As many columns as the longest label leaves room for.
         longest = max((len(e.label) for e in entries), default=0)
-        columns = max(1, min(len(entries), int(WIDTH_IN / (KEY_IN + CHARACTER_IN * longest))))
-        rows = -(-len(entries) // columns) if len(entries) > 1 else 0
-        height = (TITLE_IN + PLOT_IN + FOOT_IN) * len(figure.panels) + LEGEND_IN * rows + 0.05
+        keys = max(1, min(len(entries), int(WIDTH_IN / (KEY_IN + CHARACTER_IN * longest))))
+        legend = LEGEND_IN * -(-len(entries) // keys) if len(entries) > 1 else 0
+        places, height = _places(figure, legend)
         canvas = Canvas(figsize=(WIDTH_IN, height))
         # Fixed places: a layout engine would take most of the time of the whole report.
-        for k, panel in enumerate(figure.panels):
-            bottom = height - (TITLE_IN + PLOT_IN) * (k + 1) - FOOT_IN * k
-            _draw(canvas.add_axes((LEFT_IN / WIDTH_IN, bottom / height, 1 - (LEFT_IN + RIGHT_IN) / WIDTH_IN,
-                                   PLOT_IN / height)), panel)
-        if rows:
+        for panel, place in zip(figure.panels, places, strict=True):
+            _draw(canvas.add_axes(place), panel, figure.shared)
+        if legend:
             canvas.legend([_key(e) for e in entries], [e.label for e in entries], loc="lower center", borderaxespad=0.1,
-                          ncols=columns, frameon=False, handlelength=2.6)
+                          ncols=keys, frameon=False, handlelength=2.6)
         buffer = io.StringIO()
         canvas.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()
+
+
+def _places(figure: Figure, legend: float) -> tuple[list[tuple[float, float, float, float]], float]:
+    """Left, bottom, width and height of each panel as shares of the canvas, and the canvas' height [in]."""
+    columns = figure.columns
+    rows, plot = -(-len(figure.panels) // columns), PLOT_IN * figure.height
+    words = max((len(word) for panel in figure.panels for _, word in panel.y.ticks), default=0)
+    left = max(LEFT_IN, 0.12 + CHARACTER_IN * words + (0.16 if any(p.y.label for p in figure.panels) else 0.0))
+    title, foot = (0.18, 0.04) if figure.shared else (TITLE_IN, FOOT_IN)
+    # Panels that share their scales need room for numbers at the edges only.
+    beside = 0.05 if figure.shared else left + RIGHT_IN
+    width = (WIDTH_IN - left - RIGHT_IN - beside * (columns - 1)) / columns
+    below = FOOT_IN if figure.shared else 0.0
+    height = (title + plot + foot) * rows + below + legend + 0.05
+    places = []
+    for k in range(len(figure.panels)):
+        row, column = k // columns, k % columns
+        bottom = height - (title + plot) * (row + 1) - foot * row
+        places.append(((left + column * (width + beside)) / WIDTH_IN, bottom / height, width / WIDTH_IN, plot / height))
+    return places, height
 
 
 def _line(style: Style) -> dict[str, Any]:
@@ -52,6 +70,8 @@ def _line(style: Style) -> dict[str, Any]:
 
 
 def _key(entry: Curve | Band) -> Any:
+    if isinstance(entry, Curve) and entry.bars:
+        return Patch(facecolor=entry.style.colour)
     if isinstance(entry, Band):
         return Patch(facecolor=entry.style.colour, alpha=0.25)
     if not entry.line:
@@ -59,20 +79,28 @@ def _key(entry: Curve | Band) -> Any:
     return Line2D([], [], marker="o" if entry.points else None, markersize=3, **_line(entry.style))
 
 
-def _draw(ax: Any, panel: Panel) -> None:
+def _draw(ax: Any, panel: Panel, small: bool) -> None:
     for band in panel.bands:
         ax.fill_between(band.x, band.low, band.high, color=band.style.colour, alpha=0.25, linewidth=0)
     for curve in panel.curves:
         look = _line(curve.style)
         if not curve.line:
             look["linestyle"] = "none"
+        if curve.bars:
+            ax.bar(curve.x, curve.y, curve.bars, color=curve.style.colour)
+            continue
+        if curve.error is not None:
+            error = {f"{curve.along}err": np.where(np.isfinite(curve.error), curve.error, np.nan)}
+            ax.errorbar(curve.x, curve.y, **error, fmt="none", ecolor=curve.style.colour, elinewidth=0.9, capsize=1.8)
         ax.plot(curve.x, np.where(np.isfinite(curve.y), curve.y, np.nan), marker="o" if curve.points else None,
                 markersize=3, **look)
     _scale(ax, "x", panel.x, panel.x.range)
     _scale(ax, "y", panel.y, log_range(panel) if panel.y.scale == "log" else panel.y.range)
     ax.grid(True, linewidth=0.4, color="#dddddd")
     if panel.title:
-        ax.set_title(panel.title, fontsize=8.5, loc="left")
+        ax.set_title(panel.title, fontsize=6.5 if small else 8.5, loc="left", pad=2.5 if small else None)
+    if small:
+        ax.tick_params(labelsize=5.5)
 
 
 def _scale(ax: Any, which: str, axis: Axis, limits: tuple[float, float] | None) -> None:
@@ -84,3 +112,8 @@ def _scale(ax: Any, which: str, axis: Axis, limits: tuple[float, float] | None) 
     if axis.scale == "log" and limits is not None:
         target.set_ticks(*ticks_log(*limits))
         target.set_minor_formatter(matplotlib.ticker.NullFormatter())
+    if axis.ticks:
+        target.set_ticks(*zip(*axis.ticks, strict=True))
+    if axis.silent:
+        target.set_ticklabels([])
+        target.label.set_visible(False)

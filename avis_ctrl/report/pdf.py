@@ -13,7 +13,19 @@ import typst
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.report import matplotlib_backend
 from avis_ctrl.report.figures import Figure
-from avis_ctrl.report.pieces import Bullets, Cell, Document, Drawing, Formula, Heading, Mark, Paragraph, Piece, Table
+from avis_ctrl.report.pieces import (
+    Bullets,
+    Cell,
+    Document,
+    Drawing,
+    Fold,
+    Formula,
+    Heading,
+    Mark,
+    Paragraph,
+    Piece,
+    Table,
+)
 
 
 def render(document: Document) -> bytes:
@@ -58,6 +70,8 @@ def _piece(piece: Piece) -> dict[str, Any]:
         case Figure():
             return {"kind": "figure", "caption": piece.caption, "svg": matplotlib_backend.svg(piece),
                     "alternative": piece.caption}
+        case Fold(title, pieces):
+            return {"kind": "fold", "title": title, "pieces": [_piece(p) for p in pieces]}
     raise TypeError(f"no piece of a report: {type(piece).__name__}")
 
 

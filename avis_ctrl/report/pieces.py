@@ -85,7 +85,15 @@ class Drawing:
     alternative: str
 
 
-Piece = Heading | Paragraph | Bullets | Formula | Table | Figure | Drawing
+@dataclass(frozen=True)
+class Fold:
+    """Pieces that are there to be looked up: closed at first on a screen, in small print on paper."""
+
+    title: str
+    pieces: tuple[Piece, ...]
+
+
+Piece = Heading | Paragraph | Bullets | Formula | Table | Figure | Drawing | Fold
 
 
 @dataclass(frozen=True)
@@ -95,6 +103,10 @@ class Section:
     title: str
     anchor: str
     pieces: tuple[Piece, ...]
+
+    def flat(self) -> list[Piece]:
+        """All pieces in order, those inside folds in their place."""
+        return [q for p in self.pieces for q in ((p, *p.pieces) if isinstance(p, Fold) else (p,))]
 
 
 @dataclass(frozen=True)
@@ -112,7 +124,7 @@ class Document:
 
     def figures(self) -> list[Figure | Drawing]:
         """All figures and drawings in order."""
-        return [p for s in self.sections for p in s.pieces if isinstance(p, (Figure, Drawing))]
+        return [p for s in self.sections for p in s.flat() if isinstance(p, (Figure, Drawing))]
 
 
 def table(caption: str, header: Sequence[str], rows: Sequence[Sequence[Cell]], align: str = "") -> Table:

@@ -16,21 +16,11 @@ PANEL_PX, LEGEND_ROW_PX = 300, 22
 
 
 def graph(figure: Figure) -> dict[str, Any]:
-    """Traces and layout of a figure, as plotly.js takes them."""
-    count, traces = len(figure.panels), []
-    layout: dict[str, Any] = {"height": PANEL_PX * count + 90 + LEGEND_ROW_PX * (len(figure.legend()) // 3),
-                              "annotations": [], "showlegend": len(figure.legend()) > 1}
+    """Traces and layout of a figure, as plotly.js takes them; `narrow` is the layout for a narrow screen."""
+    traces: list[dict[str, Any]] = []
     shown: set[str] = set()
-    gap = 0.26 / count if count > 1 else 0.0
     for k, panel in enumerate(figure.panels):
         suffix = "" if k == 0 else str(k + 1)
-        top = 1.0 - k * (1.0 + gap) / count
-        domain = [max(0.0, top - (1.0 + gap) / count + gap), top]
-        layout[f"xaxis{suffix}"] = {**_axis(panel.x, panel.x.range), "anchor": f"y{suffix}"}
-        limits = log_range(panel) if panel.y.scale == "log" else panel.y.range
-        layout[f"yaxis{suffix}"] = {**_axis(panel.y, limits), "anchor": f"x{suffix}", "domain": domain}
-        if panel.title:
-            layout["annotations"].append(_title(panel, domain[1]))
         things: list[Band | Curve] = [*panel.bands, *panel.curves]
         for thing in things:
             drawn = _band(thing) if isinstance(thing, Band) else [_curve(thing)]
@@ -38,7 +28,32 @@ def graph(figure: Figure) -> dict[str, Any]:
                 in_legend = bool(thing.label) and trace.pop("key") and thing.label not in shown
                 shown.update([thing.label] if in_legend else [])
                 traces.append({**trace, "xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "showlegend": in_legend})
-    return {"data": traces, "layout": layout}
+    found = {"data": traces, "layout": _layout(figure, figure.columns)}
+    return found | {"narrow": _layout(figure, 1)} if figure.columns > 1 and not figure.shared else found
+
+
+def _layout(figure: Figure, columns: int) -> dict[str, Any]:
+    rows = -(-len(figure.panels) // columns)
+    layout: dict[str, Any] = {
+        "height": round(PANEL_PX * figure.height * rows) + 90 + LEGEND_ROW_PX * (len(figure.legend()) // 3),
+        "annotations": [], "showlegend": len(figure.legend()) > 1}
+    gap = (0.14 if figure.shared else 0.26) / rows if rows > 1 else 0.0
+    between = 0.0 if columns == 1 else 0.012 if figure.shared else 0.11
+    width = (1.0 - between * (columns - 1)) / columns
+    for k, panel in enumerate(figure.panels):
+        suffix, row, column = "" if k == 0 else str(k + 1), k // columns, k % columns
+        top = 1.0 - row * (1.0 + gap) / rows
+        domain = [max(0.0, top - (1.0 + gap) / rows + gap), top]
+        side = {} if columns == 1 else {"domain": [column * (width + between), column * (width + between) + width]}
+        small = {"tickfont": {"size": 9}} if figure.shared else {}
+        bars = {"barmode": "overlay"} if any(c.bars for c in panel.curves) else {}
+        layout |= bars
+        layout[f"xaxis{suffix}"] = {**_axis(panel.x, panel.x.range), "anchor": f"y{suffix}", **side, **small}
+        limits = log_range(panel) if panel.y.scale == "log" else panel.y.range
+        layout[f"yaxis{suffix}"] = {**_axis(panel.y, limits), "anchor": f"x{suffix}", "domain": domain, **small}
+        if panel.title:
+            layout["annotations"].append(_title(panel, domain[1], side.get("domain", [0])[0], figure.shared))
+    return layout
 
 
 @cache
@@ -57,7 +72,18 @@ def _curve(curve: Curve) -> dict[str, Any]:
     mode = "+".join(["lines"] * curve.line + ["markers"] * curve.points)
     return {"type": "scatter", "mode": mode, "x": _numbers(curve.x), "y": _numbers(curve.y), "name": _text(curve.label),
             "legendgroup": curve.label, "key": True, "marker": {"size": 6, "color": curve.style.colour},
-            "line": {"color": curve.style.colour, "dash": curve.style.dash, "width": curve.style.width}}
+            "line": {"color": curve.style.colour, "dash": curve.style.dash, "width": curve.style.width}} | _more(curve)
+
+
+def _more(curve: Curve) -> dict[str, Any]:
+    """Error bars, and bars in the place of a line."""
+    more: dict[str, Any] = {}
+    if curve.error is not None:
+        more[f"error_{curve.along}"] = {"type": "data", "array": _numbers(curve.error), "color": curve.style.colour,
+                                        "thickness": 1.3, "width": 3}
+    if curve.bars:
+        more |= {"type": "bar", "width": curve.bars, "marker": {"color": curve.style.colour}}
+    return more
 
 
 def _band(band: Band) -> list[dict[str, Any]]:
@@ -77,12 +103,17 @@ def _axis(axis: Axis, limits: tuple[float, float] | None) -> dict[str, Any]:
     if axis.scale == "log" and limits is not None:
         values, text = ticks_log(*limits)
         found |= {"tickvals": values, "ticktext": text, "tickmode": "array"}
+    if axis.ticks:
+        found |= {"tickvals": [place for place, _ in axis.ticks], "tickmode": "array",
+                  "ticktext": [_text(word) for _, word in axis.ticks]}
+    if axis.silent:
+        found |= {"showticklabels": False, "title": {"text": ""}}
     return found
 
 
-def _title(panel: Panel, top: float) -> dict[str, Any]:
-    return {"text": _text(panel.title), "xref": "paper", "yref": "paper", "x": 0, "y": top, "xanchor": "left",
-            "yanchor": "bottom", "showarrow": False, "font": {"size": 13}}
+def _title(panel: Panel, top: float, left: float, small: bool) -> dict[str, Any]:
+    return {"text": _text(panel.title), "xref": "paper", "yref": "paper", "x": left, "y": top, "xanchor": "left",
+            "yanchor": "bottom", "showarrow": False, "font": {"size": 11 if small else 13}}
 
 
 def _text(text: str) -> str:

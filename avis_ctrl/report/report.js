@@ -11,8 +11,9 @@
   const graphs = JSON.parse(document.getElementById("graphs").textContent);
   const axis = { gridcolor: "#e3e3e6", linecolor: "#555", zeroline: false, ticks: "outside", ticklen: 4, showline: true };
   const draw = frame => {
-    const { data, layout } = graphs[frame.dataset.name];
+    const { data, layout: wide, narrow } = graphs[frame.dataset.name];
     const phone = frame.clientWidth < 560;
+    const layout = phone && narrow || wide;
     const axes = Object.fromEntries(Object.entries(layout).filter(([k]) => /^[xy]axis/.test(k))
       .map(([k, v]) => [k, { ...axis, ...v }]));
     const entries = data.filter(t => t.showlegend).length;
@@ -33,7 +34,7 @@
     draw(e.target);
   }), { rootMargin: "1500px" });
   frames.forEach(f => seen.observe(f));
-  window.addEventListener("beforeprint", () => frames.filter(f => !f.childElementCount).forEach(draw));
+  window.addEventListener("beforeprint", () => frames.filter(f => !f.childElementCount && f.clientWidth).forEach(draw));
 })().catch(error => { document.querySelectorAll(".graph").forEach(f => {
   if (!f.childElementCount) { f.textContent = "The figure could not be drawn: " + error; f.classList.add("broken"); }
 }); });

@@ -21,6 +21,21 @@ def number(value: float, digits: int = 3) -> str:
     return f"{rounded:.{places}f}".replace("-", "−")
 
 
+def with_deviation(value: float, sigma: float) -> tuple[str, str]:
+    """A value and its standard deviation, both to the second significant digit of the latter."""
+    if not (np.isfinite(sigma) and sigma > 0 and np.isfinite(value)):
+        return number(value, 5), number(sigma, 2)
+    places = 1 - int(np.floor(np.log10(float(f"{sigma:.1e}"))))
+    if places > 6 or abs(value) >= 1e7:
+        # Many zeros are read wrongly: both as multiples of the value's power of ten.
+        power = int(np.floor(np.log10(abs(value)))) if value else int(np.floor(np.log10(sigma)))
+        digits = max(places + power, 0)
+        first, second = (f"{v / 10.0 ** power:.{digits}f}e{power}".replace("-", "−") for v in (value, sigma))
+    else:
+        first, second = (f"{round(v, places):.{max(places, 0)}f}".replace("-", "−") for v in (value, sigma))
+    return first, second
+
+
 def bound(value: float, digits: int = 3) -> str:
     """A bound of mu or of a gain; infinite where the set holds an unstable plant."""
     return "unstable" if np.isinf(value) else number(value, digits)

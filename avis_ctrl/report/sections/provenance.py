@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Section, table
 from avis_ctrl.study.model import DesignResult
 
 NAMES = {"avis_ctrl": "avis_ctrl version", "design_file": "design file", "inputs_sha256": "SHA-256 of the inputs",
-         "seconds": "seconds of computing", "python": "Python"}
+         "measurement_sha256": "SHA-256 of the measurement", "seconds": "seconds of computing", "python": "Python"}
 
 
 def provenance(result: DesignResult) -> Section:
-    """The provenance table."""
+    """The provenance of a design."""
+    return provenance_table(result.provenance, "With the same inputs, seed, library versions and processor the same "
+                            "figures come out; elsewhere round-off may lead the D-K iteration another way.")
+
+
+def provenance_table(made: Mapping[str, Any], caption: str) -> Section:
+    """What made a result."""
     rows = [(NAMES.get(key, key), words.number(value) if isinstance(value, float) else str(value))
-            for key, value in result.provenance.items() if value is not None]
-    return Section("Provenance", "provenance", (
-        table("With the same inputs, seed, library versions and processor the same figures come out; elsewhere "
-              "round-off may lead the D-K iteration another way.", ("what", "value"), rows, "ll"),))
+            for key, value in made.items() if value is not None]
+    return Section("Provenance", "provenance", (table(caption, ("what", "value"), rows, "ll"),))
 
 
 def stamp(result: DesignResult) -> str:
     """A short provenance for page headers."""
-    made = result.provenance
+    return stamp_of(result.provenance)
+
+
+def stamp_of(made: Mapping[str, Any]) -> str:
+    """Version and hash of the inputs."""
     return f"avis_ctrl {made.get('avis_ctrl', '')}, inputs {str(made.get('inputs_sha256', ''))[:12]}"

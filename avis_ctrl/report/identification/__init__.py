@@ -1,0 +1,1 @@
+"""The identification report: its content, one file a section."""

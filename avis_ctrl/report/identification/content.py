@@ -1,0 +1,29 @@
+"""What the identification report says, once for all renderers."""
+
+from __future__ import annotations
+
+from avis_ctrl.report.identification.gates import gates
+from avis_ctrl.report.identification.identifiability import identifiability
+from avis_ctrl.report.identification.measurements import measurements
+from avis_ctrl.report.identification.method import method
+from avis_ctrl.report.identification.opening import opening
+from avis_ctrl.report.identification.responses import responses
+from avis_ctrl.report.identification.uncertainty import uncertainty
+from avis_ctrl.report.identification.validation import validation
+from avis_ctrl.report.identification.ways import ways
+from avis_ctrl.report.pieces import Document
+from avis_ctrl.report.sections.provenance import provenance_table, stamp_of
+from avis_ctrl.study.identification import Identification
+from avis_ctrl.study.identified_uncertainty import InDesign
+
+
+def document(found: Identification, in_design: InDesign | None = None) -> Document:
+    """The report of an identification; in_design : what a design makes of it, where that was computed."""
+    made = str(found.provenance.get("date", ""))[:10]
+    sections = [make(found) for make in (opening, measurements, gates, responses, identifiability, ways, validation)]
+    sections += [uncertainty(found, in_design), method(found),
+                 provenance_table(found.provenance, "With the same measurement, rig, options, seed, library versions "
+                                  "and processor the same figures come out.")]
+    return Document(f"Identification of the rig {found.rig.name}",
+                    "From measurements to a rig with known uncertainty" + (f", {made}" if made else ""),
+                    stamp_of(found.provenance), tuple(sections))

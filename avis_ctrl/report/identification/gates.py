@@ -1,0 +1,53 @@
+"""What the gates say of the records: what warns first, what is well in small."""
+
+from __future__ import annotations
+
+from avis_ctrl.measurement.gates.finding import SEVERITIES, Finding, Picture
+from avis_ctrl.report.identification.pictures import figure_of
+from avis_ctrl.report.pieces import Cell, Fold, Mark, Paragraph, Piece, Section, table
+from avis_ctrl.study.identification import Identification
+
+MARKS: dict[str, Cell] = {"ok": Mark("ok", True), "note": "note", "warning": Mark("WARNING", False),
+                          "stop": Mark("STOP", False)}
+TOGETHER = 6
+
+
+def gates(found: Identification) -> Section:
+    """Table of all findings, and their pictures."""
+    if not found.findings:
+        return Section("Gates", "gates", (Paragraph("The gates look at records in time; there were none."),))
+    ordered = sorted(found.findings, key=lambda f: -SEVERITIES.index(f.severity))
+    rows = [(f.gate, MARKS[f.severity], f.sentence) for f in ordered]
+    counts = ", ".join(f"{sum(f.severity == s for f in ordered)} {s}" for s in reversed(SEVERITIES)
+                       if any(f.severity == s for f in ordered))
+    pieces: list[Piece] = [
+        table(f"What was tested before any fit, gravest first: {counts}. A note is to be known, a warning makes "
+              "results worse, a stop makes them wrong.", ("gate", "severity", "finding"), rows, "lcl")]
+    grave = [f for f in ordered if f.severity in ("warning", "stop")]
+    for k, (picture, sentences) in enumerate(_pictures(grave)):
+        pieces.append(figure_of(f"gate_{k}", " ".join(sentences), [picture]))
+    notes = [p for p, _ in _pictures([f for f in ordered if f.severity == "note"])]
+    pieces += _small("gate_notes", "Pictures of the gates that have a note, dashed their limits.", notes)
+    well = [p for p, _ in _pictures([f for f in ordered if f.severity == "ok"])]
+    small = _small("gate_ok", "Pictures of the gates that found nothing, dashed their limits.", well)
+    if small:
+        pieces.append(Fold(f"The {len(well)} pictures of gates that found nothing", tuple(small)))
+    return Section("Gates", "gates", tuple(pieces))
+
+
+def _pictures(findings: list[Finding]) -> list[tuple[Picture, list[str]]]:
+    """Each picture once, with the sentences that it belongs to; those without data are left out."""
+    seen: dict[tuple, tuple[Picture, list[str]]] = {}
+    for finding in findings:
+        p = finding.picture
+        if p is None or not any(len(s.x) for s in p.series):
+            continue
+        key = (p.title, p.y_label, tuple((s.name, s.x.tobytes(), s.y.tobytes()) for s in p.series))
+        seen.setdefault(key, (p, []))[1].append(finding.sentence)
+    return list(seen.values())
+
+
+def _small(name: str, caption: str, pictures: list[Picture]) -> list[Piece]:
+    groups = [pictures[k:k + TOGETHER] for k in range(0, len(pictures), TOGETHER)]
+    return [figure_of(f"{name}_{k}", caption + (f" Part {k + 1} of {len(groups)}." if len(groups) > 1 else ""), group,
+                      2, 0.75) for k, group in enumerate(groups)]

@@ -1,0 +1,60 @@
+"""Which combinations of parameters the data determine, and what would determine the others."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, level
+from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.identification import Identification
+
+
+def identifiability(found: Identification) -> Section:
+    """Rank, the determined combinations with their standard deviations, and the rest in sentences."""
+    report = found.identifiability
+    information = report.information
+    missing = len(information.names) - report.rank
+    pieces: list[Piece] = [
+        Paragraph(f"{report.rank} of {len(information.names)} combinations are determined: their relative standard "
+                  f"deviation is below 1. The condition number of the information on them, in relative parameters, is "
+                  f"{words.number(report.condition)}.", "verdict", missing == 0 or None),
+        _combinations(found), _directions(found)]
+    pieces += [Heading("In words"), Bullets(report.sentences[1:] or report.sentences)]
+    if found.advice:
+        pieces += [Heading("What would determine the rest"), Bullets(found.advice)]
+    elif missing:
+        pieces.append(Paragraph("Which further experiment would determine the rest was not computed.", "note"))
+    return Section("Identifiability", "identifiability", tuple(pieces))
+
+
+def _combinations(found: Identification) -> Table:
+    rows = []
+    for one in found.identifiability.combinations:
+        unit = "" if one.unit in ("1", "mixed units") else words.unit(one.unit)
+        if one.determined:
+            value, sigma = words.with_deviation(one.value, one.standard_deviation)
+            share = f"{words.number(100 * one.relative, 2)} %"
+        else:
+            value, sigma, share = words.number(one.value, 4), "not determined", ""
+        rows.append((one.words, value, sigma, share, unit))
+    return table("What the data determine, from the parameters' joint covariance. Parameters that stand alone here are "
+                 "determined by themselves.", ("combination", "value", "± 1 σ", "± 1 σ", "unit"), rows, "lrrrl")
+
+
+def _directions(found: Identification) -> Figure:
+    sigma = found.identifiability.information.directions[0]
+    n, known = len(sigma), np.isfinite(sigma)
+    place = np.arange(1, n + 1, dtype=float)
+    shown = np.where(known & (sigma < 1e6), sigma, np.nan)
+    lost = int(n - np.count_nonzero(np.isfinite(shown)))
+    top = max(10.0, 3 * float(np.nanmax(shown))) if np.isfinite(shown).any() else 10.0
+    bottom = float(np.nanmin(shown)) / 3 if np.isfinite(shown).any() else 1e-3
+    beyond = (f" {lost} more have no information at all." if lost > 1 else
+              " One more has no information at all." if lost else "")
+    curves = (Curve(place, shown, "relative standard deviation", Style("#0072b2"), points=True, line=False),
+              level(0.5, n + 0.5, 1.0, "not determined above"))
+    return Figure("directions", "Relative standard deviations along the principal directions of the information, the "
+                  f"best known first.{beyond}",
+                  (Panel(Axis("direction, by precision", "linear", (0.5, n + 0.5)),
+                         Axis("relative standard deviation [-]", "log", (bottom, top)), curves),))

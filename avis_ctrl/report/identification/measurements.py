@@ -1,0 +1,65 @@
+"""What was measured: records, channels, and what the reader had to assume."""
+
+from __future__ import annotations
+
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.report import words
+from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.identification import Identification
+
+
+def measurements(found: Identification) -> Section:
+    """Records with what each was used for."""
+    measured = found.measured
+    if isinstance(measured, FrequencyResponse):
+        return Section("Measurements", "measurements", _response(measured))
+    pieces: list[Piece] = [_records(found, measured), _channels(found, measured)]
+    if measured.notes:
+        pieces += [Heading("What the reader says of the file"), Bullets(tuple(measured.notes))]
+    return Section("Measurements", "measurements", tuple(pieces))
+
+
+def _records(found: Identification, campaign: Campaign) -> Table:
+    fitted = {r.header.name for r in found.split.fitted.records} if found.split else set()
+    held = {r.header.name for r in found.split.held_out.records} if found.split else set()
+    rows = []
+    for record in campaign.records:
+        h = record.header
+        periods = f"{h.periods} of {words.number(h.period_s)} s" if h.period_s else "none"
+        use = ("part fitted, part held out" if h.name in fitted & held else "held out" if h.name in held
+               else "fitted" if h.name in fitted else "not used")
+        quiet = h.excitation in ("rest", "floor")
+        rows.append((h.name, h.excitation, "silent" if quiet else f"{words.number(h.level_V)} {h.u_unit}",
+                     f"{words.number(h.duration_s)} s", periods, words.yes(bool(h.floor_names)), use))
+    how = f" {found.split.how[:1].upper()}{found.split.how[1:]}." if found.split else ""
+    return table(f"The records of {campaign.source or 'the campaign'}, sampled at "
+                 f"{words.number(campaign.sample_rate_Hz)} Hz. Levels are r.m.s. of the drives; records at rest and "
+                 f"with a shaken floor have silent drives.{how}",
+                 ("record", "excitation", "level", "duration", "periods", "floor measured", "used as"), rows,
+                 "llrrrcl")
+
+
+def _channels(found: Identification, campaign: Campaign) -> Table:
+    first = campaign.records[0].header
+    floor = next((r.header for r in campaign.records if r.header.floor_names), None)
+    low, high = found.campaign_fit.band_Hz
+    rows = [("commanded, u", str(len(first.u_names)), ", ".join(first.u_names), words.unit(first.u_unit)),
+            ("sensed, y", str(len(first.y_names)), ", ".join(first.y_names), words.unit(first.y_unit))]
+    if floor is not None:
+        rows.append(("floor velocity", str(len(floor.floor_names)), ", ".join(floor.floor_names),
+                     words.unit(floor.floor_unit)))
+    return table(f"The channels. The fit uses the spectral lines from {words.number(low)} to {words.number(high)} Hz.",
+                 ("channels", "count", "names", "unit"), rows, "lrll")
+
+
+def _response(measured: FrequencyResponse) -> tuple[Piece, ...]:
+    f = measured.frequency_Hz
+    uncertain = "covariance of the noise" if measured.noise is not None else "a variance for each entry"
+    rows = [("lines", f"{len(f)}, {words.number(float(f[0]))} to {words.number(float(f[-1]))} Hz"),
+            ("inputs", f"{', '.join(measured.inputs)} [{words.unit(measured.input_unit)}]"),
+            ("outputs", f"{', '.join(measured.outputs)} [{words.unit(measured.output_unit)}]"),
+            ("uncertainty", uncertain), ("method", measured.method or "not stated in the file")]
+    return (table("The measured frequency responses; there are no records behind them in the file.",
+                  ("what", "value"), rows, "ll"),
+            Paragraph("Every third line was held out of the fit for validation."))

@@ -1,0 +1,55 @@
+"""How the figures of an identification were computed, and where it is written down."""
+
+from __future__ import annotations
+
+from avis_ctrl.report.pieces import Bullets, Formula, Heading, Paragraph, Piece, Section
+from avis_ctrl.study.identification import Identification
+
+SOURCES = (
+    "R. Pintelon, J. Schoukens: System Identification: A Frequency Domain Approach, 2nd ed., Wiley, 2012 (sections "
+    "2.7, 7.2 and 9.11: frequency responses, local models, maximum likelihood).",
+    "G. H. Golub, V. Pereyra: The differentiation of pseudo-inverses and nonlinear least squares problems whose "
+    "variables separate, SIAM J. Numer. Anal. 10 (1973) 413-432 (transient projected out).",
+    "L. Ljung: System Identification: Theory for the User, 2nd ed., Prentice Hall, 1999 (section 16.6: tests of "
+    "residuals).",
+    "N. G. M. Rademakers: Modelling, Identification and Multivariable Control of an Active Vibration Isolation System, "
+    "report DCT 2005.63, Eindhoven University of Technology, 2005 (the AVIS; extended Kalman filter, section 3.3).",
+    "B. M. Beadle, S. Hurlebaus, U. Stöbener, L. Gaul: Modeling and Parameter Identification of an Active "
+    "Anti-Vibration System (the Halcyonics table; sequential fit, section 3).",
+)
+
+
+def method(found: Identification) -> Section:
+    """Short account of the method with its formulas."""
+    pieces: list[Piece] = [
+        Paragraph("Model. The spectra of what the sensors read follow from the rig's equations of motion with their "
+                  "physical parameters theta, the hold and delay h of the drives, and the sensors' chain s:"),
+        Formula("Y_k = underbrace(s(omega_k) R (j omega_k)^p D^(-1)(omega_k, theta) [T h space F_\"floor\"], "
+                "G(omega_k, theta)) vec(U_k, V_k) + t_k + e_k, quad D = K + j omega C - omega^2 M",
+                "Y equals G times inputs and floor velocity plus transient plus noise, D the dynamic stiffness"),
+        Paragraph("Transient. A record that does not begin and end alike holds the response to what the table was "
+                  "doing at its ends. On the lines this is linear in real unknowns x: an impulse and a step at the "
+                  "payload, the states of the sensors' chain, and a constant and a slope. "
+                  "It is fitted along with the parameters:"),
+        Formula("t_k = B(omega_k, theta) x", "the transient on line k is B times x"),
+        Paragraph("Likelihood. With circular complex normal noise of covariance C_k on line k, minus twice the "
+                  "logarithm of the likelihood is, up to a constant,"),
+        Formula("chi^2(theta) = min_x 2 sum_k e_k^H C_k^(-1) e_k + sum_j (theta_j - theta_j^0)^2 / sigma_j^2",
+                "chi-square is twice the sum of e C inverse e over lines, plus the priors"),
+        Paragraph("where the second sum has the parameters with prior knowledge, if any. It is minimised by "
+                  "Levenberg-Marquardt steps in relative parameters from several starts, with analytic derivatives. "
+                  "The noise covariance comes from the records first and then from the residuals."),
+        Paragraph("Information. With J the derivative of the whitened residuals, the Cramér-Rao bound of every "
+                  "unbiased estimate is"),
+        Formula("H = J^T J, quad op(\"cov\") hat(theta) >= S V_1 Lambda_1^(-1) V_1^T S, quad S H S = V Lambda V^T",
+                "the information H is J transposed J; the covariance is its inverse on the determined directions"),
+        Paragraph("over the directions V_1 whose relative standard deviation is below 1, S the sizes of the "
+                  "parameters. Directions without information keep their start; a parameter that shares in one is "
+                  "known only in combination."),
+        Paragraph("Validation. Chi-square of the held-out data is held against noise estimated from the fitted "
+                  "records alone; its interval allows for the number of lines, the parameters' uncertainty and the "
+                  "error of the noise estimate itself."),
+        Formula("op(\"E\") chi^2 / n = 1 + op(\"tr\") (J_v op(\"cov\") hat(theta) J_v^T) / n",
+                "the expected chi-square per number is one plus the trace of the predicted variance"),
+        Heading("Sources"), Bullets(SOURCES)]
+    return Section("Method", "method", tuple(pieces))

@@ -1,0 +1,85 @@
+"""What came out, in one sentence, one table and one figure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style
+from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.identification import Identification
+
+TOGETHER = "only in combination"
+
+
+def opening(found: Identification) -> Section:
+    """The verdict, and every parameter."""
+    pieces: list[Piece] = [_sentence(found), _parameters(found), _changes(found)]
+    pieces += [Paragraph(_upper(note), "note") for note in found.campaign_fit.notes]
+    return Section("Result", "result", tuple(pieces))
+
+
+def _upper(text: str) -> str:
+    return text[:1].upper() + text[1:].rstrip(".") + "."
+
+
+def _sentence(found: Identification) -> Paragraph:
+    information = found.campaign_fit.fit.information
+    alone = int(np.count_nonzero(information.known))
+    warned = [f for f in found.findings if f.severity in ("warning", "stop")]
+    stops = any(f.severity == "stop" for f in found.findings)
+    consistent = all(one.consistent for one in found.validation.held_out)
+    count = len(information.names)
+    said = [_upper(found.validation.verdict),
+            f"{information.rank} combinations of the {count} parameters are determined, {alone} parameters by "
+            "themselves."]
+    if not found.campaign_fit.fit.converged:
+        said.append("The fit did not converge.")
+    if warned:
+        names = list(dict.fromkeys(f.gate for f in warned))
+        said.append(f"Gates that warned: {words.joined(names)}.")
+    elif found.findings:
+        said.append("No gate warned.")
+    return Paragraph(" ".join(said), "verdict", consistent and not stops and found.campaign_fit.fit.converged)
+
+
+def _parameters(found: Identification) -> Table:
+    information, start = found.campaign_fit.fit.information, found.campaign_fit.start.values
+    rows = []
+    for name, unit, before, value, sigma in zip(information.names, information.units, start, information.values,
+                                                information.standard_deviation, strict=True):
+        change = f"{100 * (value / before - 1):+.2f} %".replace("-", "−") if before else "from zero"
+        if np.isfinite(sigma):
+            shown, spread = words.with_deviation(value, sigma)
+            share = f"{words.number(100 * sigma / abs(value), 2)} %" if value else ""
+        else:
+            shown, spread, share = words.number(value, 5), TOGETHER, ""
+        rows.append((name, words.number(before, 5), shown, spread, share, change, words.unit(unit)))
+    prior = " Prior knowledge is part of the standard deviations." if found.campaign_fit.fit.priors else ""
+    return table("Every free parameter at its start and as identified by maximum likelihood, with one standard "
+                 "deviation (Cramér-Rao bound). Where a parameter is known only in combination with others, its own "
+                 f"value is the one nearest to the start and says nothing by itself; section 5 has the combinations."
+                 f"{prior}", ("parameter", "start", "identified", "± 1 σ", "± 1 σ", "change", "unit"), rows, "lrrrrrl")
+
+
+def _changes(found: Identification) -> Figure:
+    information, start = found.campaign_fit.fit.information, found.campaign_fit.start.values
+    size = np.where(start == 0, information.scale, np.abs(start))
+    change = 100 * (information.values - start) / size
+    bars = 200 * information.standard_deviation / size
+    known, n = information.known, len(start)
+    place = np.arange(n, 0, -1.0)
+    curves = [Curve(change[known], place[known], "determined by itself, ± 2 σ", Style("#0072b2"), points=True,
+                    line=False, error=bars[known], along="x")]
+    if not known.all():
+        curves.append(Curve(change[~known], place[~known], f"{TOGETHER}: the nearest to the start",
+                            Style("#9a9a9a"), points=True, line=False))
+    curves.append(Curve(np.zeros(2), np.array([0.3, n + 0.7]), "", STYLES["faint"]))
+    ticks = tuple((float(p), name) for p, name in zip(place, information.names, strict=True))
+    longest = float(np.max(bars[known])) if known.any() else np.nan
+    caption = (f"Change of each parameter from its start. The longest bar (2 σ) is {words.number(longest, 2)} % of its "
+               "start; bars shorter than a marker are hidden by it." if known.any()
+               else "Change of each parameter from its start; none is determined by itself.")
+    return Figure("changes", caption, (Panel(Axis("change from the start [%]"),
+                                             Axis("", "linear", (0.3, n + 0.7), ticks), tuple(curves)),),
+                  height=max(0.5, 0.085 * n))

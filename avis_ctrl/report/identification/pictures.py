@@ -1,0 +1,77 @@
+"""Pictures of the gates as figures of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from avis_ctrl.measurement.gates.finding import Limit, Picture, Series
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Scale, Style, log_range, numbered
+
+LIMITS = ("#b3261e", "#7a7a7a", "#d55e00", "#222222")
+
+
+def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int = 1, height: float = 1.0) -> Figure:
+    """Pictures as panels of one figure: a name has the same look in all of them."""
+    names = list(dict.fromkeys(s.name for p in pictures for s in p.series))
+    limits = list(dict.fromkeys(one.name for p in pictures for one in p.limits))
+    return Figure(name, caption, tuple(panel_of(p, names, limits) for p in pictures), min(columns, len(pictures)),
+                  height)
+
+
+def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str]) -> Panel:
+    """A picture; names, limits : in the order of their styles."""
+    curves = tuple(_curve(one, Style(numbered(names.index(one.name)).colour)) for one in picture.series if len(one.x))
+    panel = Panel(Axis(picture.x_label, _scale(picture.x_scale)), Axis(picture.y_label, _scale(picture.y_scale)),
+                  curves, (), picture.title)
+    lines = tuple(_line(one, panel, Style(LIMITS[limits.index(one.name) % len(LIMITS)], "dash", 1.3))
+                  for one in picture.limits)
+    return _framed(replace(panel, curves=(*curves, *lines)))
+
+
+def _scale(text: str) -> Scale:
+    return "log" if text == "log" else "linear"
+
+
+def _curve(series: Series, style: Style) -> Curve:
+    x, y = np.asarray(series.x, float), np.asarray(series.y, float)
+    if series.style == "bars":
+        width = 0.8 * float(np.min(np.diff(np.sort(x)))) if len(x) > 1 else 0.8
+        return Curve(x, y, series.name, style, line=False, bars=width)
+    points = series.style == "points"
+    return Curve(x, y, series.name, style, points=points, line=not points)
+
+
+def _line(limit: Limit, panel: Panel, style: Style) -> Curve:
+    """A straight line across the data."""
+    if limit.axis == "x":
+        low, high = _span(panel, "y")
+        return Curve(np.array([limit.value, limit.value]), np.array([low, high]), limit.name, style)
+    low, high = _span(panel, "x")
+    return Curve(np.array([low, high]), np.array([limit.value, limit.value]), limit.name, style)
+
+
+def _span(panel: Panel, which: str) -> tuple[float, float]:
+    values = np.concatenate([getattr(c, which) for c in panel.curves] or [np.array([0.0, 1.0])])
+    values = values[np.isfinite(values)]
+    if getattr(panel, which).scale == "log":
+        values = values[values > 0]
+    return (float(values.min()), float(values.max())) if values.size else (0.1, 1.0)
+
+
+def _framed(panel: Panel) -> Panel:
+    """A logarithmic axis of frequencies runs from its first to its last point; few whole numbers are ticks."""
+    if panel.x.scale == "log":
+        low, high = _span(panel, "x")
+        return replace(panel, x=replace(panel.x, range=(low / 1.1, high * 1.1)), y=_with_range(panel))
+    numbers = np.unique(np.concatenate([c.x for c in panel.curves] or [np.zeros(0)]))
+    if 0 < numbers.size <= 16 and np.all(numbers == np.round(numbers)):
+        return replace(panel, x=replace(panel.x, ticks=tuple((float(v), f"{v:g}") for v in numbers)),
+                       y=_with_range(panel))
+    return replace(panel, y=_with_range(panel))
+
+
+def _with_range(panel: Panel) -> Axis:
+    return replace(panel.y, range=log_range(panel)) if panel.y.scale == "log" else panel.y

@@ -1,0 +1,140 @@
+"""The identified model against what no fit has seen."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.identification.validation import HeldOut
+from avis_ctrl.identification.whiteness import Correlation, Whiteness
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, numbered
+from avis_ctrl.report.pieces import Bullets, Mark, Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.identification import Identification
+
+BEFORE, AFTER, FLOOR = Style("#e69f00"), Style("#0072b2"), Style("#7a7a7a")
+# Records drawn one by one; a long record comes in many pieces.
+MOST_DRAWN = 3
+
+
+def validation(found: Identification) -> Section:
+    """Chi-square, errors, whiteness and modes."""
+    v = found.validation
+    pieces: list[Piece] = [Paragraph(f"{v.verdict[:1].upper()}{v.verdict[1:]}.", "verdict", v.passed), _records(found)]
+    drawn = v.held_out[:MOST_DRAWN]
+    for one in drawn:
+        pieces += [_chi_square(one, v.outputs), _errors(one, v.outputs), _nrms(one, v.outputs)]
+        if one.whiteness is not None:
+            pieces += [_whiteness(one.name, one.whiteness)]
+    if len(v.held_out) > len(drawn):
+        pieces.append(Paragraph(f"Figures are shown of the first {len(drawn)} of {len(v.held_out)} held-out records "
+                                "and pieces; the table has all.", "note"))
+    if v.modes:
+        pieces.append(_modes(found))
+    said = [f"{s[:1].upper()}{s[1:].rstrip('.')}." for s in (*v.sentences[1:], *v.notes)]
+    pieces.append(Bullets(tuple(dict.fromkeys(said))))
+    return Section("Validation", "validation", tuple(pieces))
+
+
+def _records(found: Identification) -> Table:
+    rows = []
+    for one in found.validation.held_out:
+        low, high = one.chi2_interval
+        white = one.whiteness
+        rows.append((one.name, str(one.lines), words.number(one.chi2_per_dof, 4), f"{low:.4f} to {high:.4f}",
+                     words.number(one.chi2_start, 4),
+                     "none" if np.isnan(one.chi2_local) else words.number(one.chi2_local, 4),
+                     Mark("yes", True) if one.consistent else Mark("no", False),
+                     "not tested" if white is None else Mark("yes", True) if white.white else Mark("no", False)))
+    noise = "; ".join(dict.fromkeys(one.noise for one in found.validation.held_out))
+    return table(f"Chi-square per degree of freedom of the held-out data, with its 95 % interval if only noise and the "
+                 f"parameters' uncertainty are left. Noise: {noise}. \"Local noise\" is the same against the noise of "
+                 "a local polynomial model.",
+                 ("record", "lines", "chi-square", "expected", "start model", "local noise", "inside", "white"), rows,
+                 "lrrrrrcc")
+
+
+def _places(outputs: tuple[str, ...]) -> tuple[np.ndarray, Axis]:
+    x = np.arange(1, len(outputs) + 1, dtype=float)
+    return x, Axis("output", "linear", (0.4, len(outputs) + 0.6),
+                   tuple((float(p), name) for p, name in zip(x, outputs, strict=True)))
+
+
+def _chi_square(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
+    x, axis = _places(outputs)
+    low, high = one.output_chi2_interval.T
+    curves = (Curve(x, (low + high) / 2, "95 % interval", FLOOR, points=False, line=False, error=(high - low) / 2),
+              Curve(x, one.output_chi2_per_dof, "held-out data", AFTER, points=True, line=False))
+    return Figure(f"chi_square_{one.name}", f"Chi-square per degree of freedom of each output, record {one.name}, with "
+                  "its interval.", (Panel(axis, Axis("chi-square / dof [-]"), curves),), height=0.8)
+
+
+def _errors(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
+    x, axis = _places(outputs)
+    values = [100 * v for v in (one.nrms_start, one.nrms, one.nrms_floor)]
+    labels, styles = ("start model", "identified model", "noise alone"), (BEFORE, AFTER, FLOOR)
+    curves = tuple(Curve(x + 0.26 * (k - 1), v, label, style, line=False, bars=0.24)
+                   for k, (v, label, style) in enumerate(zip(values, labels, styles, strict=True)))
+    positive = np.concatenate(values)
+    positive = positive[positive > 0]
+    limits = (float(positive.min()) / 3, float(positive.max()) * 2) if positive.size else (0.01, 100.0)
+    return Figure(f"nrms_{one.name}", f"Normalised r.m.s. error of each output in the band, record {one.name}: error "
+                  "over output, transient of the ends taken out. Logarithmic.",
+                  (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), curves),), height=0.9)
+
+
+def _nrms(one: HeldOut, outputs: tuple[str, ...]) -> Table:
+    def percent(values: np.ndarray | None, k: int) -> str:
+        return "none" if values is None else f"{words.number(100 * float(values[k]), 3)} %"
+    rows = [(name, percent(one.nrms_start, k), percent(one.nrms, k), percent(one.nrms_floor, k),
+             percent(one.nrms_time_start, k), percent(one.nrms_time, k), percent(one.nrms_time_whole, k))
+            for k, name in enumerate(outputs)]
+    note = f" In time: {one.time_note}." if one.time_note else ""
+    return table(f"Normalised r.m.s. errors of record {one.name}, on the spectral lines of the band and in time.{note}",
+                 ("output", "start", "identified", "noise alone", "in time, start", "in time, identified",
+                  "in time, no filter"), rows)
+
+
+def _whiteness(name: str, white: Whiteness) -> Figure:
+    panels = tuple(_correlation(one) for one in white.correlations)
+    return Figure(f"whiteness_{name}", f"Correlations of the residual, record {name}, of each output: the largest over "
+                  "the inputs where there are several. Noise alone exceeds a limit (dashed) anywhere in 1 % of "
+                  "validations.", panels, height=0.85)
+
+
+def _correlation(one: Correlation) -> Panel:
+    outputs = list(dict.fromkeys(row.partition(" with ")[0] for row in one.rows))
+    of = np.array([outputs.index(row.partition(" with ")[0]) for row in one.rows])
+    curves = [Curve(one.lags, one.value[of == k].max(axis=0), name, Style(numbered(k).colour, "solid", 1.0))
+              for k, name in enumerate(outputs)]
+    curves.append(Curve(one.lags, one.limit.max(axis=0), "limit", Style("#b3261e", "dash", 1.4)))
+    return Panel(Axis(f"lag [{one.lag_unit}]"), Axis("correlation [-]", "linear", (0.0, 1.15 * float(
+        max(one.value.max(), one.limit.max())))), tuple(curves), (), f"{one.what[:1].upper()}{one.what[1:]}")
+
+
+def _modes(found: Identification) -> Table:
+    rows = []
+    for row in found.validation.modes:
+        f, z = (_pair(*two) for two in ((row.frequency_Hz, row.frequency_std_Hz),
+                                        (100 * row.damping, 100 * row.damping_std)))
+        measured_f, measured_z = (_pair(*two) for two in (
+            (row.measured_frequency_Hz, row.measured_frequency_std_Hz),
+            (100 * row.measured_damping, 100 * row.measured_damping_std)))
+        rows.append((row.shape, words.number(row.start_frequency_Hz, 4), f, measured_f, _sigma(row.frequency_sigma),
+                     words.number(100 * row.start_damping, 3), z, measured_z, _sigma(row.damping_sigma)))
+    return table("Modes of the start and of the identified model beside those measured in the held-out data without "
+                 "the rig's equations. Shapes by shares of kinetic energy; the difference is model less measured over "
+                 "its standard deviation.",
+                 ("shape", "start [Hz]", "identified [Hz]", "measured [Hz]", "diff. [σ]", "damping, start [%]",
+                  "identified [%]", "measured [%]", "diff. [σ]"), rows)
+
+
+def _pair(value: float, sigma: float) -> str:
+    if not np.isfinite(value):
+        return "none"
+    if not (np.isfinite(sigma) and sigma > 0):
+        return words.number(value, 4)
+    return " ± ".join(words.with_deviation(value, sigma))
+
+
+def _sigma(value: float) -> str:
+    return f"{value:+.1f}".replace("-", "−") if np.isfinite(value) else "none"
