@@ -111,6 +111,9 @@ def model_modes(model: ResponseModel, covariance: np.ndarray | None = None) -> M
                                next_step="look at damping and stiffness of the rig")
     keep = keep[np.argsort(np.abs(poles[keep]))]
     poles, X = poles[keep], vectors[:N_Q, keep]
+    words = tuple(_in_words(M, x) for x in X.T)
+    if covariance is None:
+        return ModelModes(np.abs(poles) / (2 * np.pi), -poles.real / np.abs(poles), np.zeros((2 * N_Q,) * 2), X, words)
     d = model.derivative_matrices
     dpoles = np.zeros((len(model.names), N_Q), complex)
     for k, (pole, x) in enumerate(zip(poles, X.T, strict=True)):
@@ -122,9 +125,7 @@ def model_modes(model: ResponseModel, covariance: np.ndarray | None = None) -> M
     dsize = np.real(np.conj(poles) * dpoles) / size
     ddamping = -dpoles.real / size + poles.real * dsize / size ** 2
     gradient = np.concatenate([dsize / (2 * np.pi), ddamping], axis=1)
-    P = np.zeros((len(model.names),) * 2) if covariance is None else covariance
-    return ModelModes(size / (2 * np.pi), -poles.real / size, gradient.T @ P @ gradient, X,
-                      tuple(_in_words(M, x) for x in X.T))
+    return ModelModes(size / (2 * np.pi), -poles.real / size, gradient.T @ covariance @ gradient, X, words)
 
 
 def _in_words(M: np.ndarray, x: np.ndarray) -> str:

@@ -1,14 +1,34 @@
-"""Covariance of the noise from what a fit leaves, smoothed over frequency and pooled over records of a kind."""
+"""Covariance of the noise from what a fit leaves, smoothed over frequency and pooled over records of a kind.
+
+A floor that is not measured is most of the noise of a table. It comes to the sensors through the table itself, so that
+the covariance turns and peaks with every mode within a fraction of a Hz, with three directions of six far quieter than
+the others: an average over frequency would fill these up. So the residuals are whitened first by the shape
+
+    C_0(w) = G_floor(w) S(w) G_floor(w)^H + diag d(w)
+
+with G_floor of the model and smooth S (3 x 3) and d fitted to the residuals by expectation maximisation (Dempster,
+Laird and Rubin 1977; factor analysis with known loadings), and their covariance, whatever it is, is averaged where it
+is nearly flat: whitening before smoothing, as Blackman and Tukey (1958) have it for spectra. Noise of other origin costs
+precision of the average, not its validity.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.maximum_likelihood import Residual
+from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
+
+# Half the band [Hz] over which S and d count as constant, lines in it at least, and rounds of their fit.
+SHAPE_HALF_Hz, SHAPE_LINES, ROUNDS = 0.25, 40, 30
+# Degrees of freedom of an average: of residuals as they are, and of whitened ones. An estimate of so many costs
+# n_y / dof of the precision that the noise would allow (Pintelon and Schoukens 2012, section 12.3).
+LEAST_DOF, LEAST_DOF_FLAT = 30, 100
 
 
 def relative_noise(blocks: Sequence[SpectralBlock], fraction: float = 0.1) -> list[SpectralBlock]:
@@ -25,53 +45,139 @@ def relative_noise(blocks: Sequence[SpectralBlock], fraction: float = 0.1) -> li
     return found
 
 
-def residual_noise(residuals: Sequence[Residual], half_width_Hz: float = 0.15, least_dof: int = 30
-                   ) -> list[SpectralBlock]:
+def residual_noise(residuals: Sequence[Residual], half_width_Hz: float = 0.15, least_dof: int | None = None,
+                   model: ResponseModel | None = None) -> list[SpectralBlock]:
     """The blocks with the covariance of their residuals, averaged over +- half_width_Hz and records of a kind.
 
-    The window grows until the covariance has least_dof degrees of freedom and three for each output.
+    The window grows until the covariance has least_dof degrees of freedom and three for each output. With a model the
+    residuals are whitened by the shape that an unmeasured floor gives them before they are averaged; that allows wider
+    windows, of 100 degrees of freedom by default instead of 30.
     """
-    return noise_from_residuals(residuals, [one.block for one in residuals], half_width_Hz, least_dof)
+    return noise_from_residuals(residuals, [one.block for one in residuals], half_width_Hz, least_dof, model)
 
 
 def noise_from_residuals(residuals: Sequence[Residual], blocks: Sequence[SpectralBlock], half_width_Hz: float = 0.15,
-                         least_dof: int = 30) -> list[SpectralBlock]:
+                         least_dof: int | None = None, model: ResponseModel | None = None) -> list[SpectralBlock]:
     """Blocks, which may be other ones, with the covariance that residuals of their kind have near their lines.
 
     Raises
     ------
     InputError : a block of a kind that no residual is of.
     """
-    found = []
-    for own in blocks:
-        pool = [one for one in residuals if one.block.kind == own.kind]
+    found = {}
+    for kind in dict.fromkeys(block.kind for block in blocks):
+        pool = [one for one in residuals if one.block.kind == kind]
+        own = [block for block in blocks if block.kind == kind]
         if not pool:
-            raise InputError(f"expected residuals of its kind, {own.kind}", field=f"block {own.name}")
-        least = max(least_dof, 3 * own.Y.shape[1])
-        per_Hz = sum(len(one.block.omega) * one.error.shape[2] / np.ptp(one.block.omega) * 2 * np.pi
-                     if len(one.block.omega) > 1 else 0 for one in pool)
-        half = max(half_width_Hz, least / max(per_Hz, 1e-9) / 2)
-        total, count = np.zeros((len(own.omega), *own.Y.shape[1:2] * 2), complex), np.zeros(len(own.omega))
-        for one in pool:
-            sums, lines = _window_sums(one, own.omega, 2 * np.pi * half)
-            total += sums
-            count += lines
-        noise = total / np.maximum(count, 1)[:, None, None]
-        found.append(own.with_noise(_lifted(noise), float(np.median(count))))
-    return found
+            raise InputError(f"expected residuals of its kind, {kind}", field=f"block {own[0].name}")
+        shape = _shape(pool, model) if model is not None else None
+        flat = [_outer(one.error if shape is None else np.linalg.solve(shape.factor(one.block.omega, model), one.error))
+                for one in pool]
+        least = least_dof or (LEAST_DOF if shape is None else LEAST_DOF_FLAT)
+        half = max(half_width_Hz * 2 * np.pi, max(least, 3 * own[0].Y.shape[1]) / _density(pool) / 2)
+        for block in own:
+            total, count = _window_sums(pool, flat, block.omega, half)
+            noise = total / np.maximum(count, 1)[:, None, None]
+            if shape is not None:
+                A = shape.factor(block.omega, model)
+                noise = A @ noise @ np.conj(A.swapaxes(1, 2))
+            found[id(block)] = block.with_noise(_lifted(noise), float(np.median(count)))
+    return [found[id(block)] for block in blocks]
 
 
-def _window_sums(residual: Residual, omega: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:
-    """Sums of e e^H of the lines within half of each omega, at least one, and their numbers."""
-    e, own = residual.error, residual.block.omega
-    outer = e @ np.conj(np.swapaxes(e, -1, -2))
-    running = np.concatenate([np.zeros((1, *outer.shape[1:])), np.cumsum(outer, axis=0)])
-    # At the ends of the band the window stays whole and slides inward.
-    low, high = np.clip(omega - half, own[0], max(own[-1] - 2 * half, own[0])), None
-    high = np.minimum(low + 2 * half, own[-1])
-    first, last = np.searchsorted(own, low - 1e-9), np.searchsorted(own, high + 1e-9)
-    last = np.maximum(last, first + 1)
-    return running[np.minimum(last, len(own))] - running[np.minimum(first, len(own) - 1)], (last - first) * e.shape[2]
+class _Shape(NamedTuple):
+    """S (n, 3, 3) and d (n, n_y) on a grid omega (n,)."""
+
+    omega: np.ndarray
+    S: np.ndarray
+    d: np.ndarray
+
+    def at(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Straight lines between the grid's points, which keep them positive."""
+        right = np.clip(np.searchsorted(self.omega, omega), 1, len(self.omega) - 1)
+        gap = self.omega[right] - self.omega[right - 1]
+        share = np.clip((omega - self.omega[right - 1]) / gap, 0, 1)
+        S = (1 - share)[:, None, None] * self.S[right - 1] + share[:, None, None] * self.S[right]
+        return S, (1 - share)[:, None] * self.d[right - 1] + share[:, None] * self.d[right]
+
+    def factor(self, omega: np.ndarray, model: ResponseModel | None) -> np.ndarray:
+        """(n, n_y, n_y) Cholesky factor of C_0."""
+        assert model is not None
+        S, d = self.at(omega)
+        G = _floor_response(model, omega)
+        return np.linalg.cholesky(_lifted(G @ S @ _adjoint(G) + d[:, :, None] * np.eye(d.shape[1])))
+
+
+def _shape(pool: Sequence[Residual], model: ResponseModel) -> _Shape:
+    """S and d of residuals, windows on a grid of half their width."""
+    half = max(2 * np.pi * SHAPE_HALF_Hz, SHAPE_LINES / _density(pool) / 2)
+    low, high = min(one.block.omega[0] for one in pool), max(one.block.omega[-1] for one in pool)
+    grid = np.linspace(low, high, max(int(np.ceil((high - low) / half)) + 1, 2))
+    G = [_floor_response(model, one.block.omega) for one in pool]
+    R = [_outer(one.error) for one in pool]
+    m = [one.error.shape[2] for one in pool]
+    total, count = _window_sums(pool, R, grid, half)
+    mean = _lifted(total / np.maximum(count, 1)[:, None, None])
+    # The quietest directions hold no floor; what the others hold more than that is the floor's, shared by three axes.
+    quiet = np.linalg.eigvalsh(mean)[:, 0]
+    gain = np.interp(grid, pool[0].block.omega, np.sum(np.abs(G[0]) ** 2, axis=(1, 2)))
+    loud = np.real(np.einsum("nii->n", mean)) / gain
+    shape = _Shape(grid, loud[:, None, None] * np.eye(3, dtype=complex), np.repeat(quiet[:, None], mean.shape[1], 1))
+    for _ in range(ROUNDS):
+        parts = [_expected(g, r, k, *shape.at(one.block.omega)) for g, r, k, one in zip(G, R, m, pool, strict=True)]
+        S, count = _window_sums(pool, [part[0] for part in parts], grid, half)
+        d, _ = _window_sums(pool, [part[1] for part in parts], grid, half)
+        shape = _Shape(grid, S / count[:, None, None], np.maximum(d / count[:, None], 1e-9 * quiet[:, None]))
+    return shape
+
+
+def _expected(G: np.ndarray, R: np.ndarray, m: int, S: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """E[sum v v^H] (n, 3, 3) of the floor v and E[sum |e - G v|^2] (n, n_y), given R = sum e e^H of m experiments."""
+    C = G @ S @ _adjoint(G) + d[:, :, None] * np.eye(d.shape[1])
+    B = _adjoint(np.linalg.solve(C, G @ S))
+    BR = B @ R
+    vv = BR @ _adjoint(B) + m * (S - B @ G @ S)
+    left = np.einsum("nii->ni", R) - 2 * np.einsum("nij,nji->ni", G, BR) + np.einsum("nij,njk,nik->ni", G, vv, G.conj())
+    return vv, np.real(left)
+
+
+def _floor_response(model: ResponseModel, omega: np.ndarray) -> np.ndarray:
+    """(n, n_y, 3)"""
+    n_u = len(model.actuators)
+    U = np.broadcast_to(np.eye(len(model.inputs), dtype=complex)[:, n_u:], (len(omega), len(model.inputs), 3))
+    return model.driven(omega, U, derivative=False).Y
+
+
+def _adjoint(X: np.ndarray) -> np.ndarray:
+    return np.conj(X.swapaxes(-1, -2))
+
+
+def _outer(e: np.ndarray) -> np.ndarray:
+    """sum e e^H over experiments, (n, n_y, n_y)."""
+    return e @ _adjoint(e)
+
+
+def _density(pool: Sequence[Residual]) -> float:
+    """Lines, times experiments, per rad/s of all records together."""
+    return max(sum(len(one.block.omega) * one.error.shape[2] / np.ptp(one.block.omega) for one in pool
+                   if len(one.block.omega) > 1), 1e-9)
+
+
+def _window_sums(pool: Sequence[Residual], values: Sequence[np.ndarray], omega: np.ndarray, half: float
+                 ) -> tuple[np.ndarray, np.ndarray]:
+    """Sums of values (one array a record, by line) within half of each omega, at least one line; and their numbers."""
+    total, count = np.zeros((len(omega), *values[0].shape[1:]), values[0].dtype), np.zeros(len(omega))
+    for one, value in zip(pool, values, strict=True):
+        own = one.block.omega
+        running = np.concatenate([np.zeros((1, *value.shape[1:]), value.dtype), np.cumsum(value, axis=0)])
+        # At the ends of the band the window stays whole and slides inward.
+        low = np.clip(omega - half, own[0], max(own[-1] - 2 * half, own[0]))
+        high = np.minimum(low + 2 * half, own[-1])
+        first = np.minimum(np.searchsorted(own, low - 1e-9), len(own) - 1)
+        last = np.minimum(np.maximum(np.searchsorted(own, high + 1e-9), first + 1), len(own))
+        total += running[last] - running[first]
+        count += (last - first) * one.error.shape[2]
+    return total, count
 
 
 def _lifted(noise: np.ndarray) -> np.ndarray:

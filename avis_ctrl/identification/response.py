@@ -187,8 +187,11 @@ class ResponseModel:
     @cached_property
     def matrices(self) -> Matrices:
         """Of the rig as it is, the actuators and sensors of the model."""
-        eom = self.rig.equations_of_motion()
-        known, rows = self.rig.sensor_rows()
+        return self._matrices_of(self.rig)
+
+    def _matrices_of(self, rig: Rig) -> Matrices:
+        eom = rig.equations_of_motion()
+        known, rows = rig.sensor_rows()
         R = rows[[known.index(name) for name in self.sensors.names]]
         T = eom.T[:, [eom.actuators.index(name) for name in self.actuators]]
         return Matrices(eom.M, eom.C, eom.K, eom.C_floor, eom.K_floor, T, R)
@@ -204,7 +207,7 @@ class ResponseModel:
                 value = known[name].value
                 # Exact at any step for polynomials of second degree: a tenth loses no digits.
                 step = 0.1 * abs(value) or 1e-3
-                up, down = (replace(self, rig=self.rig.with_parameters({name: value + sign * step})).matrices
+                up, down = (self._matrices_of(self.rig.with_parameters({name: value + sign * step}))
                             for sign in (1, -1))
                 for all_of, high, low in zip(found, up, down, strict=True):
                     all_of[j] = (high - low) / (2 * step)

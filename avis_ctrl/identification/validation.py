@@ -185,7 +185,7 @@ def _with_noise(found: CampaignFit, fitted: Campaign | FrequencyResponse, block:
     if block.kind not in kinds:
         raise InputError(f"expected records of the kind that was fitted: {', '.join(sorted(kinds))}",
                          field=f"held-out record {block.name}", value=block.kind)
-    noisy = noise_from_residuals(residuals, [block])[0]
+    noisy = noise_from_residuals(residuals, [block], model=found.fit.model)[0]
     pool = sum(one.block.numbers for one in residuals if one.block.kind == block.kind)
     # The fit bent the model to its own residuals: its free numbers are missing in them.
     share = found.fit.dof / sum(one.block.numbers for one in residuals)
