@@ -20,11 +20,11 @@ MatrixFunction = Callable[[np.ndarray], np.ndarray]
 
 
 def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float = 1e-11,
-                            seed: int = 0) -> dict[Exponents, np.ndarray]:
+                            seed: int = 0, cubic: bool = False) -> dict[Exponents, np.ndarray]:
     """Coefficients N_a of function(delta) = sum_a delta^a N_a, delta in [-1, 1]^n.
 
-    Exponents go up to 2 in one parameter and to 3 in all. Entries smaller than `tolerance` times the
-    largest variation are set to zero. A fresh random sample checks the result.
+    Exponents go up to 2 in one parameter (3 where `cubic`: one that moves a mass and its position) and to 3 in all.
+    Entries smaller than `tolerance` times the largest variation are set to zero. A fresh random sample checks the result.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float =
     base = function(np.zeros(n))
     if n == 0:
         return {(): base}
-    monomials = _monomials(function, n, base)
+    monomials = _monomials(function, n, base, 3 if cubic else 2)
     rng = np.random.default_rng(seed)
     samples = rng.uniform(-1, 1, (2 * len(monomials) + 2, n))
     powers = np.stack([np.prod(samples ** np.array(a), axis=1) for a in monomials], axis=1)
@@ -51,7 +51,7 @@ def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float =
     return found
 
 
-def _monomials(function: MatrixFunction, n: int, base: np.ndarray) -> list[Exponents]:
+def _monomials(function: MatrixFunction, n: int, base: np.ndarray, highest: int) -> list[Exponents]:
     """Exponents that may occur: single parameters, and products of those that interact."""
     # About a generic point: at zero a product of three parameters would hide that any two of them interact.
     origin = np.random.default_rng(n).uniform(0.2, 0.6, n)
@@ -67,7 +67,7 @@ def _monomials(function: MatrixFunction, n: int, base: np.ndarray) -> list[Expon
                    if np.any(np.abs(moved(i, j) - reference - single[i] - single[j]) > 1e-12 * scale)}
     exponents = []
     for i in range(n):
-        exponents += [_exponent(n, {i: 1}), _exponent(n, {i: 2})]
+        exponents += [_exponent(n, {i: power}) for power in range(1, highest + 1)]
     for i, j in sorted(interacting):
         exponents += [_exponent(n, {i: 1, j: 1}), _exponent(n, {i: 2, j: 1}), _exponent(n, {i: 1, j: 2})]
     for i, j, k in combinations(range(n), 3):

@@ -207,7 +207,8 @@ def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str]
         return _stacked(rig.with_parameters(values).equations_of_motion() if values else equations, kept, scale)
 
     coefficients = {exponents: matrix / np.prod(stretch ** np.array(exponents, float))
-                    for exponents, matrix in polynomial_coefficients(N, len(parameters)).items()}
+                    for exponents, matrix in polynomial_coefficients(N, len(parameters), cubic=any(
+                        isinstance(p, UncertainDirection) for p in parameters)).items()}
     rows = _sensor_rows(rig, sensor_names, kept, scale)
     names = tuple(edge_name(name) for name in keep)
     lft = _pull_out(coefficients, len(parameters))
