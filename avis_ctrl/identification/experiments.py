@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import FLOOR, Matrices, ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.identification.structure import size_of
+from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import point_map
 
 _LINES = 120
@@ -66,9 +66,8 @@ class ChangedModel(ResponseModel):
     def inputs(self) -> tuple[str, ...]:
         return (*self.actuators, *FLOOR)
 
-    @cached_property
-    def matrices(self) -> Matrices:
-        own = self._plain().matrices
+    def matrices_of(self, rig: Rig) -> Matrices:
+        own = self._plain().matrices_of(rig)
         M = own.M + sum((kg * point_map(place).T @ point_map(place) for kg, place in self.masses), np.zeros((6, 6)))
         R = np.vstack([own.R, *(np.array(one.direction) @ point_map(one.place) for one in self.more_sensors)])
         T = np.column_stack([own.T, *(one.constant_N_per_V * point_map(one.place).T @ np.array(one.direction)

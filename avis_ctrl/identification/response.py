@@ -187,9 +187,10 @@ class ResponseModel:
     @cached_property
     def matrices(self) -> Matrices:
         """Of the rig as it is, the actuators and sensors of the model."""
-        return self._matrices_of(self.rig)
+        return self.matrices_of(self.rig)
 
-    def _matrices_of(self, rig: Rig) -> Matrices:
+    def matrices_of(self, rig: Rig) -> Matrices:
+        """Of that rig, with the actuators and sensors of the model."""
         eom = rig.equations_of_motion()
         known, rows = rig.sensor_rows()
         R = rows[[known.index(name) for name in self.sensors.names]]
@@ -207,7 +208,7 @@ class ResponseModel:
                 value = known[name].value
                 # Exact at any step for polynomials of second degree: a tenth loses no digits.
                 step = 0.1 * abs(value) or 1e-3
-                up, down = (self._matrices_of(self.rig.with_parameters({name: value + sign * step}))
+                up, down = (self.matrices_of(self.rig.with_parameters({name: value + sign * step}))
                             for sign in (1, -1))
                 for all_of, high, low in zip(found, up, down, strict=True):
                     all_of[j] = (high - low) / (2 * step)
