@@ -8,8 +8,8 @@ the others: an average over frequency would fill these up. So the residuals are 
 
 with G_floor of the model and smooth S (3 x 3) and d fitted to the residuals by expectation maximisation (Dempster,
 Laird and Rubin 1977; factor analysis with known loadings), and their covariance, whatever it is, is averaged where it
-is nearly flat: whitening before smoothing, as Blackman and Tukey (1958) have it for spectra. Noise of other origin costs
-precision of the average, not its validity.
+is nearly flat: whitening before smoothing, as Blackman and Tukey (1958) have it for spectra. Noise of another origin
+costs precision of the average, not its validity.
 """
 
 from __future__ import annotations

@@ -11,9 +11,9 @@ from scipy.signal import dlsim
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.campaign_fit import Portion, fit_campaign
+from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.modes import measured_modes, mode_table, model_modes
 from avis_ctrl.identification.noise import residual_noise
-from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.overlays import overlay
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
@@ -94,7 +94,7 @@ def test_the_prediction_in_time_is_that_of_scipy(found, records, checked):
 
 
 def test_chi_square_of_the_true_model_obeys_its_law(true):
-    """Noise of known covariance: chi2 of the projected error is chi-square with the dof claimed, in all and by output."""
+    """Noise of known covariance: chi2 of the projected error has the dof claimed, in all and by output."""
     rng = np.random.default_rng(5)
     w = 2 * np.pi * np.arange(10, 310) / 20.0
     C = np.eye(6) + 0.5
@@ -187,7 +187,7 @@ def test_measured_modes_know_their_errors(found, true, records, checked):
     z = []
     for one in records:
         block = record_block(one, true, BAND)
-        noisy = [r.block for r in found.fit.residuals][0]
+        noisy = found.fit.residuals[0].block
         measured = measured_modes([block.with_noise(noisy.noise[:, 0], noisy.dof)], true)
         assert measured.misfit == pytest.approx(1, abs=0.2)
         z.append((np.concatenate([measured.frequency_Hz - exact.frequency_Hz, measured.damping - exact.damping]))
@@ -215,7 +215,8 @@ def test_bands_of_the_model_are_those_of_drawn_parameters(true):
     rng = np.random.default_rng(9)
     covariance = np.diag((1e-3 * true.values) ** 2)
     f = np.array([1.0, 2.5, 4.0, 20.0])
-    measured = FrequencyResponse(f, true.response(2 * np.pi * f)[:, :, :8], np.broadcast_to(1e-6 * np.eye(6), (4, 6, 6)),
+    exact, C = true.response(2 * np.pi * f)[:, :, :8], np.broadcast_to(1e-6 * np.eye(6), (4, 6, 6))
+    measured = FrequencyResponse(f, exact, C,
                                  np.broadcast_to(np.eye(8), (4, 8, 8)), true.actuators, true.sensors.names)
     drawn = overlay(measured, true, true, covariance)
     G = np.array([true.at(true.values + np.sqrt(np.diag(covariance)) * rng.normal(size=len(true.names)))
