@@ -1,0 +1,114 @@
+"""The measuring commands as a user meets them: every hostile file is one clear line and exit code 2."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from test_cli import avis
+
+from avis_ctrl.measurement.formats import write_campaign
+from avis_ctrl.rigs import load_rig
+from avis_ctrl.simulation import simulate_campaign
+from avis_ctrl.study.campaign_plan import plan_from_table
+
+PLAN = {"title": "short", "duration_s": 20.0, "multisine": {"period_s": 5.0},
+        "record": [{"excitation": "noise", "level_percent": 40.0, "records": 2, "band_Hz": [0.5, 50.0]}]}
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("campaign") / "c.h5"
+    rig = load_rig("avis")
+    write_campaign(path, simulate_campaign(rig, plan_from_table(PLAN), seed=1))
+    return path
+
+
+def changed(campaign: Path, folder: Path, change: Callable[[h5py.File], None]) -> Path:
+    path = folder / "hostile.h5"
+    path.write_bytes(campaign.read_bytes())
+    with h5py.File(path, "a") as file:
+        change(file)
+    return path
+
+
+def set_y(value: float, rows: slice, column: int) -> Callable[[h5py.File], None]:
+    def change(file: h5py.File) -> None:
+        file["records/00/y"][rows, column] = value
+    return change
+
+
+def other_rate(file: h5py.File) -> None:
+    file["records/01"].attrs["sample_rate_Hz"] = 500.0
+
+
+def wrong_names(file: h5py.File) -> None:
+    for record in file["records"].values():
+        record["y"].attrs["names"] = [f"S{k}" for k in range(6)]
+
+
+def shorter_y(file: h5py.File) -> None:
+    y = file["records/00/y"][:-5]
+    names, unit = file["records/00/y"].attrs["names"], file["records/00/y"].attrs["unit"]
+    del file["records/00/y"]
+    file["records/00"].create_dataset("y", data=y).attrs.update({"names": names, "unit": unit})
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    (set_y(np.nan, slice(100, 101), 2), "Sx2"), (set_y(0.25, slice(None), 1), "Sz1"), (other_rate, "sample_rate_Hz"),
+    (wrong_names, "sensors of the rig avis"), (shorter_y, "y"),
+    (lambda file: file.attrs.update(version=9), "version"), (lambda file: file.attrs.update(format="x"), "format"),
+    (lambda file: file.pop("records"), "records")],
+    ids=["NaN", "constant channel", "unequal rates", "names", "shapes", "version", "format", "no records"])
+def test_hostile_campaigns_are_one_line(campaign, tmp_path, change, said):
+    done = avis("identify", str(changed(campaign, tmp_path, change)), "--rig", "avis", "--out", str(tmp_path / "out"))
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("avis: ") and done.stderr.count("\n") == 1
+    assert said in done.stderr
+    assert not (tmp_path / "out" / "result.json").exists()
+
+
+@pytest.mark.parametrize("keep", [0, 7, 2000, -1000])
+def test_truncated_files_are_one_line(campaign, tmp_path, keep):
+    path = tmp_path / "cut.h5"
+    path.write_bytes(campaign.read_bytes()[:keep])
+    done = avis("identify", str(path), "--rig", "avis", "--out", str(tmp_path / "out"))
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1 and "cut.h5" in done.stderr
+
+
+@pytest.mark.parametrize(("arguments", "said"), [
+    (("identify", "none.h5", "--rig", "avis", "--out", "o"), "none.h5"),
+    (("identify", "C", "--rig", "avos", "--out", "o"), "avos"),
+    (("identify", "C", "--rig", "halcyonics", "--out", "o"), "acc_A1"),
+    (("identify", "C", "--rig", "avis", "--out", "o", "--prior", "mass=heavy"), "heavy"),
+    (("identify", "C", "--rig", "avis", "--out", "o", "--parameter", "weight"), "weight"),
+    (("identify", "C", "--rig", "avis", "--out", "o", "--hold-out", "77"), "77"),
+    (("identify", "C", "--rig", "avis", "--out", "o", "--columns", "u"), "columns"),
+    (("identify", "C", "--rig", "avis"), "--out"),
+    (("predict", "nowhere", "C", "--out", "p.h5"), "nowhere"),
+    (("excite", "--rig", "avis", "--out", "s.h5", "--kind", "chirp"), "chirp"),
+    (("excite", "--rig", "avis", "--out", "s.h5", "--rms", "9"), "9"),
+    (("excite", "--rig", "avis", "--out", "s.doc"), "s.doc"),
+    (("simulate-campaign", "--rig", "avis", "--out", "no/where/c.h5", "--duration", "20"), "no/where"),
+    (("simulate-campaign", "--rig", "avis", "--out", "c.h5", "--plan", "none.toml"), "none.toml"),
+    (("convert", "C", "no/where/c.h5"), "no/where"),
+    (("single-axis", "pendulum", "C", "--columns", "u=u"), "pendulum"),
+    (("single-axis", "drive", "C", "--columns", "force"), "force"),
+], ids=lambda value: " ".join(value)[:50] if isinstance(value, tuple) else str(value))
+def test_wrong_usage_is_one_line(campaign, tmp_path, arguments, said, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = avis(*(str(campaign) if one == "C" else one for one in arguments))
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("avis: ") and done.stderr.count("\n") == 1
+    assert said in done.stderr
+
+
+def test_convert_and_predict_go_through(campaign, tmp_path):
+    done = avis("convert", str(campaign), str(tmp_path / "copy.h5"))
+    assert done.returncode == 0 and "2 records" in done.stdout
+    with h5py.File(tmp_path / "copy.h5") as copy, h5py.File(campaign) as file:
+        assert np.array_equal(copy["records/01/y"], file["records/01/y"])
