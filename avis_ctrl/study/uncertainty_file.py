@@ -167,4 +167,7 @@ def read_uncertainty(path: str | Path) -> UncertaintyFile:
     try:
         return UncertaintyFile.model_validate(table)
     except ValidationError as error:
-        raise first_complaint(error, UncertaintyFile).in_file(path) from None
+        found = first_complaint(error, UncertaintyFile)
+        # What contradicts itself is a whole section, too long for a line.
+        value = None if isinstance(found.value, (dict, list)) else found.value
+        raise InputError(found.expected, file=path, field=found.field or None, value=value) from None
