@@ -24,7 +24,8 @@ def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float =
     """Coefficients N_a of function(delta) = sum_a delta^a N_a, delta in [-1, 1]^n.
 
     Exponents go up to 2 in one parameter (3 where `cubic`: one that moves a mass and its position) and to 3 in all.
-    Entries smaller than `tolerance` times the largest variation are set to zero. A fresh random sample checks the result.
+    Entries smaller than `tolerance` times the largest variation are set to zero. A fresh random sample checks the
+    result.
 
     Raises
     ------

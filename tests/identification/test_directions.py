@@ -72,7 +72,8 @@ def test_parameters_drawn_from_the_covariance_lie_in_the_set(rng):
         delta = white.T @ np.linalg.solve(S, step) / found.box
         left = step - found.changes.T @ delta
         rest = [np.linalg.norm(np.tensordot(left, one, 1), 2, axis=(1, 2)) for one in (driven, floor)]
-        inside.append(np.all(np.abs(delta) <= 1) and np.all(rest[0] <= found.rest) and np.all(rest[1] <= found.rest_floor))
+        covered = np.all(rest[0] <= found.rest) and np.all(rest[1] <= found.rest_floor)
+        inside.append(np.all(np.abs(delta) <= 1) and covered)
     # The ball is enclosed by its bound on the response: coverage is what was asked or more.
     assert 0.95 - 3 * np.sqrt(0.95 * 0.05 / 1500) < np.mean(inside)
 

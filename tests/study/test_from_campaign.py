@@ -22,12 +22,11 @@ from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import nominal_loop
 
 SCRIPT = Path(__file__).resolve().parents[2] / "designs" / "from_campaign.py"
-pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The script's own run: about a minute."""
+    """The script's own run: some 40 s."""
     folder = tmp_path_factory.mktemp("from_campaign")
     runpy.run_path(str(SCRIPT))["main"](str(folder))
     return folder
@@ -67,7 +66,7 @@ def test_the_true_table_lies_inside_the_spread_at_every_frequency(study, truth):
     A, D = kept_axes(rig, ("z", "phi_x"), models[0].actuators, models[0].sensors.names)
     own, true = (D @ one.response(omega)[:, :, :8] @ A for one in models)
     L = np.linalg.norm(np.linalg.solve(own, true - own), ord=2, axis=(1, 2))
-    assert np.all(L <= weight.magnitude(omega))
+    assert np.all(weight.magnitude(omega) >= L)
     # The rig file that the identification began with does not.
     start = D @ ResponseModel.of(load_rig("avis"), ()).response(omega)[:, :, :8] @ A
     assert np.any(np.linalg.norm(np.linalg.solve(own, start - own), ord=2, axis=(1, 2)) > weight.magnitude(omega))
@@ -99,6 +98,6 @@ def test_the_certified_controller_keeps_its_promise_on_the_true_table(folder, st
     omega = 2 * np.pi * np.geomspace(low, high, 200)
     band = 20 * np.log10(np.linalg.norm(motion.frequency_response(omega), ord=2, axis=(1, 2)).max())
     assert peak <= promised["worst-case peak transmissibility"]
-    assert band <= next(value for name, value in promised.items() if name.startswith("worst-case transmissibility over"))
+    assert band <= promised["worst-case transmissibility over 1 to 10 Hz"]
     loop = nominal_loop(design, rig, plant, K).with_plant("truth", truth)
     assert spectral_radius(loop) < 1.0

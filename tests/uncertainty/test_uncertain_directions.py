@@ -97,7 +97,8 @@ def test_what_several_deltas_move_adds_up():
 
 
 def test_words():
-    direction = UncertainDirection("identified direction 1", (("mass", 1.0), ("isolator1.k_z", 2000.0), ("com_y", 1e-4)))
+    changes = (("mass", 1.0), ("isolator1.k_z", 2000.0), ("com_y", 1e-4))
+    direction = UncertainDirection("identified direction 1", changes)
     told = direction.words(0.8, {"mass": 500.0, "isolator1.k_z": 2e5, "com_y": 0.0},
                            {"mass": "kg", "isolator1.k_z": "N/m", "com_y": "m"})
     assert told == "identified direction 1 at +0.8: com_y +8e-05 m, isolator1.k_z +0.8 %, mass +0.16 %"

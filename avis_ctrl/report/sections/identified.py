@@ -31,7 +31,7 @@ def _origin(result: DesignResult, found: InDesign) -> Paragraph:
     d = found.found
     source = content.provenance.get("measurement")
     determined, kept = len(content.direction), len(found.directions)
-    text = (f"The identification{f' from {source}' if source else ''} determined {determined} combinations of "
+    text = (f"The identification{f' ({source})' if source else ''} determined {determined} combinations of "
             f"{len(content.parameter)} parameters; {content.undetermined} change nothing that was measured and stay "
             f"where they were. ")
     if kept:
