@@ -43,7 +43,8 @@ class HeldOut:
     output_chi2_per_dof, output_chi2_interval : (n_y,) and (n_y, 2), each output by itself.
     nrms, nrms_start : (n_y,) r.m.s. error in the band over r.m.s. output in the band, transient of the ends taken out.
     nrms_floor : (n_y,) what noise alone would leave.
-    nrms_all, nrms_all_start, nrms_all_floor : the same of all outputs together.
+    nrms_all, nrms_all_start, nrms_all_floor : the same of all outputs together. nrms_all_interval : where nrms_all lies
+        at 95 % if noise alone is left; wide where few lines at a resonance hold most of the noise.
     nrms_time, nrms_time_start : (n_y,) of the prediction from rest in time, its error and the output filtered to the
         band; None where the record does not start at rest. nrms_time_whole : (n_y,) without the filter.
     time_note : why there is no prediction in time, or what it covers.
@@ -65,6 +66,7 @@ class HeldOut:
     nrms_all: float
     nrms_all_start: float
     nrms_all_floor: float
+    nrms_all_interval: tuple[float, float]
     nrms_time: np.ndarray | None = None
     nrms_time_start: np.ndarray | None = None
     nrms_time_whole: np.ndarray | None = None
@@ -219,7 +221,20 @@ def _figures(found: CampaignFit, fitted: Campaign | FrequencyResponse, block: Sp
         block.name, len(block.omega), words, error.chi2 / error.dof, interval(expected, error.dof, noise_dof, LEVEL),
         before.chi2 / before.dof, _local_chi2(found, fitted, raw, notes), error.output_chi2 / error.output_dof,
         np.array(of_output), _root(error.error, power), _root(before.error, power), np.sqrt(floor / power),
-        _root_all(error), _root_all(before), float(np.sqrt(floor.sum() / power.sum())), *_in_time(found, record), white)
+        _root_all(error), _root_all(before), float(np.sqrt(floor.sum() / power.sum())),
+        _floor_interval(error, float(floor.sum() / power.sum()), noise_dof / (2 * block.Y.size)),
+        *_in_time(found, record), white)
+
+
+def _floor_interval(error: PredictionError, floor: float, times: float) -> tuple[float, float]:
+    """Interval of the root of sum |e|^2 / sum |Y|^2 of noise, estimated from `times` as many lines; it has few degrees
+    of freedom where few lines hold most of it (Welch and Satterthwaite)."""
+    assert error.block.noise is not None
+    C = np.broadcast_to(error.block.noise, (*error.block.noise.shape[:1], error.error.shape[2],
+                                            *error.block.noise.shape[2:]))
+    dof = 2 * np.real(np.einsum("kmii->", C)) ** 2 / np.real(np.einsum("kmij,kmji->", C, C))
+    low, high = interval(floor, dof, max(dof * times, 3.0))
+    return float(np.sqrt(low)), float(np.sqrt(high))
 
 
 def _root(error: np.ndarray, power: np.ndarray) -> np.ndarray:
@@ -305,8 +320,9 @@ def _verdict(figures: list[HeldOut]) -> str:
     """Of the record that fits worst."""
     worst = max(figures, key=lambda one: one.chi2_per_dof / one.chi2_interval[1])
     return (f"the identified model leaves {_percent(worst.nrms_all)} on held-out record {worst.name} where noise alone "
-            f"leaves {_percent(worst.nrms_all_floor)} and the start model left {_percent(worst.nrms_all_start)}; "
-            f"chi-square per degree of freedom {worst.chi2_per_dof:.4g} ({worst.chi2_interval[0]:.4g} to "
+            f"leaves {_percent(worst.nrms_all_interval[0])} to {_percent(worst.nrms_all_interval[1])} "
+            f"and the start model left {_percent(worst.nrms_all_start)}; chi-square per degree of "
+            f"freedom {worst.chi2_per_dof:.4g} ({worst.chi2_interval[0]:.4g} to "
             f"{worst.chi2_interval[1]:.4g} expected)")
 
 

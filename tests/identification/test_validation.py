@@ -19,7 +19,7 @@ from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block
-from avis_ctrl.identification.validation import validate
+from avis_ctrl.identification.validation import _floor_interval, validate
 from avis_ctrl.identification.whiteness import whiteness
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -71,6 +71,7 @@ def test_an_identified_rig_leaves_what_noise_leaves(checked):
         assert abs(one.chi2_per_dof - 1) < 0.06 and one.chi2_start > 100
         assert one.nrms_all == pytest.approx(one.nrms_all_floor, rel=0.15) and one.nrms_all_start > 10 * one.nrms_all
         assert np.allclose(one.nrms, one.nrms_floor, rtol=0.3)
+        assert 0.97 * one.nrms_all_interval[0] < one.nrms_all < 1.03 * one.nrms_all_interval[1]
         assert one.whiteness is not None and one.whiteness.white
     assert "%" in checked.verdict and "expected" in checked.verdict
     json.dumps(checked.as_dict(), allow_nan=False)
@@ -220,11 +221,26 @@ def test_bands_of_the_model_are_those_of_drawn_parameters(true):
                                  np.broadcast_to(np.eye(8), (4, 8, 8)), true.actuators, true.sensors.names)
     drawn = overlay(measured, true, true, covariance)
     G = np.array([true.at(true.values + np.sqrt(np.diag(covariance)) * rng.normal(size=len(true.names)))
-                  .response(2 * np.pi * f)[:, :, :8] for _ in range(600)])
+                  .response(2 * np.pi * f)[:, :, :8] for _ in range(150)])
     large = np.abs(drawn.model) > 0.05 * np.abs(drawn.model).max(axis=(1, 2), keepdims=True)
-    assert np.allclose(np.std(np.abs(G), axis=0)[large], drawn.model_magnitude_std[large], rtol=0.15)
-    assert np.allclose(np.std(np.angle(G / drawn.model), axis=0)[large], drawn.model_phase_std[large], rtol=0.15)
+    assert np.allclose(np.std(np.abs(G), axis=0)[large], drawn.model_magnitude_std[large], rtol=0.3)
+    assert np.allclose(np.std(np.angle(G / drawn.model), axis=0)[large], drawn.model_phase_std[large], rtol=0.3)
     assert np.allclose(drawn.measured_std, 1e-3 / np.sqrt(2)) and drawn.inside == 1.0
+
+
+def test_the_floor_of_a_few_loud_lines_is_wide(true):
+    """Noise on mostly five lines: the interval of the r.m.s. error against draws."""
+    rng = np.random.default_rng(14)
+    level = np.where(np.arange(200) < 5, 100.0, 0.1)
+    C = level[:, None, None] * np.eye(6)
+    block = SpectralBlock("00", 2 * np.pi * np.linspace(1, 20, 200), np.zeros((200, 11, 1), complex),
+                          np.ones((200, 6, 1), complex)).with_noise(C)
+    e = rng.normal(size=(4000, 200, 6, 1)) + 1j * rng.normal(size=(4000, 200, 6, 1))
+    e *= np.sqrt(level / 2)[:, None, None]
+    drawn = np.sqrt(np.sum(np.abs(e) ** 2, axis=(1, 2, 3)) / 1200)
+    error = PredictionError(block, e[0], e[0], e[0], np.empty(0), 2400, np.full(6, 400.0))
+    low, high = _floor_interval(error, float(np.sum(6 * level) / 1200), np.inf)
+    assert np.mean((drawn > low) & (drawn < high)) == pytest.approx(0.95, abs=0.012)
 
 
 def test_noise_near_sharp_modes_is_measured(true):
