@@ -10,12 +10,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from avis_ctrl.errors import InputError
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.prediction import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
+
+# Lines to each side of a window; None for the fewest that the degrees of freedom allow.
+HALF_WIDTHS = (None, 16, 24, 36)
 
 
 class Unexplained(RecordSource):
@@ -54,18 +59,32 @@ def unexplained(campaign: Campaign, model: ResponseModel) -> Campaign:
 
 
 def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float],
-                      longest_piece: int | None = None) -> FrequencyResponse:
+                      longest_piece: int | None = None, frequency_Hz: np.ndarray | None = None) -> FrequencyResponse:
     """The frequency response as the records have it: the model's, and what it leaves unexplained.
+
+    Windows of the local polynomial grow until the inputs can be told apart in each: with zippered lines each input has
+    only some of them. What is left is smooth, which wide windows need.
 
     Raises
     ------
     InputError : as `unexplained` and `local_polynomial`.
     ComputationError : inputs that cannot be told apart.
     """
-    left = local_polynomial(unexplained(campaign, model), band_Hz=band_Hz, longest_piece=longest_piece)
+    left = _local(unexplained(campaign, model), band_Hz, longest_piece, frequency_Hz)
     response = model.response(left.omega)[:, :, [model.inputs.index(name) for name in left.inputs]]
     rows = [left.outputs.index(name) for name in model.sensors.names]
     value = left.value.copy()
     value[:, rows] += response
     return replace(left, value=value, method=f"response of the model with what it leaves: {left.method}")
 
+
+def _local(campaign: Campaign, band_Hz: tuple[float, float], longest_piece: int | None,
+           frequency_Hz: np.ndarray | None) -> FrequencyResponse:
+    for half_width in HALF_WIDTHS[:-1]:
+        try:
+            return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=half_width,
+                                    longest_piece=longest_piece)
+        except ComputationError:
+            continue
+    return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=HALF_WIDTHS[-1],
+                            longest_piece=longest_piece)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from avis_ctrl.errors import AvisError, ComputationError, InputError
+from avis_ctrl.errors import AvisError, InputError
+from avis_ctrl.identification import model_error
+from avis_ctrl.identification.campaign_fit import Portion
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
-from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 
 # Frequencies of a figure.
 POINTS = 400
@@ -83,8 +84,12 @@ def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseMo
         spread[0] * np.abs(found.Y), spread[1], measured.method)
 
 
-def measured_response(data: Campaign | FrequencyResponse, band_Hz: tuple[float, float]) -> FrequencyResponse:
+def measured_response(data: Campaign | FrequencyResponse, band_Hz: tuple[float, float], model: ResponseModel
+                      ) -> FrequencyResponse:
     """The response as given; of records the best linear approximation where they allow it, or a local polynomial one.
+
+    The latter is of what the model leaves unexplained, with the model's response added: of the records themselves it
+    would round off the resonances, the more so the wider its windows have to be.
 
     Raises
     ------
@@ -102,18 +107,14 @@ def measured_response(data: Campaign | FrequencyResponse, band_Hz: tuple[float, 
         if not 0 < low < high:
             raise InputError("expected a band with lines of every record", field="band_Hz", value=band_Hz) from None
         points = min(POINTS, round((high - low) / step) + 1)
-        return _local(data, band_Hz, np.clip(np.geomspace(low, high, points), low, high))
+        grid = np.clip(np.geomspace(low, high, points), low, high)
+        return model_error.measured_response(_wholes(data), model, band_Hz, LONGEST_PIECE, grid)
 
 
-def _local(data: Campaign, band_Hz: tuple[float, float], frequency_Hz: np.ndarray) -> FrequencyResponse:
-    """Local polynomials over windows that grow until the inputs can be told apart in each."""
-    for half_width in (None, 16, 24, 36):
-        try:
-            return local_polynomial(data, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=half_width,
-                                    longest_piece=LONGEST_PIECE)
-        except ComputationError as failed:
-            last = failed
-    raise last
+def _wholes(data: Campaign) -> Campaign:
+    """Whole records in the place of their parts, which do not all start at rest as a prediction does."""
+    wholes = {record.header.name: record.whole if isinstance(record, Portion) else record for record in data.records}
+    return replace(data, records=tuple(wholes.values()))
 
 
 def _thinned(response: FrequencyResponse) -> FrequencyResponse:

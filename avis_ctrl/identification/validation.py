@@ -309,7 +309,7 @@ def _overlay(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
     else:
         data = held_out
     try:
-        return overlay(measured_response(data, found.band_Hz), found.fit.model, found.start,
+        return overlay(measured_response(data, found.band_Hz, found.fit.model), found.fit.model, found.start,
                        found.fit.information.covariance)
     except AvisError as failed:
         notes.append(f"no measured response to draw ({failed})")

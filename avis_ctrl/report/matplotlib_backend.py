@@ -17,11 +17,13 @@ from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, lo
 WIDTH_IN, LEFT_IN, RIGHT_IN, PLOT_IN = 6.7, 0.66, 0.14, 1.75
 TITLE_IN, FOOT_IN, LEGEND_IN = 0.2, 0.42, 0.18
 CHARACTER_IN, KEY_IN = 0.068, 0.5
+# Mean width of a letter over its height.
+LETTER = 0.54
 LINES = {"solid": "-", "dash": (0, (5, 2)), "dot": (0, (1, 1.5)), "dashdot": (0, (5, 1.5, 1, 1.5))}
 # Same input, same bytes: element names follow from the salt, and no date is written.
 SETTINGS: Any = {"svg.fonttype": "none", "svg.hashsalt": "avis_ctrl", "font.size": 8.0,
                  "axes.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False,
-                 "axes.unicode_minus": True, "path.simplify": True}
+                 "axes.unicode_minus": True, "axes.formatter.useoffset": False, "path.simplify": True}
 
 
 def svg(figure: Figure) -> str:
@@ -36,7 +38,7 @@ def svg(figure: Figure) -> str:
         canvas = Canvas(figsize=(WIDTH_IN, height))
         # Fixed places: a layout engine would take most of the time of the whole report.
         for panel, place in zip(figure.panels, places, strict=True):
-            _draw(canvas.add_axes(place), panel, figure.shared)
+            _draw(canvas.add_axes(place), panel, figure, place[2] * WIDTH_IN)
         if legend:
             canvas.legend([_key(e) for e in entries], [e.label for e in entries], loc="lower center", borderaxespad=0.1,
                           ncols=keys, frameon=False, handlelength=2.6)
@@ -79,7 +81,8 @@ def _key(entry: Curve | Band) -> Any:
     return Line2D([], [], marker="o" if entry.points else None, markersize=3, **_line(entry.style))
 
 
-def _draw(ax: Any, panel: Panel, small: bool) -> None:
+def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> None:
+    small = figure.shared
     for band in panel.bands:
         ax.fill_between(band.x, band.low, band.high, color=band.style.colour, alpha=0.25, linewidth=0)
     for curve in panel.curves:
@@ -87,6 +90,7 @@ def _draw(ax: Any, panel: Panel, small: bool) -> None:
         if not curve.line:
             look["linestyle"] = "none"
         if curve.bars:
+            ax.set_axisbelow(True)
             ax.bar(curve.x, curve.y, curve.bars, color=curve.style.colour)
             continue
         if curve.error is not None:
@@ -98,9 +102,18 @@ def _draw(ax: Any, panel: Panel, small: bool) -> None:
     _scale(ax, "y", panel.y, log_range(panel) if panel.y.scale == "log" else panel.y.range)
     ax.grid(True, linewidth=0.4, color="#dddddd")
     if panel.title:
-        ax.set_title(panel.title, fontsize=6.5 if small else 8.5, loc="left", pad=2.5 if small else None)
+        ax.set_title(panel.title, fontsize=_fitting(panel.title, width, 6.5 if small else 8.5), loc="left",
+                     pad=2.5 if small else None)
+    ax.yaxis.label.set_fontsize(_fitting(panel.y.label, PLOT_IN * figure.height + 0.2, 6.5 if small else 8.0))
     if small:
         ax.tick_params(labelsize=5.5)
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_minor_locator(matplotlib.ticker.NullLocator())
+
+
+def _fitting(text: str, room: float, most: float) -> float:
+    """Points of a text's letters in so many inches."""
+    return max(5.5, min(most, 72 * room / (LETTER * max(len(text), 1))))
 
 
 def _scale(ax: Any, which: str, axis: Axis, limits: tuple[float, float] | None) -> None:

@@ -37,7 +37,8 @@ def _layout(figure: Figure, columns: int) -> dict[str, Any]:
     layout: dict[str, Any] = {
         "height": round(PANEL_PX * figure.height * rows) + 90 + LEGEND_ROW_PX * (len(figure.legend()) // 3),
         "annotations": [], "showlegend": len(figure.legend()) > 1}
-    gap = (0.14 if figure.shared else 0.26) / rows if rows > 1 else 0.0
+    # As many pixels as title and numbers need, however low the panels are.
+    gap = (0.14 if figure.shared else 0.26 / figure.height) / rows if rows > 1 else 0.0
     between = 0.0 if columns == 1 else 0.012 if figure.shared else 0.11
     width = (1.0 - between * (columns - 1)) / columns
     for k, panel in enumerate(figure.panels):
@@ -51,6 +52,9 @@ def _layout(figure: Figure, columns: int) -> dict[str, Any]:
         layout[f"xaxis{suffix}"] = {**_axis(panel.x, panel.x.range), "anchor": f"y{suffix}", **side, **small}
         limits = log_range(panel) if panel.y.scale == "log" else panel.y.range
         layout[f"yaxis{suffix}"] = {**_axis(panel.y, limits), "anchor": f"x{suffix}", "domain": domain, **small}
+        room = PANEL_PX * figure.height * (1.0 if rows == 1 else 0.75)
+        if len(panel.y.label) * 7 > room:
+            layout[f"yaxis{suffix}"]["title"]["font"] = {"size": 10}
         if panel.title:
             layout["annotations"].append(_title(panel, domain[1], side.get("domain", [0])[0], figure.shared))
     return layout

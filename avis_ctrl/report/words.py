@@ -26,7 +26,7 @@ def with_deviation(value: float, sigma: float) -> tuple[str, str]:
     if not (np.isfinite(sigma) and sigma > 0 and np.isfinite(value)):
         return number(value, 5), number(sigma, 2)
     places = 1 - int(np.floor(np.log10(float(f"{sigma:.1e}"))))
-    if places > 6 or abs(value) >= 1e7:
+    if places > 9 or abs(value) >= 1e7:
         # Many zeros are read wrongly: both as multiples of the value's power of ten.
         power = int(np.floor(np.log10(abs(value)))) if value else int(np.floor(np.log10(sigma)))
         digits = max(places + power, 0)
@@ -34,6 +34,14 @@ def with_deviation(value: float, sigma: float) -> tuple[str, str]:
     else:
         first, second = (f"{round(v, places):.{max(places, 0)}f}".replace("-", "−") for v in (value, sigma))
     return first, second
+
+
+def in_brackets(value: float, sigma: float) -> str:
+    """A value with its standard deviation in units of its last two digits, 1.2345(67)."""
+    places = 1 - int(np.floor(np.log10(float(f"{sigma:.1e}"))))
+    if not 0 <= places <= 12:
+        return " ± ".join(with_deviation(value, sigma))
+    return f"{value:.{places}f}({round(sigma * 10.0 ** places)})".replace("-", "−")
 
 
 def bound(value: float, digits: int = 3) -> str:

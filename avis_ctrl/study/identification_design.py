@@ -16,6 +16,7 @@ from avis_ctrl.identification.spread import FrfSpread, frf_spread
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.study.design_file import ChainUncertainty, Design, design_from_table, read_design
 from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE, UNCERTAINTY_FILE
+from avis_ctrl.study.identified_uncertainty import InDesign, in_design
 from avis_ctrl.study.uncertainty_file import UncertaintyFile
 from avis_ctrl.study.uncertainty_writer import uncertainty_content, uncertainty_json
 
@@ -51,10 +52,19 @@ def design_files(found: Identification, template: Path | Design | None = None) -
     InputError : a template that is wrong; coordinates that the measured channels cannot push or tell apart.
     ComputationError : records that do not tell the actuators apart, so that no spread can be measured.
     """
+    return design_start(found, template)[0]
+
+
+def design_start(found: Identification, template: Path | Design | None = None) -> tuple[dict[str, str], InDesign]:
+    """As `design_files`, and beside it what a design makes of the measured uncertainty, for the report.
+
+    The filter covers what was measured; a design adds what it declares of its drives where nothing was.
+    """
     design = _template(found, template)
     spread = measured_spread(found, tuple(design.keep))
     content = uncertainty_content(found.rig, found.campaign_fit.fit.information, [spread], found.provenance)
-    return {UNCERTAINTY_FILE: uncertainty_json(content), DESIGN_FILE: identification_design(content, design)}
+    made = in_design(content, found.rig, design.keep, design.uncertainty.confidence_percent / 100)
+    return {UNCERTAINTY_FILE: uncertainty_json(content), DESIGN_FILE: identification_design(content, design)}, made
 
 
 def measured_spread(found: Identification, keep: tuple[str, ...]) -> FrfSpread:

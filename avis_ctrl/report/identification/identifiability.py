@@ -39,7 +39,7 @@ def _combinations(found: Identification) -> Table:
             value, sigma, share = words.number(one.value, 4), "not determined", ""
         rows.append((one.words, value, sigma, share, unit))
     return table("What the data determine, from the parameters' joint covariance. Parameters that stand alone here are "
-                 "determined by themselves.", ("combination", "value", "± 1 σ", "± 1 σ", "unit"), rows, "lrrrl")
+                 "determined by themselves.", ("combination", "value", "± 1 σ", "relative", "unit"), rows, "lrrrl")
 
 
 def _directions(found: Identification) -> Figure:

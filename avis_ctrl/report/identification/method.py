@@ -49,7 +49,7 @@ def method(found: Identification) -> Section:
         Paragraph("Validation. Chi-square of the held-out data is held against noise estimated from the fitted "
                   "records alone; its interval allows for the number of lines, the parameters' uncertainty and the "
                   "error of the noise estimate itself."),
-        Formula("op(\"E\") chi^2 / n = 1 + op(\"tr\") (J_v op(\"cov\") hat(theta) J_v^T) / n",
+        Formula("op(\"E\") chi^2 / n = 1 + 1/n op(\"tr\") (J_v op(\"cov\") hat(theta) thin J_v^T)",
                 "the expected chi-square per number is one plus the trace of the predicted variance"),
         Heading("Sources"), Bullets(SOURCES)]
     return Section("Method", "method", tuple(pieces))

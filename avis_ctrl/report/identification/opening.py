@@ -59,7 +59,8 @@ def _parameters(found: Identification) -> Table:
     return table("Every free parameter at its start and as identified by maximum likelihood, with one standard "
                  "deviation (Cramér-Rao bound). Where a parameter is known only in combination with others, its own "
                  f"value is the one nearest to the start and says nothing by itself; section 5 has the combinations."
-                 f"{prior}", ("parameter", "start", "identified", "± 1 σ", "± 1 σ", "change", "unit"), rows, "lrrrrrl")
+                 f"{prior}", ("parameter", "start", "identified", "± 1 σ", "relative", "change", "unit"), rows,
+                 "lrrrrrl")
 
 
 def _changes(found: Identification) -> Figure:

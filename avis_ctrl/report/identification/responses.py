@@ -13,7 +13,7 @@ from avis_ctrl.study.identification import Identification
 MEASURED, START, MODEL = Style("#222222"), Style("#e69f00", "dash", 1.6), Style("#0072b2", "solid", 1.6)
 OUTPUTS_TOGETHER = 3
 # Points of a measured response in a full figure, and in the overview.
-MOST_POINTS, MOST_SMALL = 400, 90
+MOST_POINTS, MOST_SMALL = 120, 90
 
 
 def responses(found: Identification) -> Section:
@@ -25,7 +25,7 @@ def responses(found: Identification) -> Section:
     pairs = strongest(seen)
     named = words.joined([f"{seen.outputs[i]} from {seen.inputs[j]}" for i, j in pairs])
     pieces: list[Piece] = [Paragraph(
-        f"Measured: {seen.method}, from all records. {words.number(100 * seen.inside)} % of the measured entries lie "
+        f"Measured: {seen.method}. {words.number(100 * seen.inside)} % of the measured entries lie "
         f"within two standard deviations of the identified model, 95 % if nothing but noise separates them and the "
         f"estimate has no bias. In full: the strongest input of each output, {named}.")]
     groups = [pairs[k:k + OUTPUTS_TOGETHER] for k in range(0, len(pairs), OUTPUTS_TOGETHER)]
@@ -43,9 +43,10 @@ def strongest(seen: ResponseOverlay) -> list[tuple[int, int]]:
 
 
 def _unit(seen: ResponseOverlay, j: int) -> str:
-    """Floor columns are per m/s whatever the drives' unit is."""
-    output = seen.unit.partition(" per ")[0]
-    return words.unit(f"{output} per m/s" if seen.inputs[j] in ("vx", "vy", "vz") else seen.unit)
+    """Floor columns are per m/s whatever the drives' unit is, which stands first."""
+    output, _, inputs = seen.unit.partition(" per ")
+    drive = inputs.partition(";")[0]
+    return words.unit(f"{output} per {'m/s' if seen.inputs[j] in ('vx', 'vy', 'vz') else drive}")
 
 
 def _frequencies(seen: ResponseOverlay) -> Axis:
@@ -70,7 +71,7 @@ def _magnitude(seen: ResponseOverlay, i: int, j: int) -> Panel:
     low = 0.5 * float(min(model.min(), start.min(), np.quantile(size, 0.02)))
     high = 2.0 * float(max(model.max(), start.max(), size.max()))
     curves = (Curve(f[keep], size[keep], "measured", Style(MEASURED.colour), points=True, line=False),
-              Curve(f, start, "start", START), Curve(f, model, "identified", MODEL))
+              Curve(f, model, "identified", MODEL), Curve(f, start, "start", START))
     band = Band(f, np.maximum(size - s, low), np.maximum(size + s, low), "measured, ± 2 σ", Style("#7a7a7a"))
     return Panel(_frequencies(seen), Axis(f"magnitude [{_unit(seen, j)}]", "log", (low, high)), curves, (band,),
                  f"{seen.outputs[i]} from {seen.inputs[j]}")
@@ -85,7 +86,7 @@ def _phase(seen: ResponseOverlay, i: int, j: int) -> Panel:
     s = np.rad2deg(np.minimum(2 * seen.measured_std[:, i, j] / np.maximum(np.abs(measured), 1e-300), np.pi))
     keep = _thin(len(f), MOST_POINTS)
     curves = (Curve(f[keep], shown["measured"][keep], "measured", Style(MEASURED.colour), points=True, line=False),
-              Curve(f, shown["start"], "start", START), Curve(f, np.rad2deg(base), "identified", MODEL))
+              Curve(f, np.rad2deg(base), "identified", MODEL), Curve(f, shown["start"], "start", START))
     band = Band(f, shown["measured"] - s, shown["measured"] + s, "measured, ± 2 σ", Style("#7a7a7a"))
     return Panel(_frequencies(seen), Axis("phase [°]"), curves, (band,),
                  f"{seen.outputs[i]} from {seen.inputs[j]}")
@@ -105,8 +106,7 @@ def _residual(seen: ResponseOverlay, pairs: list[tuple[int, int]]) -> Figure:
         panels.append(Panel(_frequencies(seen), Axis(f"residual [{_unit(seen, j)}]", "log", limits), curves, (),
                             f"{seen.outputs[i]} from {seen.inputs[j]}"))
     return Figure("residuals", "What is left between measured and model, magnitude of the complex difference. With "
-                  "noise alone 86 % of the points lie below the dotted line. The local estimate rounds off sharp "
-                  "resonances, which shows here as a residual at the peaks of short records.", tuple(panels), 2, 0.75)
+                  "noise alone 86 % of the points lie below the dotted line.", tuple(panels), 2, 0.75)
 
 
 def _overview(seen: ResponseOverlay) -> Figure:
@@ -123,10 +123,10 @@ def _overview(seen: ResponseOverlay) -> Figure:
             first, last = j == columns[0], i == n_y - 1
             measured, start, model = (np.abs(G[keep, i, j]) for G in (seen.measured, seen.start, seen.model))
             curves = (Curve(f, measured, "measured", Style("#7a7a7a", "solid", 2.6)),
-                      Curve(f, start, "start", Style(START.colour, "dash", 1.0)),
-                      Curve(f, model, "identified", Style(MODEL.colour, "solid", 1.0)))
+                      Curve(f, model, "identified", Style(MODEL.colour, "solid", 1.0)),
+                      Curve(f, start, "start", Style(START.colour, "dash", 1.0)))
             panels.append(Panel(Axis("[Hz]" if last else "", "log", _frequencies(seen).range, silent=not last),
                                 Axis(f"{seen.outputs[i]}" if first else "", "log", limits, silent=not first),
                                 curves, (), seen.inputs[j] if i == 0 else ""))
-    return Figure("overview", f"Magnitude of every pair on the same scales [{words.unit(seen.unit)}]: inputs from left "
-                  "to right, outputs from top to bottom.", tuple(panels), len(columns), 0.36, True)
+    return Figure("overview", f"Magnitude of every pair on the same scales [{_unit(seen, columns[0])}]: inputs from "
+                  "left to right, outputs from top to bottom.", tuple(panels), len(columns), 0.36, True)

@@ -22,10 +22,12 @@ def uncertainty(found: Identification, made: InDesign | None) -> Section:
             "result.json."),))
     kept = words.joined([words.axis(name) for name in made.spread.keep])
     count = len(made.directions)
-    text = (f"For a design of {kept} the parameters' joint covariance becomes {count} bounded "
-            f"direction{'s' * (count != 1)} and the measured spread becomes one filter. Box and ball hold together "
-            f"with {words.number(100 * made.found.coverage)} % probability; the bound of the spread holds at each line "
-            f"with {words.number(100 * made.confidence)} %.")
+    bounded = (f"the parameters' joint covariance becomes {count} bounded direction{'s' * (count != 1)}" if count else
+               "the parameters are known so well that no direction of their covariance needs a bound of its own")
+    text = (f"For a design of {kept} {bounded}; the measured spread becomes one filter. The directions with what they "
+            f"leave hold with {words.number(100 * made.found.coverage)} % probability, the bound of the spread at each "
+            f"line with {words.number(100 * made.confidence)} %. Beyond the band, and where a design declares more of "
+            "its drives, the design file adds to the filter.")
     return Section(TITLE, "uncertainty", (Paragraph(text), _directions(made, found), _rest(made), _spread(made)))
 
 

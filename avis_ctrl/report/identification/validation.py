@@ -62,7 +62,7 @@ def _places(outputs: tuple[str, ...]) -> tuple[np.ndarray, Axis]:
 def _chi_square(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
     x, axis = _places(outputs)
     low, high = one.output_chi2_interval.T
-    curves = (Curve(x, (low + high) / 2, "95 % interval", FLOOR, points=False, line=False, error=(high - low) / 2),
+    curves = (Curve(x, (low + high) / 2, "95 % interval", FLOOR, points=True, line=False, error=(high - low) / 2),
               Curve(x, one.output_chi2_per_dof, "held-out data", AFTER, points=True, line=False))
     return Figure(f"chi_square_{one.name}", f"Chi-square per degree of freedom of each output, record {one.name}, with "
                   "its interval.", (Panel(axis, Axis("chi-square / dof [-]"), curves),), height=0.8)
@@ -122,7 +122,8 @@ def _modes(found: Identification) -> Table:
         rows.append((row.shape, words.number(row.start_frequency_Hz, 4), f, measured_f, _sigma(row.frequency_sigma),
                      words.number(100 * row.start_damping, 3), z, measured_z, _sigma(row.damping_sigma)))
     return table("Modes of the start and of the identified model beside those measured in the held-out data without "
-                 "the rig's equations. Shapes by shares of kinetic energy; the difference is model less measured over "
+                 "the rig's equations. Brackets hold one standard deviation in units of the last "
+                 "digits. Shapes by shares of kinetic energy; the difference is model less measured over "
                  "its standard deviation.",
                  ("shape", "start [Hz]", "identified [Hz]", "measured [Hz]", "diff. [σ]", "damping, start [%]",
                   "identified [%]", "measured [%]", "diff. [σ]"), rows)
@@ -133,7 +134,7 @@ def _pair(value: float, sigma: float) -> str:
         return "none"
     if not (np.isfinite(sigma) and sigma > 0):
         return words.number(value, 4)
-    return " ± ".join(words.with_deviation(value, sigma))
+    return words.in_brackets(value, sigma)
 
 
 def _sigma(value: float) -> str:

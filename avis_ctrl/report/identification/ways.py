@@ -92,8 +92,9 @@ def _figure(found: Identification, curves: ParameterCurves, number: int) -> Figu
     panels = []
     for k, name in enumerate(curves.names):
         likely = float(information.values[information.names.index(name)])
-        low, high = float(np.min(curves.lower[:, k])), float(np.max(curves.upper[:, k]))
-        low, high = min(low, likely), max(high, likely)
+        # The prior's band, at the first point, would hide what the data say.
+        low = float(np.min(curves.lower[1:, k], initial=likely))
+        high = float(np.max(curves.upper[1:, k], initial=likely))
         pad = 0.05 * (high - low) or 1.0
         ends = (low - pad, high + pad)
         edges = [b for b in curves.boundaries_s if frame[0] < b < frame[1]]
@@ -103,13 +104,14 @@ def _figure(found: Identification, curves: ParameterCurves, number: int) -> Figu
                  Curve(np.array(frame), np.array([likely, likely]), "maximum likelihood", LIKELY),
                  Curve(x, y, "a record begins", RECORDS)]
         band = Band(t, curves.lower[:, k], curves.upper[:, k], "± 2 σ", ESTIMATE)
-        known = "" if information.known[information.names.index(name)] else ", only in combination"
+        known = "" if information.known[information.names.index(name)] else " *"
         panels.append(Panel(Axis("time in the records [s]", "linear", frame),
                             Axis(f"[{words.unit(curves.units[k])}]", "linear", ends), tuple(drawn), (band,),
                             f"{name}{known}"))
     return Figure(f"kalman_{number}", f"{curves.title}: the extended Kalman filter's estimate against time, as in "
-                  "figs. 3.1 to 3.3 of its source. A parameter that is known only in combination stays where the prior "
-                  "and its partners leave it.", tuple(panels), min(3, len(panels)), 0.62)
+                  "figs. 3.1 to 3.3 of its source; the first second, when the prior's band is far wider, is cut off. A "
+                  "parameter with * is known only in combination and stays where the prior and its partners leave it.",
+                  tuple(panels), min(3, len(panels)), 0.62)
 
 
 def _names(found: Identification, result: EkfResult) -> list[str]:

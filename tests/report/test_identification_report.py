@@ -1,0 +1,271 @@
+"""The report of an identification: what it says agrees with what was found, in HTML and in PDF."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_report import HOSTILE, Reader, pdf_text
+
+from avis_ctrl.identification.ekf_result import EkfHistory, EkfResult, innovation_statistics
+from avis_ctrl.identification.ekf_settings import HONEST_SETTINGS
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series
+from avis_ctrl.report import identification_html, identification_pdf, words
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style
+from avis_ctrl.report.identification.content import document
+from avis_ctrl.report.identification.pictures import figure_of
+from avis_ctrl.report.identification.responses import strongest
+from avis_ctrl.report.matplotlib_backend import svg
+from avis_ctrl.report.pieces import Fold, Mark, Paragraph, Section, Table
+from avis_ctrl.report.plotly_backend import graph
+from avis_ctrl.rigs import load_rig
+from avis_ctrl.simulation import rehearse
+from avis_ctrl.study.campaign_plan import plan_from_table
+from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
+
+FREE = ("mass", "isolator*.k_x", "isolator*.k_z", "isolator1.c_z")
+PLAN = {"title": "small", "duration_s": 8.0, "settle_s": 2.0, "band_Hz": [1.0, 20.0],
+        "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
+        "record": [{"excitation": "noise", "records": 3}, {"excitation": "rest"}]}
+
+
+@pytest.fixture(scope="module")
+def found() -> Identification:
+    """A small campaign: three records of noise and one at rest."""
+    rig = load_rig("avis")
+    campaign = rehearse(rig, plan_from_table(PLAN), seed=2).campaign
+    return identify(campaign, rig, IdentifyOptions(parameters=FREE, starts=1, despite_gates=True))
+
+
+@pytest.fixture(scope="module")
+def html(found: Identification) -> bytes:
+    return identification_html(found)
+
+
+@pytest.fixture(scope="module")
+def pdf(found: Identification) -> bytes:
+    return identification_pdf(found)
+
+
+def section(found: Identification, anchor: str) -> Section:
+    return next(s for s in document(found).sections if s.anchor == anchor)
+
+
+def tables(part: Section) -> list[Table]:
+    return [p for p in part.flat() if isinstance(p, Table)]
+
+
+def figures(part: Section) -> dict[str, Figure]:
+    return {p.name: p for p in part.flat() if isinstance(p, Figure)}
+
+
+def test_same_sections_figures_and_tables_in_both(found, html, pdf, tmp_path):
+    content, page, text = document(found), Reader(html), pdf_text(pdf, tmp_path)
+    assert len(content.sections) == 10
+    drawn = [a["data-name"] for tag, a in page.elements if "data-name" in a]
+    assert drawn == [p.name for p in content.figures()] == list(page.graphs())
+    count = sum(len(tables(s)) for s in content.sections)
+    for word, things in (("Figure", len(drawn)), ("Table", count)):
+        for source in (page.text, text):
+            assert {int(n) for n in re.findall(rf"\b{word} (\d+)[.:]", source)} == set(range(1, things + 1))
+    for number, one in enumerate(content.sections, 1):
+        assert f"{number}. {one.title}" in page.text
+        assert re.search(rf"^ *{number} +{re.escape(one.title)}", text, re.M), one.title
+
+
+def test_verdict_has_the_numbers_of_the_validation(found):
+    first = section(found, "result").pieces[0]
+    assert isinstance(first, Paragraph) and found.validation.verdict[1:] in first.text
+    information = found.campaign_fit.fit.information
+    assert f"{information.rank} combinations of the {len(information.names)} parameters" in first.text
+    assert first.good == (all(h.consistent for h in found.validation.held_out)
+                          and not any(f.severity == "stop" for f in found.findings)
+                          and found.campaign_fit.fit.converged)
+
+
+def test_every_parameter_is_shown_as_well_as_it_is_known(found):
+    """Horizontal springs in one line are known only as sums; the table says so, and gives numbers for the others."""
+    rows = {row[0]: row for row in tables(section(found, "result"))[0].rows}
+    information = found.campaign_fit.fit.information
+    assert tuple(rows) == information.names
+    for name, value, sigma in zip(information.names, information.values, information.standard_deviation, strict=True):
+        if np.isfinite(sigma):
+            assert abs(float(rows[name][2]) - value) < sigma
+            assert float(rows[name][3]) == pytest.approx(sigma, rel=0.06)
+        else:
+            assert rows[name][3] == "only in combination"
+    assert rows["isolator1.k_x"][3] == "only in combination" != rows["mass"][3]
+
+
+def test_combinations_in_the_table_are_those_determined(found):
+    shown = tables(section(found, "identifiability"))[0].rows
+    assert [row[0] for row in shown] == [one.words for one in found.identifiability.combinations]
+    assert "isolator1.k_x + isolator2.k_x" in {row[0] for row in shown}
+
+
+def test_records_say_what_they_were_used_for(found):
+    rows = {row[0]: row for row in tables(section(found, "measurements"))[0].rows}
+    held = {r.header.name for r in found.split.held_out.records}
+    assert {name for name, row in rows.items() if row[-1] == "held out"} == held
+    assert [row[1] for row in rows.values()] == ["noise", "noise", "noise", "rest"]
+
+
+def test_measured_and_model_reach_the_page(found, html):
+    seen = found.validation.overlay
+    assert seen is not None
+    i, j = strongest(seen)[0]
+    gain = np.mean(np.log(np.abs(seen.model)), axis=0)[i, :8]
+    assert j == int(np.argmax(gain))
+    traces = Reader(html).graphs()["response_0"]["data"]
+    model = next(t for t in traces if t["name"] == "identified" and t["xaxis"] == "x")
+    np.testing.assert_allclose(model["y"], np.abs(seen.model[:, i, j]), rtol=1e-5)
+
+
+def test_warnings_come_first_with_their_pictures(found):
+    picture = Picture("Sz1", "time [s]", "Sz1 [V]", (Series("Sz1", np.arange(4.0), np.array([1.0, 2, 2, 2])),),
+                      (Limit("stuck from", 1.0, "x"),))
+    extra = Finding("dead channel", "warning", "Sz1 is stuck.", picture=picture)
+    part = section(replace(found, findings=(*found.findings, extra)), "gates")
+    assert tables(part)[0].rows[0][:2] == ("dead channel", Mark("WARNING", False))
+    drawn = figures(part)["gate_0"]
+    assert drawn.caption == "Sz1 is stuck."
+    line = next(c for c in drawn.panels[0].curves if c.label == "stuck from")
+    assert line.x.tolist() == [1.0, 1.0] and line.y.tolist() == [1.0, 2.0]
+    assert any(isinstance(p, Fold) for p in part.pieces)
+    first = section(replace(found, findings=(extra,)), "result").pieces[0]
+    assert "Gates that warned: dead channel." in first.text
+
+
+def test_pictures_of_every_style_are_drawn():
+    x = np.array([0.0, 1.0, 2.0])
+    picture = Picture("A", "channel", "r.m.s. [V]", (Series("b", x, x + 1, "bars"), Series("p", x, x + 2, "points")),
+                      (Limit("most", 5.0),), y_scale="log")
+    figure = figure_of("f", "c", [picture, picture], 2)
+    assert [c.bars > 0 for c in figure.panels[0].curves] == [True, False, False]
+    assert figure.panels[0].x.ticks == ((0.0, "0"), (1.0, "1"), (2.0, "2"))
+    drawn = graph(figure)
+    assert [t["type"] for t in drawn["data"][:3]] == ["bar", "scatter", "scatter"]
+    assert svg(figure).startswith("<?xml")
+
+
+def test_panels_of_a_grid_do_not_overlap():
+    panel = Panel(Axis("x"), Axis("y"), (Curve(np.arange(2.0), np.arange(2.0), "a", Style("#000000"),
+                                               error=np.ones(2)),))
+    for columns, shared in ((1, False), (2, False), (3, True)):
+        figure = Figure("f", "c", (panel,) * 5, columns, 0.7, shared)
+        found = graph(figure)
+        layout = found["layout"]
+        boxes = [(layout[f"xaxis{s}"].get("domain", [0, 1]), layout[f"yaxis{s}"]["domain"])
+                 for s in ("", "2", "3", "4", "5")]
+        for k, (x, y) in enumerate(boxes):
+            assert 0 <= x[0] < x[1] <= 1 + 1e-9 and 0 <= y[0] < y[1] <= 1 + 1e-9
+            for other_x, other_y in boxes[:k]:
+                assert x[0] >= other_x[1] or other_x[0] >= x[1] or y[1] <= other_y[0] or other_y[1] <= y[0]
+        assert ("narrow" in found) == (columns == 2)
+        assert found["data"][0]["error_y"]["array"] == [1.0, 1.0]
+
+
+def kalman(found: Identification, off: float) -> EkfResult:
+    """A filter's result that lies `off` standard deviations from the likelihood's, with white innovations."""
+    information = found.campaign_fit.fit.information
+    values = information.values * (1 + off * 1e-3)
+    n, m = len(values), 6
+    theta = np.tile(values, (m, 1))
+    history = EkfHistory(np.arange(m, dtype=float), theta, 0.99 * theta, 1.01 * theta, np.array([0.0, 3.0, 6.0]))
+    white = innovation_statistics(np.random.default_rng(3).standard_normal((4000, 6)))
+    return EkfResult(information.names, information.units, information.values, values, 1e-6 * np.eye(n), False, 0.25,
+                     history, (white, white), np.zeros(n, int), HONEST_SETTINGS)
+
+
+def test_ways_are_compared_in_standard_deviations(found):
+    near = section(replace(found, kalman=kalman(found, 0.0)), "ways")
+    rows = tables(near)[0].rows
+    assert len(rows) == len(found.identifiability.combinations)
+    assert all(abs(float(row[5].replace("−", "-"))) < 0.05 for row in rows)
+    assert near.pieces[0].good is True
+    far = section(replace(found, kalman=kalman(found, 20.0)), "ways")
+    assert far.pieces[0].good is False
+    mass = next(row for row in tables(far)[0].rows if row[0] == "mass")
+    assert float(mass[5]) == pytest.approx(20, rel=0.02)
+    names = [p.title.removesuffix(" *") for f in figures(far).values() for p in f.panels]
+    assert sorted(names) == sorted(found.campaign_fit.fit.information.names)
+
+
+def test_a_filter_that_did_not_run_is_said_to_have_not(found):
+    part = section(replace(found, kalman=None, kalman_note="the extended Kalman filter was not asked for"), "ways")
+    assert part.pieces[0].text == "The extended Kalman filter was not asked for." and not figures(part)
+
+
+def test_text_from_files_is_never_markup(found, html, tmp_path):
+    bad = replace(found, measured=replace(found.measured, notes=(HOSTILE,), source=HOSTILE),
+                  findings=(Finding(HOSTILE, "warning", HOSTILE),), advice=(HOSTILE,), kalman_note=HOSTILE)
+    page, plain = Reader(identification_html(bad)), Reader(html)
+    assert [tag for tag, _ in page.elements].count("script") == [tag for tag, _ in plain.elements].count("script")
+    assert page.text.count(HOSTILE) >= 5
+    # The PDF without the figures of responses, which take most of its time.
+    bad = replace(bad, validation=replace(bad.validation, overlay=None))
+    text = " ".join(pdf_text(identification_pdf(bad), tmp_path).split())
+    assert '#panic("y") $ *z* {{ 7*7 }}' in text and "<b>x</b>" in text
+
+
+def test_html_fetches_nothing_and_stays_small(html):
+    for tag, attributes in Reader(html).elements:
+        for name in ("src", "href", "data", "action"):
+            assert re.match(r"#|data:|$", attributes.get(name) or ""), (tag, attributes)
+    assert len(html) < 8e6
+
+
+@pytest.mark.slow
+def test_same_input_same_bytes(found, html, pdf):
+    assert identification_html(found) == html and identification_pdf(found) == pdf
+
+
+def test_no_cell_shows_a_programmer_s_nothing(found):
+    cells = [c.text if isinstance(c, Mark) else c for s in document(found).sections for t in tables(s)
+             for row in t.rows for c in row]
+    assert len(cells) > 150
+    assert not [c for c in cells if re.search(r"\b(inf|nan|None|np\.|array)\b", c)]
+
+
+def test_frequency_responses_alone(found):
+    """No records, no gates, no filter: the report says so."""
+    assert isinstance(found.measured, Campaign)
+    records = found.measured.only(("00", "01", "02"))
+    response = local_polynomial(records, band_Hz=(1.5, 18.0), half_width=20, floor=False)
+    alone = replace(found, measured=response, findings=(), split=None, kalman_note="needs records")
+    content = document(alone)
+    text = " ".join(p.text for s in content.sections for p in s.flat() if isinstance(p, Paragraph))
+    assert "there were none" in text and "Every third line" in text
+    assert identification_pdf(alone).startswith(b"%PDF-")
+
+
+def test_little_was_found(found):
+    """No overlay, no modes, no whiteness: sentences in their place."""
+    v = found.validation
+    poor = replace(found, advice=(), validation=replace(v, overlay=None, modes=(), held_out=tuple(
+        replace(h, whiteness=None, nrms_time=None, nrms_time_start=None, nrms_time_whole=None) for h in v.held_out)))
+    text = " ".join(Reader(identification_html(poor)).text.split())
+    assert "No frequency response could be measured" in text and "not tested" in text
+
+
+@given(st.floats(1e-9, 1e9), st.floats(1e-9, 1e5), st.booleans())
+def test_rounding_to_the_standard_deviation(value, sigma, negative):
+    """What is shown lies within a twentieth of sigma of the value, and sigma within 5 % of itself."""
+    signed = -value if negative else value
+    shown = [float(text.replace("−", "-")) for text in words.with_deviation(signed, sigma)]
+    assert abs(shown[0] - signed) <= 0.06 * sigma + 1e-15 * value
+    if sigma < value:
+        assert shown[1] == pytest.approx(sigma, rel=0.06)
+    if 1e-9 < sigma < 10:
+        text = words.in_brackets(signed, sigma)
+        if "(" in text:
+            number, _, rest = text.partition("(")
+            places = len(number.partition(".")[2])
+            assert abs(float(number.replace("−", "-")) - signed) <= 0.06 * sigma + 1e-15 * value
+            assert float(rest[:-1]) * 10.0 ** -places == pytest.approx(sigma, rel=0.06)
