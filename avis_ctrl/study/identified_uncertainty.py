@@ -12,7 +12,7 @@ from avis_ctrl.identification.directions import Directions, directions_that_matt
 from avis_ctrl.identification.spread import FrfSpread
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.uncertainty_file import UncertaintyFile
-from avis_ctrl.uncertainty.identified_spread import IdentifiedSpread
+from avis_ctrl.uncertainty.identified_spread import IdentifiedSpread, covering_spread
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
@@ -67,4 +67,4 @@ def in_design(content: UncertaintyFile, rig: Rig, keep: Sequence[str], confidenc
     left = np.interp(np.log(omega), np.log(found.omega), found.rest)
     # A spread of exactly zero has no logarithm; a part in a thousand million is none.
     data = np.maximum(values.bound(confidence) + left, 1e-9)
-    return InDesign(directions, found, values, confidence, IdentifiedSpread(omega, data, declared, factor))
+    return InDesign(directions, found, values, confidence, covering_spread(omega, data, declared, factor))

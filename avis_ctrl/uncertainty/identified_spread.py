@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from avis_ctrl.errors import InputError
+from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.rational import Rational
 from avis_ctrl.uncertainty.weight_base import Role, Weight, require, smallest_cover
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
@@ -16,6 +16,8 @@ from avis_ctrl.uncertainty.weights import NeglectedDynamics
 POINTS_PER_OCTAVE = 8
 # How far beyond the data (and a declared crossover) the filter is asked to follow.
 REACH = 10.0
+# Steepest envelope first; a flatter one where no filter of its order follows.
+SLOPES, ORDERS = (2.0, 1.0), (6, 10)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,3 +96,21 @@ class IdentifiedSpread(Weight):
                 f"decade; beyond the band as at its ends")
         return text if self.declared is None else f"{text}; the larger of this and of what is declared: " \
                                                   f"{self.declared.meaning}"
+
+
+def covering_spread(omega: np.ndarray, data: np.ndarray, declared: NeglectedDynamics | None = None,
+                    factor: float = 1.0) -> IdentifiedSpread:
+    """The filter over an envelope of 40 dB a decade where order 6 follows it, otherwise over one of 20 dB a decade.
+
+    Raises
+    ------
+    InputError : as `IdentifiedSpread`. ComputationError : order 10 does not cover the flatter one either.
+    """
+    steep, flat = (IdentifiedSpread(omega, data, declared, factor, slope, max_order=order)
+                   for slope, order in zip(SLOPES, ORDERS, strict=True))
+    try:
+        _ = steep.shape
+    except ComputationError:
+        _ = flat.shape
+        return flat
+    return steep

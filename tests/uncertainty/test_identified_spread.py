@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.magnitude_fit import covering_fit
-from avis_ctrl.uncertainty.identified_spread import IdentifiedSpread
+from avis_ctrl.uncertainty.identified_spread import IdentifiedSpread, covering_spread
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
 OMEGA = 2 * np.pi * np.geomspace(0.5, 60.0, 90)
@@ -71,3 +71,15 @@ def test_where_the_declared_uncertainty_is_larger_it_is_the_weight():
 def test_what_is_refused(changes, field):
     with pytest.raises(InputError, match=field):
         IdentifiedSpread(**{"omega": OMEGA, "data": bumpy(0), **changes})
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_steeper_envelope_is_taken_where_a_low_order_follows_it(seed):
+    flat, found = IdentifiedSpread(OMEGA, bumpy(seed)), covering_spread(OMEGA, bumpy(seed))
+    assert found.slack_dB <= 1.0 and np.all(found.magnitude(OMEGA) >= found.data * (1 - 1e-9))
+    assert found.slope == 1.0 or (found.slope == 2.0 and found.shape.order <= 6)
+    assert np.all(found.envelope(OMEGA) <= flat.envelope(OMEGA) * (1 + 1e-12))
+
+
+def test_a_plain_slope_is_followed_steeply():
+    assert covering_spread(OMEGA, 1e-3 * (OMEGA / OMEGA[0])).slope == 2.0
