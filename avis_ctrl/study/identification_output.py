@@ -82,7 +82,7 @@ def result_dict(found: Identification) -> dict[str, Any]:
         "fit": {"chi2_per_dof": found.campaign_fit.first.chi2_per_dof, "dof": fit.dof, "band_Hz": list(
             found.campaign_fit.band_Hz), "converged": fit.converged, "starts_chi2": list(fit.starts),
             "notes": list(found.campaign_fit.notes)},
-        "advice": list(found.advice), "validation": {"verdict": found.validation.verdict},
+        "advice": list(found.advice), "validation": found.validation.as_dict(),
         "gates": [{"gate": f.gate, "severity": f.severity, "sentence": f.sentence, "channels": list(f.channels),
                    "records": list(f.records)} for f in found.findings],
         "unit_of_y": found.model.sensors.unit, "amplifier_corner_Hz": found.model.amplifier_corner_Hz,
