@@ -33,7 +33,7 @@ def _records(found: Identification, campaign: Campaign) -> Table:
         rows.append((h.name, h.excitation, "silent" if quiet else f"{words.number(h.level_V)} {h.u_unit}",
                      f"{words.number(h.duration_s)} s", periods, words.yes(bool(h.floor_names)), use))
     how = f" {found.split.how[:1].upper()}{found.split.how[1:]}." if found.split else ""
-    return table(f"The records of {campaign.source or 'the campaign'}, sampled at "
+    return table(f"The records{f' ({campaign.source})' if campaign.source else ''}, sampled at "
                  f"{words.number(campaign.sample_rate_Hz)} Hz. Levels are r.m.s. of the drives; records at rest and "
                  f"with a shaken floor have silent drives.{how}",
                  ("record", "excitation", "level", "duration", "periods", "floor measured", "used as"), rows,

@@ -13,7 +13,7 @@ from avis_ctrl.study.identification import Identification
 MEASURED, START, MODEL = Style("#222222"), Style("#e69f00", "dash", 1.6), Style("#0072b2", "solid", 1.6)
 OUTPUTS_TOGETHER = 3
 # Points of a measured response in a full figure, and in the overview.
-MOST_POINTS, MOST_SMALL = 120, 90
+MOST_POINTS, MOST_SMALL = 60, 90
 
 
 def responses(found: Identification) -> Section:
