@@ -28,6 +28,12 @@ def responses(found: Identification) -> Section:
         f"Measured: {seen.method}. {words.number(100 * seen.inside)} % of the measured entries lie "
         f"within two standard deviations of the identified model, 95 % if nothing but noise separates them and the "
         f"estimate has no bias. In full: the strongest input of each output, {named}.")]
+    if seen.method.startswith("response of the model"):
+        pieces.append(Paragraph("The records do not allow a response that is measured without a model and not rounded "
+                                "off at the resonances. The points are therefore the identified model's response plus "
+                                "what it leaves in the records, regressed on the inputs: an error of the model that is "
+                                "narrower than a window of lines does not show here, but in the tests of section 7.",
+                                "note"))
     groups = [pairs[k:k + OUTPUTS_TOGETHER] for k in range(0, len(pairs), OUTPUTS_TOGETHER)]
     pieces += [_bode(seen, group, k) for k, group in enumerate(groups)]
     pieces += [_residual(seen, pairs), _overview(seen)]
