@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from avis_ctrl.cli.console import Progress
-from avis_ctrl.errors import InputError
+from avis_ctrl.errors import AvisError, InputError
 
 
 def identify(
@@ -29,6 +29,8 @@ def identify(
     band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default "
                                                                 "what is excited")] = None,
     starts: Annotated[int, typer.Option("--starts", help="starting points of the fit")] = 3,
+    amplifier_Hz: Annotated[float | None, typer.Option("--amplifier-corner", help="first-order lag of the amplifiers "
+                                                       "[Hz], where there is one")] = None,
     kalman: Annotated[bool, typer.Option("--kalman", help="run the extended Kalman filter beside it")] = False,
     design: Annotated[Path | None, typer.Option("--design", metavar="DESIGN.toml", help="design file whose rig and "
                                                 "uncertainty are replaced by what is identified; by default z and "
@@ -58,19 +60,25 @@ def identify(
     with Progress(console) as progress:
         from avis_ctrl.report import identification_html, identification_pdf
         from avis_ctrl.study.identification import IdentifyOptions, identify
+        from avis_ctrl.study.identification_design import design_start
         from avis_ctrl.study.identification_output import write_identification
-        from avis_ctrl.study.identification_design import design_files
 
         options = IdentifyOptions(tuple(parameters or ()), dict(_prior(text) for text in priors or ()),
-                                  tuple(hold_out) if hold_out else None, band_Hz, starts, kalman, despite_gates, seed)
+                                  tuple(hold_out) if hold_out else None, band_Hz, starts, kalman, despite_gates, seed,
+                                  amplifier_Hz)
         found = identify(measured, start, options, progress)
         progress("uncertainty for design")
-        more = design_files(found, design)
+        try:
+            more, made = design_start(found, design)
+            then = f"; next: avis design {folder / 'design.toml'} --out {folder / 'design'}"
+        except AvisError as error:
+            # What was identified stands without it.
+            more, made, then = {}, None, f"; no uncertainty.json and design.toml: {error}"
         progress("report")
-        files = write_identification(found, folder, identification_html(found), identification_pdf(found), more)
+        files = write_identification(found, folder, identification_html(found, made), identification_pdf(found, made),
+                                     more)
     _summary(console, found)
-    console.print(f"{len(files)} files in {folder}; open {folder / 'report.html'} or {folder / 'report.pdf'}; next: "
-                  f"avis design {folder / 'design.toml'} --out {folder / 'design'}")
+    console.print(f"{len(files)} files in {folder}; open {folder / 'report.html'} or {folder / 'report.pdf'}{then}")
 
 
 def predict(
@@ -115,7 +123,7 @@ def _summary(console, found) -> None:
         table.add_row(name, f"{start[name]:.6g}", f"{value:.6g}",
                       f"{sigma:.2g}" if sigma < float("inf") else "only in combination", unit)
     console.print(table)
-    for sentence in (*found.identifiability.sentences, found.validation.verdict):
+    for sentence in (*found.identifiability.sentences, *found.validation.sentences):
         console.print(f"- {sentence}")
 
 

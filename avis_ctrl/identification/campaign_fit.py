@@ -10,7 +10,6 @@ import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import AvisError, InputError
-from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, Prior, fit
 from avis_ctrl.identification.noise import relative_noise, residual_noise
 from avis_ctrl.identification.response import ResponseModel
@@ -229,16 +228,4 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
         found = fit(found.model, residual_noise(found.residuals, model=found.model), priors, seed=seed)
         if progress:
             progress(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
-    found = replace(found, starts=first.starts, information=_of_estimated_noise(found))
-    return CampaignFit(found, first, band_Hz, tuple(notes), model)
-
-
-def _of_estimated_noise(found: LikelihoodFit) -> Information:
-    """The information less what weights from an estimated covariance cost: n_y of its dof degrees of freedom.
-
-    Without it, it is that of a known covariance (Pintelon and Schoukens 2012, section 12.3.3).
-    """
-    deviations = {name: sigma for name, (_, sigma) in found.priors.items()}
-    data = found.information.without_priors(deviations)
-    share = min(1 - one.block.Y.shape[1] / one.block.dof for one in found.residuals)
-    return replace(data, matrix=share * data.matrix).with_priors(deviations)
+    return CampaignFit(replace(found, starts=first.starts), first, band_Hz, tuple(notes), model)

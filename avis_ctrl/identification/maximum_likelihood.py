@@ -10,7 +10,8 @@ with t_k the transient of a record, linear in real unknowns x, which are project
 and Pereyra 1973; the Jacobian contains the derivative of t_k at the best x, so that the step is that of the joint
 problem).
 Levenberg-Marquardt steps in relative parameters; the information matrix is J^T J at the end, its inverse the
-Cramer-Rao bound. Directions that the data do not determine keep their starting value.
+Cramer-Rao bound where C_k is known. Where C_k was estimated, weights that scatter cost precision, and the information
+is less by what they cost (`weight_cost`). Directions that the data do not determine keep their starting value.
 """
 
 from __future__ import annotations
@@ -48,8 +49,9 @@ class LikelihoodFit:
     Attributes
     ----------
     model : at the estimate.
-    information : of the estimate, with the Cramer-Rao bound.
-    chi2, dof : sum of squares of what should be standard normal numbers, and how many are free.
+    information : of the estimate: the Cramer-Rao bound, less what estimated weights cost.
+    chi2, dof : sum of squares of what should be standard normal numbers, priors included, and how many are free: less
+        the transients' unknowns and the combinations of parameters that are determined.
     iterations, converged : of the best start. history : chi2 after each of its steps.
     residuals : one a block.
     starts : chi2 reached from each start, infinite where it failed.
@@ -78,11 +80,12 @@ class LikelihoodFit:
 
 @dataclass(frozen=True, eq=False)
 class _Quadratic:
-    """chi2 and its expansion: g = -J^T e, H = J^T J in relative parameters."""
+    """chi2 and its expansion: g = -J^T e, H = J^T J in relative parameters; F the same less the weights' cost."""
 
     chi2: float
     gradient: np.ndarray
     H: np.ndarray
+    F: np.ndarray
     residuals: tuple[Residual, ...] = ()
 
 
@@ -127,8 +130,8 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
     last = best.evaluate(best.model, residuals=True)
     scale = _scale(model.values)
     unknown = sum(_unknowns(block, model) for block in blocks)
-    dof = sum(block.numbers for block in blocks) - unknown - len(model.names)
-    information = Information(model.names, best.model.values, model.units, last.H / np.outer(scale, scale), scale)
+    information = Information(model.names, best.model.values, model.units, last.F / np.outer(scale, scale), scale)
+    dof = sum(block.numbers for block in blocks) + len(priors) - unknown - information.rank
     return LikelihoodFit(best.model, information, last.chi2, dof, best.iterations, best.converged,
                          tuple(best.history), last.residuals, tuple(value for value, _ in reached), priors)
 
@@ -156,7 +159,7 @@ class _Descent:
     def evaluate(self, model: ResponseModel, derivative: bool = True, residuals: bool = False) -> _Quadratic:
         """chi2 at a model, with its expansion if asked for."""
         n_p = len(model.names)
-        chi2, g, H, kept = 0.0, np.zeros(n_p), np.zeros((n_p, n_p)), []
+        chi2, g, H, F, kept = 0.0, np.zeros(n_p), np.zeros((n_p, n_p)), np.zeros((n_p, n_p)), []
         _ = model.matrices, derivative and model.derivative_matrices  # formed once, before the threads ask for them
         work = partial(_block_residual, model, derivative=derivative)
         # Large arrays in few calls, which leave the interpreter free: threads serve, and keep the order of the sums.
@@ -167,7 +170,9 @@ class _Descent:
             if derivative:
                 J *= self.scale[:, None]
                 g -= J @ e
-                H += J @ J.T
+                own = J @ J.T
+                H += own
+                F += own / weight_cost(residual.block)
             if residuals:
                 kept.append(residual)
         for name, (mean, sigma) in self.priors.items():
@@ -176,7 +181,8 @@ class _Descent:
             chi2 += miss ** 2
             g[j] -= slope * miss
             H[j, j] += slope ** 2
-        return _Quadratic(chi2, g, H, tuple(kept))
+            F[j, j] += slope ** 2
+        return _Quadratic(chi2, g, H, F, tuple(kept))
 
     def run(self, max_iterations: int) -> None:
         damping = 1e-3
@@ -288,6 +294,18 @@ def whitener(block: SpectralBlock) -> np.ndarray:
                          "channels that repeat each other, leave it singular", field=f"block {block.name}") from None
     correction = 1.0 if np.isinf(block.dof) else (block.dof - n_y) / block.dof
     return np.sqrt(2 * correction) * np.linalg.inv(factor)
+
+
+def weight_cost(block: SpectralBlock) -> float:
+    """By how much the variance of an estimate with estimated weights exceeds that with the true ones.
+
+    For weights inv(C_k) of independent complex Wishart matrices of p outputs and nu degrees of freedom, the errors of
+    a weighted least squares follow from E inv(W) and E inv(W)^2 (Maiwald and Kraus, IEE Proc. Radar 147, 2000): the
+    ratio is nu (nu - p) / ((nu - p)^2 - 1). Of less than a degree of freedom above p there is no such moment.
+    """
+    assert block.noise is not None
+    p, nu = block.noise.shape[-1], block.dof
+    return 1.0 if np.isinf(nu) else nu * (nu - p) / max((nu - p) ** 2 - 1, 1.0)
 
 
 def whitened(L: np.ndarray, error: np.ndarray) -> np.ndarray:

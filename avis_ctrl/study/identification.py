@@ -20,6 +20,7 @@ from avis_ctrl.identification.campaign_fit import (
     CampaignFit,
     Split,
     averaged,
+    driven_inputs,
     excited_band,
     fit_campaign,
     split_campaign,
@@ -50,6 +51,7 @@ class IdentifyOptions:
     parameters : names or wildcards of what is free; the rig's usual ones by default.
     priors : (mean, standard deviation) by parameter.
     hold_out : records that no fit sees; chosen where None. band_Hz : of the fit; the excited one where None.
+    amplifier_corner_Hz : first-order lag of the amplifiers, which no rig file states; None for none.
     starts : of the maximum likelihood fit. kalman : run the extended Kalman filter beside it.
     despite_gates : go on where a gate says stop.
     """
@@ -62,6 +64,7 @@ class IdentifyOptions:
     kalman: bool = False
     despite_gates: bool = False
     seed: int = 1
+    amplifier_corner_Hz: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +158,7 @@ def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: Ident
         unit, sensors, sampled = measured.output_unit, measured.outputs, False
         actuators = tuple(name for name in measured.inputs if name not in ("vx", "vy", "vz"))
     names = named_parameters(rig, options.parameters, unit) if options.parameters else default_parameters(rig)
-    return ResponseModel.of(rig, names, unit, sensors, actuators, sampled)
+    return ResponseModel.of(rig, names, unit, sensors, actuators, sampled, options.amplifier_corner_Hz)
 
 
 def gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options: IdentifyOptions,
@@ -219,9 +222,13 @@ def _kalman(fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str]
         return None, "the extended Kalman filter was not asked for"
     if not isinstance(fitted, Campaign):
         return None, "the extended Kalman filter needs records; these are frequency responses"
-    progress("extended Kalman filter over the same records")
+    # It takes a measured floor for noise; a shaken one would be a disturbance far above what it allows for.
+    driven = tuple(record.header.name for record in fitted.records if driven_inputs(record))
+    if not driven:
+        return None, "the extended Kalman filter needs records that drive the actuators"
+    progress(f"extended Kalman filter over the records {', '.join(driven)}")
     try:
-        return identify_ekf(rig, fitted, HONEST_SETTINGS, names, progress), ""
+        return identify_ekf(rig, fitted.only(driven), HONEST_SETTINGS, names, progress), ""
     except AvisError as error:
         return None, f"the extended Kalman filter gave no answer: {error}"
 

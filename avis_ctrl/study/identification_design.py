@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.campaign_fit import LONGEST_PIECE
+from avis_ctrl.identification.campaign_fit import LONGEST_PIECE, driven_inputs, excited_band
 from avis_ctrl.identification.model_error import measured_response
 from avis_ctrl.identification.spread import FrfSpread, frf_spread
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -68,11 +68,17 @@ def design_start(found: Identification, template: Path | Design | None = None) -
 
 
 def measured_spread(found: Identification, keep: tuple[str, ...]) -> FrfSpread:
-    """What the measurement leaves between its response and the identified model's, in some coordinates."""
+    """What the measurement leaves between its response and the identified model's, in some coordinates.
+
+    Over the band that the actuators drive: a floor that is shaken below it says nothing of their response.
+    """
     measured, band, model = found.measured, found.campaign_fit.band_Hz, found.model
-    response = (measured.between(*band) if isinstance(measured, FrequencyResponse)
-                else measured_response(measured, model, band, LONGEST_PIECE))
-    return frf_spread(response, model, keep)
+    if isinstance(measured, FrequencyResponse):
+        return frf_spread(measured.between(*band), model, keep)
+    driven = measured.only(tuple(record.header.name for record in measured.records if driven_inputs(record)))
+    low, high = excited_band(driven)
+    band = max(band[0], low), min(band[1], high)
+    return frf_spread(measured_response(driven, model, band, LONGEST_PIECE), model, keep)
 
 
 def identification_design(content: UncertaintyFile, template: Design) -> str:

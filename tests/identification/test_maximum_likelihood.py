@@ -7,10 +7,13 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_law
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.identification import campaign_fit
+from avis_ctrl.identification.campaign_fit import campaign_blocks
 from avis_ctrl.identification.maximum_likelihood import fit
 from avis_ctrl.identification.noise import relative_noise, residual_noise
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
+from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
 
@@ -82,12 +85,49 @@ def test_chi_square_and_errors_are_what_they_claim(avis):
         error = V.T @ ((found.values - true.values) / found.information.scale)
         # Directions far from being linear in their parameters would need a larger sample.
         z.append((error / sigma)[:20])
-        # dof counts all free parameters; eight of them were never used
         totals.append(found.chi2)
-        dof = found.dof + 8
+        dof = found.dof
     assert chi2_law.ppf(1e-4, 16 * dof) < np.sum(totals) < chi2_law.ppf(1 - 1e-4, 16 * dof)
     spread = np.mean(np.square(z))
     assert abs(spread - 1) < 4 * np.sqrt(2 / np.size(z))
+
+
+def test_estimated_weights_cost_what_the_deviations_say(avis):
+    """A covariance of 16 degrees of freedom for 6 outputs on every line: errors 1.27 times those of known weights."""
+    true = ResponseModel.of(avis, ["mass", "J1", "isolator1.k_z", "isolator1.c_z"])
+    rng = np.random.default_rng(11)
+
+    def circular(*shape):
+        return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2)
+    lines, dof = 30, 16
+    mix, w = 1e-3 * circular(6, 6), 2 * np.pi * np.geomspace(0.8, 20, lines)
+    U = np.zeros((lines, len(true.inputs), 2), complex)
+    U[:, 1, 0] = U[:, 3, 1] = 1
+    Y, z = true.driven(w, U, False).Y, []
+    mix = mix * np.sqrt(np.mean(np.abs(Y) ** 2)) * 20
+    for _ in range(60):
+        samples = mix @ circular(lines, 6, dof)
+        noise = samples @ np.conj(samples.swapaxes(1, 2)) / dof
+        found = fit(true, [SpectralBlock("frf", w, U, Y + mix @ circular(*Y.shape)).with_noise(noise, dof)])
+        sigma, V = found.information.directions
+        z.append(V.T @ ((found.values - true.values) / found.information.scale) / sigma)
+    assert abs(np.mean(np.square(z)) - 1) < 4 * np.sqrt(2 / np.size(z))
+
+
+def test_averaged_records_are_independent_from_line_to_line(avis, monkeypatch):
+    """Too many lines are averaged into responses, whose errors the fit takes as independent."""
+    monkeypatch.setattr(campaign_fit, "MOST_LINES", 0)
+    rng, model = np.random.default_rng(12), ResponseModel.of(avis, ["mass"])
+    records = []
+    for k in range(3):
+        u = 0.3 * rng.normal(size=(60_000, 8))
+        records.append(record(avis, u, np.zeros((len(u), 3)), rng, name=f"{k:02d}", excitation="noise"))
+    (block,), said = campaign_blocks(Campaign("avis", tuple(records)), model, (10.0, 60.0))
+    error = block.Y - model.driven(block.omega, block.U, False).Y
+    white = np.linalg.solve(np.linalg.cholesky(block.noise[:, 0]), error)
+    correlation = np.abs(np.vdot(white[:-1], white[1:])) / np.linalg.norm(white) ** 2
+    assert "averaged" in said[0] and len(block.omega) > 100
+    assert correlation < 4 / np.sqrt(white.size)
 
 
 def test_records_of_a_rig_with_floor_motion(avis):

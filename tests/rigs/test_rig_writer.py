@@ -58,7 +58,8 @@ def test_what_only_some_rigs_have(tmp_path):
     assert np.allclose(read_back(moved).isolators[1].chassis_offset, offset.chassis_offset, rtol=0, atol=1e-16)
     assert read_back(moved).ambient is None and read_back(moved).name == moved.name
     loaded = load_rig("halcyonics_loaded")
-    other = replace(loaded, load=replace(loaded.load, Izz=0.1875, Ixy=0.01, Ixz=-0.02, Iyz=0.003), k_s=(1e4, 1.1e4, 1.2e4, 1.3e4),
+    other = replace(loaded, load=replace(loaded.load, Izz=0.1875, Ixy=0.01, Ixz=-0.02, Iyz=0.003),
+                    k_s=(1e4, 1.1e4, 1.2e4, 1.3e4),
                     M2_arm=0.21, ambient=avis.ambient)
     assert read_back(other) == other
 

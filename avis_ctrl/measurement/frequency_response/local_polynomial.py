@@ -63,11 +63,15 @@ class _Spectra(NamedTuple):
 
 def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
                      order: int = 2, half_width: int | None = None, inputs: Sequence[str] | None = None,
-                     floor: bool | None = None, longest_piece: int | None = None) -> FrequencyResponse:
+                     floor: bool | None = None, longest_piece: int | None = None,
+                     apart: bool = False) -> FrequencyResponse:
     """Local polynomial estimate, all records pooled (Pintelon and Schoukens 2012, section 7.2).
 
     The bias grows with the half width and the curvature of G: (half width / record length)^(order + 1). Nonlinear
     distortion counts as noise. Memory is one triangular factor per frequency and one piece of a record.
+
+    Estimates whose windows overlap share lines, so that their errors are correlated: the covariance is that of each
+    frequency by itself. Whoever takes the errors of different frequencies as independent asks for `apart`.
 
     Parameters
     ----------
@@ -79,13 +83,17 @@ def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequen
     floor : the floor's velocity as additional inputs; by default where every record measured it. Records with u = 0
         take part only then.
     longest_piece : samples; longer records are read and used in pieces, each with its own transient.
+    apart : estimate at the centres of windows that do not overlap, in place of frequency_Hz.
 
     Raises
     ------
-    InputError : bands, names, windows or records that do not allow an estimate.
+    InputError : bands, names, windows or records that do not allow an estimate, `apart` beside frequency_Hz.
     ComputationError : inputs that cannot be told apart.
     """
-    return _local_response(campaign, False, band_Hz, frequency_Hz, order, half_width, inputs, floor, longest_piece)
+    if apart and frequency_Hz is not None:
+        raise InputError("expected frequencies, or windows that do not overlap, not both", field="apart", value=apart)
+    return _local_response(campaign, False, band_Hz, frequency_Hz, order, half_width, inputs, floor, longest_piece,
+                           apart)
 
 
 def local_rational(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
@@ -101,7 +109,7 @@ def local_rational(campaign: Campaign, *, band_Hz: Band | None = None, frequency
 
 def _local_response(campaign: Campaign, rational: bool, band_Hz: Band | None, frequency_Hz: np.ndarray | None,
                     order: int, half_width: int | None, inputs: Sequence[str] | None, floor: bool | None,
-                    longest: int | None) -> FrequencyResponse:
+                    longest: int | None, apart: bool = False) -> FrequencyResponse:
     records = taking_part(campaign, floor)
     used = channels(campaign, records, inputs, floor)
     band = checked_band(band_Hz, campaign.sample_rate_Hz)
@@ -116,6 +124,8 @@ def _local_response(campaign: Campaign, rational: bool, band_Hz: Band | None, fr
     if width is None:
         width = least_half_width(plan.count, len(names), n_y, order, rational, spacing)
     where = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
+    if apart:
+        where = _apart(where, width)
     fit = LocalFit(where, len(names), n_y, order, width, width * campaign.sample_rate_Hz / plan.shortest, rational)
     for part in _spectra(records, used, driven, band, width, plan):
         fit.add(*part)
@@ -162,7 +172,7 @@ def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz:
     asked = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
     if smooth_Hz is not None and not smooth_Hz > 0:
         raise InputError("expected a positive frequency", field="smooth_Hz", value=smooth_Hz)
-    centres = every[width:every.size - width:2 * width + 1]
+    centres = _apart(every, width)
     fit = LocalFit(centres, len(driven), n_y, order, width, width * step)
     for part in _spectra(records, used, driven, band, width, plan):
         fit.add(*part)
@@ -229,6 +239,11 @@ def _grid(frequency_Hz: np.ndarray | None, band: Band, samples: int, rate: float
         raise InputError(f"expected increasing frequencies from {every[0]:g} to {every[-1]:g} Hz, lines in the band",
                          field="frequency_Hz", value=asked if asked.size < 4 else f"{asked.size} values")
     return asked
+
+
+def _apart(every: np.ndarray, half_width: int) -> np.ndarray:
+    """Centres of windows that share no line."""
+    return every[half_width:every.size - half_width:2 * half_width + 1]
 
 
 def _spectra(records: Sequence[RecordSource], used: Channels, driven: list[int], band: Band, half_width: int,
