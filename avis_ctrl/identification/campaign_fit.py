@@ -124,15 +124,12 @@ def excited_band(campaign: Campaign) -> tuple[float, float]:
 def averaged(campaign: Campaign, band_Hz: tuple[float, float]) -> FrequencyResponse | None:
     """Frequency responses in the place of records that hold more lines than are fitted one by one; None otherwise.
 
-    Made piece by piece: of records of any length only one piece is in memory.
+    Made piece by piece: of records of any length only one piece is in memory. A fit counts frequencies as independent,
+    which windows that overlap are not: those taken here do not.
     """
     if sum(record.header.duration_s * (band_Hz[1] - band_Hz[0]) for record in campaign.records) <= MOST_LINES:
         return None
-    # No closer than two lines of a piece, and off the ends of the band.
-    step = 2 * campaign.sample_rate_Hz / LONGEST_PIECE
-    multiples = np.unique(np.round(np.geomspace(band_Hz[0] + step, band_Hz[1] - step, 1000) / step))
-    grid = multiples[(multiples * step > band_Hz[0] + step) & (multiples * step < band_Hz[1] - step)] * step
-    return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=grid, longest_piece=LONGEST_PIECE)
+    return local_polynomial(campaign, band_Hz=band_Hz, apart=True, longest_piece=LONGEST_PIECE)
 
 
 def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float]
