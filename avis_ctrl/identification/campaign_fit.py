@@ -220,9 +220,15 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     found = fit(model, blocks, priors, starts, seed=seed, progress=progress)
     first = found
     if isinstance(campaign, FrequencyResponse) or not blocks[0].transient:
-        return CampaignFit(found, first, band_Hz, tuple(notes), model)
+        return CampaignFit(found, first, band_Hz, (*notes, *_bounds(found)), model)
     for k in range(reweights):
         found = fit(found.model, residual_noise(found.residuals, model=found.model), priors, seed=seed)
         if progress:
             progress(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
-    return CampaignFit(replace(found, starts=first.starts), first, band_Hz, tuple(notes), model)
+    return CampaignFit(replace(found, starts=first.starts), first, band_Hz, (*notes, *_bounds(found)), model)
+
+
+def _bounds(found: LikelihoodFit) -> tuple[str, ...]:
+    """A sentence on parameters that physics stops."""
+    return (f"the data ask for less than physics allows of {', '.join(found.held)}: held just above zero, where "
+            "standard deviations say little",) if found.held else ()

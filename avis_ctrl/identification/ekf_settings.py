@@ -69,11 +69,13 @@ class EkfSettings:
 
 
 SOURCE_SETTINGS = EkfSettings()
-"""Section 3.3 as printed. What this tuning hides: R = 1e-8 is an r.m.s. velocity of 1e-4 m/s, the size of the payload's
-own motion, five orders of variance above sensor noise and converter (1e-13); Q = 1e-8 is an acceleration as strong as
-that of the drives. The source raised R because the filter was unstable without. The bands are therefore those of a
-filter that distrusts its data: they are wide, and cover errors that the data would have shown. And of the 26 parameters
-only 20 combinations act on the payload: the bands of the others tell the prior, not the data."""
+"""Section 3.3 as printed, but for the sensors' chain, which is undone here and was not there (`undo_chain`). What this
+tuning hides: R = 1e-8 is an r.m.s. velocity of 1e-4 m/s, the size of the payload's own motion, five orders of variance
+above sensor noise and converter (1e-13); Q = 1e-8 is near the density of what the drives of section 3.4 do along x and
+y (1.6e-8), a sixth of it along z and a hundredth about x. The source raised R because the filter was unstable without.
+The bands are therefore those of a filter that distrusts its data: they are wide, and cover errors that the data would
+have shown. And of the 26 parameters only 20 combinations act on the payload: the bands of the others tell the prior,
+not the data."""
 
 HONEST_SETTINGS = EkfSettings(q_sigma=2.5e-6, v_sigma=1e-4, Q=None, R=None, reset=False, warm_up=1)
 """R from the rig's sensor noise and quantiser, process noise from its ambient floor motion (white velocity through the

@@ -12,6 +12,8 @@ problem).
 Levenberg-Marquardt steps in relative parameters; the information matrix is J^T J at the end, its inverse the
 Cramer-Rao bound where C_k is known. Where C_k was estimated, weights that scatter cost precision, and the information
 is less by what they cost (`weight_cost`). Directions that the data do not determine keep their starting value.
+Parameters that physics keeps positive stop just above zero, and stay there while chi2 would fall below it (an active
+set); the others then find their own optimum.
 """
 
 from __future__ import annotations
@@ -30,6 +32,8 @@ from avis_ctrl.identification.response import N_Q, ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, transient_columns
 
 Prior = tuple[float, float]
+# Share of its size at the start that a positive parameter keeps.
+LOWEST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +59,8 @@ class LikelihoodFit:
     iterations, converged : of the best start. history : chi2 after each of its steps.
     residuals : one a block.
     starts : chi2 reached from each start, infinite where it failed.
-    priors : used, by name.
+    priors : used, by name. held : parameters that ended at the smallest value that physics allows; what the information
+        says of them, and of what goes with them, is that of a normal law that is cut off there.
     """
 
     model: ResponseModel
@@ -68,6 +73,7 @@ class LikelihoodFit:
     residuals: tuple[Residual, ...]
     starts: tuple[float, ...]
     priors: Mapping[str, Prior] = field(default_factory=dict)
+    held: tuple[str, ...] = ()
 
     @property
     def values(self) -> np.ndarray:
@@ -133,7 +139,8 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
     information = Information(model.names, best.model.values, model.units, last.F / np.outer(scale, scale), scale)
     dof = sum(block.numbers for block in blocks) + len(priors) - unknown - information.rank
     return LikelihoodFit(best.model, information, last.chi2, dof, best.iterations, best.converged,
-                         tuple(best.history), last.residuals, tuple(value for value, _ in reached), priors)
+                         tuple(best.history), last.residuals, tuple(value for value, _ in reached), priors,
+                         tuple(name for name, low in zip(model.names, best.at_bound(), strict=True) if low))
 
 
 def _thinned_descent(begin: ResponseModel, blocks, priors, scale_values, max_iterations: int) -> ResponseModel:
@@ -152,6 +159,7 @@ class _Descent:
     def __init__(self, model: ResponseModel, blocks, whiteners, priors, scale_values):
         self.model, self.blocks, self.whiteners, self.priors = model, blocks, whiteners, priors
         self.scale = _scale(scale_values)
+        self.lowest = np.where([positive(name) for name in model.names], LOWEST * self.scale, -np.inf)
         self.now = self.evaluate(model)
         self.history = [self.now.chi2]
         self.iterations, self.converged = 0, False
@@ -210,22 +218,30 @@ class _Descent:
 
         The diagonal is scaled away before the eigenvalues tell what is determined.
         """
-        H, g = self.now.H, self.now.gradient
+        free = ~(self.at_bound() & (self.now.gradient > 0))
+        step = np.zeros(len(free))
+        H, g = self.now.H[np.ix_(free, free)], self.now.gradient[free]
+        if not g.size:
+            return step, 0.0
         size = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(H / np.outer(size, size))
         along = vectors.T @ (g / size)
         known = values > 1e-11 * values[-1]
         y = np.where(known, -along / np.where(known, values + damping, 1.0), 0.0)
-        step = vectors @ y / size
+        step[free] = vectors @ y / size
         # No parameter by more than half of itself at once.
         largest = np.max(np.abs(step))
         if largest > 0.5:
             y, step = y * (0.5 / largest), step * (0.5 / largest)
         return step, float(-(2 * along @ y + y @ (values * y)))
 
+    def at_bound(self) -> np.ndarray:
+        """(n_p,) parameters at the smallest value that physics allows."""
+        return self.model.values <= self.lowest * (1 + 1e-9)
+
     def _try(self, step: np.ndarray) -> tuple[ResponseModel, float] | None:
         try:
-            model = self.model.at(self.model.values + step * self.scale)
+            model = self.model.at(np.maximum(self.model.values + step * self.scale, self.lowest))
         except InputError:
             return None  # no rig has these parameters: a shorter step
         if not _physical(model):

@@ -114,6 +114,29 @@ def test_estimated_weights_cost_what_the_deviations_say(avis):
     assert abs(np.mean(np.square(z)) - 1) < 4 * np.sqrt(2 / np.size(z))
 
 
+def test_a_parameter_at_its_bound_leaves_the_others_at_their_optimum(avis):
+    """A mount without damping, which noise makes negative: chi-square as with the damping fixed there."""
+    names = ["mass", "J1", "isolator1.k_z", "isolator1.c_z"]
+    bare = avis.with_parameters({"isolator1.c_z": 1e-3})
+    true, fixed = ResponseModel.of(bare, names), ResponseModel.of(bare, names[:3])
+    block = responses(true, noise=0.3, seed=3, lines=60)
+    start = ResponseModel.of(avis, names).at([520, 30, 46e3, 160])
+    met = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        size = np.sqrt(block.noise[:, 0, :1, :1].real / 2)
+        Y = true.driven(block.omega, block.U, False).Y
+        Y = Y + size * (rng.normal(size=Y.shape) + 1j * rng.normal(size=Y.shape))
+        noisy = SpectralBlock("frf", block.omega, block.U, Y, block.noise)
+        found, other = fit(start, [noisy]), fit(fixed.at([520, 30, 46e3]), [noisy])
+        if found.held:
+            met += 1
+            assert found.held == ("isolator1.c_z",) and found.converged
+            assert found.chi2 == pytest.approx(other.chi2, abs=0.01)
+            assert np.allclose(found.values[:3], other.values, rtol=1e-4)
+    assert met >= 2
+
+
 def test_averaged_records_are_independent_from_line_to_line(avis, monkeypatch):
     """Too many lines are averaged into responses, whose errors the fit takes as independent."""
     monkeypatch.setattr(campaign_fit, "MOST_LINES", 0)
