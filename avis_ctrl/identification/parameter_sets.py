@@ -12,7 +12,9 @@ from avis_ctrl.rigs.rig import Rig
 # Rademakers, eq. 3.11: b_11 and k_11 are left out, positions and motor constants are known.
 _SOURCE_AVIS = ("mass", "J1", "J2", "J3", *(f"isolator{i}.{kind}_{axis}" for kind in "ck" for i in (1, 2, 3, 4)
                                             for axis in "xyz" if (i, axis) != (1, "x")))
-_HALCYONICS = ("Ixx", "Iyy", "Izz", "k_s", "k_t", "k_r", "d1", "d3", "d4", "d5", "d6", *(f"e{k}" for k in range(1, 9)))
+_SPRINGS = tuple(f"k_s{k}" for k in range(1, 5))
+_HALCYONICS = ("Ixx", "Iyy", "Izz", *_SPRINGS, "k_a", "k_t", "k_r", "d1", "d3", "d4", "d5", "d6",
+               *(f"e{k}" for k in range(1, 9)))
 _LOAD = ("load.L7", "load.L8", "load.L9", "load.Ixx", "load.Iyy", "load.Izz", "load.Ixy")
 
 
@@ -25,15 +27,15 @@ def default_parameters(rig: Rig) -> tuple[str, ...]:
     """Free parameters where the user names none.
 
     AVIS: mass, principal inertias, stiffness and damping of every mount along every axis; positions and motor
-    constants are known (Rademakers, section 3.2). Halcyonics: what Table 1 identifies, with the load of Table 2 in
-    place of the plate where it is on; mass, lengths and k_a are known.
+    constants are known (Rademakers, section 3.2). Halcyonics: what Table 1 identifies, each spring by itself, and
+    the actuators' k_a, with the load of Table 2 in place of the plate where it is on; mass and lengths are known.
     """
     known = rig.parameters()
     if "mass" in known and "J1" in known:
         mounts = [name for name in known if name.startswith("isolator") and name.rpartition(".")[2][:2] in ("k_", "c_")]
         return ("mass", "J1", "J2", "J3", *mounts)
     if "load.mass" in known:
-        return ("k_s", "k_t", "k_r", "d1", "d3", "d4", "d5", "d6", *_LOAD)
+        return (*_SPRINGS, "k_a", "k_t", "k_r", "d1", "d3", "d4", "d5", "d6", *_LOAD)
     return _HALCYONICS
 
 

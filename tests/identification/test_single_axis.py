@@ -253,6 +253,21 @@ def test_an_oscillator_is_recovered_from_a_piece_of_record(rng):
     assert damping_ratio(fit)[0] == pytest.approx(0.02, rel=0.03)
 
 
+def test_deviations_of_an_oscillator_hold_over_repeated_records():
+    """A resonance five lines wide, on which the damping rests; noise of another colour than the response."""
+    theta, rate, whole = np.array([2.0, 3.0, 2 * (2 * np.pi * 8) ** 2]), 200.0, 16384
+    s, z = 2j * np.pi * np.fft.rfftfreq(whole, 1 / rate), []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        U = np.where(s.imag < 2 * np.pi * 60, np.fft.rfft(rng.standard_normal(whole)), 0)
+        u, y = np.fft.irfft(U), np.fft.irfft(U / (theta[0] * s ** 2 + theta[1] * s + theta[2]))
+        noise = signal.lfilter([1], [1, -0.8], rng.standard_normal(whole))
+        y = y + 0.05 * noise * y.std() / noise.std()
+        fit = fit_oscillator(u[5000:9096], y[5000:9096], rate, (1.0, 40.0))
+        z.append((fit.values - theta) / fit.standard_deviation)
+    assert np.all(np.mean(np.square(z), axis=0) < 1 + 4 * np.sqrt(2 / 40))
+
+
 # --- the door
 
 @pytest.mark.parametrize(("kind", "columns", "options", "expected"), [

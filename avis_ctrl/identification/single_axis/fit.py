@@ -138,6 +138,17 @@ def sandwich(bread: np.ndarray, scores: np.ndarray, lags: int, dof: float) -> np
     return bread @ (n * long_run_covariance(scores, lags)) @ bread.T * n / dof
 
 
+def not_below(covariance: np.ndarray, bread: np.ndarray) -> np.ndarray:
+    """The covariance with no variance smaller than that of `bread`, correlations kept.
+
+    Where few rows hold most of what is known of a parameter (lines at a resonance, few frequencies), the fit bends to
+    them, their residuals are small, and the scores say too little: bread is the variance for residuals that are
+    independent and of the level of their neighbours.
+    """
+    lift = np.sqrt(np.maximum(np.diag(bread) / np.maximum(np.diag(covariance), np.finfo(float).tiny), 1.0))
+    return covariance * np.outer(lift, lift)
+
+
 def regression(model: str, names: Sequence[str], units: Sequence[str], X: np.ndarray, y: np.ndarray,
                time: np.ndarray, instruments: np.ndarray | None = None) -> SingleAxisFit:
     """y = X theta + e for time series, by least squares or with instruments.

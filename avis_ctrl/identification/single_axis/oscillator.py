@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.single_axis.fit import SingleAxisFit, residual_statistics, sandwich
+from avis_ctrl.identification.single_axis.fit import SingleAxisFit, not_below, residual_statistics, sandwich
 
 TRANSIENT = 4  # coefficients of T
 SMOOTHED = 8  # lines on either side whose residual gives the noise
@@ -90,7 +90,8 @@ def _result(f: np.ndarray, Y: np.ndarray, error: np.ndarray, theta: np.ndarray, 
     bread = np.linalg.inv((J / size).T @ (J / size)) / np.outer(size, size)
     scores = J[:n] * e[:n, None] + J[n:] * e[n:, None]
     spent = len(theta) + TRANSIENT
-    covariance = sandwich(bread, scores, CORRELATED_LINES, n * (1 - spent / (2 * n)))
+    # Damping rests on the few lines of the resonance, to which the fit bends.
+    covariance = not_below(sandwich(bread, scores, CORRELATED_LINES, n * (1 - spent / (2 * n))), bread)
     statistics = residual_statistics(error, Y, np.sqrt(np.diag(covariance)), np.sqrt(np.diag(bread)), CORRELATED_LINES)
     information = Information(NAMES, theta, UNITS, J.T @ J, np.abs(theta))
     return SingleAxisFit("m y'' + d y' + k y = u", information, covariance,

@@ -19,7 +19,7 @@ from scipy.optimize import brentq, least_squares
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.single_axis.fit import SingleAxisFit, residual_statistics, sandwich
+from avis_ctrl.identification.single_axis.fit import SingleAxisFit, not_below, residual_statistics, sandwich
 
 # The misfit of neighbouring frequencies is alike; scores are taken as correlated over this many.
 CORRELATED_LINES = 2
@@ -148,10 +148,8 @@ def _result(data: Responses, names: tuple[str, ...], units: tuple[str, ...], the
     scores = np.einsum("nkp,nk->np", J, e)
     lags = min(CORRELATED_LINES, len(scores) // 4)
     # Of the numbers of a frequency, p / n were spent on the fit.
-    covariance = sandwich(bread, scores, lags, len(scores) * (1 - p / e.size))
     # Few frequencies: a parameter on which their misfits happen to cancel is not known better for it.
-    lift = np.sqrt(np.maximum(np.diag(bread) / np.maximum(np.diag(covariance), np.finfo(float).tiny), 1.0))
-    covariance = covariance * np.outer(lift, lift)
+    covariance = not_below(sandwich(bread, scores, lags, len(scores) * (1 - p / e.size)), bread)
     chi2 = float(np.sum(misses(theta, 0.0) ** 2))
     model = response(data.frequency_Hz, names, theta)
     measured = np.column_stack([data.value[kind] for kind in data.value])

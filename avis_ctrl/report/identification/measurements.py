@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.campaign import Campaign, in_short
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, table
@@ -15,8 +15,8 @@ def measurements(found: Identification) -> Section:
     if isinstance(measured, FrequencyResponse):
         return Section("Measurements", "measurements", _response(measured))
     pieces: list[Piece] = [_records(found, measured), _channels(found, measured)]
-    if measured.notes:
-        pieces += [Heading("What the reader says of the file"), Bullets(tuple(measured.notes))]
+    if in_short(measured.notes):
+        pieces += [Heading("What the reader says of the file"), Bullets(tuple(in_short(measured.notes)))]
     return Section("Measurements", "measurements", tuple(pieces))
 
 
