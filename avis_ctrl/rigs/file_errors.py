@@ -1,10 +1,12 @@
-"""From pydantic's report on a file to one line for a person."""
+"""Files of keys and values: read, and what is wrong with them as one line for a person."""
 
 from __future__ import annotations
 
 import difflib
 import re
+import tomllib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
@@ -81,3 +83,21 @@ def _model_within(annotation: Any) -> type[BaseModel] | None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((found for part in get_args(annotation) if (found := _model_within(part))), None)
+
+
+def read_toml(path: Path, expected: str) -> dict[str, Any]:
+    """The table of a TOML file; `expected` says what the file should have been.
+
+    Raises
+    ------
+    InputError : one line naming the file: it is not there, cannot be read, is not TOML in UTF-8.
+    """
+    try:
+        # Editors on Windows begin a file with a byte-order mark.
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError(f"no such file; expected {expected}", file=path) from None
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"expected a TOML file in UTF-8; {' '.join(str(error).split())}", file=path) from None

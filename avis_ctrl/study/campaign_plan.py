@@ -7,14 +7,12 @@ expected.
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import ValidationError
 
-from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.file_errors import first_complaint
+from avis_ctrl.rigs.file_errors import first_complaint, read_toml
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
 
@@ -33,16 +31,7 @@ def read_plan(path: str | Path) -> CampaignPlan:
     InputError : one line naming file, field, value and what was expected.
     """
     path = Path(path)
-    try:
-        # Editors on Windows begin a file with a byte-order mark.
-        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError("no such file; expected a campaign plan with [[record]] sections", file=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"expected a TOML file in UTF-8; {' '.join(str(error).split())}", file=path) from None
-    return plan_from_table(table, path)
+    return plan_from_table(read_toml(path, "a campaign plan with [[record]] sections"), path)
 
 
 def plan_from_table(table: dict, file: object = None) -> CampaignPlan:

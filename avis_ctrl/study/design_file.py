@@ -7,7 +7,6 @@ was expected; a misspelt key is answered with the nearest one.
 from __future__ import annotations
 
 import difflib
-import tomllib
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,7 +23,7 @@ from pydantic import (
 )
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.file_errors import first_complaint
+from avis_ctrl.rigs.file_errors import first_complaint, read_toml
 from avis_ctrl.rigs.floor_spectrum import shipped_spectra
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import LIMIT, SHIPPED, load_rig
@@ -245,16 +244,7 @@ def read_design(path: str | Path) -> Design:
     InputError : one line naming file, field, value and what was expected.
     """
     path = Path(path)
-    try:
-        # Editors on Windows begin a file with a byte-order mark.
-        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError("no such file; expected a design file such as designs/avis_z_phix.toml", file=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"expected a TOML file in UTF-8; {' '.join(str(error).split())}", file=path) from None
-    return design_from_table(table, path)
+    return design_from_table(read_toml(path, "a design file such as designs/avis_z_phix.toml"), path)
 
 
 def design_from_table(table: dict, file: object = None) -> Design:
