@@ -123,7 +123,7 @@ def _summary(console, found) -> None:
         table.add_row(name, f"{start[name]:.6g}", f"{value:.6g}",
                       f"{sigma:.2g}" if sigma < float("inf") else "only in combination", unit)
     console.print(table)
-    for sentence in (*found.identifiability.sentences, *found.validation.sentences):
+    for sentence in (*found.campaign_fit.notes, *found.identifiability.sentences, *found.validation.sentences):
         console.print(f"- {sentence}")
 
 

@@ -62,8 +62,8 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
     active = [name for name in names if driven[name]]
     for name in reversed(active):
         others = [driven[other] for other in active if other != name]
-        # Several inputs at once need as many records, or different lines, to be told apart: never less than two.
-        if len(others) >= 2 and driven[name] <= set.intersection(*map(set, others[:1])) | set().union(*others):
+        # One record alone seldom tells several inputs apart: never less than two are left.
+        if len(others) >= 2 and driven[name] <= set().union(*others):
             rest = tuple(other for other in names if other != name)
             return Split(campaign.only(rest), campaign.only((name,)), f"record {name} held out")
     parts = [_divided(record) for record in campaign.records]
@@ -152,16 +152,14 @@ def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[flo
 
 
 def weighted(blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple[float, float]
-             ) -> tuple[list[SpectralBlock], str]:
-    """The blocks with the noise that a local model measures, whatever the rig's model; and a sentence on it."""
-    if all(block.noise is not None for block in blocks):
-        return list(blocks), "noise as estimated with the frequency responses"
+             ) -> tuple[list[SpectralBlock], str, bool]:
+    """The blocks with the noise that a local model measures, whatever the rig's; a sentence, and whether it did."""
     try:
         found = [measured_noise(campaign, block, band_Hz) for block in blocks]
     except AvisError as error:
-        return relative_noise(blocks), f"no measured noise covariance ({error}); lines weigh alike at first"
+        return relative_noise(blocks), f"no measured noise covariance ({error}); lines weigh alike at first", False
     return found, (f"noise covariance measured by a local polynomial model, {found[0].dof:.0f} degrees of freedom a "
-                   "line")
+                   "line"), True
 
 
 def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:
@@ -189,9 +187,11 @@ def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[floa
 class CampaignFit:
     """A fit to a campaign.
 
-    fit : with the noise of its own residuals. first : with the noise that was measured without a model of the rig;
-    its chi-square per degree of freedom is 1 where the model leaves nothing but noise. start : the model before the
-    fit. notes : sentences.
+    fit : with the noise of its own residuals. first : with the noise that was measured without a model of the rig,
+    where `measured`; its chi-square per degree of freedom is a rough figure then (0.85 to 0.95 for a right model,
+    for local models take some of the response's curvature for noise), and none otherwise. The held-out chi-square
+    judges.
+    start : the model before the fit. notes : sentences.
     """
 
     fit: LikelihoodFit
@@ -199,6 +199,7 @@ class CampaignFit:
     band_Hz: tuple[float, float]
     notes: tuple[str, ...]
     start: ResponseModel
+    measured: bool = True
 
 
 def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, band_Hz: tuple[float, float],
@@ -210,12 +211,13 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     ------
     InputError, ComputationError : as `fit`, `record_block`, `response_block`.
     """
+    known = True
     if isinstance(campaign, FrequencyResponse):
         blocks = [response_block(campaign.between(*band_Hz), model)]
         notes = [f"frequency responses: {campaign.method or 'as measured'}"]
     else:
         raw, notes = campaign_blocks(campaign, model, band_Hz)
-        blocks, said = weighted(raw, campaign, band_Hz)
+        blocks, said, known = weighted(raw, campaign, band_Hz)
         notes = [*notes, said]
     found = fit(model, blocks, priors, starts, seed=seed, progress=progress)
     first = found
@@ -225,7 +227,7 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
         found = fit(found.model, residual_noise(found.residuals, model=found.model), priors, seed=seed)
         if progress:
             progress(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
-    return CampaignFit(replace(found, starts=first.starts), first, band_Hz, (*notes, *_bounds(found)), model)
+    return CampaignFit(replace(found, starts=first.starts), first, band_Hz, (*notes, *_bounds(found)), model, known)
 
 
 def _bounds(found: LikelihoodFit) -> tuple[str, ...]:

@@ -34,6 +34,7 @@ class SpectralBlock:
     dof : complex degrees of freedom that `noise` was estimated with; infinite when it is exact.
     transient : the ends of a record leave a transient in it, which the fit takes out (m = 1).
     kind : records of one kind share their noise.
+    shared : lines whose errors go together; the information of so many is that of one.
     """
 
     name: str
@@ -44,6 +45,7 @@ class SpectralBlock:
     dof: float = np.inf
     transient: bool = False
     kind: str = ""
+    shared: float = 1.0
 
     def __post_init__(self) -> None:
         n, m = len(self.omega), self.U.shape[-1]
@@ -55,8 +57,8 @@ class SpectralBlock:
 
     @property
     def numbers(self) -> int:
-        """Real numbers in Y."""
-        return 2 * self.Y.size
+        """Independent real numbers in Y."""
+        return round(2 * self.Y.size / self.shared)
 
     def with_noise(self, noise: np.ndarray, dof: float = np.inf) -> SpectralBlock:
         """With the covariance of the noise, (n, n_y, n_y) or (n, m, n_y, n_y)."""
@@ -104,6 +106,9 @@ def response_block(measured: FrequencyResponse, model: ResponseModel, name: str 
                    ) -> SpectralBlock:
     """A measured frequency response, weighted by its covariance.
 
+    Where neighbouring lines share their data, each is given a covariance as many times larger: together they then hold
+    the information that they have.
+
     Raises
     ------
     InputError : channels or units that are not the model's, a Gram matrix that is not positive definite.
@@ -128,7 +133,8 @@ def response_block(measured: FrequencyResponse, model: ResponseModel, name: str 
         noise = variance[..., None] * np.eye(len(rows))
     U = np.zeros((n, len(model.inputs), n_in), complex)
     _place(U, measured.inputs, model.inputs, W, "inputs")
-    return SpectralBlock(name, measured.omega, U, measured.value[:, rows] @ W, noise, measured.dof, kind=name)
+    return SpectralBlock(name, measured.omega, U, measured.value[:, rows] @ W, noise * measured.shared, measured.dof,
+                         kind=name, shared=measured.shared)
 
 
 def _place(into: np.ndarray, names: Sequence[str], known: Sequence[str], values: np.ndarray, field: str,

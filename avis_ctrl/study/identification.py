@@ -184,17 +184,28 @@ def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions):
     """Split, what is fitted, what is held out, and the band."""
     if isinstance(measured, FrequencyResponse):
         band = options.band_Hz or (float(measured.frequency_Hz[0]), float(measured.frequency_Hz[-1]))
-        inside = measured.between(*band)
-        third = np.arange(len(inside.frequency_Hz)) % 3 == 2
-        return None, inside.at(~third), inside.at(third), band
+        return None, *_divided_lines(measured.between(*band)), band
     split = split_campaign(measured, options.hold_out)
     band = options.band_Hz or excited_band(split.fitted)
     fitted = averaged(split.fitted, band)
     if fitted is None:
         return split, split.fitted, split.held_out, band
     # The records of the other side may be short: their responses are what can be compared.
-    held_out = averaged(split.held_out, band) or local_polynomial(split.held_out, band_Hz=band)
+    held_out = averaged(split.held_out, band) or local_polynomial(split.held_out, band_Hz=band)  # knows what it shares
     return split, fitted, held_out, band
+
+
+def _divided_lines(measured: FrequencyResponse) -> tuple[FrequencyResponse, FrequencyResponse]:
+    """Fitted and held-out lines: every fourth stretch is held out, with nothing beside it that shares its data."""
+    gap = int(np.ceil(measured.shared)) if measured.shared > 1 else 0
+    stretch = max(3, 3 * gap)
+    place = np.arange(len(measured.frequency_Hz))
+    held = (place // stretch) % 4 == 3
+    near = np.convolve(held, np.ones(2 * gap + 1), mode="same") > 0
+    if not np.any(held) or np.all(near):
+        raise InputError(f"expected more than {4 * stretch} lines, of which a quarter is held out", value=len(place),
+                         field="lines of the frequency response")
+    return measured.at(~near), measured.at(held)
 
 
 def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, report: IdentifiabilityReport,

@@ -79,7 +79,8 @@ def result_dict(found: Identification) -> dict[str, Any]:
         "covariance": {"names": list(information.names), "matrix": information.covariance.tolist()},
         "rank": information.rank, "condition": information.condition,
         "identifiability": list(found.identifiability.sentences),
-        "fit": {"chi2_per_dof": found.campaign_fit.first.chi2_per_dof, "dof": fit.dof, "band_Hz": list(
+        "fit": {"chi2_per_dof_of_measured_noise": found.campaign_fit.first.chi2_per_dof if found.campaign_fit.measured
+                else None, "dof": fit.dof, "held_at_bounds": list(fit.held), "band_Hz": list(
             found.campaign_fit.band_Hz), "converged": fit.converged, "starts_chi2": list(fit.starts),
             "notes": list(found.campaign_fit.notes)},
         "advice": list(found.advice), "validation": found.validation.as_dict(),

@@ -135,7 +135,22 @@ def _local_response(campaign: Campaign, rational: bool, band_Hz: Band | None, fr
     method = (f"local {kind} method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces"
               + (f"; not excited and left out: {', '.join(left_out)}" if left_out else ""))
     return FrequencyResponse(found.frequency_Hz, found.value, found.noise, found.gram, names, used.outputs,
-                             used.input_unit, used.output_unit, float(found.dof), method=method)
+                             used.input_unit, used.output_unit, float(found.dof), method=method,
+                             shared=1.0 if apart else _shared(where, width, order,
+                                                              campaign.sample_rate_Hz / plan.shortest))
+
+
+def _shared(where: np.ndarray, half_width: int, order: int, spacing_Hz: float) -> float:
+    """Lines whose errors go together: the sum of the correlations of estimates from windows that overlap.
+
+    A local polynomial is a moving average with weights h that sum to one; over all shifts its correlations sum to
+    1 / sum h^2 lines, and lines that are estimated more sparsely share less.
+    """
+    if where.size < 2:
+        return 1.0
+    offsets = np.arange(-half_width, half_width + 1)
+    h = np.linalg.pinv(np.vander(offsets / half_width, order + 1, increasing=True))[0]
+    return max(1.0, float(1 / np.sum(h ** 2) * spacing_Hz / np.median(np.diff(where))))
 
 
 def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz: float | None = None,

@@ -31,6 +31,8 @@ class FrequencyResponse:
     coherence : (n, n_y) multiple coherence where it was computed.
     entry_variance : (n, n_y, n_u) E|error|^2 of each entry, for files that know no more (coherence, or variances);
         entries then count as independent, and `noise` and `gram` are None.
+    shared : of how many neighbouring lines the errors go together, because their estimates rest on the same data: the
+        sum of their correlation over all distances; 1 for independent lines.
     method : how it was estimated, in words.
     """
 
@@ -48,6 +50,7 @@ class FrequencyResponse:
     coherence: np.ndarray | None = None
     entry_variance: np.ndarray | None = None
     method: str = ""
+    shared: float = 1.0
 
     def __post_init__(self) -> None:
         n, n_y, n_u = len(self.frequency_Hz), len(self.outputs), len(self.inputs)
@@ -103,4 +106,4 @@ class FrequencyResponse:
         return FrequencyResponse(self.frequency_Hz[keep], self.value[keep], cut(self.noise), cut(self.gram),
                                  self.inputs, self.outputs, self.input_unit, self.output_unit, self.dof,
                                  cut(self.measurement_noise), cut(self.distortion), cut(self.coherence),
-                                 cut(self.entry_variance), self.method)
+                                 cut(self.entry_variance), self.method, self.shared)
