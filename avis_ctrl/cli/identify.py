@@ -117,13 +117,16 @@ def _summary(console, found) -> None:
     information = found.campaign_fit.fit.information
     start = {name: one.value for name, one in found.campaign_fit.first.model.all_parameters().items()}
     start |= {name: one.value for name, one in found.start.parameters().items()}
-    table = Table("parameter", "start", "identified", "+- 1 sigma", "unit", title=f"{found.rig.name}, identified")
+    table = Table("parameter", "start", "identified", "+- 1 sigma", "unit", title=f"{found.rig.name}{' with its load' if getattr(found.rig, 'load', None) else ''}, "
+                  "identified")
     for name, value, sigma, unit in zip(information.names, information.values, information.standard_deviation,
                                         information.units, strict=True):
         table.add_row(name, f"{start[name]:.6g}", f"{value:.6g}",
                       f"{sigma:.2g}" if sigma < float("inf") else "only in combination", unit)
+    from avis_ctrl.study.identification import CAUTION
+
     console.print(table)
-    for sentence in (*found.campaign_fit.notes, *found.identifiability.sentences, *found.validation.sentences):
+    for sentence in (CAUTION, *found.campaign_fit.notes, *found.identifiability.sentences, *found.validation.sentences):
         console.print(f"- {sentence}")
 
 

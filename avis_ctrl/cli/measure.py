@@ -80,7 +80,8 @@ def simulate_campaign(
                                             "20 %")] = False,
     orthogonal: Annotated[bool, typer.Option("--orthogonal", help="default plan with orthogonal multisines")] = False,
     duration_s: Annotated[float, typer.Option("--duration", help="of each record of the default plan [s]")] = 60.0,
-    seed: Annotated[int, typer.Option("--seed")] = 1,
+    seed: Annotated[int, typer.Option("--seed", help="of excitation, floor and noise, and of --perturbed: for another "
+                                      "campaign of the same table give --rig the --truth file")] = 1,
 ) -> None:
     """A measurement campaign from the nonlinear model, to plan and rehearse an identification."""
     from rich.console import Console

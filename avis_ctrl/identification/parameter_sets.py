@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
@@ -51,7 +52,9 @@ def named_parameters(model_of: Rig, patterns: Sequence[str], unit: str = "V") ->
     for pattern in patterns:
         matching = [name for name in known if fnmatchcase(name, pattern)]
         if not matching:
-            raise InputError(f"the rig {model_of.name} has no parameter that matches; it has {', '.join(known)}",
-                             field="parameters", value=pattern)
+            near = difflib.get_close_matches(pattern, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
+            raise InputError(f"the rig {model_of.name} has no parameter that matches; {hint}", field="parameters",
+                             value=pattern)
         found |= dict.fromkeys(matching)
     return tuple(found)

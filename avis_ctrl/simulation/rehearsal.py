@@ -10,6 +10,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -54,7 +55,8 @@ def rehearse(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | N
 def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.0, seed: int = 1) -> Rig:
     """Stiffness, mass and inertia within +-percent, damping within +-damping_percent; independent uniform draws.
 
-    Products of inertia, positions, actuators, sensors and the inertia of a load stay as they are.
+    Products of inertia, positions, actuators, sensors, the inertia of a load and, of a spring-suspended table, masses
+    stay as they are: a scale tells those.
 
     Raises
     ------
@@ -66,6 +68,8 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
     rng, known = np.random.default_rng((seed, 5)), rig.parameters()
     spread = {name: (damping_percent if DAMPING.fullmatch(name) else percent) / 100 for name in known
               if DAMPING.fullmatch(name) or STIFF_OR_HEAVY.fullmatch(name)}
+    if isinstance(rig, Halcyonics):
+        spread = {name: width for name, width in spread.items() if name not in ("mass", "load.mass")}
     for _ in range(ATTEMPTS):
         draws = rng.uniform(-1, 1, len(spread))
         changes = {name: known[name].value * (1 + width * draw)

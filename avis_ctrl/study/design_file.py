@@ -219,10 +219,11 @@ class RequirementSection(_Section):
 
 
 class Design(_Section):
-    """A whole design file."""
+    """A whole design file. loaded : with the load of the rig file's [load] section on the table."""
 
     title: str
     rig: str
+    loaded: bool = False
     keep: Annotated[list[Axis], Field(min_length=1), AfterValidator(_different)]
     loop: LoopSection = LoopSection()
     uncertainty: UncertaintySection = UncertaintySection()
@@ -269,7 +270,7 @@ def read_study(path: str | Path) -> tuple[Design, Rig]:
     if design.rig not in SHIPPED and not beside.is_file():
         raise InputError(f"expected a rig file beside the design or one of {', '.join(SHIPPED)}", file=path,
                          field="rig", value=design.rig)
-    rig = load_rig(design.rig if design.rig in SHIPPED else beside)
+    rig = load_rig(design.rig if design.rig in SHIPPED else beside, design.loaded)
     if isinstance(named := design.uncertainty.identified, str):
         content = read_uncertainty(path.parent / named)
         design = design.model_copy(update={"uncertainty": design.uncertainty.model_copy(

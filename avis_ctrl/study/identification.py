@@ -40,8 +40,11 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 from avis_ctrl.measurement.gates import Expectation, Finding, examine
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
 
 Progress = Callable[[str], None]
+CAUTION = ("standard deviations hold the noise of these records alone; what was not free (such as force constants, "
+           "sensitivities, places) counts as exact")
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class IdentifyOptions:
     parameters : names or wildcards of what is free; the rig's usual ones by default.
     priors : (mean, standard deviation) by parameter.
     hold_out : records that no fit sees; chosen where None. band_Hz : of the fit; the excited one where None.
-    amplifier_corner_Hz : first-order lag of the amplifiers, which no rig file states; None for none.
+    amplifier_corner_Hz : first-order lag of the amplifiers, which no rig file states; see `amplifier_corner`.
     starts : of the maximum likelihood fit. kalman : run the extended Kalman filter beside it.
     despite_gates : go on where a gate says stop.
     """
@@ -122,11 +125,16 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
     ComputationError : a fit that does not come to an end.
     """
     options, began = options or IdentifyOptions(), time.monotonic()
+    _check(measured, options)
     with threadpool_limits(1):
         model = start_model(measured, rig, options)
         findings = gates(measured, model, options, progress)
         progress("which records to fit, which to hold out, and the band")
         split, fitted, held_out, band = _divide(measured, options)
+        if model.amplifier_corner_Hz:
+            progress(f"amplifiers with a first-order lag of {model.amplifier_corner_Hz:g} Hz"
+                     + ("" if options.amplifier_corner_Hz else ", as rehearsals and designs assume; --amplifier-corner "
+                                                               "states another"))
         progress(f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
                  + (f"; {split.how}" if split else ""))
         found = fit_campaign(fitted, model, band, options.priors, options.starts, options.seed, progress=progress)
@@ -144,6 +152,22 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
                           kalman, note, provenance(measured, rig, options, seconds), seconds)
 
 
+def _check(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> None:
+    """What can be refused before anything slow begins."""
+    if options.band_Hz is not None and not 0 <= options.band_Hz[0] < options.band_Hz[1]:
+        raise InputError("expected the lower end first, the upper one after it", field="band_Hz", value=options.band_Hz)
+    if isinstance(measured, Campaign):
+        for name in options.hold_out or ():
+            measured.named(name)
+
+
+def amplifier_corner(rig: Rig, options: IdentifyOptions) -> float | None:
+    """The amplifiers' corner [Hz] as stated; on tables with accelerometers what rehearsals and designs assume."""
+    if options.amplifier_corner_Hz is None and rig.geophones is None and rig.accelerometers is not None:
+        return ACCELEROMETER_AMPLIFIER_HZ
+    return options.amplifier_corner_Hz
+
+
 def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions) -> ResponseModel:
     """The rig as its file describes it, with the channels of the measurement.
 
@@ -158,7 +182,7 @@ def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: Ident
         unit, sensors, sampled = measured.output_unit, measured.outputs, False
         actuators = tuple(name for name in measured.inputs if name not in ("vx", "vy", "vz"))
     names = named_parameters(rig, options.parameters, unit) if options.parameters else default_parameters(rig)
-    return ResponseModel.of(rig, names, unit, sensors, actuators, sampled, options.amplifier_corner_Hz)
+    return ResponseModel.of(rig, names, unit, sensors, actuators, sampled, amplifier_corner(rig, options))
 
 
 def gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options: IdentifyOptions,

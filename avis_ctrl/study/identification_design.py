@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from avis_ctrl.errors import InputError
 from avis_ctrl.identification.campaign_fit import LONGEST_PIECE, driven_inputs, excited_band
 from avis_ctrl.identification.model_error import measured_response
 from avis_ctrl.identification.spread import FrfSpread, frf_spread
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.rigs.avis import AvisTable
+from avis_ctrl.rigs.halcyonics import Halcyonics
+from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.design_file import ChainUncertainty, Design, design_from_table, read_design
 from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE, UNCERTAINTY_FILE
 from avis_ctrl.study.identified_uncertainty import InDesign, in_design
@@ -38,6 +41,15 @@ _AVIS: dict[str, Any] = _COMMON | {
                     {"quantity": "worst_case_peak_transmissibility_dB", "at_most": 4.0},
                     {"quantity": "worst_case_band_transmissibility_dB", "at_most": -6.0},
                     {"quantity": "fastest_controller_pole_Hz", "at_most": 250.0}]}
+_HALCYONICS: dict[str, Any] = _COMMON | {
+    "loop": {"amplifier_corner_Hz": 300.0, "integrator_corner_Hz": 0.1},
+    "uncertainty": {"actuator_chains": {"low_percent": 10.0, "crossover_Hz": 150.0, "high_percent": 400.0}},
+    "transmissibility": {"peak_dB": 3.5, "band_dB": -12.0, "band_Hz": [4.0, 16.0], "transition_octaves": 0.8,
+                         "tolerance_dB": 1.0},
+    "control_effort": {"floor_velocity_m_per_s": 1e-4, "bandwidth_Hz": 150.0, "reduction": 30.0},
+    "floor": {"velocity_rms_m_per_s": 2e-5},
+    "synthesis": {"max_iterations": 8, "time_limit_s": 60.0, "target_mu": 0.95},
+    "requirement": _AVIS["requirement"]}
 
 
 def design_files(found: Identification, template: Path | Design | None = None) -> dict[str, str]:
@@ -45,7 +57,7 @@ def design_files(found: Identification, template: Path | Design | None = None) -
 
     Parameters
     ----------
-    template : design whose rig and uncertainty are replaced; by default z and phi_x of the AVIS.
+    template : design whose rig and uncertainty are replaced; by default z and phi_x as designs/*.toml have them.
 
     Raises
     ------
@@ -64,7 +76,8 @@ def design_start(found: Identification, template: Path | Design | None = None) -
     spread = measured_spread(found, tuple(design.keep))
     content = uncertainty_content(found.rig, found.campaign_fit.fit.information, [spread], found.provenance)
     made = in_design(content, found.rig, design.keep, design.uncertainty.confidence_percent / 100)
-    return {UNCERTAINTY_FILE: uncertainty_json(content), DESIGN_FILE: identification_design(content, design)}, made
+    files = {UNCERTAINTY_FILE: uncertainty_json(content), DESIGN_FILE: identification_design(content, design, found.rig)}
+    return files, made
 
 
 def measured_spread(found: Identification, keep: tuple[str, ...]) -> FrfSpread:
@@ -81,7 +94,7 @@ def measured_spread(found: Identification, keep: tuple[str, ...]) -> FrfSpread:
     return frf_spread(measured_response(driven, model, band, LONGEST_PIECE), model, keep)
 
 
-def identification_design(content: UncertaintyFile, template: Design) -> str:
+def identification_design(content: UncertaintyFile, template: Design, rig: Rig) -> str:
     """The text of a design file for an identified rig, from a design with uncertainty set by hand.
 
     Ranges of parameters that were identified give way to the identification. Of the actuators' chains the frequency
@@ -90,14 +103,16 @@ def identification_design(content: UncertaintyFile, template: Design) -> str:
     """
     asked = template.uncertainty
     uncertainty: dict[str, Any] = {
-        "parameters_percent": _not_identified(asked.parameters_percent, content),
-        "parameters_absolute": _not_identified(asked.parameters_absolute, content)}
+        "parameters_percent": _not_identified(asked.parameters_percent, content, rig.parameters()),
+        "parameters_absolute": _not_identified(asked.parameters_absolute, content, rig.parameters())}
     if asked.actuator_chains is not None:
         uncertainty["actuator_chains"] = _chains(asked.actuator_chains, content, template).model_dump()
     if asked.sensor_chains is not None:
         uncertainty["sensor_chains"] = asked.sensor_chains.model_dump()
     uncertainty |= {"identified": UNCERTAINTY_FILE, "confidence_percent": asked.confidence_percent}
     table = template.model_dump(exclude_none=True) | {"rig": RIG_FILE, "uncertainty": uncertainty}
+    if isinstance(rig, Halcyonics) and rig.load is not None:
+        table["loaded"] = True
     return design_toml(design_from_table(table))
 
 
@@ -135,16 +150,16 @@ def _template(found: Identification, template: Path | Design | None) -> Design:
         return template
     if template is not None:
         return read_design(template)
-    if "isolator1.k_z" not in found.rig.parameters():
-        raise InputError(f"there is no default design for the rig {found.rig.name}: name a design file",
-                         field="--design")
+    shape = _AVIS if isinstance(found.rig, AvisTable) else _HALCYONICS
     title = f"{found.rig.name}, identified: z and phi_x under one controller"
-    return design_from_table(_AVIS | {"title": title, "rig": RIG_FILE})
+    return design_from_table(shape | {"title": title, "rig": RIG_FILE})
 
 
-def _not_identified(ranges: dict[str, float], content: UncertaintyFile) -> dict[str, float]:
+def _not_identified(ranges: dict[str, float], content: UncertaintyFile, known: Collection[str]) -> dict[str, float]:
+    """Ranges of parameters that this rig has and that were not identified."""
     return {pattern: value for pattern, value in ranges.items()
-            if not any(fnmatchcase(name, pattern) for name in content.names)}
+            if not any(fnmatchcase(name, pattern) for name in content.names)
+            and any(fnmatchcase(name, pattern) for name in known)}
 
 
 def _chains(asked: ChainUncertainty, content: UncertaintyFile, template: Design) -> ChainUncertainty:

@@ -20,7 +20,7 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.study.files import write_json, write_whole
-from avis_ctrl.study.identification import Identification
+from avis_ctrl.study.identification import CAUTION, Identification
 from avis_ctrl.study.identification_files import FILES, RESULT_FILE, RIG_FILE
 
 PIECE = 1 << 17
@@ -48,18 +48,18 @@ def identified_rig(model: ResponseModel) -> Rig:
 def identified_toml(found: Identification) -> str:
     """The rig file of an identification: each identified value with its standard deviation beside it."""
     information = found.campaign_fit.fit.information
-    known = found.rig.parameters()
+    known, start = found.rig.parameters(), found.start.parameters()
     comments = {}
-    for name, value, sigma in zip(information.names, information.values, information.standard_deviation, strict=True):
+    for name, sigma in zip(information.names, information.standard_deviation, strict=True):
         if name in known:
-            comments[name] = (f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}" if np.isfinite(sigma)
-                              else f"{name.rpartition('.')[2]} not determined by itself, near its start {value:.4g}")
+            comments[name] = (f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}" if np.isfinite(sigma) else
+                              f"{name.rpartition('.')[2]} known only in combination (start {start[name].value:.4g})")
     p = found.provenance
     header = [f"{found.rig.name}, identified by avis_ctrl {p['avis_ctrl']} on {p['date']}",
               f"from {p['measurement'] or 'a measurement'}, SHA-256 {p['measurement_sha256'][:16]}",
               f"{information.rank} of {len(information.names)} combinations of parameters are determined; standard "
               "deviations (1 sigma) beside the values",
-              "what the combinations are stands in the report and in result.json"]
+              "what the combinations are stands in the report and in result.json", CAUTION]
     return rig_toml(identified_rig(found.model), comments, "\n".join(header))
 
 

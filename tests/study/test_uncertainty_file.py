@@ -226,7 +226,7 @@ def test_the_generated_design_reads_back(folder, rig, content):
         "parameters_percent": {"mass": 10.0, "isolator*.k_z": 15.0, "isolator*.k_x": 15.0},
         "parameters_absolute": {"com_y": 0.01},
         "actuator_chains": {"low_percent": 10.0, "crossover_Hz": 80.0, "high_percent": 400.0}}})
-    (folder / "design.toml").write_text(identification_design(content, template), encoding="utf-8")
+    (folder / "design.toml").write_text(identification_design(content, template, rig), encoding="utf-8")
     design, _ = read_study(folder / "design.toml")
     assert design.uncertainty.identified == content and design.rig == "rig.toml"
     # What was identified gave way, what was not stays.
