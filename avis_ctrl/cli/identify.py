@@ -61,7 +61,7 @@ def identify(
         from avis_ctrl.report import identification_html, identification_pdf
         from avis_ctrl.study.identification import IdentifyOptions, identify
         from avis_ctrl.study.identification_design import design_start
-        from avis_ctrl.study.identification_output import write_identification
+        from avis_ctrl.study.identification_output import require_readable, write_identification
 
         options = IdentifyOptions(tuple(parameters or ()), dict(_prior(text) for text in priors or ()),
                                   tuple(hold_out) if hold_out else None, band_Hz, starts, kalman, despite_gates, seed,
@@ -69,6 +69,7 @@ def identify(
         found = identify(measured, start, options, progress)
         progress("uncertainty for design")
         try:
+            require_readable(found)
             more, made = design_start(found, design)
             then = f"; next: avis design {folder / 'design.toml'} --out {folder / 'design'}"
         except AvisError as error:
@@ -115,10 +116,11 @@ def _summary(console, found) -> None:
     from rich.table import Table
 
     information = found.campaign_fit.fit.information
+    loaded = " with its load" if getattr(found.rig, "load", None) else ""
     start = {name: one.value for name, one in found.campaign_fit.first.model.all_parameters().items()}
     start |= {name: one.value for name, one in found.start.parameters().items()}
-    table = Table("parameter", "start", "identified", "+- 1 sigma", "unit", title=f"{found.rig.name}{' with its load' if getattr(found.rig, 'load', None) else ''}, "
-                  "identified")
+    table = Table("parameter", "start", "identified", "+- 1 sigma", "unit",
+                  title=f"{found.rig.name}{loaded}, identified")
     for name, value, sigma, unit in zip(information.names, information.values, information.standard_deviation,
                                         information.units, strict=True):
         table.add_row(name, f"{start[name]:.6g}", f"{value:.6g}",

@@ -55,8 +55,8 @@ def rehearse(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | N
 def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.0, seed: int = 1) -> Rig:
     """Stiffness, mass and inertia within +-percent, damping within +-damping_percent; independent uniform draws.
 
-    Products of inertia, positions, actuators, sensors, the inertia of a load and, of a spring-suspended table, masses
-    stay as they are: a scale tells those.
+    Products of inertia, positions, actuators, sensors and the inertia of a load stay as they are; of a spring-suspended
+    table masses too, which a scale tells, and with a load on it the plate's inertia.
 
     Raises
     ------
@@ -69,7 +69,9 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
     spread = {name: (damping_percent if DAMPING.fullmatch(name) else percent) / 100 for name in known
               if DAMPING.fullmatch(name) or STIFF_OR_HEAVY.fullmatch(name)}
     if isinstance(rig, Halcyonics):
-        spread = {name: width for name, width in spread.items() if name not in ("mass", "load.mass")}
+        # Of a loaded table the plate was identified before: its inertia and the load's are seen only together.
+        known_before = ("mass", "load.mass", *(("Ixx", "Iyy", "Izz") if rig.load else ()))
+        spread = {name: width for name, width in spread.items() if name not in known_before}
     for _ in range(ATTEMPTS):
         draws = rng.uniform(-1, 1, len(spread))
         changes = {name: known[name].value * (1 + width * draw)

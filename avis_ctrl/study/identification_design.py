@@ -76,8 +76,8 @@ def design_start(found: Identification, template: Path | Design | None = None) -
     spread = measured_spread(found, tuple(design.keep))
     content = uncertainty_content(found.rig, found.campaign_fit.fit.information, [spread], found.provenance)
     made = in_design(content, found.rig, design.keep, design.uncertainty.confidence_percent / 100)
-    files = {UNCERTAINTY_FILE: uncertainty_json(content), DESIGN_FILE: identification_design(content, design, found.rig)}
-    return files, made
+    text = identification_design(content, design, found.rig)
+    return {UNCERTAINTY_FILE: uncertainty_json(content), DESIGN_FILE: text}, made
 
 
 def measured_spread(found: Identification, keep: tuple[str, ...]) -> FrfSpread:

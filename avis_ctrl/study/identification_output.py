@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from avis_ctrl.measurement.campaign import Campaign, ranges
 from avis_ctrl.measurement.formats.hdf5 import replacing
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.rigs.rig_file import load_rig, rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.study.files import write_json, write_whole
 from avis_ctrl.study.identification import CAUTION, Identification
@@ -43,6 +44,16 @@ def identified_rig(model: ResponseModel) -> Rig:
     volts = tuple(float(found.get(name, old)) for name, old in zip(g.names, g.sensitivity_Vs_per_m, strict=True))
     return replace(rig, geophones=replace(g, sensitivity_Vs_per_m=volts),
                    acquisition=replace(rig.acquisition, loop_delay_s=model.delay_s))
+
+
+def require_readable(found: Identification) -> None:
+    """Raises InputError where the identified values make no rig that a rig file may hold, such as an inertia that no
+    body has: what the fit took as known was wrong then."""
+    try:
+        rig_from(tomllib.loads(identified_toml(found)), getattr(found.rig, "load", None) is not None)
+    except InputError as error:
+        raise InputError(f"the identified values make no rig: {error}; something that was taken as known is wrong",
+                         field="rig.toml") from None
 
 
 def identified_toml(found: Identification) -> str:
