@@ -311,10 +311,11 @@ def _load(section: LoadSection, plate: PlateSection) -> Load:
 def _check_inertia(J: np.ndarray, field: str, value: Any, slender: bool = False) -> None:
     """A body's principal moments are positive and none exceeds the sum of the others.
 
-    A slender rod (one moment zero) is on the edge of both and allowed for a load, up to round-off.
+    A slender rod (one moment zero) is on the edge of both and allowed for a load, up to what a measurement of it
+    scatters about the edge.
     """
     moments = np.linalg.eigvalsh(J)
-    slack = 1e-9 * moments[-1]
+    slack = (1e-3 if slender else 1e-9) * moments[-1]
     if moments[0] < (-slack if slender else slack) or moments[2] > moments[0] + moments[1] + slack:
         raise InputError("expected an inertia that a body can have (principal moments positive, none above the sum "
                          f"of the other two); they are {np.round(moments, 6).tolist()} kg m^2", field=field,
