@@ -14,7 +14,10 @@ from avis_ctrl.cli.design import design
 from avis_ctrl.cli.identify import identify, predict, single_axis
 from avis_ctrl.cli.measure import convert, excite, simulate_campaign
 from avis_ctrl.errors import AvisError
+from avis_ctrl.measurement.layouts import FORMATS
 
+# A line a paragraph: the terminal breaks them.
+LAYOUTS = "\n\n".join(" ".join(part.split()) for part in FORMATS.split("\n\n"))
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False,
@@ -56,7 +59,7 @@ def doctor() -> None:
 
 for command, name in ((design, "design"), (identify, "identify"), (predict, "predict"), (excite, "excite"),
                       (simulate_campaign, "simulate-campaign"), (convert, "convert"), (single_axis, "single-axis")):
-    app.command(name)(command)
+    app.command(name, epilog=LAYOUTS if name in ("identify", "convert") else None)(command)
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from avis_ctrl.cli.console import Progress
+from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints
 from avis_ctrl.errors import AvisError, InputError
 
 
@@ -18,7 +19,12 @@ def identify(
                                      "halcyonics_loaded or a rig.toml")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for rig, report and uncertainty")],
     columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="which variable of the file "
-                                                "is what, such as u=V1+V2,y=S1,t=time")] = None,
+                                                "is what, such as u=V1+V2,y=S1,t=time; names of the channels: "
+                                                "y_names=Sy1+Sz1")] = None,
+    period_s: PERIOD = None,
+    excitation: EXCITATION = None,
+    sample_rate_Hz: SAMPLE_RATE = None,
+    unit_y: UNIT_Y = None,
     parameters: Annotated[list[str] | None, typer.Option("--parameter", metavar="NAME", help="what is free, such as "
                                                          "'isolator*.k_z' (repeatable); by default mass, inertia, "
                                                          "stiffness, damping")] = None,
@@ -50,10 +56,16 @@ def identify(
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.files import open_folder
     from avis_ctrl.study.identification_files import FILES
+    from avis_ctrl.study.rig_channels import in_words_of
 
     console = Console(highlight=False)
     start = load_rig(rig)
-    measured = read_measurements(measurement, parse_columns(columns) if columns else None)
+    measured = read_measurements(measurement, parse_columns(columns) if columns else None,
+                                 **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
+    try:
+        measured = in_words_of(start, measured)
+    except InputError as error:
+        raise error.in_file(measurement) from None
     for note in in_short(measured.notes) if isinstance(measured, Campaign) else ():
         console.print(f"[dim]{note}[/]")
     folder = open_folder(out, FILES)
@@ -156,8 +168,29 @@ def single_axis(
         except ValueError:
             raise InputError("expected ROLE=NUMBER", field="--scale", value=part) from None
     found = identify_single_axis(kind, path, roles, scale=factors or None, sample_rate_Hz=sample_rate_Hz)
+    console = Console(highlight=False)
+    console.print(_assumed_units(kind, roles, factors), soft_wrap=True)
     for line in found.lines():
-        Console(highlight=False).print(line)
+        console.print(line)
+
+
+# What the fits take the numbers of each role for, after --scale.
+UNITS = {
+    "seismometer": {"drive": "N (m/s where ground is mapped)", "coil": "V", "displacement": "m", "ground": "V"},
+    "decay": {"y": "any unit"},
+    "drive": {"force": "N", "position": "m", "reference": "m"},
+    "oscillator": {"u": "any unit", "y": "any unit"},
+}
+
+
+def _assumed_units(kind: str, roles: dict[str, str], factors: dict[str, float]) -> str:
+    """One line: what each column was taken for."""
+    said = [f"{role} = {roles[role]}{f' times {factors[role]:g}' if role in factors else ''} in {unit}"
+            for role, unit in UNITS[kind].items() if role in roles]
+    unscaled = [role for role in roles if role in UNITS[kind] and role not in factors
+                and UNITS[kind][role] != "any unit"]
+    change = f" (as in the file; --scale {unscaled[0]}=FACTOR for another unit)" if unscaled else ""
+    return f"taken: {', '.join(said)}, t in s{change}"
 
 
 def _pair(text: str, option: str) -> tuple[str, str]:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from avis_ctrl.cli.console import Progress
+from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints
 from avis_ctrl.errors import InputError
 
 # A rig is stiffer or better damped than its file says, but not twice.
@@ -112,8 +113,13 @@ def convert(
     source: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="HDF5, .mat, UFF 58, CSV or a folder of CSV")],
     out: Annotated[Path, typer.Argument(metavar="CAMPAIGN.h5")],
     columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="which variable is what, "
-                                                "such as u=vir,y=qm,t=t")] = None,
+                                                "such as u=vir,y=qm,t=t; names of the channels: y_names=Sy1+Sz1"
+                                                )] = None,
     rig: Annotated[str | None, typer.Option("--rig", help="name of the rig, where the file has none")] = None,
+    period_s: PERIOD = None,
+    excitation: EXCITATION = None,
+    sample_rate_Hz: SAMPLE_RATE = None,
+    unit_y: UNIT_Y = None,
 ) -> None:
     """Any measurement file as a campaign in HDF5, with what had to be assumed."""
     from rich.console import Console
@@ -124,7 +130,8 @@ def convert(
     from avis_ctrl.measurement.formats.stored_response import write_frequency_response
 
     console = Console(highlight=False)
-    measured = read_measurements(source, parse_columns(columns) if columns else None, rig)
+    measured = read_measurements(source, parse_columns(columns) if columns else None, rig,
+                                 **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
     if isinstance(measured, Campaign):
         write_campaign(out, measured)
         for note in in_short(measured.notes):

@@ -147,7 +147,7 @@ def test_what_is_no_measurement_at_all(tmp_path):
     assert refusal(path) == (f"{path}: expected HDF5, MATLAB .mat (v5 to v7.3), UFF 58 or CSV; the content is none of "
                              "them")
     path.write_text("just words\nand more\n")
-    assert "y = []: expected at least one column; the file has just words" in refusal(path)
+    assert "line 1 = 'just words': not a measurement file: a text" in refusal(path)
     assert "cannot be opened" in refusal(tmp_path / ("long" * 100))
     assert "cannot be opened" in refusal(tmp_path / "x\0y")
 

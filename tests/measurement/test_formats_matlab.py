@@ -172,17 +172,19 @@ def test_as_many_lines_as_channels_are_refused(path, rng):
 
 
 WRONG = {
-    "no rate": ({"sample_rate_Hz": MISSING}, "record 00: sample_rate_Hz: missing"),
-    "no y": ({"y": MISSING}, "record 00: y: missing; the record has"),
-    "no names": ({"u_names": MISSING}, "record 00: u_names: missing; expected a cell array"),
+    "no rate": ({"sample_rate_Hz": MISSING},
+                "records: missing: sample_rate_Hz, fs or a time vector t; the records have excitation, floor"),
+    "no y": ({"y": MISSING}, "records: missing: y, what the sensors gave; the records have"),
+    "all at once": ({"y": MISSING, "sample_rate_Hz": MISSING, "period_s": 0.0},
+                    "missing: y, what .*; sample_rate_Hz, fs or a time vector t; period_s, the period in s of a mult"),
     "names": ({"y_names": cells(["S1", "S2"])}, "expected 2 channels, as there are names; it is 60x3"),
     "same names": ({"y_names": cells(["S1", "S1", "S2"])}, "expected different names"),
     "lengths": ({"y": np.zeros((59, 3))}, "expected equally many samples; u is 60x2, y is 59x3, floor is 60x3"),
     "text": ({"y": "none"}, "record 00: y = 'text': expected a real matrix"),
     "cells": ({"y": cells([1.0, 2.0])}, "y = 'cell or struct array': expected a real matrix"),
-    "empty": ({"y": np.zeros((0, 0))}, "record 00: y: expected samples, found an empty array"),
+    "empty": ({"y": np.zeros((0, 0))}, "records: missing: y, what the sensors gave"),
     "period": ({"period_s": 0.123}, "expected a whole number of samples"),
-    "no period": ({"period_s": np.nan}, "period_s: missing; expected the period in s of a multisine"),
+    "no period": ({"period_s": np.nan}, "missing: period_s, the period in s of a multisine"),
     "unit": ({"y_unit": "Pa"}, "record 00: y unit = 'Pa': expected a unit of V"),
 }
 

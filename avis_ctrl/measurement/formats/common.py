@@ -236,18 +236,22 @@ def header_from(fields: Mapping[str, Any], name: str, samples: int, channels: Ma
                         channels.get("floor", ()), units.get("floor", "m/s"))
 
 
-def _period(value: Any, excitation: str, where: str) -> float | None:
-    """Period of a record; struct arrays state an empty or NaN one where there is none."""
+def stated_period(value: Any, field: str) -> float | None:
+    """Period of a record in s; an empty one, NaN or 0 is how struct arrays and tables say that there is none."""
     if isinstance(value, np.ndarray) and value.size == 0:
-        value = None
-    single = _single(value)
-    if isinstance(single, float) and np.isnan(single):
-        single = None
-    if single is None:
-        if excitation == "multisine":
-            raise InputError("missing; expected the period in s of a multisine", field=f"{where}: period_s")
         return None
-    return as_number(single, f"{where}: period_s")
+    single = _single(value)
+    if single is None or (isinstance(single, (int, float)) and not isinstance(single, bool)
+                          and (single == 0 or np.isnan(single))):
+        return None
+    return as_number(single, field)
+
+
+def _period(value: Any, excitation: str, where: str) -> float | None:
+    period = stated_period(value, f"{where}: period_s")
+    if period is None and excitation == "multisine":
+        raise InputError("missing; expected the period in s of a multisine", field=f"{where}: period_s")
+    return period
 
 
 def numbers(array: Any, field: str) -> np.ndarray:

@@ -24,7 +24,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record
 from avis_ctrl.measurement.formats.common import as_number, existing_file, reading, require_small
-from avis_ctrl.measurement.formats.flat import Hints, Mapped, flat_record, mapped, one_clock, pick
+from avis_ctrl.measurement.formats.flat import UNNAMED, Hints, Mapped, flat_record, mapped, one_clock, pick
 from avis_ctrl.measurement.formats.time_axis import sample_rate_from
 
 CHUNK = 1 << 16  # lines that are turned into numbers at once
@@ -74,7 +74,7 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
         rigs.append(stated)
     harmonised, assumed = one_clock(records)
     with reading(path):
-        return Campaign(rig or rigs[0] or "unnamed", harmonised, str(path), tuple([*notes, *assumed]))
+        return Campaign(rig or rigs[0] or UNNAMED, harmonised, str(path), tuple([*notes, *assumed]))
 
 
 def is_text(head: bytes) -> bool:
@@ -143,7 +143,7 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _roles(layout: Layout, columns: Mapped | None) -> dict[str, list[str]]:
+def _roles(layout: Layout, columns: Mapped | None, path: Path) -> dict[str, list[str]]:
     """Names of the columns of each role, as the caller mapped them or as they are usually called."""
     titles = {f"{name} [{unit}]": name for name, unit in zip(layout.names, layout.units, strict=True) if unit}
     if columns is not None:
@@ -158,16 +158,27 @@ def _roles(layout: Layout, columns: Mapped | None) -> dict[str, list[str]]:
         roles["floor"] = list(FLOOR_NAMES) if set(FLOOR_NAMES) <= set(layout.names) else []
     for role, wanted in (("t", "at most one column"), ("y", "at least one column")):
         if len(roles[role]) > 1 if role == "t" else not roles[role]:
+            if not roles["t"] and not _followed_by_numbers(path, layout):
+                raise InputError("not a measurement file: a text, but no CSV with a header line and lines of numbers",
+                                 field=f"line {layout.lines}", value=", ".join(layout.names)[:60])
             raise InputError(f"expected {wanted}; the file has {', '.join(layout.names)}; say with columns which is "
                              "what (roles t, u, y, floor)", field=role, value=roles[role])
     return roles
+
+
+def _followed_by_numbers(path: Path, layout: Layout) -> bool:
+    """Whether the first filled line below the header is one of numbers."""
+    with _open(path) as stream:
+        below = (line for line in islice(_lines(stream), layout.lines, None) if line.strip())
+        entries = [entry.strip().replace(",", ".") for entry in next(below, "").split(layout.separator)]
+    return any(entries) and all(_is_number(entry) for entry in entries if entry)
 
 
 def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[Record, list[str], str]:
     with _open(path) as stream:
         lines = _lines(stream)
         layout = _layout(lines)
-        roles = _roles(layout, columns)
+        roles = _roles(layout, columns, path)
         wanted = [name for names in roles.values() for name in names]
         table = _table(lines, layout, sorted({layout.names.index(name) for name in wanted}))
     place = {layout.names.index(name): at for at, name in

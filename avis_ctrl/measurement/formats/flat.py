@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Record, RecordHeader
+from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Record, RecordHeader, RecordSource
 from avis_ctrl.measurement.formats.common import as_number, as_text, numbers, require_finite, unit_of, units_of
 
 ROLES = ("t", "u", "y", "floor", "sample_rate_Hz", "u_names", "y_names")
+UNNAMED = "unnamed"  # rig of a campaign whose file does not say
 SAME_RATE = 1e-6  # relative difference below which two records' time stamps mean one clock
 
 Mapped = Mapping[str, Any]
@@ -95,24 +96,23 @@ def pick(names: Sequence[str], available: Sequence[str], role: str) -> None:
 
 
 def flat_header(name: str, samples: int, rate_Hz: float, start_s: float, channels: Mapping[str, tuple[str, ...]],
-                units: Mapping[str, str], u: np.ndarray | None, hints: Hints) -> tuple[RecordHeader, list[str]]:
+                units: Mapping[str, str], rms: float | None, hints: Hints) -> tuple[RecordHeader, list[str]]:
     """Header of a record of which the file says little, and a note for each assumption.
 
-    u : (samples, n_u) V in memory, from which level and rest are told; None where it is not loaded.
+    rms : of u, from which level and rest are told; None where there is no input.
     """
     notes = []
     excitation, period = hints.excitation, hints.period_s
     if excitation is None:
-        at_rest = u is not None and not np.any(u)
-        excitation = "multisine" if period is not None else "rest" if at_rest else "noise"
-        if period is None:
-            notes.append(f"record {name}: excitation not stated; taken as {excitation!r}")
+        excitation = "multisine" if period is not None else "noise" if rms else "rest"
+        why = {"multisine": "there is a period", "rest": "u is zero", "noise": "u is not zero and no period is stated"}
+        notes.append(f"record {name}: excitation not stated; taken as {excitation!r}: {why[excitation]}")
     if excitation == "multisine" and period is None:
         raise InputError("missing; expected the period in s of a multisine", field=f"record {name}: period_s")
     level = hints.level_V
     if level is None:
-        level = 0.0 if u is None or not u.size else _root_mean_square(u)
-        if u is not None and u.size:
+        level = rms or 0.0
+        if rms is not None:
             notes.append(f"record {name}: level_V not stated; taken as the r.m.s. of u, {level:.4g}")
     header = RecordHeader(name, rate_Hz, samples, channels["u"], channels["y"], excitation, level,
                           start_s if hints.start_s is None else hints.start_s, period, units["u"], units["y"],
@@ -120,7 +120,7 @@ def flat_header(name: str, samples: int, rate_Hz: float, start_s: float, channel
     return header, notes
 
 
-def _root_mean_square(u: np.ndarray) -> float:
+def root_mean_square(u: np.ndarray) -> float:
     """Scaled by a power of two, so that no square overflows."""
     exponent = np.frexp(np.max(np.abs(u)))[1]
     return float(np.ldexp(np.sqrt(np.mean(np.square(np.ldexp(u, -exponent)))), exponent))
@@ -166,17 +166,23 @@ def flat_record(name: str, parts: Mapping[str, tuple[Sequence[str], Sequence[str
     if not channels["u"] and hints.excitation not in ("rest", "floor"):
         raise InputError("expected at least one input; only a record of excitation 'rest' or 'floor' does without",
                          field=f"{where}: u")
-    header, assumed = flat_header(name, lengths["y"], rate_Hz, start_s, channels, units, arrays["u"], hints)
+    rms = root_mean_square(arrays["u"]) if arrays["u"].size else None
+    header, assumed = flat_header(name, lengths["y"], rate_Hz, start_s, channels, units, rms, hints)
     return Record(header, arrays["u"], arrays["y"], arrays.get("floor")), notes + assumed
 
 
-def one_clock(records: Sequence[Record]) -> tuple[tuple[Record, ...], list[str]]:
+def with_header(record: RecordSource, **changes: Any) -> RecordSource:
+    """The record with some fields of its header changed; records of every kind are dataclasses with a header."""
+    return replace(record, header=replace(record.header, **changes))  # type: ignore[type-var]
+
+
+def one_clock(records: Sequence[RecordSource]) -> tuple[tuple[RecordSource, ...], list[str]]:
     """Records whose time stamps leave sample rates that differ by rounding only get the rate of the first."""
     first, notes, result = records[0].header.sample_rate_Hz, [], []
     for record in records:
         rate = record.header.sample_rate_Hz
         if rate != first and abs(rate - first) <= SAME_RATE * first:
             notes.append(f"record {record.header.name}: sample rate {rate:.9g} Hz taken as {first:.9g} Hz")
-            record = replace(record, header=replace(record.header, sample_rate_Hz=first))
+            record = with_header(record, sample_rate_Hz=first)
         result.append(record)
     return tuple(result), notes

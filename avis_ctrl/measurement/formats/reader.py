@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +14,16 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import csv, hdf5, matlab, uff
 from avis_ctrl.measurement.formats.common import existing_file, reading
-from avis_ctrl.measurement.formats.flat import ROLES, hints_from
+from avis_ctrl.measurement.formats.flat import ROLES, hints_from, mapped, with_header
 from avis_ctrl.measurement.formats.stored import attributes, member, members, open_hdf5
 from avis_ctrl.measurement.formats.stored_response import read_frequency_response
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.layouts import FORMATS
 
-FORMATS = """\
-Measurement files, told apart by their content:
-  HDF5 campaign   /records/NN with u, y, floor; or /frf with frequency_Hz, value and variance or coherence
-  MATLAB .mat     v5 to v7.3: struct array `records` with `rig`; or flat variables u, y and t or fs;
-                  or frequency_Hz, H and variance, or coherence with averages
-  UFF 58, 58b     time responses, or frequency responses with their coherence; ASCII or binary
-  CSV             header line with channel names such as "Sz1 [V]", column t or "# sample_rate_Hz = 1000";
-                  a directory of CSV files is a campaign, one record each
-A mapping of columns says which variable, channel or column is what: u=vir,y=qm,t=t (roles t, u, y, floor,
-sample_rate_Hz, u_names, y_names; several of one role: u=A1+A2).
-"""
+__all__ = ["FORMATS", "parse_columns", "read_measurements"]
+
+# Suffixes of texts that would pass for CSV.
+NO_MEASUREMENT = {".py", ".m", ".md", ".rst", ".toml", ".json", ".yaml", ".yml", ".html", ".ipynb", ".tex", ".sh"}
 
 
 def parse_columns(text: str) -> dict[str, list[str]]:
@@ -52,10 +47,11 @@ def read_measurements(path: str | Path, columns: Mapping[str, Any] | None = None
                       **hints: Any) -> Campaign | FrequencyResponse:
     """Measurements of whatever format: a campaign of records, or a frequency response.
 
-    columns : roles (t, u, y, floor, ...) to names, for files of flat columns; rig : name of the rig, in the place of
-    the file's; hints : what the file does not say, see `flat.Hints` (sample_rate_Hz, excitation, period_s, level_V,
-    start_s, u_unit, y_unit, averages, relative_standard_deviation). A self-describing HDF5 campaign takes none of the
-    hints for records: it states them.
+    columns : roles (t, u, y, floor, ...) to names, for files of flat columns; u_names and y_names to the name of a
+    MATLAB variable or, in any format, to the channels' names themselves in the order of the file; rig : name of the
+    rig, in the place of the file's; hints : what the file does not say, see `flat.Hints` (sample_rate_Hz, excitation,
+    period_s, level_V, start_s, u_unit, y_unit, averages, relative_standard_deviation). A self-describing HDF5 campaign
+    takes none of the hints for records: it states them.
 
     Raises
     ------
@@ -63,10 +59,15 @@ def read_measurements(path: str | Path, columns: Mapping[str, Any] | None = None
     """
     known = hints_from(hints)
     path = Path(path)
+    naming = {role: names for role in ("u_names", "y_names") if (names := mapped(columns, role))}
+    plain = {role: names for role, names in (columns or {}).items() if role not in naming} or None
     with reading(path):
         if os.path.isdir(path):  # False, not an error, for names that no file can have
-            return csv.read(path, columns, rig, known)
+            return renamed(csv.read(path, plain, rig, known), naming)
         path = existing_file(path)
+        if path.suffix.lower() in NO_MEASUREMENT:
+            raise InputError(f"not a measurement file ({path.suffix}); expected HDF5, MATLAB .mat, UFF 58 or CSV",
+                             file=path)
         with path.open("rb") as stream:
             head = stream.read(4096)
     if head.startswith(b"MATLAB "):
@@ -74,12 +75,13 @@ def read_measurements(path: str | Path, columns: Mapping[str, Any] | None = None
     if matlab.is_version_4(head):
         raise InputError("a MATLAB v4 file; expected version 5 to 7.3: load it in MATLAB and save it with -v7",
                          file=path)
-    if _is_hdf5(path, head):
-        return _hdf5(path, columns, rig, hints)
-    if _is_uff(head):
-        return uff.read(path, columns, rig, known)
-    if csv.is_text(head):
-        return csv.read(path, columns, rig, known)
+    with reading(path):
+        if _is_hdf5(path, head):
+            return _hdf5(path, columns, plain, naming, rig, hints)
+        if _is_uff(head):
+            return renamed(uff.read(path, plain, rig, known), naming)
+        if csv.is_text(head):
+            return renamed(csv.read(path, plain, rig, known), naming)
     raise InputError("expected HDF5, MATLAB .mat (v5 to v7.3), UFF 58 or CSV; the content is none of them", file=path)
 
 
@@ -98,8 +100,31 @@ def _is_uff(head: bytes) -> bool:
     return len(lines) > 1 and lines[0].strip() == b"-1" and lines[1][:6].strip().rstrip(b"bB").isdigit()
 
 
-def _hdf5(path: Path, columns: Mapping[str, Any] | None, rig: str | None,
-          hints: Mapping[str, Any]) -> Campaign | FrequencyResponse:
+def renamed(measured: Campaign | FrequencyResponse, naming: Mapping[str, list[str]]) -> Campaign | FrequencyResponse:
+    """The same with other names of its channels; naming : u_names, y_names to names in the order of the file.
+
+    Raises
+    ------
+    InputError : not one name for each channel.
+    """
+    response = isinstance(measured, FrequencyResponse)
+    fields = {"u_names": "inputs", "y_names": "outputs"} if response else {"u_names": "u_names", "y_names": "y_names"}
+    changes: dict[str, Any] = {}
+    for role, names in naming.items():
+        old = getattr(measured, fields[role])
+        if len(names) != len(old):
+            raise InputError(f"expected {len(old)} names, for the channels {', '.join(old)}; there are {len(names)}",
+                             field=f"columns: {role}", value="+".join(names))
+        changes[fields[role]] = tuple(names)
+    if not changes:
+        return measured
+    if isinstance(measured, FrequencyResponse):
+        return replace(measured, **changes)
+    return replace(measured, records=tuple(with_header(record, **changes) for record in measured.records))
+
+
+def _hdf5(path: Path, columns: Mapping[str, Any] | None, plain: Mapping[str, Any] | None,
+          naming: Mapping[str, list[str]], rig: str | None, hints: Mapping[str, Any]) -> Campaign | FrequencyResponse:
     with reading(path, "the HDF5 file"), open_hdf5(path) as file:
         names = members(file)
         matlab_classes = not attributes(file, "format") and any(
@@ -109,10 +134,10 @@ def _hdf5(path: Path, columns: Mapping[str, Any] | None, rig: str | None,
     if matlab_classes:  # a v7.3 file that lost its text header
         return matlab.read(path, columns, rig, hints_from(hints))
     used = ("averages", "relative_standard_deviation") if response else ()
-    for name, value in {"columns": columns, **hints}.items():
+    for name, value in {"columns": plain, **hints}.items():
         if value is not None and name not in used:
             raise InputError("an HDF5 campaign states this itself; expected no such argument", file=path, field=name,
                              value=value)
     if response:
-        return read_frequency_response(path, **{name: hints.get(name) for name in used})
-    return hdf5.read(path, rig)
+        return renamed(read_frequency_response(path, **{name: hints.get(name) for name in used}), naming)
+    return renamed(hdf5.read(path, rig), naming)

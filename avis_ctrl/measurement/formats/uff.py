@@ -18,7 +18,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record
 from avis_ctrl.measurement.formats.common import ALLOWED, Unit, existing_file, reading, require_small, unit_of
-from avis_ctrl.measurement.formats.flat import Hints, Mapped, flat_record, mapped, one_clock, pick
+from avis_ctrl.measurement.formats.flat import UNNAMED, Hints, Mapped, flat_record, mapped, one_clock, pick
 from avis_ctrl.measurement.formats.response import response_from
 from avis_ctrl.measurement.formats.time_axis import rounded, sample_rate_from
 from avis_ctrl.measurement.formats.uff_functions import Axis, Function, Point, functions
@@ -156,7 +156,7 @@ def _campaign(path: Path, found: Sequence[Function], columns: Mapped | None, rig
         records.append(record)
         notes += assumed
     harmonised, assumed = one_clock(records)
-    return Campaign(rig or "unnamed", harmonised, str(path), tuple([*notes, *assumed]))
+    return Campaign(rig or UNNAMED, harmonised, str(path), tuple([*notes, *assumed]))
 
 
 def _roles(takes: Mapping[Point, list[Function]], names: Mapping[Point, str], columns: Mapped | None,

@@ -1,0 +1,23 @@
+"""Options of the commands that read a measurement file of any format."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+# Of `convert` and `identify`: what a file may not say.
+PERIOD = Annotated[float | None, typer.Option("--period", metavar="SECONDS", help="of a multisine, where the file does "
+                                              "not say")]
+EXCITATION = Annotated[str | None, typer.Option("--excitation", metavar="KIND", help="multisine, noise, rest, floor or "
+                                                "sine, where the file does not say")]
+SAMPLE_RATE = Annotated[float | None, typer.Option("--sample-rate", metavar="HZ", help="where the file has no time")]
+UNIT_Y = Annotated[str | None, typer.Option("--unit-y", metavar="UNIT", help="of the file's y: V, mV, m/s, mm/s, "
+                                            "m/s^2, g, m, ...; V by default")]
+
+
+def known_hints(period_s: float | None, excitation: str | None, sample_rate_Hz: float | None,
+                y_unit: str | None) -> dict[str, Any]:
+    """Those of the hints that were given."""
+    given = {"period_s": period_s, "excitation": excitation, "sample_rate_Hz": sample_rate_Hz, "y_unit": y_unit}
+    return {name: value for name, value in given.items() if value is not None}
