@@ -62,6 +62,21 @@ class FrfSpread:
                              "computed for", field="confidence", value=confidence)
         return self.measured + self.noise[min(able, key=lambda k: self.confidences[k])]
 
+    def drowned(self, confidence: float = 0.95) -> np.ndarray:
+        """(n,) bool: lines at which noise alone makes a spread of 100 % or more, with that confidence."""
+        return np.asarray(self.bound(confidence) - self.measured >= 1.0)
+
+    def usable(self, confidence: float = 0.95) -> np.ndarray:
+        """(n,) the bound, where noise drowns the response no more than 100 % or what is there for certain.
+
+        A response that noise alone hides says nothing of the model: at such lines the bound is the noise's size. The
+        100 % in its place are an assumption, not a measurement, unless the difference stays above them with the noise
+        taken off. Elsewhere as `bound`.
+        """
+        bound, drowned = self.bound(confidence), self.drowned(confidence)
+        certain = np.maximum(1.0, 2 * self.measured - bound)
+        return np.where(drowned, np.minimum(bound, certain), bound)
+
     def thinned(self, per_octave: int = 24, confidence: float = 0.95) -> FrfSpread:
         """Of each part of an octave the line with the largest bound."""
         place = np.floor(per_octave * np.log2(self.frequency_Hz / self.frequency_Hz[0]) + 1e-9).astype(int)

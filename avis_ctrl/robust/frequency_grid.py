@@ -27,11 +27,11 @@ def frequency_grid(system: StateSpace, change: float = 1e-3) -> np.ndarray:
     even = np.geomspace(low, high, max(30, int(POINTS_PER_DECADE * np.log10(high / low))))
     # A decade more on either side shows scalings settle where the loop has settled already.
     ends = np.concatenate([low / np.array([10.0, 3.0]), high * np.array([3.0, 10.0])])
-    return merged(np.concatenate([even, ends]), _resonances(poles, low, high))
+    return merged(np.concatenate([even, ends]), resonances(poles, low, high))
 
 
-def _resonances(poles: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Peaks of lightly damped modes, with points at half a bandwidth to either side."""
+def resonances(poles: np.ndarray, low: float = 0.0, high: float = np.inf) -> np.ndarray:
+    """Peaks of lightly damped modes [rad/s] within a range, with points at half a bandwidth to either side."""
     light = poles[(poles.imag > 0) & (np.abs(poles.real) < 0.4 * np.abs(poles))]
     centre = np.sqrt(np.maximum(np.abs(light) ** 2 - 2 * light.real ** 2, 0.0))
     points = np.concatenate([centre, centre + light.real, centre - light.real])

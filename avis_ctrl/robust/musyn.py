@@ -1,7 +1,8 @@
 """mu synthesis: a controller that makes the peak of the structured singular value small.
 
 D-K iteration (Doyle 1985; Zhou, Doyle and Glover 1996, section 11.4) with scalings of automatic order, followed,
-where it stalls, by descent on the H-infinity optimum over the scalings themselves (`gamma_descent`).
+where it stalls, by descent on the H-infinity optimum over the scalings themselves (`gamma_descent`). Where the first
+H-infinity controller does nothing, the iteration starts from other constant scalings (`_stuck_at_rest`).
 
 Real uncertainty is synthesised for as if it were complex, which is conservative: every real perturbation is a
 complex one. What that costs is measured on the final loop, where mu is computed both ways.
@@ -18,13 +19,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
+from avis_ctrl.lti import StateSpace, gain, hinf_norm, lft_lower
 from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, band_of, d_step, tightened
 from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
 from avis_ctrl.robust.gamma_descent import descend, grown
 from avis_ctrl.robust.hinf_plant import as_plant
 from avis_ctrl.robust.hinfsyn import Synthesis, hinfsyn
 from avis_ctrl.robust.mu_peak import mu_peak
+from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn_state import Iteration, Loop, State, analysed
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
@@ -34,6 +36,10 @@ STALL = 0.005
 FLAT = 0.001
 # A step that lowers mu by more than this share is followed by another of its kind.
 FAST = 0.25
+# A loop within this share of the plant without control is that of a controller that does nothing.
+IDLE = 0.01
+# Constant scalings of all uncertainty against performance from which the iteration starts where identity leads nowhere.
+STARTS = tuple(10.0 ** k for k in (-3, -2.5, -2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2, 2.5, 3))
 # What the certificate may leave above mu of the final loop.
 TIGHT = 0.003
 NORM_TOLERANCE = 1e-6
@@ -218,6 +224,8 @@ def _proposed(problem: _Problem, state: State, options: _Options) -> _Proposal |
     """The next scalings; None where the phase has nothing more to offer."""
     if state.last is None or state.best is None or state.points is None:
         return _Proposal(Scalings.identity(problem.structure), 0.0, "H-infinity")
+    if _stuck_at_rest(problem, state) and (other := _other_start(problem, state.best.gamma, options)):
+        return other
     if state.phase == "D-K":
         points = replace(state.points, floor=BROAD_FLOOR if _falls_fast(state) else DETAILED_FLOOR)
         try:
@@ -241,6 +249,37 @@ def _proposed(problem: _Problem, state: State, options: _Options) -> _Proposal |
     except ComputationError:
         return None
     return _Proposal(descent.scalings, 0.0, state.phase)
+
+
+def _stuck_at_rest(problem: _Problem, state: State) -> bool:
+    """Whether the H-infinity controller of the first scalings does nothing, and no other start was tried.
+
+    With K = 0 the uncertainty of the drives sees no signal and no D is better than another: no D-step leads away.
+    """
+    if len(state.history) != 1 or state.last is None or state.points is None:
+        return False
+    at_rest = lft_lower(problem.P, gain(np.zeros((problem.ncon, problem.nmeas)), state.last.K.inputs,
+                                        state.last.K.outputs))
+    if not at_rest.is_stable():
+        return False
+    open_loop = upper_bound(at_rest.frequency_response(state.points.omega)[:, None], problem.structure, 1e-3).beta
+    return state.last.mu > (1 - IDLE) * float(np.max(open_loop))
+
+
+def _other_start(problem: _Problem, gamma: float, options: _Options) -> _Proposal | None:
+    """The constant scalings, alike for all uncertainty, of least H-infinity optimum; None where none is below gamma."""
+    best = None
+    for d in STARTS:
+        scalings = Scalings.uniform(problem.structure, d)
+        try:
+            made = hinfsyn(scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff)
+        except ComputationError:
+            continue
+        if made.gamma < (1 - STALL) * gamma:
+            best, gamma = scalings, made.gamma
+        if time.monotonic() > options.deadline:
+            break
+    return _Proposal(best, 0.0, "start") if best else None
 
 
 def _falls_fast(state: State) -> bool:

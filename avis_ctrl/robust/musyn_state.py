@@ -25,7 +25,8 @@ class Iteration:
     mu_upper : largest upper bound of complex mu over the frequency grid.
     order : states of K; d_order : sum of the orders of the scalings that K was made with.
     d_fit_error : what those realised scalings cost against the best ones at each frequency, relative.
-    kind : "K-step" after a D-step, "descent" after a descent on gamma.
+    kind : how the scalings were made: "H-infinity" (identity), "start" (other constants, where the controller of
+        identity does nothing), "D-K", "descent" or "growth".
     """
 
     iteration: int

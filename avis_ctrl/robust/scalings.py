@@ -240,6 +240,13 @@ class Scalings:
         return Scalings(structure, tuple(MatrixScaling(gain(np.eye(b.rows))) if b.repeated else
                                          ScalarScaling.constant(1.0) for b in structure.blocks))
 
+    @staticmethod
+    def uniform(structure: BlockStructure, d: float) -> Scalings:
+        """The constant d > 0 for every block but the performance."""
+        parts = [MatrixScaling(gain(d * np.eye(b.rows))) if b.repeated else ScalarScaling.constant(d)
+                 for b in structure.blocks[:-1]]
+        return Scalings(structure, (*parts, ScalarScaling.constant(1.0)))
+
     @property
     def orders(self) -> tuple[int, ...]:
         """Order of each block's d(s) or D(s)."""

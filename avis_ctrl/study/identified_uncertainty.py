@@ -28,6 +28,7 @@ class InDesign:
 
     directions : bounded, for the rig's LFT. found : with their effects and what they leave.
     spread : measured, with its confidence. weight : covers spread, what the directions leave, and what is declared.
+    The spread counts as `FrfSpread.usable` has it: 100 % are assumed at lines that noise drowns.
     """
 
     directions: tuple[UncertainDirection, ...]
@@ -35,6 +36,21 @@ class InDesign:
     spread: FrfSpread
     confidence: float
     weight: IdentifiedSpread
+
+    @property
+    def assumption(self) -> str:
+        """What is assumed at lines that the measurement's noise drowns; empty where there are none."""
+        drowned, f = self.spread.drowned(self.confidence), self.spread.frequency_Hz
+        if not np.any(drowned):
+            return ""
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], drowned, [False]])))
+        where = ", ".join(f"{f[first]:.3g} Hz" if last == first + 1 else f"{f[first]:.3g} to {f[last - 1]:.3g} Hz"
+                          for first, last in edges.reshape(-1, 2))
+        largest = 100 * float(np.max(self.spread.bound(self.confidence)[drowned]))
+        return (f"The noise of the measurement hides the response at {where}: there it alone makes a spread of 100 % "
+                f"or more (bound up to {largest:.0f} %), which says nothing of the model. The uncertainty is assumed "
+                "to be 100 % there, more only where the measurement proves more; record longer or at a higher level to "
+                "measure it.")
 
 
 def in_design(content: UncertaintyFile, rig: Rig, keep: Sequence[str], confidence: float = 0.95,
@@ -66,5 +82,5 @@ def in_design(content: UncertaintyFile, rig: Rig, keep: Sequence[str], confidenc
     omega = 2 * np.pi * values.frequency_Hz
     left = np.interp(np.log(omega), np.log(found.omega), found.rest)
     # A spread of exactly zero has no logarithm; a part in a thousand million is none.
-    data = np.maximum(values.bound(confidence) + left, 1e-9)
+    data = np.maximum(values.usable(confidence) + left, 1e-9)
     return InDesign(directions, found, values, confidence, covering_spread(omega, data, declared, factor))

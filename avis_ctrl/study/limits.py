@@ -9,12 +9,17 @@ import numpy as np
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.robust.mu import mu_upper
 from avis_ctrl.robust.musyn_state import Iteration
+from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.model import ControllerResult
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 WORTH_NAMING = 0.02
 STILL_FALLING = 0.05
+# A mu within this share of the table's without control is that of a controller that does nothing.
+IDLE = 0.01
+# From here up the uncertainty of an identified response is named as what to measure better.
+LARGE_SPREAD = 0.3
 
 
 def without_each(plant: DesignPlant, K: StateSpace, omega: float) -> list[tuple[str, float]]:
@@ -54,15 +59,45 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
     """
     if mu.K is None:
         return ""
+    spread = _spread_there(plant, mu.mu.omega)
+    if no_better_than_none(mu, others):
+        return (f"The synthesis found no controller better than none: mu of the table is {mu.mu.upper:.3g} with it, at "
+                f"{mu.mu.omega / (2 * np.pi):.3g} Hz, and no smaller than without control. No D-K iteration "
+                f"came nearer to the bounds with this uncertainty. "
+                f"{spread or 'Declare less uncertainty, or wider bounds'}.")
     worth = (1 - WORTH_NAMING) * mu.mu.upper
-    relief = [f"{name} ({value:.2f} without it)" for name, value in without_each(plant, mu.K, mu.mu.omega)
-              if value < worth]
+    reliefs = [(name, value) for name, value in without_each(plant, mu.K, mu.mu.omega) if value < worth]
+    relief = [f"{name} ({value:.2f} without it)" for name, value in reliefs]
     text = (f"The specification is not met for all plants of the set: mu of the mu controller is {mu.mu.upper:.3g}, at "
             f"{mu.mu.omega / (2 * np.pi):.3g} Hz. What holds it up there: {', '.join(relief[:4]) or 'all together'}. "
             f"With uncertainties {mu.mu.upper:.3g} times smaller and bounds {mu.mu.upper:.3g} times wider it is met.")
+    if spread and any(RESPONSE in name for name, _ in reliefs):
+        text += f" {spread}."
     if len(history) > 1 and history[-1].mu_upper < (1 - STILL_FALLING) * history[-2].mu_upper:
         text += " The D-K iteration ended while mu was still falling: raise synthesis.max_iterations or time_limit_s."
     if better := [c for c in others if c.mu.upper < mu.mu.upper]:
         best = min(better, key=lambda c: c.mu.upper)
         text += f" The controller {best.title!r} has a smaller mu, {best.mu.upper:.3g}: the iteration ended too early."
     return text
+
+
+def no_better_than_none(mu: ControllerResult, others: Sequence[ControllerResult]) -> bool:
+    """Whether the mu controller misses its target and lowers mu by less than 1 % of that of the table at rest."""
+    at_rest = min((c.mu.upper for c in others if c.K is None), default=np.inf)
+    return bool(mu.mu.upper >= 1 and np.isfinite(at_rest) and mu.mu.upper > (1 - IDLE) * at_rest)
+
+
+def _spread_there(plant: DesignPlant, omega: float) -> str:
+    """How large the uncertainty of an identified response is, and what would make it smaller; empty where small."""
+    if plant.identified is None:
+        return ""
+    weight = plant.identified.weight
+    size = float(weight.magnitude(np.array([omega]))[0])
+    if size < LARGE_SPREAD:
+        return ""
+    data = float(np.exp(np.interp(np.log(omega), np.log(weight.omega), np.log(weight.data))))
+    inside = weight.omega[0] <= omega <= weight.omega[-1]
+    beside = f"{100 * data:.3g} % in the data there" if inside else "beyond the measured band, as at its end"
+    return (f"The uncertainty of the identified response is {100 * size:.3g} % at {omega / (2 * np.pi):.3g} Hz "
+            f"({beside}): to make it smaller, record longer, at a higher level or with more records; or ask for less at "
+            "this frequency")

@@ -8,6 +8,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.study.design_file import Design, Quantity
+from avis_ctrl.study.limits import no_better_than_none
 from avis_ctrl.study.model import ControllerResult, Requirement
 
 
@@ -34,6 +35,8 @@ def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requ
         raise InputError("requirements are judged on the controllers mu, skyhook and passive", field="controllers",
                          value=sorted(by_name))
     low, high = design.transmissibility.band_Hz
+    # The poles of a controller that does nothing say nothing.
+    idle = no_better_than_none(mu, controllers)
     band = f"over {low:g} to {high:g} Hz"
     measured: dict[Quantity, tuple[str, Callable[[], float], str]] = {
         "mu_upper": ("mu of the weighted performance, upper bound", lambda: mu.mu.upper,
@@ -52,7 +55,9 @@ def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requ
             lambda: _advantage(skyhook, mu),
             f"skyhook reaches {decibel(skyhook.worst_band.lower):+.1f} dB at a worst-case peak of "
             f"{decibel(skyhook.worst_peak.lower):+.1f} dB"),
-        "fastest_controller_pole_Hz": ("fastest pole of the mu controller", lambda: mu.fastest_pole_Hz, ""),
+        "fastest_controller_pole_Hz": ("fastest pole of the mu controller",
+                                      lambda: np.nan if idle else mu.fastest_pole_Hz,
+                                      "no controller better than none was found" if idle else ""),
     }
     rows = []
     for one in design.requirement:

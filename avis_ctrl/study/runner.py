@@ -86,7 +86,9 @@ def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesi
         reduction = reduction_error(rig, design.keep)
         mu = next(c for c in controllers if c.name == "mu")
         six_dof = six_dof_check(design, rig, plant, mu)
-        notes = (best_found(plant, mu, controllers, synthesis.history),) if mu.mu.upper >= 1 else ()
+        assumed = plant.identified.assumption if plant.identified else ""
+        verdict = best_found(plant, mu, controllers, synthesis.history) if mu.mu.upper >= 1 else ""
+        notes = tuple(text for text in (verdict, assumed) if text)
     return DesignResult(design, rig, plant, tuple(controllers), synthesis.history, judge(design, controllers),
                         reduction, six_dof, simulation, provenance(design, source, rig, seconds), seconds, notes)
 

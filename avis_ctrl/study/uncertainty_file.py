@@ -51,7 +51,10 @@ class DirectionSection(_Section):
 
 
 class WeightSection(_Section):
-    """The filter of lowest order that covers the spread alone, for a reader of the file; roots in rad/s."""
+    """The filter of lowest order that covers the spread alone, for a reader of the file; roots in rad/s.
+
+    Of lines that noise drowns it covers the 100 % that designs assume there.
+    """
 
     zeros: list[Pair]
     poles: list[Pair]

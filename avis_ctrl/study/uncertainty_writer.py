@@ -46,7 +46,7 @@ def uncertainty_content(rig: Rig, information: Information, spreads: Sequence[Fr
 
 
 def _spread_section(spread: FrfSpread, confidence: float = 0.95) -> SpreadSection:
-    filter = IdentifiedSpread(2 * np.pi * spread.frequency_Hz, spread.bound(confidence))
+    filter = IdentifiedSpread(2 * np.pi * spread.frequency_Hz, spread.usable(confidence))
     shape = filter.shape
     weight = WeightSection(zeros=[[z.real, z.imag] for z in shape.zeros().tolist()],
                            poles=[[p.real, p.imag] for p in shape.poles().tolist()], gain=shape.gain,

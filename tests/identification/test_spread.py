@@ -11,7 +11,7 @@ from exact import floor_velocity, record
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.model_error import measured_response, unexplained
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spread import frf_spread, kept_axes, largest_singular_value
+from avis_ctrl.identification.spread import FrfSpread, frf_spread, kept_axes, largest_singular_value
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
@@ -102,6 +102,15 @@ def test_thinning_keeps_the_largest_bounds(model, rng):
     for f, bound in zip(found.frequency_Hz, found.bound(), strict=True):
         near = np.abs(np.log2(thin.frequency_Hz / f)) <= 1 / 24 + 1e-9
         assert thin.bound()[near].max() >= bound
+
+
+def test_where_noise_drowns_the_response_100_percent_are_assumed():
+    """A spread within noise counts as 1, one that stays above it with the noise off counts so, others as bounded."""
+    measured, noise = np.array([0.01, 0.7, 30.0, 9.0, 1.5]), np.array([0.02, 0.6, 40.0, 2.0, 0.5])
+    spread = FrfSpread(("z",), np.geomspace(1, 16, 5), measured, noise[None], (0.95,))
+    assert spread.drowned().tolist() == [False, False, True, True, False]
+    assert spread.usable() == pytest.approx([0.03, 1.3, 1.0, 7.0, 2.0])
+    assert np.all(spread.usable() <= spread.bound())
 
 
 def test_what_is_refused(model):

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from avis_ctrl.lti import gain, hinf_norm
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.analysis import analyse
-from avis_ctrl.study.controllers import classical_skyhook, passive
+from avis_ctrl.study.controllers import classical_skyhook, passive, reduction_grid
 from avis_ctrl.study.design_file import Design, RequirementSection, read_study
+from avis_ctrl.study.limits import best_found
 from avis_ctrl.study.model import ControllerResult
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.requirements import judge
@@ -159,3 +161,29 @@ def test_the_skyhook_may_peak_as_high_as_asked_or_as_its_rival(one_axis, measure
     design, _ = one_axis
     mu = with_bounds(measured["passive"], "mu", own, own)
     assert skyhook_limit(asking(design, worst_case_peak_transmissibility_dB=asked_dB), mu) == pytest.approx(limit)
+
+
+def test_a_controller_no_better_than_none_is_called_so(one_axis, measured):
+    """Its poles, 0 Hz, are no merit; the verdict names what was found, not a controller's limits."""
+    design, plant = one_axis
+    rest = measured["passive"]
+    idle = gain(np.zeros((1, 1)), plant.synthesis.y, plant.synthesis.u)
+    nothing = replace(rest, name="mu", K=idle)
+    line, = judge(asking(design, fastest_controller_pole_Hz=250.0), [rest, replace(rest, name="skyhook"), nothing])
+    assert np.isnan(line.value) and not line.met
+    text = best_found(plant, nothing, [rest], ())
+    assert "no controller better than none" in text and "ended too early" not in text
+    better = replace(nothing, mu=replace(rest.mu, upper=0.9 * rest.mu.upper), fastest_pole_Hz=20.0)
+    line, = judge(asking(design, fastest_controller_pole_Hz=250.0), [rest, replace(rest, name="skyhook"), better])
+    assert (line.value, line.met) == (20.0, True)
+
+
+def test_reduction_is_compared_where_the_table_at_rest_peaks(shipped):
+    """The weighted norm of the table at rest on that grid is its peak, which the even grid missed by a factor 3."""
+    _, plant = shipped
+    nominal = plant.synthesis.closed(None).select(slice(plant.synthesis.blocks.n_z, None),
+                                                  slice(plant.synthesis.blocks.n_w, None))
+    omega = reduction_grid(plant, 1.0)
+    seen = np.max(np.linalg.norm(nominal.frequency_response(omega), 2, axis=(1, 2)))
+    assert seen > 0.99 * hinf_norm(nominal).gain
+    assert 1.0 in omega

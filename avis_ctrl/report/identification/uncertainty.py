@@ -67,5 +67,6 @@ def _spread(made: InDesign) -> Figure:
               Curve(f, 100 * weight.envelope(omega), "envelope", Style("#e69f00", "dashdot", 1.3)),
               Curve(f, 100 * weight.shape.magnitude(omega), f"filter of order {weight.shape.order}",
                     Style("#222222", "solid", 2.0)))
-    return Figure("spread", f"Relative spread of the response, largest singular value: {weight.meaning}.",
+    assumed = f" {made.assumption}" if made.assumption else ""
+    return Figure("spread", f"Relative spread of the response, largest singular value: {weight.meaning}.{assumed}",
                   (Panel(hertz(float(f[0]), float(f[-1])), Axis("relative error [%]", "log"), curves),), height=1.3)

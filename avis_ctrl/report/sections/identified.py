@@ -82,9 +82,10 @@ def _spread(found: InDesign) -> Figure:
     high = 10 ** np.ceil(np.log10(100 * np.max(weight.magnitude(omega))))
     declared = (" Where the design declares more of its drives, the envelope follows that." if weight.declared else
                 " Beyond the measured band it keeps the value of the band's end.")
+    assumed = f" {found.assumption}" if found.assumption else ""
     return Figure("identified_spread", "Relative difference between the measured response and the identified model in "
                   "the kept coordinates (largest singular value), its bound with the measurement's noise, the envelope "
                   f"and the filter of lowest order within 1 dB above it: order {weight.shape.order}, at most "
-                  f"{weight.slack_dB:.2f} dB above.{declared}",
+                  f"{weight.slack_dB:.2f} dB above.{declared}{assumed}",
                   (Panel(hertz(float(f[0]), float(f[-1])), Axis("relative difference [%]", "log",
                                                                 (float(low), float(high))), tuple(curves)),))
