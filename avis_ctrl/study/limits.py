@@ -95,9 +95,14 @@ def _spread_there(plant: DesignPlant, omega: float) -> str:
     size = float(weight.magnitude(np.array([omega]))[0])
     if size < LARGE_SPREAD:
         return ""
-    data = float(np.exp(np.interp(np.log(omega), np.log(weight.omega), np.log(weight.data))))
-    inside = weight.omega[0] <= omega <= weight.omega[-1]
-    beside = f"{100 * data:.3g} % in the data there" if inside else "beyond the measured band, as at its end"
+    nearest = int(np.argmin(np.abs(np.log(weight.omega / omega))))
+    drowned = plant.identified.spread.drowned(plant.identified.confidence)
+    if not weight.omega[0] <= omega <= weight.omega[-1]:
+        beside = "beyond the measured band, as at its end"
+    elif drowned[nearest]:
+        beside = "assumed, for noise hides the response there"
+    else:
+        beside = f"{100 * weight.data[nearest]:.3g} % in the data there"
     return (f"The uncertainty of the identified response is {100 * size:.3g} % at {omega / (2 * np.pi):.3g} Hz "
-            f"({beside}): to make it smaller, record longer, at a higher level or with more records; or ask for less at "
-            "this frequency")
+            f"({beside}): to make it smaller, record longer, at a higher level or with more records; or ask for less "
+            "at this frequency")

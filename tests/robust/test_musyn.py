@@ -236,7 +236,7 @@ def barely_known_table(spread: float) -> StateSpace:
 def test_a_first_controller_that_does_nothing_does_not_end_the_iteration():
     """With K = 0 no D is better than another: the iteration crept from mu of the table at rest, 18.7, to 14.7.
 
-    A mu of about `spread` is within reach, for delta below 1 / mu leaves the drive's sign known. SLICOT judges the loop.
+    A mu of about `spread` is within reach: delta below 1 / mu leaves the drive's sign known. SLICOT judges the loop.
     """
     spread = 8.0
     P = barely_known_table(spread)
