@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import scipy.io
 from test_cli import avis
 
 from avis_ctrl.measurement.formats import write_campaign
@@ -112,3 +113,73 @@ def test_convert_and_predict_go_through(campaign, tmp_path):
     assert done.returncode == 0 and "2 records" in done.stdout
     with h5py.File(tmp_path / "copy.h5") as copy, h5py.File(campaign) as file:
         assert np.array_equal(copy["records/01/y"], file["records/01/y"])
+
+
+@pytest.fixture(scope="module")
+def flat(campaign, tmp_path_factory) -> tuple[Path, Path]:
+    """The first record as flat u, y, t; and with the first two sensors exchanged."""
+    folder = tmp_path_factory.mktemp("flat")
+    with h5py.File(campaign) as file:
+        u, y = (file[f"records/00/{role}"][:] for role in "uy")
+    t = np.arange(len(u)) / 1000.0
+    scipy.io.savemat(folder / "flat.mat", {"u": u, "y": y, "t": t})
+    scipy.io.savemat(folder / "swapped.mat", {"u": u, "y": y[:, [1, 0, 2, 3, 4, 5]], "t": t})
+    return folder / "flat.mat", folder / "swapped.mat"
+
+
+@pytest.mark.parametrize("command", ["convert", "identify"])
+def test_help_says_the_layouts_of_files(command):
+    done = avis(command, "--help")
+    words = " ".join(done.stdout.split())
+    assert done.returncode == 0
+    for said in ("struct array `records`", "u, y and t or sample_rate_Hz (or fs) are required", "y_names=Sy1+Sz1",
+                 "--period", "--excitation", "--sample-rate", "--unit-y"):
+        assert said in words, said
+
+
+def test_a_flat_file_without_names_is_held_against_the_rig(flat, tmp_path):
+    """The order of the rig is taken with a note, and the gate stops what it is not."""
+    done = avis("identify", str(flat[1]), "--rig", "avis", "--out", str(tmp_path / "out"))
+    words = " ".join(done.stdout.split())
+    assert "y: the file names no channels; taken in the order of the rig avis: Sy1, Sz1" in words
+    assert "the file names no rig; taken as avis" in words
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "Sensors 'Sy1' and 'Sz1' are exchanged" in done.stderr
+    named = avis("identify", str(flat[1]), "--rig", "avis", "--out", str(tmp_path / "out"), "--band", "0.01", "0.011",
+                 "--columns", "y_names=Sz1+Sy1+Sx2+Sz2+Sy3+Sz3")
+    assert "exchanged" not in named.stderr and "y: the file names no channels" not in " ".join(named.stdout.split())
+
+
+@pytest.mark.parametrize(("arguments", "said"), [
+    (("identify", "F", "--rig", "avis", "--out", "o", "--columns", "y_names=a+b+c+d+e+f"),
+     "--columns y_names=Sy1+Sz1+..."),
+    (("identify", "C", "--rig", "halcyonics", "--out", "o"), "the file says it is a campaign of avis"),
+    (("convert", "F", "o.h5", "--excitation", "chirp"), "excitation = 'chirp': expected one of multisine"),
+    (("convert", "F", "o.h5", "--unit-y", "Pa"), "y unit = 'Pa'"),
+    (("convert", "F", "o.h5", "--sample-rate", "500"), "expected 1000 Hz, as the time vector says"),
+    (("convert", "C", "o.h5", "--period", "5"), "an HDF5 campaign states this itself"),
+    (("convert", __file__, "o.h5"), "not a measurement file (.py)"),
+], ids=lambda value: " ".join(map(str, value))[-40:] if isinstance(value, tuple) else "")
+def test_files_that_say_little_are_refused_in_one_line(campaign, flat, tmp_path, monkeypatch, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    done = avis(*({"C": str(campaign), "F": str(flat[0])}.get(one, one) for one in arguments))
+    assert done.returncode == 2 and done.stderr.startswith("avis: ") and done.stderr.count("\n") == 1
+    assert said in done.stderr and not list(tmp_path.glob("o*/result.json"))
+
+
+def test_what_the_file_does_not_say_may_be_said(flat, tmp_path):
+    out = tmp_path / "c.h5"
+    done = avis("convert", str(flat[0]), str(out), "--period", "5", "--unit-y", "mV", "--rig", "avis")
+    assert done.returncode == 0, done.stderr
+    with h5py.File(out) as file:
+        record = file["records/00"]
+        assert (record.attrs["excitation"], record.attrs["period_s"], file.attrs["rig"]) == ("multisine", 5.0, "avis")
+        np.testing.assert_allclose(record["y"][:], 1e-3 * scipy.io.loadmat(flat[0])["y"], rtol=1e-15)
+
+
+def test_single_axis_says_what_it_took_the_columns_for(data):
+    drive = ("single-axis", "drive", str(data / "emps" / "DATA_EMPS.mat"), "--columns", "force=vir,position=qm,t=t")
+    plain, scaled = avis(*drive), avis(*drive, "--scale", "force=35.15")
+    assert plain.stdout.splitlines()[0] == ("taken: force = vir in N, position = qm in m, t in s (as in the file; "
+                                            "--scale force=FACTOR for another unit)")
+    assert "force = vir times 35.15 in N" in scaled.stdout

@@ -60,10 +60,10 @@ def identify(
 
     console = Console(highlight=False)
     start = load_rig(rig)
-    measured = read_measurements(measurement, parse_columns(columns) if columns else None,
-                                 **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
+    mapping = parse_columns(columns) if columns else None
+    measured = read_measurements(measurement, mapping, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
     try:
-        measured = in_words_of(start, measured)
+        measured = in_words_of(start, measured, mapping)
     except InputError as error:
         raise error.in_file(measurement) from None
     for note in in_short(measured.notes) if isinstance(measured, Campaign) else ():
@@ -104,12 +104,18 @@ def predict(
 
     from avis_ctrl.measurement.campaign import Campaign
     from avis_ctrl.measurement.formats import read_measurements
-    from avis_ctrl.study.identification_output import write_predictions
+    from avis_ctrl.study.identification_output import read_identified, write_predictions
+    from avis_ctrl.study.rig_channels import in_words_of
 
     console = Console(highlight=False)
     measured = read_measurements(campaign)
     if not isinstance(measured, Campaign):
         raise InputError("expected records, found frequency responses", file=campaign)
+    try:
+        measured = in_words_of(read_identified(folder)[0], measured)
+    except InputError as error:
+        raise error if error.file else error.in_file(campaign) from None
+    assert isinstance(measured, Campaign)  # as it was
     with Progress(console) as progress:
         write_predictions(folder, measured, out, progress)
     console.print(f"{out}: {len(measured.records)} records")

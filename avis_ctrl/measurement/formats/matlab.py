@@ -59,9 +59,10 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
         tree = variables(path)
         if len(tree) == 1 and isinstance(only := next(iter(tree.values())), dict) and "records" not in tree:
             tree = only  # everything in one struct
-        if "records" in tree and set(columns or ()) <= {"u_names", "y_names"}:
+        usual_names = set(columns or ()) <= {"u_names", "y_names"}
+        if "records" in tree and usual_names:
             return matlab_records.campaign(path, tree, columns, rig, hints)
-        if "frequency_Hz" in tree and "H" in tree and columns is None:
+        if "frequency_Hz" in tree and "H" in tree and usual_names:
             return response(tree, hints)
         record, notes = _flat(path, tree, columns, hints)
         stated = rig or (UNNAMED if empty(tree.get("rig")) else as_text(tree["rig"], "rig"))

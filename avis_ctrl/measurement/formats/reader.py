@@ -14,7 +14,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import csv, hdf5, matlab, uff
 from avis_ctrl.measurement.formats.common import existing_file, reading
-from avis_ctrl.measurement.formats.flat import ROLES, hints_from, mapped, with_header
+from avis_ctrl.measurement.formats.flat import ROLES, Hints, hints_from, mapped, with_header
 from avis_ctrl.measurement.formats.stored import attributes, member, members, open_hdf5
 from avis_ctrl.measurement.formats.stored_response import read_frequency_response
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -71,7 +71,7 @@ def read_measurements(path: str | Path, columns: Mapping[str, Any] | None = None
         with path.open("rb") as stream:
             head = stream.read(4096)
     if head.startswith(b"MATLAB "):
-        return matlab.read(path, columns, rig, known)
+        return _matlab(path, columns, naming, rig, known)
     if matlab.is_version_4(head):
         raise InputError("a MATLAB v4 file; expected version 5 to 7.3: load it in MATLAB and save it with -v7",
                          file=path)
@@ -123,6 +123,14 @@ def renamed(measured: Campaign | FrequencyResponse, naming: Mapping[str, list[st
     return replace(measured, records=tuple(with_header(record, **changes) for record in measured.records))
 
 
+def _matlab(path: Path, columns: Mapping[str, Any] | None, naming: Mapping[str, list[str]], rig: str | None,
+            known: Hints) -> Campaign | FrequencyResponse:
+    """Records take the names themselves: those tell which way round a matrix is."""
+    measured = matlab.read(path, columns, rig, known)
+    with reading(path):
+        return renamed(measured, naming) if isinstance(measured, FrequencyResponse) else measured
+
+
 def _hdf5(path: Path, columns: Mapping[str, Any] | None, plain: Mapping[str, Any] | None,
           naming: Mapping[str, list[str]], rig: str | None, hints: Mapping[str, Any]) -> Campaign | FrequencyResponse:
     with reading(path, "the HDF5 file"), open_hdf5(path) as file:
@@ -132,7 +140,7 @@ def _hdf5(path: Path, columns: Mapping[str, Any] | None, plain: Mapping[str, Any
             for item in (member(file, name) for name in names))  # None: a broken link
         response = "frf" in names and "records" not in names
     if matlab_classes:  # a v7.3 file that lost its text header
-        return matlab.read(path, columns, rig, hints_from(hints))
+        return _matlab(path, columns, naming, rig, hints_from(hints))
     used = ("averages", "relative_standard_deviation") if response else ()
     for name, value in {"columns": plain, **hints}.items():
         if value is not None and name not in used:
