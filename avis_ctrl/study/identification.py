@@ -193,14 +193,15 @@ def gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options:
     kinds = ", ".join(sorted({record.header.excitation for record in measured.records}))
     progress(f"gates: {len(measured.records)} records of {kinds}")
     findings = examine(measured, expectation(model))
-    for finding in findings:
-        if finding.severity in ("warning", "stop"):
-            progress(f"  {finding.severity}: {finding.sentence}")
     stops = [finding for finding in findings if finding.severity == "stop"]
-    if stops and not options.despite_gates:
-        more = f" (and {len(stops) - 1} more)" if len(stops) > 1 else ""
-        raise InputError(f"{stops[0].sentence}{more}; --despite-gates goes on all the same", field="measurement",
-                         value=stops[0].gate)
+    raised = stops[0] if stops and not options.despite_gates else None
+    for finding in findings:
+        if finding.severity in ("warning", "stop") and finding is not raised:
+            progress(f"  {finding.severity}: {finding.sentence}")
+    if raised is not None:
+        more = f" (and {len(stops) - 1} more, above)" if len(stops) > 1 else ""
+        raise InputError(f"{raised.sentence.rstrip('.')}{more}; --despite-gates goes on all the same",
+                         field="measurement", value=raised.gate)
     return findings
 
 

@@ -195,13 +195,14 @@ class Polarity:
         column = np.diag(comparison.columns(p, r)[:, q])
         picture = Picture(
             "Correlation of each channel with its expected response",
-            "channel number (sensors, then drives)",
+            "sensors, then drives",
             "correlation [-]",
             (
                 Series("sensors", np.arange(len(p)), row, "bars"),
                 Series("drives", len(p) + np.arange(len(q)), column, "bars"),
             ),
             (Limit("opposite sign", -limit),),
+            x_names=(*campaign.y_names, *campaign.u_names),
         )
         found = []
         both = np.count_nonzero(r < 0) + np.count_nonzero(c < 0)
@@ -303,7 +304,8 @@ def _picture(c: np.ndarray, names: tuple[str, ...], what: str, limit: float) -> 
     others = np.max(np.where(np.eye(len(c), dtype=bool), -np.inf, c), axis=1) if len(c) > 1 else np.zeros(1)
     return Picture(
         f"{what}s against the model",
-        f"{what.lower()} number ({', '.join(names)})",
+        what.lower(),
         "correlation [-]",
         (Series("own expected response", x, np.diag(c), "points"), Series("best other", x, others, "points")),
+        x_names=tuple(names),
     )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy import stats
@@ -17,11 +18,20 @@ from avis_ctrl.measurement.gates.finding import (
     Picture,
     Series,
     Severity,
+    quoted,
     thinned,
 )
 
 # A noise-free sine's top code is hit up to 2.42 times as often as the next one.
 SINE_TOP = 2.42
+# Tops flatter than a sine's, as two tones may make, reach 5.3 (fourth order); below this ratio nothing is concluded.
+FLATTER = 8.0
+# Steps that the signal's range has at least; a few codes of noise at rest have no tops.
+STEPS = 20
+# Widths of the top by the signal's range, beside the value itself: noise after the clipping rounds a flat top.
+WIDTHS = (1 / 4096, 1 / 1024, 1 / 256, 1 / 64)
+# More samples than this part at or beyond the range: not clipping but a wrong unit.
+UNIT = 0.5
 # An over-range level: its spread is at most this part of the jump into it.
 LEVEL_SPREAD = 0.05
 # ... and the jump at least so many times the median change over two samples.
@@ -43,19 +53,22 @@ class _Ends:
     bursts: int = 0
     t: np.ndarray | None = None
     x: np.ndarray | None = None
+    unit: bool = False
 
 
 class Clipping(Gate):
     """Flat tops.
 
-    At a known range: samples within half a step of its ends; none are expected, so that two together or three in all
-    are
-    an alarm. At an unknown range: the extreme value comes more often than a sine's top would (2.42 times as often
-    as any of the next five values), by a binomial test at 1 % shared over ends, channels and records; it needs
-    about 50 clipped samples. And, in either case, levels outside the signal: runs entered and left by jumps of opposite
-    sign,
-    larger than 20 times the spread within, at the record's very end of range (an instrument's "out of range" output);
-    3 samples suffice, an unclipped signal has no such runs.
+    At a known range: samples within half a step of its ends; none are expected, so that two are an alarm. More than
+    half of all samples there are no clipping but a wrong unit or scale.
+    At any range, also below its known end, as of a preamplifier that saturates: `repeated_extreme`, a binomial test
+    at 1 % shared over ends, channels and records. It needs about 40 samples at one end, 8 for each period of a periodic
+    record, and a level that is flat within 1/64 of the signal's range; a single clipped peak stays hidden. Of
+    campaigns of tests/measurement/gates_rig.py (20 of multisines, 20 of noise) none gave an alarm, and of 24000 to
+    40000 samples clipped at both ends at 80 to 98 % of the peak all were found from 82 samples on.
+    And levels outside the signal: runs entered and left by jumps of opposite sign, larger than 20 times the spread
+    within, at the record's very end of range (an instrument's "out of range" output); 3 samples suffice, an unclipped
+    signal has no such runs.
     """
 
     name = "clipping"
@@ -65,19 +78,24 @@ class Clipping(Gate):
         u = np.concatenate([p.u for p in seen.pieces])
         y = np.concatenate([p.y for p in seen.pieces])
         t = np.concatenate([p.time for p in seen.pieces]) - h.start_s
-        limit = expectation.drive_limit_V
+        limit, periods = expectation.drive_limit_V, max(1, h.periods)
         ends = []
         for k, name in enumerate(h.u_names):
             bounds = (-limit, limit) if limit else None
             ends.append(_ends(h.name, name, t, u[:, k], bounds, 2e-9 * limit if limit else None, free=False))
         for k, name in enumerate(h.y_names):
-            ends.append(_ends(h.name, name, t, y[:, k], expectation.y_range_V, expectation.y_lsb_V, free=True))
+            ends.append(_ends(h.name, name, t, y[:, k], expectation.y_range_V, expectation.y_lsb_V, True, periods))
         return ends
 
     def conclude(self, kept: list[list[_Ends]], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         rows = [row for rows in kept for row in rows]
         level = FALSE_ALARM / (2 * len(rows))
-        found = [self._finding(row) for row in rows if row.count and row.p < level]
+        wrong = [row for row in rows if row.unit]
+        names = tuple(dict.fromkeys(row.channel for row in wrong))
+        found = [self._unit(wrong, names, expectation, campaign)] if wrong else []
+        bad = [row for row in rows if row.count and row.p < level and row.channel not in names]
+        for channel in dict.fromkeys(row.channel for row in bad):
+            found.append(self._finding([row for row in bad if row.channel == channel]))
         if found:
             return found
         peaks = {n: max(r.peak for r in rows if r.channel == n) for n in (*campaign.u_names, *campaign.y_names)}
@@ -86,10 +104,11 @@ class Clipping(Gate):
         x = np.arange(len(peaks))
         picture = Picture(
             "Largest absolute value of each channel",
-            "channel number",
+            "channel",
             f"largest value [{campaign.y_unit}]",
             (Series("peak", x, np.array(list(peaks.values())), "bars"),),
             limits,
+            x_names=tuple(peaks),
         )
         return [
             Finding(
@@ -102,7 +121,37 @@ class Clipping(Gate):
             )
         ]
 
-    def _finding(self, row: _Ends) -> Finding:
+    def _unit(
+        self, rows: list[_Ends], names: tuple[str, ...], expectation: Expectation, campaign: Campaign
+    ) -> Finding:
+        """Most samples at or beyond the range, in some record."""
+        row = max(rows, key=lambda r: r.count)
+        assert row.t is not None and row.x is not None and expectation.y_range_V is not None
+        t, x = thinned(row.t, row.x)
+        return Finding(
+            self.name,
+            "stop",
+            f"{100 * row.count / row.samples:.0f} % of the samples of channel {row.channel!r} of record {row.record}"
+            f" are at or beyond the converter's range, which ends at {expectation.y_range_V[1]:.6g} {campaign.y_unit}; the"
+            f" largest is {row.peak:.6g}. {quoted(names)} {'are' if len(names) > 1 else 'is'} so. The unit or scale is"
+            f" probably wrong (mV given as {campaign.y_unit}?), or the range in the rig file. Correct it; clipping is"
+            " judged only then.",
+            names,
+            tuple(dict.fromkeys(r.record for r in rows)),
+            row.count / row.samples,
+            UNIT,
+            Picture(
+                f"Record {row.record}, {row.channel}",
+                "time [s]",
+                f"{row.channel} [{campaign.y_unit}]",
+                (Series(row.channel, t, x),),
+                (Limit("converter", expectation.y_range_V[1]),),
+            ),
+        )
+
+    def _finding(self, of: list[_Ends]) -> Finding:
+        """Of the records in which one channel is clipped."""
+        row = max(of, key=lambda r: r.count)
         part = row.count / row.samples
         severity: Severity = "note" if row.count < 2 else "stop" if part > 1e-3 else "warning"
         assert row.t is not None and row.x is not None
@@ -115,11 +164,15 @@ class Clipping(Gate):
             (Limit("clipped at", row.value),),
         )
         bursts = f" in {row.bursts} bursts" if row.bursts > 1 else ""
+        others = [f"{r.record} ({r.count} samples at {r.value:.4g})" for r in of if r is not row]
+        also = f" So it is in record {', '.join(others)}." if others else ""
         sentence = (
             f"Channel {row.channel!r} of record {row.record} has {row.count} samples ({100 * part:.2g} %){bursts} at "
-            f"{row.value:.6g}: {row.why}. Lower the level or the gain and repeat the record; until then leave it out."
+            f"{row.value:.6g}: {row.why}.{also} Lower the level or the gain and repeat the record; until then leave it"
+            " out."
         )
-        return Finding(self.name, severity, sentence, (row.channel,), (row.record,), float(row.count), 0.0, picture)
+        records = tuple(r.record for r in of)
+        return Finding(self.name, severity, sentence, (row.channel,), records, float(row.count), 0.0, picture)
 
 
 def _ends(
@@ -130,8 +183,9 @@ def _ends(
     bounds: tuple[float, float] | None,
     lsb: float | None,
     free: bool,
+    periods: int = 1,
 ) -> _Ends:
-    """Judge one channel; `free` looks for repeated extremes and over-range levels too."""
+    """Judge one channel; `free` looks for repeated extremes, over-range levels and a wrong unit too."""
     peak = float(np.max(np.abs(x)))
     best = _Ends(record, channel, len(x), peak)
     if np.ptp(x) == 0:
@@ -148,6 +202,8 @@ def _ends(
         at = (x >= bounds[1] - margin) | (x <= bounds[0] + margin)
         if at.any():
             value = float(x[at][0])
+            if free and at.mean() > UNIT:
+                return replace(made(at, value, "", 0.0), unit=True)
             what = "the end of its range, where flat tops hide the true signal"
             return made(at, value, what, 0.0 if at.sum() > 1 else 1.0)
     if not free:
@@ -164,24 +220,54 @@ def _ends(
                 f"instrument gives when it is out of range (the rest of the record ends at {inside:.6g})",
                 0.0,
             )
-        if bounds is None and (p := repeated_extreme(sign * x)) < best.p:
-            top = np.max(sign * x)
+        top, p, width = repeated_extreme(sign * x, periods)
+        if p < best.p:
+            flat = sign * x >= top - width
+            opposite = float(np.max(-sign * x))
+            both = abs(opposite - top) <= 0.01 * top  # a symmetric limit: its other end counts too
+            if both:
+                flat |= -sign * x >= opposite - width
             best = made(
-                sign * x == top,
+                flat,
                 float(sign * top),
-                "the largest value repeats far more often than the next ones, as at the end of a converter's range",
+                ("here and at the opposite value " if both else "")
+                + "the outermost value repeats far more often than the next ones, a flat top as where a converter or a"
+                " preamplifier saturates" + (" below the end of the known range" if bounds is not None else ""),
                 p,
             )
     return best
 
 
-def repeated_extreme(x: np.ndarray) -> float:
-    """Chance that a sine's top or a noise's tail repeats the largest value so often; 1 where it does not repeat."""
-    counts = np.unique(x, return_counts=True)[1]
-    n, others = int(counts[-1]), int(counts[-6:-1].max(initial=0))
-    if n < 5 or others == 0:
-        return 1.0
-    return float(stats.binom.sf(n - 1, n + others, SINE_TOP / (1 + SINE_TOP)))
+def repeated_extreme(x: np.ndarray, periods: int = 1) -> tuple[float, float, float]:
+    """The largest value, the chance that an unclipped signal repeats it so often, and the width of the flat top.
+
+    Samples at the top are counted against the fullest of the five next values, or bins of the same width below it:
+    a parabola, the top of a smooth signal, has 1 / (sqrt 2 - 1) = 2.42 times as many. Above 8 times, where no smooth
+    top reaches, the chance is that of the binomial distribution with 2.42 / 3.42, shared over the widths. A peak that
+    recurs in every period counts once for each, so that the next values count at least `periods`.
+    """
+    values, counts = np.unique(x, return_counts=True)
+    top, extent = float(values[-1]), float(values[-1] - values[0])
+    none = top, 1.0, 0.0
+    if len(values) <= STEPS or top - np.median(x) < 0.1 * extent:
+        return none
+    step = float(np.min(np.diff(values)))
+    trials = [(0.0, int(counts[-1]), int(counts[-6:-1].max()))]
+    for part in WIDTHS:
+        width = part * extent
+        if width > 2 * step:
+            near = np.searchsorted(values, top - width * np.arange(7) - 1e-9 * extent)
+            bins = [int(counts[low:high].sum()) for low, high in pairwise([*near[1:][::-1], len(values)])][::-1]
+            trials.append((width, bins[0], max(bins[1:])))
+    best = none
+    for width, n, others in trials:
+        others = max(others, periods)
+        if n >= max(5.0, FLATTER * others):
+            p = len(trials) * float(stats.binom.sf(n - 1, n + others, SINE_TOP / (1 + SINE_TOP)))
+            best = min(best, (top, p, width), key=lambda b: b[1])
+            if p < FALSE_ALARM / 1000:  # the narrowest that is beyond doubt counts the samples best
+                break
+    return best
 
 
 def over_range(x: np.ndarray) -> np.ndarray:

@@ -16,10 +16,12 @@ from avis_ctrl.measurement.gates.missing_samples import MissingSamples
 from avis_ctrl.measurement.gates.periodicity import Periodicity
 from avis_ctrl.measurement.gates.repeatability import LevelDependence, Repeatability
 from avis_ctrl.measurement.gates.signal_quality import Coherence, SignalToNoise
+from avis_ctrl.measurement.gates.spikes import Spikes
 from avis_ctrl.measurement.gates.stepped_sine import SteppedSine
 
 GATES: tuple[type[Gate], ...] = (
     Clipping,
+    Spikes,
     DeadChannel,
     ChannelMap,
     SteppedSine,
@@ -31,6 +33,8 @@ GATES: tuple[type[Gate], ...] = (
     Repeatability,
     LevelDependence,
 )
+# What rows that do not belong together spoil.
+CONSEQUENCES = ("signal to noise", "coherence", "periodicity", "repeatability", "level dependence", "spikes")
 
 
 def examine(campaign: Campaign, expectation: Expectation | None = None, longest: int = LONGEST) -> tuple[Finding, ...]:
@@ -58,6 +62,7 @@ def examine(campaign: Campaign, expectation: Expectation | None = None, longest:
         for gate, of in zip(gates, kept, strict=True):
             of.append(gate.look(seen, known))
     findings = [f for gate, of in zip(gates, kept, strict=True) for f in gate.conclude(of, campaign, known)]
+    findings = after_clipping(after_missing_samples(findings))
     if shortened:
         said = (
             f" (Of record {', '.join(shortened[:4])}{' and others' if len(shortened) > 4 else ''} only pieces of"
@@ -65,3 +70,42 @@ def examine(campaign: Campaign, expectation: Expectation | None = None, longest:
         )
         findings = [replace(f, sentence=f.sentence + said) for f in findings]
     return tuple(findings)
+
+
+def after_missing_samples(findings: list[Finding]) -> list[Finding]:
+    """Findings that follow from missing samples say so and are notes: the cause stops, and they are to be judged again.
+
+    Only gates that compare rows with the commanded voltage or with each other, of the records concerned or of all.
+    """
+    records = {r for f in findings if f.gate == MissingSamples.name and f.severity == "stop" for r in f.records}
+    said = (
+        f" This is likely a consequence of the missing or doubled samples of record {', '.join(sorted(records))}:"
+        " judge it again without them."
+    )
+
+    def follows(f: Finding) -> bool:
+        of = {name.removeprefix("record ") for name in f.records}
+        return f.gate in CONSEQUENCES and f.severity in ("warning", "stop") and (not of or bool(of & records))
+
+    if not records:
+        return findings
+    return [replace(f, severity="note", sentence=f.sentence + said) if follows(f) else f for f in findings]
+
+
+def after_clipping(findings: list[Finding]) -> list[Finding]:
+    """Spikes of a clipped channel are corners of its flat tops; its noise is not its own where the unit is wrong."""
+    clipped = {(f.channels[0], r) for f in findings if f.gate == Clipping.name and f.severity == "stop"
+               for r in f.records}
+    scaled = {name for f in findings if f.gate == Clipping.name and f.severity == "stop" and f.limit for name in
+              f.channels}
+    spikes = " The channel is clipped in this record: these are likely corners of its flat tops."
+    noise = " This is likely a consequence of the wrong unit or scale."
+    made = []
+    for f in findings:
+        grave, channels = f.severity in ("warning", "stop"), set(f.channels)
+        if grave and f.gate == Spikes.name and {(n, r) for n in channels for r in f.records} <= clipped:
+            f = replace(f, severity="note", sentence=f.sentence + spikes)
+        elif grave and f.gate == SignalToNoise.name and channels and channels <= scaled:
+            f = replace(f, severity="note", sentence=f.sentence + noise)
+        made.append(f)
+    return made

@@ -38,7 +38,10 @@ class Limit:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """Plain data for a plot. Labels carry the unit; scales are "linear" or "log"."""
+    """Plain data for a plot. Labels carry the unit; scales are "linear" or "log".
+
+    x_names : of the places 0, 1, 2 ... along x, where these are channels; empty otherwise.
+    """
 
     title: str
     x_label: str
@@ -47,6 +50,7 @@ class Picture:
     limits: tuple[Limit, ...] = ()
     x_scale: str = "linear"
     y_scale: str = "linear"
+    x_names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,8 @@ from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 NOTABLE, LARGE = 0.01, 0.05
 # Noise of the comparison above this part of the response hides changes that matter.
 BLIND = 0.2
+# Levels closer than this factor cannot show a dependence on the level.
+APART = 1.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +36,7 @@ class _Kept:
     """u, y: mean period after the first (samples, channels) with the variance of its windowed lines, where periodic."""
 
     record: str
+    kind: str
     level: float
     rate: float
     u: np.ndarray | None
@@ -68,11 +71,11 @@ class _Records(Gate):
         u, y, wrap = usable(seen)
         of = spectra(u, y, h.sample_rate_Hz, segment_length(len(u), int(np.count_nonzero(np.ptp(u, axis=0)))), wrap)
         if not wrap or (periods := seen.periods("y")[1:]).shape[0] < 3:
-            return _Kept(h.name, h.level_V, h.sample_rate_Hz, None, None, None, 0, of)
+            return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, None, None, None, 0, of)
         P = len(periods)
         lines = windowed(periods - y)
         variance = smoothed(np.sum(np.abs(lines) ** 2, axis=0) / (P - 1)) / P
-        return _Kept(h.name, h.level_V, h.sample_rate_Hz, u, y, variance, P - 1, of)
+        return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, u, y, variance, P - 1, of)
 
     def _picture(self, d: Difference, names: tuple[str, ...]) -> Picture:
         return Picture(
@@ -106,7 +109,7 @@ class _Records(Gate):
 
 
 class Repeatability(_Records):
-    """Records of the same level against the first of them.
+    """Records of the same kind of excitation and level against the first of them.
 
     Where two records repeat one periodic u, their mean periods are compared line by line against the variance between
     periods (Hann-windowed, smoothed
@@ -122,10 +125,7 @@ class Repeatability(_Records):
     name = "repeatability"
 
     def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        groups: dict[float, list[_Kept]] = {}
-        for k in kept:
-            if k is not None:
-                groups.setdefault(_rounded(k.level), []).append(k)
+        groups = _by_kind_and_level(kept)
         pairs = [(group[0], other) for group in groups.values() for other in group[1:]]
         level = FALSE_ALARM / max(1, len(pairs) * len(campaign.y_names))
         differences = [d for a, b in pairs if (d := difference(a, b, level)) is not None]
@@ -173,25 +173,27 @@ class Repeatability(_Records):
 class LevelDependence(_Records):
     """The response at different level_V, compared as in `Repeatability` (scaled where u is the same up to a factor).
 
-    H1 estimates are taken over all records of a level. 1 % is shared over pairs of levels and channels.
+    Compared are records of one kind of excitation at levels at least a factor 1.4 apart: closer ones show leakage and
+    drift rather than nonlinearity. H1 estimates are taken over all records of a level. 1 % is shared over pairs of
+    levels and channels.
     """
 
     name = "level dependence"
 
     def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        groups: dict[float, list[_Kept]] = {}
-        for k in kept:
-            if k is not None:
-                groups.setdefault(_rounded(k.level), []).append(k)
-        pairs = list(combinations(sorted(groups), 2))
+        groups = _by_kind_and_level(kept)
+        pairs = [
+            (a, b) for a, b in combinations(sorted(groups), 2) if a[0] == b[0] and b[1] >= APART * a[1]
+        ]
         level = FALSE_ALARM / max(1, len(pairs) * len(campaign.y_names))
-        differences = [d for a, b in pairs if (d := _of_levels(groups[a], groups[b], a, b, level)) is not None]
+        differences = [d for a, b in pairs if (d := _of_levels(groups[a], groups[b], level)) is not None]
         if not differences:
             return [
                 Finding(
                     self.name,
                     "ok",
-                    "Dependence on the level was not tested: no driven records of two levels and enough length.",
+                    "Dependence on the level was not tested: no driven records of one kind and enough length at"
+                    f" two levels, at least a factor {APART:g} apart.",
                     picture=Picture("Level dependence", "frequency [Hz]", "relative difference [-]", ()),
                 )
             ]
@@ -223,6 +225,15 @@ class LevelDependence(_Records):
         return found
 
 
+def _by_kind_and_level(kept: list[_Kept | None]) -> dict[tuple[str, float], list[_Kept]]:
+    """Records of one excitation and level: leakage, and so the bias of H1, differs between kinds."""
+    groups: dict[tuple[str, float], list[_Kept]] = {}
+    for k in kept:
+        if k is not None:
+            groups.setdefault((k.kind, _rounded(k.level)), []).append(k)
+    return groups
+
+
 def _rounded(level: float) -> float:
     """To two digits: what scatters by a few percent in r.m.s. does not make a new level."""
     return float(f"{level:.2g}")
@@ -234,8 +245,8 @@ def difference(a: _Kept, b: _Kept, level: float) -> Difference | None:
     return _same_input(a, b, level, names) or _by_h1(a.of, b.of, level, names)
 
 
-def _of_levels(a: list[_Kept], b: list[_Kept], low: float, high: float, level: float) -> Difference | None:
-    names = f"{low:g} V", f"{high:g} V"
+def _of_levels(a: list[_Kept], b: list[_Kept], level: float) -> Difference | None:
+    names = f"{_rounded(a[0].level):g} V", f"{_rounded(b[0].level):g} V"
     for one in a:
         for other in b:
             if (d := _same_input(one, other, level, names)) is not None:

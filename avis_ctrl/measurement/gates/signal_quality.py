@@ -19,10 +19,12 @@ from avis_ctrl.measurement.gates.finding import (
     Severity,
     quoted,
 )
-from avis_ctrl.measurement.gates.h1 import Spectra, h1, octaves, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.h1 import H1, h1, octaves, segment_length, spectra, usable
 
 LOW_DB, POOR_DB = 10.0, 0.0
 LOW_COHERENCE = 0.5
+# Records within this factor of the largest level are taken together.
+SAME_LEVEL = 1.4
 NOISE_FACTOR = 3.0
 
 
@@ -129,11 +131,12 @@ class SignalToNoise(Gate):
         x = np.arange(len(rms))
         picture = Picture(
             "Noise of each channel, from above half the Nyquist frequency",
-            "channel number",
+            "channel",
             f"r.m.s. [{campaign.y_unit}]",
             (Series("measured", x, rms, "bars"),),
             (Limit("stated", stated),),
             y_scale="log",
+            x_names=campaign.y_names,
         )
         return [
             Finding(
@@ -153,39 +156,40 @@ class SignalToNoise(Gate):
 
 @dataclass(frozen=True, eq=False)
 class _Coherence:
-    record: str
+    """u (samples, n_u), y (samples, n_y) of a driven record; wrap: of one period."""
+
     level: float
-    of: Spectra | None
+    rate: float
+    u: np.ndarray
+    y: np.ndarray
+    wrap: bool
 
 
 class Coherence(Gate):
-    """Multiple coherence of each channel with all inputs, by octave band, over the records of one level.
+    """Multiple coherence of each channel with all inputs, over the driven records near the largest level.
 
-    Estimates are freed of their bias, gamma^2 - (1 - gamma^2) n_u / (K - n_u). A band is low where the mean is under
-    0.5 and the mean of its lines does not reach 0.5 by chance (normal approximation of the beta distribution's mean, 1
-    % shared over bands and
-    channels). A channel that is low in all bands is a warning; in some, a note. Short segments leak around
-    lightly damped resonances, which lowers the coherence there without any fault.
+    Records within a factor 1.4 of the largest level count together, which leaves long segments; the lowest frequency
+    is that of the second line of a segment, and the sentence says so where the voltage begins lower.
+    Estimates are freed of their bias,
+    gamma^2 - (1 - gamma^2) n_u / (K - n_u), and averaged over thirds of octaves: what is drawn is what is judged. A
+    mean under 0.5 is a note. A channel that is low in all bands by more than chance (normal approximation of the mean,
+    1 % shared over bands and channels) is a warning. Segments leak where a mode decays longer than they last, which
+    lowers the coherence there without any fault; the sentence states their length.
     """
 
     name = "coherence"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Coherence:
+    def look(self, seen: Excerpt, expectation: Expectation) -> _Coherence | None:
         if not seen.driven or seen.header.excitation == "sine":
-            return _Coherence(seen.header.name, 0.0, None)
-        u, y, wrap = usable(seen)
-        length = segment_length(len(u), int(np.count_nonzero(np.ptp(u, axis=0))))
-        return _Coherence(
-            seen.header.name, seen.header.level_V, spectra(u, y, seen.header.sample_rate_Hz, length, wrap)
-        )
+            return None
+        return _Coherence(seen.header.level_V, seen.header.sample_rate_Hz, *usable(seen))
 
-    def conclude(self, kept: list[_Coherence], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        groups: dict[tuple[float, int], list[Spectra]] = {}
-        for k in kept:
-            if k.of is not None:
-                groups.setdefault((k.level, len(k.of.f)), []).append(k.of)
-        estimates = [(level, e) for (level, _), of in groups.items() if (e := h1(of)) is not None]
-        if not estimates:
+    def conclude(self, kept: list[_Coherence | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+        driven = [k for k in kept if k is not None]
+        top = max((k.level for k in driven), default=0.0)
+        chosen = [k for k in driven if k.level * SAME_LEVEL >= top]
+        best, seconds = _pooled(chosen)
+        if best is None:
             return [
                 Finding(
                     self.name,
@@ -194,55 +198,116 @@ class Coherence(Gate):
                     picture=Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ()),
                 )
             ]
-        level, best = max(estimates, key=lambda e: (e[1].dof, e[0]))
         n_u = int(np.count_nonzero(best.G.any(axis=(0, 1))))
         free = best.coherence - (1 - best.coherence) * n_u / best.dof
-        bands = octaves(best.f)
+        bands = thirds(best.f)
         middle = np.array([np.sqrt(best.f[b][0] * best.f[b][-1]) for b in bands])
         mean = np.array([free[b].mean(axis=0) for b in bands])
         # Standard deviation of an estimate of 0.5: (1 - g) sqrt(2 g / K), Bendat and Piersol table 9.6.
         z = stats.norm.isf(FALSE_ALARM / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
-        low = mean < LOW_COHERENCE - margin[:, None]
+        surely = np.all(mean < LOW_COHERENCE - margin[:, None], axis=0)
         picture = Picture(
-            f"Multiple coherence at {level:g} V",
+            f"Multiple coherence at {top:.3g} V, thirds of octaves",
             "frequency [Hz]",
             "coherence [-]",
-            tuple(Series(n, best.f, best.coherence[:, j]) for j, n in enumerate(campaign.y_names)),
+            tuple(Series(n, middle, mean[:, j]) for j, n in enumerate(campaign.y_names)),
             (Limit("low", LOW_COHERENCE),),
             "log",
         )
-        found = []
-        for j, name in enumerate(campaign.y_names):
-            if low[:, j].any():
-                severity: Severity = "warning" if low[:, j].all() else "note"
-                where = ", ".join(f"{middle[b]:.3g} Hz ({max(mean[b, j], 0):.2f})" for b in np.flatnonzero(low[:, j]))
-                found.append(
-                    Finding(
-                        self.name,
-                        severity,
-                        f"Channel {name!r} has low coherence with the inputs around {where}: noise, an input that is"
-                        " not recorded, or nonlinearity. Raise the level or leave these bands out of the fit.",
-                        (name,),
-                        value=float(mean[:, j].min()),
-                        limit=LOW_COHERENCE,
-                        picture=picture,
-                    )
-                )
-        if not found:
-            b, j = divmod(int(np.argmin(mean)), mean.shape[1])
-            found.append(
-                Finding(
-                    self.name,
-                    "ok",
-                    f"Multiple coherence is at least {mean[b, j]:.2f} in every band (lowest"
-                    f" {quoted((campaign.y_names[j],))} around {middle[b]:.3g} Hz).",
-                    value=float(mean[b, j]),
-                    limit=LOW_COHERENCE,
-                    picture=picture,
-                )
+        below, excited = "", _lowest_driven(chosen)
+        if best.f[0] > 1.5 * excited:
+            below = (
+                f" Below {best.f[0]:.3g} Hz, down to {excited:.3g} Hz where the voltage begins, the records are too"
+                " short for a coherence of all inputs."
             )
-        return found
+        low = np.any(mean < LOW_COHERENCE, axis=0)
+        groups = [[int(j)] for j in np.flatnonzero(surely)] + [[int(j) for j in np.flatnonzero(low & ~surely)]]
+        found = [
+            self._low(campaign.y_names, group, middle, mean, bool(surely[group[0]]), seconds, below, picture)
+            for group in groups
+            if group
+        ]
+        if found:
+            return found
+        b, j = divmod(int(np.argmin(mean)), mean.shape[1])
+        return [
+            Finding(
+                self.name,
+                "ok",
+                f"Multiple coherence is at least {mean[b, j]:.2f} in every third of an octave from {best.f[0]:.3g} to"
+                f" {best.f[-1]:.3g} Hz (lowest {quoted((campaign.y_names[j],))} around {middle[b]:.3g} Hz).{below}",
+                value=float(mean[b, j]),
+                limit=LOW_COHERENCE,
+                picture=picture,
+            )
+        ]
+
+    def _low(
+        self,
+        names: tuple[str, ...],
+        group: list[int],
+        middle: np.ndarray,
+        mean: np.ndarray,
+        surely: bool,
+        seconds: float,
+        below: str,
+        picture: Picture,
+    ) -> Finding:
+        """One channel that is low everywhere, or all those that are low somewhere."""
+        severity: Severity = "warning" if surely else "note"
+        ordered = sorted(group, key=lambda j: float(mean[:, j].min()))
+        said = []
+        for j in ordered[:4]:
+            b = int(np.argmin(mean[:, j]))
+            count = int(np.count_nonzero(mean[:, j] < LOW_COHERENCE))
+            said.append(f"{names[j]!r} {max(mean[b, j], 0):.2f} around {middle[b]:.3g} Hz (low in {count} bands)")
+        more = f" and {len(group) - 4} more channels" if len(group) > 4 else ""
+        return Finding(
+            self.name,
+            severity,
+            f"Multiple coherence is below {LOW_COHERENCE:g} in {'all' if surely else 'some'} of the"
+            f" {len(middle)} thirds of octaves: {'; '.join(said)}{more}. Causes are noise, an input that is not"
+            f" recorded, nonlinearity, or leakage of a mode that decays longer than the segments of {seconds:.3g} s, where the"
+            " signal to noise is high. Longer records tell leakage from the others; raise the level against noise."
+            f"{below}",
+            tuple(names[j] for j in ordered),
+            value=float(mean[:, group].min()),
+            limit=LOW_COHERENCE,
+            picture=picture,
+        )
+
+
+def _pooled(chosen: list[_Coherence]) -> tuple[H1 | None, float]:
+    """H1 over records, of the longest segments that leave enough of them, and their length in s."""
+    if not chosen:
+        return None, 0.0
+    n_u = int(np.count_nonzero(np.max([np.ptp(k.u, axis=0) for k in chosen], axis=0)))
+    shortest, samples = min(len(k.u) for k in chosen), sum(len(k.u) for k in chosen)
+    length = 1 << int(np.log2(max(16, shortest)))
+    # Segments as long as leaves enough of them: twice the inputs and some.
+    rate = chosen[0].rate
+    while length >= 16:
+        enough = 2 * samples / length >= 2 * n_u + 8
+        if enough and (made := h1([spectra(k.u, k.y, rate, length, k.wrap) for k in chosen])) is not None:
+            return made, length / rate
+        length //= 2
+    return None, 0.0
+
+
+def _lowest_driven(chosen: list[_Coherence]) -> float:
+    """Hz: the lowest line of the whole record at which some voltage has a thousandth of its largest power."""
+    lowest = []
+    for k in chosen:
+        power = np.sum(np.abs(np.fft.rfft(k.u - k.u.mean(axis=0), axis=0)) ** 2, axis=1)
+        lowest.append(float(np.flatnonzero(power > 1e-3 * power.max())[0]) * k.rate / len(k.u))
+    return min(lowest)
+
+
+def thirds(f: np.ndarray) -> list[np.ndarray]:
+    """Masks of thirds of octaves that hold a line."""
+    place = np.floor(3 * np.log2(f / f[0]) + 1e-9).astype(int)
+    return [place == k for k in np.unique(place)]
 
 
 def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None]:

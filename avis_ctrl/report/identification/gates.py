@@ -48,6 +48,9 @@ def _pictures(findings: list[Finding]) -> list[tuple[Picture, list[str]]]:
 
 
 def _small(name: str, caption: str, pictures: list[Picture]) -> list[Piece]:
-    groups = [pictures[k:k + TOGETHER] for k in range(0, len(pictures), TOGETHER)]
+    # Those with a curve for each channel share a legend; among others it would name what they do not have.
+    many = [p for p in pictures if len(p.series) > 2]
+    few = [p for p in pictures if len(p.series) <= 2]
+    groups = [of[k:k + TOGETHER] for of in (many, few) for k in range(0, len(of), TOGETHER)]
     return [figure_of(f"{name}_{k}", caption + (f" Part {k + 1} of {len(groups)}." if len(groups) > 1 else ""), group,
                       2, 0.75) for k, group in enumerate(groups)]

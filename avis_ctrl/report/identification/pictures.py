@@ -10,6 +10,8 @@ import numpy as np
 from avis_ctrl.measurement.gates.finding import Limit, Picture, Series
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Scale, Style, log_range, numbered
 
+# Letters that fit beside each other under a panel of half the width.
+LETTERS = 36
 LIMITS = ("#b3261e", "#7a7a7a", "#d55e00", "#222222")
 
 
@@ -24,11 +26,20 @@ def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int
 def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str]) -> Panel:
     """A picture; names, limits : in the order of their styles."""
     curves = tuple(_curve(one, Style(numbered(names.index(one.name)).colour)) for one in picture.series if len(one.x))
-    panel = Panel(Axis(picture.x_label, _scale(picture.x_scale)), Axis(picture.y_label, _scale(picture.y_scale)),
+    if len(picture.series) == 1:  # title and axis say what it is
+        curves = tuple(replace(curve, label="") for curve in curves)
+    x = Axis(picture.x_label, _scale(picture.x_scale), ticks=_named(picture.x_names))
+    panel = Panel(x, Axis(picture.y_label, _scale(picture.y_scale)),
                   curves, (), picture.title)
     lines = tuple(_line(one, panel, Style(LIMITS[limits.index(one.name) % len(LIMITS)], "dash", 1.3))
                   for one in picture.limits)
     return _framed(replace(panel, curves=(*curves, *lines)))
+
+
+def _named(names: Sequence[str]) -> tuple[tuple[float, str], ...]:
+    """Names as ticks, in as many rows as keep them from each other."""
+    rows = 1 + sum(len(name) + 1 for name in names) // LETTERS
+    return tuple((float(k), "\n" * (k % rows) + name) for k, name in enumerate(names))
 
 
 def _scale(text: str) -> Scale:
@@ -66,6 +77,8 @@ def _framed(panel: Panel) -> Panel:
     if panel.x.scale == "log":
         low, high = _span(panel, "x")
         return replace(panel, x=replace(panel.x, range=(low / 1.1, high * 1.1)), y=_with_range(panel))
+    if panel.x.ticks:
+        return replace(panel, y=_with_range(panel))
     numbers = np.unique(np.concatenate([c.x for c in panel.curves] or [np.zeros(0)]))
     if 0 < numbers.size <= 16 and np.all(numbers == np.round(numbers)):
         return replace(panel, x=replace(panel.x, ticks=tuple((float(v), f"{v:g}") for v in numbers)),
