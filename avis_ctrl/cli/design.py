@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
 from typing import Annotated
 
@@ -45,7 +46,8 @@ def _verdict(console, result) -> None:
     for r in result.requirements:
         unit = f" {r.unit}" if r.unit else ""
         asked = "yes" if r.comparison == "is" else f"{r.comparison} {r.limit:.4g}{unit}"
-        table.add_row(r.name, asked, f"{r.value:.4g}{unit}", "[green]met[/]" if r.met else "[red]not met[/]")
+        table.add_row(r.name, asked, f"{r.value:.4g}{unit}" if isfinite(r.value) else "-",
+                      "[green]met[/]" if r.met else "[red]not met[/]")
     console.print(table)
     for note in result.notes:
         console.print(note)
