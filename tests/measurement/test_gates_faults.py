@@ -12,6 +12,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.gates import examine
 from avis_ctrl.measurement.gates.clipping import repeated_extreme
 from avis_ctrl.measurement.gates.spikes import spikes
+from avis_ctrl.report.identification.pictures import figure_of
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.identification import IdentifyOptions, gates, start_model
 
@@ -162,3 +163,12 @@ def test_a_stop_is_said_once_and_without_a_second_full_stop(clean):
         gates(campaign, start_model(campaign, load_rig("avis"), IdentifyOptions()), IdentifyOptions(), lines.append)
     assert ".;" not in str(error.value) and "--despite-gates" in str(error.value)
     assert not [line for line in lines if "stop:" in line]
+
+
+def test_figures_name_the_channels(clean):
+    """Ticks are names, and no curve that stands alone is in the legend."""
+    (said,) = [f for f in examine(clean, known()) if f.gate == "clipping"]
+    figure = figure_of("a", "b", [said.picture])
+    names = (*clean.u_names, *clean.y_names)
+    assert [word.strip() for _, word in figure.panels[0].x.ticks] == list(names)
+    assert [thing.label for thing in figure.legend()] == ["converter"]

@@ -268,9 +268,9 @@ class Coherence(Gate):
             severity,
             f"Multiple coherence is below {LOW_COHERENCE:g} in {'all' if surely else 'some'} of the"
             f" {len(middle)} thirds of octaves: {'; '.join(said)}{more}. Causes are noise, an input that is not"
-            f" recorded, nonlinearity, or leakage of a mode that decays longer than the segments of {seconds:.3g} s, where the"
-            " signal to noise is high. Longer records tell leakage from the others; raise the level against noise."
-            f"{below}",
+            f" recorded, nonlinearity, or leakage of a mode that decays longer than the segments of {seconds:.3g} s,"
+            " where the signal to noise is high. Longer records tell leakage from the others; raise the level against"
+            f" noise.{below}",
             tuple(names[j] for j in ordered),
             value=float(mean[:, group].min()),
             limit=LOW_COHERENCE,
