@@ -134,8 +134,8 @@ class Clipping(Gate):
             f"{100 * row.count / row.samples:.0f} % of the samples of channel {row.channel!r} of record {row.record}"
             f" are at or beyond the converter's range, which ends at {expectation.y_range_V[1]:.6g} {campaign.y_unit};"
             f" the largest is {row.peak:.6g}. {quoted(names)} {'are' if len(names) > 1 else 'is'} so. The unit or scale"
-            f" is probably wrong (mV given as {campaign.y_unit}?), or the range in the rig file. Correct it; clipping is"
-            " judged only then.",
+            f" is probably wrong (mV given as {campaign.y_unit}?), or the range in the rig file. Correct it; clipping"
+            " is judged only then.",
             names,
             tuple(dict.fromkeys(r.record for r in rows)),
             row.count / row.samples,
