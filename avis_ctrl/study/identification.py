@@ -41,6 +41,7 @@ from avis_ctrl.measurement.frequency_response.local_polynomial import local_poly
 from avis_ctrl.measurement.gates import Expectation, Finding, examine
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
+from avis_ctrl.study.rig_channels import in_words_of
 
 Progress = Callable[[str], None]
 CAUTION = ("standard deviations hold the noise of these records alone; what was not free (such as force constants, "
@@ -125,6 +126,7 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
     ComputationError : a fit that does not come to an end.
     """
     options, began = options or IdentifyOptions(), time.monotonic()
+    measured = in_words_of(rig, measured)
     _check(measured, options)
     with threadpool_limits(1):
         model = start_model(measured, rig, options)
