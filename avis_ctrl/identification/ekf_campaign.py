@@ -6,32 +6,19 @@ It is the friendliest case for an identification: no nonlinearity, every chain a
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-import scipy.linalg as la
 import scipy.signal as signal
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.prefilter import delayed
+from avis_ctrl.identification.prediction import Predictor
+from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.rigs.converter import Converter
-from avis_ctrl.rigs.geophone import CompensationFilter, Geophone, SensorChain
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig import Rig
 
 TRANSLATION_V2, ROTATION_V2 = 0.25, 0.1
 FLOOR_BAND_Hz = (0.5, 60.0)
-
-
-class ExactStep(NamedTuple):
-    """x+ = Phi x + Gamma_u u + Gamma_w w0 + Gamma_r (w1 - w0); y = C x + D w0 with w the floor velocity, a ramp."""
-
-    Phi: np.ndarray
-    held: np.ndarray
-    floor: np.ndarray
-    ramp: np.ndarray
-    C: np.ndarray
 
 
 def source_campaign(rig: Rig, sets: int = 10, duration_s: float = 100.0, *, seed: int = 1, noise: bool = True,
@@ -95,51 +82,6 @@ def _record(rig: Rig, name: str, samples: int, rng: np.random.Generator, noise: 
 def sensor_volts(rig: Rig, u: np.ndarray, floor: np.ndarray) -> np.ndarray:
     """(n, n_y) volts before noise, for commanded u (n, n_u) and floor velocity (n + 1, 3), ramps between samples.
 
-    Exact where the loop delay is a whole number of samples, as it is on the AVIS.
+    From rest. The last floor sample ends a ramp that no reading sees.
     """
-    step, delay = exact_step(rig), rig.loop_delay_s * rig.sample_rate_Hz
-    drive = delayed(u, delay) @ step.held.T + floor[:-1] @ step.floor.T + np.diff(floor, axis=0) @ step.ramp.T
-    x = np.empty((len(u) + 1, len(step.Phi)))
-    x[0] = 0.0
-    for k in range(len(u)):
-        x[k + 1] = step.Phi @ x[k] + drive[k]
-    return x[:-1] @ step.C.T
-
-
-def exact_step(rig: Rig) -> ExactStep:
-    """Table with floor displacement and sensor chains over one sample, by the matrix exponential (Van Loan 1978)."""
-    A, B, C = _continuous(rig)
-    n, m = B.shape
-    h = 1 / rig.sample_rate_Hz
-    block = np.zeros((n + 2 * m, n + 2 * m))
-    block[:n, :n], block[:n, n:n + m], block[n:n + m, n + m:] = A * h, B * h, np.eye(m)
-    power = la.expm(block)
-    held, ramp = power[:n, n:n + m], power[:n, n + m:]
-    n_u = m - 3
-    return ExactStep(power[:n, :n], held[:, :n_u], held[:, n_u:], ramp[:, n_u:], C)
-
-
-def _continuous(rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, B, C of states (q, q', floor displacement, chains) and inputs (u, floor velocity)."""
-    g, a = rig.geophones, rig.acquisition
-    assert g is not None and a is not None
-    eom, (_, rows) = rig.equations_of_motion(), rig.sensor_rows()
-    corners = CompensationFilter(g.suspension_Hz, g.suspension_damping, g.compensated_Hz, g.compensated_damping)
-    converter = Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz)
-    chain = SensorChain(Geophone(g.suspension_Hz, g.suspension_damping, 1.0), corners, 1.0, converter).system()
-    gains = np.array(g.sensitivity_Vs_per_m) * g.preamplifier_gain
-    n_c, n_y, n_u = chain.nstates, len(rows), len(eom.actuators)
-    n, n_s = 15, 15 + n_c * len(rows)
-    A, B, C = np.zeros((n_s, n_s)), np.zeros((n_s, n_u + 3)), np.zeros((n_y, n_s))
-    A[:6, 6:12] = np.eye(6)
-    A[6:12, :15] = la.solve(eom.M, np.hstack([-eom.K, -eom.C, eom.K_floor[:, :3]]))
-    B[6:12] = la.solve(eom.M, np.hstack([eom.T, eom.C_floor[:, :3]]))
-    B[12:15, n_u:] = np.eye(3)
-    for i, row in enumerate(rows):
-        s = slice(n + n_c * i, n + n_c * (i + 1))
-        A[s, s] = chain.A
-        A[s, 6:12] = np.outer(chain.B[:, 0], row)
-        C[i, s] = gains[i] * chain.C[0]
-        C[i, 6:12] = gains[i] * chain.D[0, 0] * row
-    return A, B, C
-
+    return Predictor(ResponseModel.of(rig, ())).read(u, floor[:-1])

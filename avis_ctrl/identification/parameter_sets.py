@@ -10,18 +10,10 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs.rig import Rig
 
-# Rademakers, eq. 3.11: b_11 and k_11 are left out, positions and motor constants are known.
-_SOURCE_AVIS = ("mass", "J1", "J2", "J3", *(f"isolator{i}.{kind}_{axis}" for kind in "ck" for i in (1, 2, 3, 4)
-                                            for axis in "xyz" if (i, axis) != (1, "x")))
 _SPRINGS = tuple(f"k_s{k}" for k in range(1, 5))
 _HALCYONICS = ("Ixx", "Iyy", "Izz", *_SPRINGS, "k_a", "k_t", "k_r", "d1", "d3", "d4", "d5", "d6",
                *(f"e{k}" for k in range(1, 9)))
 _LOAD = ("load.L7", "load.L8", "load.L9", "load.Ixx", "load.Iyy", "load.Izz", "load.Ixy")
-
-
-def source_parameters() -> tuple[str, ...]:
-    """The 26 parameters of Rademakers' eq. 3.11 by our names."""
-    return _SOURCE_AVIS
 
 
 def default_parameters(rig: Rig) -> tuple[str, ...]:

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.avis import AvisTable, Isolator, LinearMotor
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
 from avis_ctrl.rigs.file_errors import first_complaint
+from avis_ctrl.rigs.floor_spectrum import shipped_spectra
 from avis_ctrl.rigs.halcyonics import Halcyonics, Load, ReactionMass
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
@@ -36,6 +37,23 @@ Point = Annotated[list[Length], Field(min_length=3, max_length=3)]
 PositiveVector = Annotated[list[Positive], Field(min_length=3, max_length=3)]
 DampingVector = Annotated[list[NotNegative], Field(min_length=3, max_length=3)]
 Axis = Literal["x", "y", "z"]
+
+
+def _rising(band: list[float]) -> list[float]:
+    if band[0] >= band[1]:
+        raise ValueError("expected the lower end first, the upper one after it")
+    return band
+
+
+def _shipped(spectrum: str) -> str:
+    if spectrum not in shipped_spectra():
+        raise ValueError(f"expected one of {', '.join(shipped_spectra())}")
+    return spectrum
+
+
+# What other files share: a frequency band [Hz], and the name of a shipped spectrum of floor motion.
+Band = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(_rising)]
+Spectrum = Annotated[str, AfterValidator(_shipped)]
 
 
 File = TypeVar("File", bound=BaseModel)

@@ -4,19 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
-from avis_ctrl.rigs.floor_spectrum import shipped_spectra
-from avis_ctrl.rigs.rig_file import NotNegative, Positive
+from avis_ctrl.rigs.rig_file import Band, NotNegative, Positive, Spectrum
 
-
-def _rising(band: list[float]) -> list[float]:
-    if band[0] >= band[1]:
-        raise ValueError("expected the lower end first, the upper one after it")
-    return band
-
-
-Band = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(_rising)]
 Duration = Annotated[float, Field(gt=0, le=36000)]
 Percent = Annotated[float, Field(gt=0, le=100)]
 Spread = Annotated[float, Field(ge=0, lt=100)]
@@ -82,16 +73,9 @@ class AmbientPlan(_Section):
     velocity_rms_m_per_s : in band_Hz; what the rig's file says where absent, 0 for a floor at rest.
     """
 
-    spectrum: str = "kamioka_quiet"
+    spectrum: Spectrum = "kamioka_quiet"
     velocity_rms_m_per_s: NotNegative | None = None
     band_Hz: Band = [0.5, 60.0]
-
-    @field_validator("spectrum")
-    @classmethod
-    def _known(cls, spectrum: str) -> str:
-        if spectrum not in shipped_spectra():
-            raise ValueError(f"expected one of {', '.join(shipped_spectra())}")
-        return spectrum
 
 
 class FloorSensorPlan(_Section):

@@ -24,17 +24,10 @@ from pydantic import (
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.file_errors import first_complaint, read_toml
-from avis_ctrl.rigs.floor_spectrum import shipped_spectra
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.rig_file import LIMIT, SHIPPED, load_rig
+from avis_ctrl.rigs.rig_file import LIMIT, SHIPPED, Band, Spectrum, load_rig
 from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty
 from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter
-
-
-def _rising(band: list[float]) -> list[float]:
-    if band[0] >= band[1]:
-        raise ValueError("expected the lower end first, the upper one after it")
-    return band
 
 
 def _different(axes: list[str]) -> list[str]:
@@ -47,7 +40,6 @@ Positive = Annotated[float, Field(gt=0, le=LIMIT)]
 NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
 Percent = Annotated[float, Field(gt=0, lt=100)]
 Decibel = Annotated[float, Field(ge=-200, le=200)]
-Band = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(_rising)]
 Axis = Literal["x", "y", "z", "phi_x", "phi_y", "phi_z"]
 
 
@@ -153,16 +145,9 @@ class ComplianceSection(_Section):
 class FloorSection(_Section):
     """Floor motion of the site: a measured shape, scaled to a velocity r.m.s. in a band."""
 
-    spectrum: str = "kamioka_quiet"
+    spectrum: Spectrum = "kamioka_quiet"
     velocity_rms_m_per_s: Positive | None = None
     band_Hz: Band = [0.5, 60.0]
-
-    @field_validator("spectrum")
-    @classmethod
-    def _known(cls, spectrum: str) -> str:
-        if spectrum not in shipped_spectra():
-            raise ValueError(f"expected one of {', '.join(shipped_spectra())}")
-        return spectrum
 
 
 class SynthesisSection(_Section):
