@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification import model_error
-from avis_ctrl.identification.campaign_fit import Portion
+from avis_ctrl.identification.campaign_fit import LONGEST_PIECE, Portion
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -16,8 +16,6 @@ from avis_ctrl.measurement.frequency_response.best_linear import best_linear_app
 
 # Frequencies of a figure.
 POINTS = 400
-# Samples; longer records are used in pieces.
-LONGEST_PIECE = 1 << 18
 
 
 @dataclass(frozen=True, eq=False)
