@@ -1,0 +1,278 @@
+"""Resolution and clipping of a channel's converter, where they are worse than the rig file says.
+
+Resolution. A signal that passed a step q has its values near q k + b, k whole. The characteristic function of its
+amplitudes, phi(nu) = mean exp(2 pi j nu y), then has modulus near 1 at nu = 1/q, where that of a smooth distribution of
+standard deviation s is close to 0 (Widrow and Kollar, Quantization Noise, 2008, chapter 4). With the values rounded
+again to the nominal lsb it is sinc(lsb/q) at least. phi is the transform of the histogram of codes.
+Signals of a few steps only have no phi to speak of; there the gaps between the codes used tell: noise of one lsb never
+leaves the code next to its most frequent one empty.
+
+Clipping. The outermost value of the whole campaign repeats far more often than a smooth signal allows
+(`measurement.gates.clipping.repeated_extreme`), well inside the nominal range.
+
+Nominal range and resolution belong to the model and are no finding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.fft
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.signals.leftover import Estimate
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.gates.clipping import repeated_extreme
+from avis_ctrl.measurement.gates.finding import Limit, Picture, Series, thinned
+from avis_ctrl.rigs.converter import Converter
+from avis_ctrl.rigs.rig import Rig
+
+# False alarms of a clean campaign, over all channels, ends and records.
+FALSE_ALARM = 1e-3
+# Smallest step that counts [nominal lsb], and |phi| that a comb of such a step reaches: sinc(1/2) = 0.64 at two.
+LEAST_STEP, LEAST_PHI = 1.9, 0.5
+# phi of a smooth signal has died out from this many cycles per standard deviation on (a sine's Bessel function last).
+FREE_OF_SIGNAL = 2.0
+# Codes used up to which a signal counts as one of few steps; samples that must lie off its most frequent code.
+FEW_CODES, OFF_THE_MODE = 40, 20
+# Probability of the code next to the most frequent one, at least, for noise of 0.3 lsb and more and any offset.
+NEIGHBOUR = 0.02
+# Distance of a clip level from the nominal limit [lsb] below which it is the nominal one.
+NOMINAL_MARGIN = 4.0
+# Samples of a record that are looked at.
+LONGEST = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class ConverterFinding:
+    """One departure of one channel's converter from the rig file.
+
+    Attributes
+    ----------
+    kind : "resolution" or "clipping".
+    parameters : "resolution_V" (step between values), or "clip_high_V" and/or "clip_low_V" (values where it clips).
+    nominal : what the rig file has in the place of each parameter.
+    confidence : 1 - p, p a bound on the chance that a channel as in the rig file shows this anywhere in the campaign.
+    samples : that are clipped; 0 for a resolution.
+    """
+
+    channel: str
+    kind: Literal["resolution", "clipping"]
+    parameters: dict[str, Estimate]
+    nominal: dict[str, float]
+    confidence: float
+    sentence: str
+    records: tuple[str, ...]
+    picture: Picture
+    samples: int = 0
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return (self.channel,)
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Of one channel in one record; codes are the nearest nominal ones of samples inside the nominal range."""
+
+    record: str
+    y: np.ndarray
+    codes: np.ndarray
+    periods: int
+
+
+def nominal_converter(rig: Rig) -> Converter:
+    """Of the rig file.
+
+    Raises
+    ------
+    InputError : a rig without geophones or acquisition.
+    """
+    acquisition = getattr(rig, "acquisition", None)
+    if acquisition is None:
+        raise InputError("the rig file describes no converter", field="acquisition")
+    return Converter(acquisition.adc_bits, acquisition.adc_range_V, acquisition.sample_rate_Hz)
+
+
+def inspect_converter(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, ...]:
+    """What each sensor's converter does worse than the rig file says; empty where it does not.
+
+    A step is found from 1.9 nominal lsb on, a clip level where some 40 samples reach it (8 for each period of a
+    periodic record). Both need samples of a record in memory, one record and channel at a time beside the codes of all.
+
+    Raises
+    ------
+    InputError : y not in V, a rig without converter.
+    """
+    if campaign.y_unit != "V":
+        raise InputError("expected V: the converter's steps are seen in its own unit", field="unit of y",
+                         value=campaign.y_unit)
+    nominal = nominal_converter(rig)
+    of_channel: dict[str, list[_Samples]] = {name: [] for name in campaign.y_names}
+    for source in campaign.records:
+        h = source.header
+        record = source.load(0, min(h.samples, LONGEST))
+        for k, name in enumerate(h.y_names):
+            y = record.y[:, k]
+            inside = (y > nominal.limits_V[0] + nominal.lsb_V) & (y < nominal.limits_V[1] - nominal.lsb_V)
+            codes = np.rint(y[inside] / nominal.lsb_V).astype(np.int64)
+            of_channel[name].append(_Samples(h.name, y, codes, max(1, record.header.periods)))
+    tests = len(of_channel)
+    found: list[ConverterFinding | None] = []
+    for name, of in of_channel.items():
+        step = _resolution(name, of, nominal, FALSE_ALARM / (2 * tests))
+        lsb = step.parameters["resolution_V"].value if step else nominal.lsb_V
+        found += [step, _clipping(name, of, nominal, lsb, FALSE_ALARM / (4 * tests))]
+    return tuple(one for one in found if one is not None)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """q, b [lsb] with standard error of q, and the chance p of seeing it in a clean channel."""
+
+    q: float
+    std: float
+    p: float
+
+
+def _resolution(name: str, of: Sequence[_Samples], nominal: Converter, level: float) -> ConverterFinding | None:
+    seen = [one for one in of if one.codes.size > 1]
+    step = (_gaps(seen) or _comb(seen)) if seen else None
+    if step is None or step.p > level:
+        return None
+    lsb = nominal.lsb_V
+    value, std = step.q * lsb, step.std * lsb
+    bits = np.log2(2 * nominal.range_V / value)
+    loudest = max(of, key=lambda one: np.ptp(one.y))
+    shown = slice(0, min(len(loudest.y), 400))
+    picture = Picture(f"Record {loudest.record}, {name}: values in steps of {1e3 * value:.4g} mV", "sample",
+                      f"{name} [V]", (Series(name, np.arange(len(loudest.y))[shown], loudest.y[shown], "points"),))
+    return ConverterFinding(
+        name, "resolution", {"resolution_V": Estimate(value, std, "V")}, {"resolution_V": lsb},
+        1 - min(1.0, step.p),
+        f"Sensor {name} is converted in steps of {1e3 * value:.4g} +- {1e3 * std:.2g} mV, {step.q:.3g} times the"
+        f" {1e3 * lsb:.4g} mV of the rig file: {bits:.2f} instead of {nominal.bits} bits over its range.",
+        tuple(one.record for one in of), picture)
+
+
+def _comb(of: Sequence[_Samples]) -> _Step | None:
+    """The step whose comb |phi| shows, over the records that spread over enough steps."""
+    low = min(int(one.codes.min()) for one in of)
+    size = scipy.fft.next_fast_len(4 * (max(int(one.codes.max()) for one in of) - low + 1), real=True)
+    nu = np.arange(size // 2 + 1) / size
+    total, weight, travelled = np.zeros(len(nu)), np.zeros(len(nu)), np.zeros(len(nu))
+    for one in of:
+        spread = float(one.codes.std())
+        if spread * nu[-1] < FREE_OF_SIGNAL:
+            continue
+        counts = np.bincount(one.codes - low, minlength=1).astype(float)
+        phi = np.abs(scipy.fft.rfft(counts, size)) / len(one.codes)
+        free = nu >= FREE_OF_SIGNAL / spread
+        n = float(len(one.codes))
+        total[free] += n * phi[free]
+        weight[free] += n
+        # Each step that is passed is one look at where the values lie within a step.
+        travelled += free * np.minimum(n, np.abs(np.diff(one.codes)).sum() * nu)
+    usable = (weight > 0) & (nu <= 1 / LEAST_STEP)
+    if not usable.any():
+        return None
+    mean = np.where(usable, total / np.maximum(weight, 1), 0.0)
+    high = np.flatnonzero(mean >= max(LEAST_PHI, 0.85 * mean.max()))
+    if not high.size:
+        return None
+    # The lowest frequency of the comb is its step's; beside it phi has the width of the transform.
+    run = high[: int(np.argmax(np.append(np.diff(high), 2) > 1)) + 1]
+    at = int(run[np.argmax(mean[run])])
+    q, std = _fitted(of, 1 / nu[at])
+    bound = np.log(len(nu)) - travelled[at] * mean[at] ** 2
+    return _Step(q, std, float(np.exp(min(bound, 0.0))))
+
+
+def _fitted(of: Sequence[_Samples], q: float) -> tuple[float, float]:
+    """q by least squares of the distinct codes over their numbers k, widening from the middle where k is certain."""
+    codes, counts = np.unique(np.concatenate([one.codes for one in of]), return_counts=True)
+    middle = float(codes[np.argmax(counts)])
+    x = codes - middle
+    b = 0.0
+    for reach in np.geomspace(8 * q, max(np.abs(x).max(), 16 * q), 12):
+        near = np.abs(x) <= reach
+        k = np.rint((x[near] - b) / q)
+        if np.ptp(k) < 2:
+            continue
+        q, b = (float(c) for c in np.polyfit(k, x[near], 1))
+    k = np.rint((x - b) / q)
+    # Rounding to the nominal lsb is the error, at least where the comb happens to be exact.
+    rest = max(float(np.std(x - b - q * k)), 1 / np.sqrt(12.0))
+    return q, rest / max(float(k.std()) * np.sqrt(len(k)), 1e-9)
+
+
+def _gaps(of: Sequence[_Samples]) -> _Step | None:
+    """The step of a signal that shows a few values only, from the codes between them that nothing reaches."""
+    codes, counts = np.unique(np.concatenate([one.codes for one in of]), return_counts=True)
+    off = int(counts.sum() - counts.max())
+    if not 2 <= len(codes) <= FEW_CODES or off < OFF_THE_MODE:
+        return None
+    steps = np.diff(codes)
+    smallest = int(steps.min())
+    if smallest < 2:
+        return None
+    # A step that is no whole number of codes shows as two of them, one apart.
+    k = np.concatenate([[0], np.cumsum(np.rint(steps / steps[steps <= smallest + 1].mean()))])
+    q = float(np.polyfit(k, codes, 1)[0])
+    std = 1 / np.sqrt(6.0) / max(float(k[-1]), 1.0)
+    # Both neighbours of the most frequent code empty, in so many changes of value.
+    return _Step(q, std, float((1 - NEIGHBOUR) ** min(counts.sum(), 1e5)))
+
+
+def _clipping(name: str, of: Sequence[_Samples], nominal: Converter, lsb: float, level: float
+              ) -> ConverterFinding | None:
+    """Both ends of a channel."""
+    parameters, limits, p_all, count, records = {}, {}, 0.0, 0, set()
+    for end, sign, bound in (("low", -1.0, -nominal.limits_V[0]), ("high", 1.0, nominal.limits_V[1])):
+        made = _plateau(of, sign, bound, nominal.lsb_V, lsb, level)
+        if made is None:
+            continue
+        top, width, p, where = made
+        std = max(lsb / np.sqrt(12.0), width / np.sqrt(12.0))
+        parameters[f"clip_{end}_V"] = Estimate(sign * top, std, "V")
+        limits[f"clip_{end}_V"] = sign * bound
+        p_all = max(p_all, 4 * p)
+        count += sum(where.values())
+        records |= set(where)
+    if not parameters:
+        return None
+    shown = max(of, key=lambda one: sum(int(np.count_nonzero(np.sign(e.value) * one.y >= abs(e.value) - 2 * e.std))
+                                        for e in parameters.values()))
+    at = int(np.argmax(np.abs(shown.y)))
+    part = slice(max(0, at - 1000), at + 1000)
+    t, x = thinned(np.arange(len(shown.y))[part].astype(float), shown.y[part])
+    levels = " and ".join(f"{e.value:.4g}" for e in parameters.values())
+    names = tuple(one.record for one in of if one.record in records)
+    return ConverterFinding(
+        name, "clipping", parameters, limits, 1 - min(1.0, p_all),
+        f"Sensor {name} clips at {levels} V, {count} samples of record{'s' if len(names) > 1 else ''}"
+        f" {', '.join(names)}; the rig file's converter ends at {nominal.limits_V[0]:.4g} and"
+        f" {nominal.limits_V[1]:.4g} V.",
+        names, Picture(f"Record {shown.record}, {name}", "sample", f"{name} [V]", (Series(name, t, x),),
+                       tuple(Limit("clips at", e.value) for e in parameters.values())), count)
+
+
+def _plateau(of: Sequence[_Samples], sign: float, bound: float, nominal_lsb: float, lsb: float, level: float
+             ) -> tuple[float, float, float, dict[str, int]] | None:
+    """Level, width, chance and samples by record of a flat end that no record goes beyond."""
+    top = max(float(np.max(sign * one.y)) for one in of)
+    if top <= 0 or top > bound - max(NOMINAL_MARGIN * nominal_lsb, lsb):
+        return None
+    best, widest = 1.0, 0.0
+    near = [one for one in of if float(np.max(sign * one.y)) >= top - max(2 * lsb, top / 256)]
+    for one in near:
+        _, p, width = repeated_extreme(sign * one.y, one.periods)
+        if p * len(of) < best:
+            best, widest = p * len(of), width
+    if best > level:
+        return None
+    at = {one.record: int(np.count_nonzero(sign * one.y >= top - max(widest, lsb / 2))) for one in near}
+    return top, widest, best, at

@@ -1,0 +1,100 @@
+"""Clipped samples of y replaced by what a model expects there, and u as the drives can follow it.
+
+A clipped sample says only that the true value lies beyond the limit. Its expectation given the model is the prediction
+where that lies beyond the limit too, and close to the limit otherwise: the E step of expectation maximisation for
+censored data (Dempster, Laird and Rubin 1977, section 4.2), with noise small against the excess. Refit, predict and
+repair again until the share and the parameters stand still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.signals.converter import ConverterFinding, nominal_converter
+from avis_ctrl.measurement.campaign import Campaign, Record
+from avis_ctrl.rigs.rig import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class Repaired:
+    """A campaign in memory.
+
+    clipped, replaced : shares of the samples of y of each channel, over all records, that lie at its limits, and that
+    the model puts beyond them. drive_clipped : share of the samples of u beyond the drive's limit.
+    """
+
+    campaign: Campaign
+    clipped: dict[str, float]
+    replaced: dict[str, float]
+    drive_clipped: float
+
+
+def channel_limits(rig: Rig, names: tuple[str, ...], findings: tuple[ConverterFinding, ...] = ()
+                   ) -> dict[str, tuple[float, float]]:
+    """Lowest and highest value [V] that each channel can show: what was found, otherwise the rig file's."""
+    limits = dict.fromkeys(names, nominal_converter(rig).limits_V)
+    for one in findings:
+        if one.kind == "clipping" and one.channel in limits:
+            low, high = limits[one.channel]
+            of = one.parameters
+            limits[one.channel] = (of["clip_low_V"].value if "clip_low_V" in of else low,
+                                   of["clip_high_V"].value if "clip_high_V" in of else high)
+    return limits
+
+
+def repair(campaign: Campaign, rig: Rig, predicted: Mapping[str, np.ndarray] | None = None,
+           findings: tuple[ConverterFinding, ...] = ()) -> Repaired:
+    """Every record in memory, clipped samples replaced where a prediction (samples, n_y) of the record is given.
+
+    Samples within half a nominal step of a limit count as clipped. Without predictions only u is clipped, at the rig's
+    drive limit: what was commanded beyond it is nominal behaviour.
+
+    Raises
+    ------
+    InputError : y not in V, predictions of another shape or of records that the campaign does not have.
+    """
+    if campaign.y_unit != "V":
+        raise InputError("expected V: the converter clips in its own unit", field="unit of y", value=campaign.y_unit)
+    for name in predicted or {}:
+        campaign.named(name)
+    names = campaign.y_names
+    limits = channel_limits(rig, names, findings)
+    low, high = (np.array([limits[name][k] for name in names]) for k in (0, 1))
+    margin = nominal_converter(rig).lsb_V / 2
+    at, beyond, samples, drive, driven = np.zeros(len(names)), np.zeros(len(names)), 0, 0, 0
+    records = []
+    for source in campaign.records:
+        record = source.load()
+        top, bottom = record.y >= high - margin, record.y <= low + margin
+        y = record.y
+        at += np.count_nonzero(top | bottom, axis=0)
+        samples += len(y)
+        if predicted is not None and record.header.name in predicted:
+            model = _checked(record, predicted[record.header.name])
+            swap = (top & (model > y)) | (bottom & (model < y))
+            beyond += np.count_nonzero(swap, axis=0)
+            y = np.where(swap, model, y)
+        u = drive_limited(record.u, rig)
+        drive += int(np.count_nonzero(u != record.u))
+        driven += u.size
+        records.append(replace(record, u=u, y=y))
+    return Repaired(replace(campaign, records=tuple(records)), dict(zip(names, (at / samples).tolist(), strict=True)),
+                    dict(zip(names, (beyond / samples).tolist(), strict=True)), drive / max(driven, 1))
+
+
+def drive_limited(u: np.ndarray, rig: Rig) -> np.ndarray:
+    """u [V] held at the rig's drive limit."""
+    limit = rig.drive_limit_V
+    return u if limit is None else np.clip(u, -limit, limit)
+
+
+def _checked(record: Record, model: np.ndarray) -> np.ndarray:
+    model = np.asarray(model, float)
+    if model.shape != record.y.shape or not np.all(np.isfinite(model)):
+        raise InputError(f"expected finite numbers of shape {record.y.shape}", value=model.shape,
+                         field=f"record {record.header.name}: prediction")
+    return model
