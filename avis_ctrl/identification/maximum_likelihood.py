@@ -28,12 +28,10 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.response import N_Q, ResponseModel
+from avis_ctrl.identification.response import N_Q, ResponseModel, positive
 from avis_ctrl.identification.spectra import SpectralBlock, transient_columns
 
 Prior = tuple[float, float]
-# Share of its size at the start that a positive parameter keeps.
-LOWEST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +118,8 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
         begin = model if k == 0 else _moved(model, spread, rng)
         if begin is not None:
             if k > 0:
-                begin = _thinned_descent(begin, blocks, priors, model.values, max_iterations)
-            descent = _Descent(begin, blocks, whiteners, priors, model.values)
+                begin = _thinned_descent(begin, blocks, priors, model, max_iterations)
+            descent = _Descent(begin, blocks, whiteners, priors, model)
             descent.run(max_iterations)
             reached.append((descent.now.chi2, descent))
         else:
@@ -134,7 +132,7 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
                                cause="data that are zero or far from this rig",
                                next_step="look at the gates, and start nearer")
     last = best.evaluate(best.model, residuals=True)
-    scale = _scale(model.values)
+    scale = model.scales()
     unknown = sum(_unknowns(block, model) for block in blocks)
     information = Information(model.names, best.model.values, model.units, last.F / np.outer(scale, scale), scale)
     dof = sum(block.numbers for block in blocks) + len(priors) - unknown - information.rank
@@ -143,12 +141,12 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
                          tuple(name for name, low in zip(model.names, best.at_bound(), strict=True) if low))
 
 
-def _thinned_descent(begin: ResponseModel, blocks, priors, scale_values, max_iterations: int) -> ResponseModel:
+def _thinned_descent(begin: ResponseModel, blocks, priors, first: ResponseModel, max_iterations: int) -> ResponseModel:
     """A first descent on some of the lines, drawn at random: from afar it leads to the same place, in less time."""
     rng = np.random.default_rng(0)
     few = [block.lines(np.sort(rng.choice(len(block.omega), max(min(len(block.omega), 200), len(block.omega) // 8),
                                           replace=False))) for block in blocks]
-    descent = _Descent(begin, few, [whitener(block) for block in few], priors, scale_values)
+    descent = _Descent(begin, few, [whitener(block) for block in few], priors, first)
     descent.run(max_iterations)
     return descent.model
 
@@ -156,10 +154,9 @@ def _thinned_descent(begin: ResponseModel, blocks, priors, scale_values, max_ite
 class _Descent:
     """One Levenberg-Marquardt run."""
 
-    def __init__(self, model: ResponseModel, blocks, whiteners, priors, scale_values):
+    def __init__(self, model: ResponseModel, blocks, whiteners, priors, first: ResponseModel):
         self.model, self.blocks, self.whiteners, self.priors = model, blocks, whiteners, priors
-        self.scale = _scale(scale_values)
-        self.lowest = np.where([positive(name) for name in model.names], LOWEST * self.scale, -np.inf)
+        self.scale, (self.lowest, self.highest) = first.scales(), first.bounds()
         self.now = self.evaluate(model)
         self.history = [self.now.chi2]
         self.iterations, self.converged = 0, False
@@ -218,7 +215,7 @@ class _Descent:
 
         The diagonal is scaled away before the eigenvalues tell what is determined.
         """
-        free = ~(self.at_bound() & (self.now.gradient > 0))
+        free = ~((self.at_bound() & (self.now.gradient > 0)) | (self.at_top() & (self.now.gradient < 0)))
         step = np.zeros(len(free))
         H, g = self.now.H[np.ix_(free, free)], self.now.gradient[free]
         if not g.size:
@@ -237,11 +234,15 @@ class _Descent:
 
     def at_bound(self) -> np.ndarray:
         """(n_p,) parameters at the smallest value that physics allows."""
-        return self.model.values <= self.lowest * (1 + 1e-9)
+        return self.model.values <= self.lowest + 1e-9 * np.abs(self.lowest)
+
+    def at_top(self) -> np.ndarray:
+        """(n_p,) parameters at the largest."""
+        return self.model.values >= self.highest - 1e-9 * np.abs(self.highest)
 
     def _try(self, step: np.ndarray) -> tuple[ResponseModel, float] | None:
         try:
-            model = self.model.at(np.maximum(self.model.values + step * self.scale, self.lowest))
+            model = self.model.at(np.clip(self.model.values + step * self.scale, self.lowest, self.highest))
         except InputError:
             return None  # no rig has these parameters: a shorter step
         if not _physical(model):
@@ -255,27 +256,17 @@ def _physical(model: ResponseModel) -> bool:
     return all(value > 0 for name, value in zip(model.names, model.values, strict=True) if positive(name))
 
 
-def positive(name: str) -> bool:
-    """Whether physics asks for a positive value: masses, stiffness, damping, force constants, sensitivities."""
-    last = name.rpartition(".")[2]
-    inertia = ("mass", "load.mass", "J1", "J2", "J3", "Ixx", "Iyy", "Izz")
-    if name.startswith(("sensor.", "actuator.")) or name in inertia:
-        return True
-    return last.startswith(("k_", "c_")) or (len(last) == 2 and last[0] in "de" and last[1].isdigit())
-
-
 def _block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
                     ) -> tuple[np.ndarray, np.ndarray, Residual]:
     """Real residual e (N,) of unit variance, its negative Jacobian J (n_p, N), both free of the transient."""
-    U = block.U
     if not block.transient:
-        found = model.driven(block.omega, U, derivative)
+        found = model.answer(block, None, derivative)
         error = block.Y - found.Y
         white = whitened(L, error)
         J = as_real(whitened(L, found.dY)) if derivative else np.empty(0)
         return as_real(white[None])[0], J, Residual(block, error, white / np.sqrt(2), np.zeros_like(error))
     columns, norms = transient_columns(block, model)
-    plain = block.Y - model.driven(block.omega, U, False).Y
+    plain = block.Y - model.answer(block, None, False).Y
     T = as_real(np.moveaxis(whitened(L, columns), -1, 0))
     Q, R = np.linalg.qr(T.T)
     e = as_real(whitened(L, plain)[None])[0]
@@ -287,7 +278,7 @@ def _block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, *
     if derivative:
         n_b = 2 * N_Q
         body = np.broadcast_to((x[:n_b] / norms[:n_b])[None, :, None], (len(block.omega), n_b, 1))
-        J = as_real(whitened(L, model.driven(block.omega, np.concatenate([U, body], axis=1)).dY))
+        J = as_real(whitened(L, model.answer(block, body).dY))
         J = J - (J @ Q) @ Q.T
     return e, J, Residual(block, plain - transient, white / np.sqrt(2), transient)
 
@@ -337,11 +328,6 @@ def as_real(white: np.ndarray) -> np.ndarray:
     return np.concatenate([flat.real, flat.imag], axis=1)
 
 
-def _scale(values: np.ndarray) -> np.ndarray:
-    """What one relative unit of a parameter is: its size, or 0.1 (m, kg m^2, ..) for one that is zero."""
-    return np.where(values == 0, 0.1, np.abs(values))
-
-
 def _unknowns(block: SpectralBlock, model: ResponseModel) -> int:
     return len(transient_columns(block.lines(np.arange(1)), model)[1]) if block.transient else 0
 
@@ -350,7 +336,7 @@ def _moved(model: ResponseModel, spread: float, rng: np.random.Generator) -> Res
     """Another start: each parameter a random factor away; None where no rig has the draw."""
     for _ in range(20):
         try:
-            moved = model.at(model.values + _scale(model.values) * spread * rng.uniform(-1, 1, len(model.names)))
+            moved = model.at(model.values + model.scales() * spread * rng.uniform(-1, 1, len(model.names)))
         except InputError:
             continue
         if _physical(moved):

@@ -79,7 +79,7 @@ def prediction_error(model: ResponseModel, block: SpectralBlock, derivative: boo
     """
     L = whitener(block)
     n, n_y, m = block.Y.shape
-    found = model.driven(block.omega, block.U, derivative)
+    found = model.answer(block, None, derivative)
     plain = block.Y - found.Y
     e = as_real(whitened(L, plain)[None])[0]
     J = as_real(whitened(L, found.dY)) if derivative else np.empty((0, e.size))

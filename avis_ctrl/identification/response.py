@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -28,11 +28,15 @@ from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.geophone import Accelerometer, CompensationFilter, Geophone, SensorChain
 from avis_ctrl.rigs.rig import Parameter, Rig
 
+if TYPE_CHECKING:
+    from avis_ctrl.identification.spectra import SpectralBlock
+
 FLOOR = ("vx", "vy", "vz")
 MOTION_OF_UNIT: dict[str, Motion] = {"m": "displacement", "m/s": "velocity", "m/s^2": "acceleration"}
 _POWER: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
-_MATRICES = ("M", "C", "K", "C_floor", "K_floor", "T")
 N_Q = 6
+# Share of its size at the start that a positive parameter keeps in a fit.
+LOWEST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +171,16 @@ class ResponseModel:
         known = self.all_parameters()
         return tuple(known[name].unit for name in self.names)
 
+    def scales(self) -> np.ndarray:
+        """(n_p,) what one relative unit of a parameter is: its size, or 0.1 (m, kg m^2, ..) for one that is zero."""
+        values = self.values
+        return np.where(values == 0, 0.1, np.abs(values))
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n_p,) lowest and highest values in a fit from here: what is positive keeps LOWEST of its size."""
+        low = np.where([positive(name) for name in self.names], LOWEST * self.scales(), -np.inf)
+        return low, np.full(len(low), np.inf)
+
     @property
     def inputs(self) -> tuple[str, ...]:
         """Actuators, then the floor's velocities."""
@@ -218,6 +232,11 @@ class ResponseModel:
         """G, (n, n_y, n_u + 3): from commanded volts and floor velocity [m/s] to y; omega > 0 [rad/s]."""
         n, n_in = len(omega), len(self.inputs)
         return self.driven(omega, np.broadcast_to(np.eye(n_in, dtype=complex), (n, n_in, n_in)), derivative=False).Y
+
+    def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True) -> Driven:
+        """y of a block of data; body (n, 12, m): impulses and steps of the transient beside the block's inputs."""
+        U = block.U if body is None else np.concatenate([block.U, body], axis=1)
+        return self.driven(block.omega, U, derivative)
 
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
         """y for spectra of the inputs, and its derivative by the free parameters.
@@ -296,6 +315,15 @@ class ResponseModel:
     def _passband(self) -> float:
         """The chain far above its corners."""
         return 1.0 if self.sensors.chain is None else float(self.sensors.chain.D[0, 0])
+
+
+def positive(name: str) -> bool:
+    """Whether physics asks for a positive value: masses, stiffness, damping, force constants, sensitivities."""
+    last = name.rpartition(".")[2]
+    inertia = ("mass", "load.mass", "J1", "J2", "J3", "Ixx", "Iyy", "Izz")
+    if name.startswith(("sensor.", "actuator.")) or name in inertia:
+        return True
+    return last.startswith(("k_", "c_")) or (len(last) == 2 and last[0] in "de" and last[1].isdigit())
 
 
 def _force_derivative(d: Matrices, j: int, s, q, driven, floor) -> np.ndarray | float:

@@ -36,6 +36,8 @@ FALSE_ALARM = 1e-3
 LEAST_STEP, LEAST_PHI = 1.9, 0.5
 # phi of a smooth signal has died out from this many cycles per standard deviation on (a sine's Bessel function last).
 FREE_OF_SIGNAL = 2.0
+# Part of the codes in use that lie within one of the comb.
+ON_THE_COMB = 0.9
 # Codes used up to which a signal counts as one of few steps; samples that must lie off its most frequent code.
 FEW_CODES, OFF_THE_MODE = 40, 20
 # Probability of the code next to the most frequent one, at least, for noise of 0.3 lsb and more and any offset.
@@ -186,13 +188,19 @@ def _comb(of: Sequence[_Samples]) -> _Step | None:
     # The lowest frequency of the comb is its step's; beside it phi has the width of the transform.
     run = high[: int(np.argmax(np.append(np.diff(high), 2) > 1)) + 1]
     at = int(run[np.argmax(mean[run])])
-    q, std = _fitted(of, 1 / nu[at])
+    fitted = _fitted(of, 1 / nu[at])
+    if fitted is None:
+        return None
+    q, std = fitted
     bound = np.log(len(nu)) - travelled[at] * mean[at] ** 2
     return _Step(q, std, float(np.exp(min(bound, 0.0))))
 
 
-def _fitted(of: Sequence[_Samples], q: float) -> tuple[float, float]:
-    """q by least squares of the distinct codes over their numbers k, widening from the middle where k is certain."""
+def _fitted(of: Sequence[_Samples], q: float) -> tuple[float, float] | None:
+    """q by least squares of the distinct codes over their numbers k, widening from the middle where k is certain.
+
+    None where the codes in use do not lie on the comb: samples heaped at a few levels have a large phi too.
+    """
     codes, counts = np.unique(np.concatenate([one.codes for one in of]), return_counts=True)
     middle = float(codes[np.argmax(counts)])
     x = codes - middle
@@ -204,6 +212,8 @@ def _fitted(of: Sequence[_Samples], q: float) -> tuple[float, float]:
             continue
         q, b = (float(c) for c in np.polyfit(k, x[near], 1))
     k = np.rint((x - b) / q)
+    if np.mean(np.abs(x - b - q * k) <= 1.0) < ON_THE_COMB:
+        return None
     # Rounding to the nominal lsb is the error, at least where the comb happens to be exact.
     rest = max(float(np.std(x - b - q * k)), 1 / np.sqrt(12.0))
     return q, rest / max(float(k.std()) * np.sqrt(len(k)), 1e-9)

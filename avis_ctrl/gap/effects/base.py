@@ -1,0 +1,144 @@
+"""What an effect is: a named piece of physics with a place, parameters, and a way to act on the table.
+
+To add one, write a class and register it:
+
+    @register
+    class EddyBrake(Effect):
+        name = "eddy_brake"
+        ...
+
+`change` acts on the table line by line; an effect that depends on amplitude or time gives `volts` or `force`
+instead, from the record's motion in time. Parameters marked `linear` vanish at `none`: the effect is nearly linear
+in them there, which the score test and the starting values use; the others shape it (a frequency, a damping).
+"""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+
+if TYPE_CHECKING:
+    from avis_ctrl.gap.motion import RecordMotion
+    from avis_ctrl.gap.operators import Operators
+    from avis_ctrl.gap.table_model import TableModel
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """A parameter of an effect.
+
+    none : value without the effect. low, high : what physics allows. size : one unit of it in a fit.
+    linear : the effect vanishes as this goes to `none`, at first in proportion.
+    grid : for one that is not linear, where to look for it.
+    """
+
+    name: str
+    unit: str
+    description: str
+    none: float
+    low: float
+    high: float
+    size: float
+    linear: bool = True
+    grid: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Reported:
+    """A parameter as the report gives it: value, standard deviation, unit."""
+
+    value: float
+    std: float
+    unit: str
+
+
+class Effect(ABC):
+    """A piece of physics that a model may lack.
+
+    Attributes
+    ----------
+    name : of the contract. title : in words, for a sentence. looks_like : what it does to responses.
+    confusable : names of effects that look alike in part of the data.
+    nonlinear : depends on amplitude or time; acts through `volts` or `force`.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    looks_like: ClassVar[str]
+    confusable: ClassVar[tuple[str, ...]] = ()
+    nonlinear: ClassVar[bool] = False
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        """Where it can act on this table; empty where it cannot."""
+        raise NotImplementedError
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        """Its parameters there."""
+        raise NotImplementedError
+
+    def rig_changes(self, model: TableModel, place: str, values: Mapping[str, float]) -> dict[str, float]:
+        """Parameters of the rig that it sets."""
+        return {}
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        """Act on the table line by line."""
+
+    def volts(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+        """(samples, n_u) commanded volts that act, None where they are as commanded."""
+        return None
+
+    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+        """(samples, 6) generalised force on the payload, None for none."""
+        return None
+
+    def starts(self, model: TableModel, place: str) -> Sequence[np.ndarray]:
+        """Where to look: (n_parameters,) each, shape parameters on their grid and the linear ones at none."""
+        parameters = self.parameters(model, place)
+        points = [np.array([])]
+        for one in parameters:
+            values = (one.none,) if one.linear else one.grid
+            points = [np.append(point, value) for point in points for value in values]
+        return points
+
+    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+        """Why physics forbids these values, empty where it does not."""
+        return ""
+
+    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+                 ) -> dict[str, Reported]:
+        """Parameters as a person reads them; by default as they are."""
+        return {one.name: Reported(values[one.name], float(np.sqrt(max(covariance[k, k], 0.0))), one.unit)
+                for k, one in enumerate(self.parameters(model, place))}
+
+
+_registry: dict[str, Effect] = {}
+
+
+def register(effect: type[Effect]) -> type[Effect]:
+    """Put an effect into the library (as a class decorator).
+
+    Raises
+    ------
+    InputError : a name that is taken by another class, or none.
+    """
+    name = getattr(effect, "name", "")
+    if not name:
+        raise InputError("expected an effect with a name", field="effect", value=effect.__name__)
+    known = _registry.get(name)
+    if known is not None and type(known).__qualname__ != effect.__qualname__:
+        raise InputError("expected a name that no other effect has", field="effect", value=name)
+    _registry[name] = effect()
+    return effect
+
+
+def library() -> dict[str, Effect]:
+    """Every registered effect by name."""
+    import avis_ctrl.gap.effects.shipped  # noqa: F401  (registers them)
+
+    return dict(_registry)

@@ -1,0 +1,113 @@
+"""What a model may lack of the drives and of the loop: force constant, lag, delay, limit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, register
+
+if TYPE_CHECKING:
+    from avis_ctrl.gap.motion import RecordMotion
+    from avis_ctrl.gap.operators import Operators
+    from avis_ctrl.gap.table_model import TableModel
+
+
+@register
+class ActuatorGain(Effect):
+    """One force constant times a factor (Rademakers, eqs. 2.17-2.18)."""
+
+    name = "actuator_gain"
+    title = "an actuator's force constant is not the one of the rig file"
+    looks_like = "the response to one input is off by the same real factor at every frequency and output"
+    confusable = ("actuator_saturation",)
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return model.actuators
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        return (EffectParameter("gain", "1", "force constant over that of the rig file", 1.0, 0.05, 10.0, 1.0),)
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        drive = ops.drive.copy()
+        drive[:, ops.actuator(place)] *= values["gain"]
+        ops.drive = drive
+
+
+@register
+class ActuatorLag(Effect):
+    """Every amplifier 1/(1 + s tau), corner 1/(2 pi tau)."""
+
+    name = "actuator_lag"
+    title = "the current amplifiers lag, first order"
+    looks_like = "phase lag that grows with frequency, the same in every channel, with a loss of gain"
+    confusable = ("loop_delay",)
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("actuators",)
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        return (EffectParameter("time_constant_s", "s", "time constant of the amplifiers", 0.0, 0.0, 0.3, 1e-3),)
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        tau = values["time_constant_s"]
+        if tau > 1e-9 and ops.amplifier_corner_Hz is None:
+            ops.amplifier_corner_Hz = 1 / (2 * np.pi * tau)
+        elif tau > 1e-9:  # behind the lag that the model has already
+            ops.drive = ops.drive / (1 + ops.s * tau)[:, None]
+
+    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+                 ) -> dict[str, Reported]:
+        tau, std = values["time_constant_s"], float(np.sqrt(max(covariance[0, 0], 0.0)))
+        return {"corner_Hz": Reported(1 / (2 * np.pi * tau), std / (2 * np.pi * tau ** 2), "Hz"),
+                "time_constant_s": Reported(tau, std, "s")}
+
+
+@register
+class LoopDelay(Effect):
+    """exp(-s tau) beyond the rig file's delay, between samples as well as at them."""
+
+    name = "loop_delay"
+    title = "a delay of transport or computing beyond the nominal one"
+    looks_like = "phase lag in proportion to frequency, the same in every channel, without loss of gain"
+    confusable = ("actuator_lag",)
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("loop",)
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        return (EffectParameter("extra_delay_s", "s", "delay beyond that of the rig file", 0.0, 0.0, 0.2, 1e-3),)
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        ops.delay_s = ops.delay_s + values["extra_delay_s"]
+
+    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+                 ) -> dict[str, Reported]:
+        extra, std = values["extra_delay_s"], float(np.sqrt(max(covariance[0, 0], 0.0)))
+        return {"extra_delay_s": Reported(extra, std, "s"), "delay_s": Reported(model.delay_s + extra, std, "s")}
+
+
+@register
+class ActuatorSaturation(Effect):
+    """Volts clipped at a limit below the rig file's."""
+
+    name = "actuator_saturation"
+    title = "the drives clip below their nominal limit"
+    looks_like = "less response than expected in records at high level only, and harmonics of the input"
+    confusable = ("actuator_gain", "contact_friction")
+    nonlinear = True
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("actuators",)
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        peaks = [float(np.max(np.abs(one.volts))) for one in model.motion.values()] or [model.rig.drive_limit_V]
+        peak = min(max(peaks), model.rig.drive_limit_V) or model.rig.drive_limit_V
+        grid = tuple(peak * share for share in (0.9, 0.7, 0.5, 0.35, 0.2))
+        return (EffectParameter("limit_V", "V", "voltage at which the drives clip", model.rig.drive_limit_V,
+                                peak / 50, peak, peak, False, grid),)
+
+    def volts(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+        return np.clip(record.volts, -values["limit_V"], values["limit_V"])

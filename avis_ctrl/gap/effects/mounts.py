@@ -1,0 +1,316 @@
+"""What a model may lack of the mounts: relaxation, loss, mass, leveling, amplitude, time, and what they stand on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, register
+from avis_ctrl.gap.effects.sensors import second_order
+from avis_ctrl.gap.operators import mount_geometry
+
+if TYPE_CHECKING:
+    from avis_ctrl.gap.motion import RecordMotion
+    from avis_ctrl.gap.operators import Operators
+    from avis_ctrl.gap.table_model import TableModel
+
+# Frequency at which the mounts' stiffness is meant where it depends on frequency.
+REFERENCE_Hz = 3.0
+
+
+def has_mounts(model: TableModel) -> bool:
+    """Whether the rig's mounts have stiffness and damping of their own by name."""
+    return "isolator1.k_z" in model.rig.parameters()
+
+
+def vertical(model_or_ops) -> np.ndarray:
+    """(n_g,) which mount rows are vertical."""
+    rig = model_or_ops.rig if hasattr(model_or_ops, "rig") else model_or_ops.base.rig
+    return mount_geometry(rig).along("z")
+
+
+class _OfMounts(Effect):
+    where = "isolators z"
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return (self.where,) if has_mounts(model) else ()
+
+
+@register
+class MountRelaxation(_OfMounts):
+    """Vertical stiffness k (1 + r s tau/(1 + s tau)): a Maxwell branch in parallel, a second chamber with an orifice."""
+
+    name = "mount_relaxation"
+    title = "the vertical stiffness of the mounts rises with frequency (a second chamber, a Maxwell branch)"
+    looks_like = "vertical resonances higher and more damped than low frequencies say"
+    confusable = ("structural_damping", "leveling_loop", "attached_oscillator")
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        return (EffectParameter("stiffness_ratio", "1", "stiffness of the branch over that at rest", 0.0, 0.0, 20.0, 0.1),
+                EffectParameter("corner_Hz", "Hz", "above which the branch acts", 0.0, 0.02, 300.0, 1.0, False,
+                                (0.3, 0.8, 1.5, 2.5, 4.0, 7.0, 15.0, 40.0)))
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        x = ops.s / (2 * np.pi * values["corner_Hz"])
+        branch = values["stiffness_ratio"] * x / (1 + x)
+        ops.stiffness_factor = ops.stiffness_factor + branch[:, None] * vertical(ops)
+
+
+@register
+class StructuralDamping(_OfMounts):
+    """Loss nearly independent of frequency in every mount.
+
+    causal : k (s/w_ref)^a, loss factor tan(pi a/2) at every frequency, with the rise of stiffness that causality asks
+    for. complex : k (1 + j eta), the textbook's constant, which no passive element has over all frequencies.
+    """
+
+    name = "structural_damping"
+    title = "the mounts lose energy nearly independently of frequency, not in proportion to velocity"
+    looks_like = "damping at low resonances larger, at high ones smaller than one dashpot gives"
+    confusable = ("mount_relaxation",)
+    where = "isolators"
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("isolators/causal", "isolators/complex") if has_mounts(model) else ()
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        return (EffectParameter("loss_factor", "1", "loss factor of the mounts", 0.0, 0.0, 1.0, 0.05),)
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        eta = values["loss_factor"]
+        if place.endswith("complex"):
+            factor = np.full(len(ops.s), 1 + 1j * eta)
+        else:
+            factor = (ops.s / (2 * np.pi * REFERENCE_Hz)) ** (2 / np.pi * np.arctan(eta))
+        ops.stiffness_factor = ops.stiffness_factor * factor[:, None]
+
+
+@register
+class MountSurge(_OfMounts):
+    """A mass inside every vertical mount, between two springs in series that have the mount's stiffness together."""
+
+    name = "mount_surge"
+    title = "an internal resonance of the mounts (mass of spring, diaphragm or piston)"
+    looks_like = "a resonance far above the suspension's along z, in every vertical channel alike"
+    confusable = ("payload_flexible_mode", "attached_oscillator", "base_compliance")
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        k = float(np.mean(mount_geometry(model.rig).stiffness[vertical(model)]))
+        grid = tuple(4 * k / (2 * np.pi * f) ** 2 for f in (10.0, 14.0, 20.0, 28.0, 40.0, 56.0, 80.0))
+        return (EffectParameter("mass_kg", "kg", "inside each mount", 0.0, 0.0, 500.0, grid[2], False, grid),
+                EffectParameter("payload_share", "1", "of the mount's compliance between mass and payload", 0.5, 0.05,
+                                0.95, 0.2, False, (0.5,)),
+                EffectParameter("bypass", "1", "of the mount's damping that bypasses the mass", 0.0, 0.0, 1.0, 0.2,
+                                False, (0.0, 0.9)))
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        up = vertical(ops)
+        ops.internal_mass = ops.internal_mass + values["mass_kg"] * up
+        ops.payload_share = np.where(up, values["payload_share"], ops.payload_share)
+        ops.outer_damping = np.where(up, values["bypass"], ops.outer_damping)
+
+    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+                 ) -> dict[str, Reported]:
+        found = super().reported(model, place, values, covariance)
+        k = float(np.mean(mount_geometry(model.rig).stiffness[vertical(model)]))
+        m, a = values["mass_kg"], values["payload_share"]
+        f = np.sqrt(k * (1 / a + 1 / (1 - a)) / m) / (2 * np.pi)
+        # The standard deviation of the mass and of its place go into the frequency to first order.
+        slope = np.array([-0.5 * f / m, 0.5 * f * (2 * a - 1) / (a * (1 - a)), 0.0])
+        return {"frequency_Hz": Reported(f, float(np.sqrt(max(slope @ covariance @ slope, 0.0))), "Hz"), **found}
+
+
+@register
+class LevelingLoop(_OfMounts):
+    """Force -g integral of the deflection at the first three mounts, through a valve with a lag."""
+
+    name = "leveling_loop"
+    title = "the leveling integrates the position of isolators 1-3"
+    looks_like = "phase and gain change at the lowest frequencies, vertical and tilting channels only"
+    confusable = ("mount_relaxation", "tilt_coupling", "cable_stiffness")
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("isolators 1-3 z/plain", "isolators 1-3 z/lag") if has_mounts(model) else ()
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        k = float(np.mean(mount_geometry(model.rig).stiffness))
+        gain = EffectParameter("integral_gain_N_per_ms", "N/(m s)", "force by displacement and second", 0.0, 0.0, 1e3 * k,
+                               0.1 * k)
+        if place.endswith("plain"):
+            return (gain,)
+        return (gain, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, 0.01, 100.0, 1.0,
+                                      False, (0.1, 1.0)))
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        rows = mount_geometry(ops.base.rig).payload[vertical(ops)][:3]
+        Z = values["integral_gain_N_per_ms"] / ops.s
+        if "valve_corner_Hz" in values:
+            Z = Z / (1 + ops.s / (2 * np.pi * values["valve_corner_Hz"]))
+        Z = np.repeat(Z[:, None], 3, axis=1)
+        ops.add_impedance(Z, rows, Z)
+
+
+@register
+class CubicStiffness(_OfMounts):
+    """Force -k3 d^3 at every vertical mount."""
+
+    name = "cubic_stiffness"
+    title = "the mounts stiffen with amplitude"
+    looks_like = "vertical resonances rise with level, and third harmonics appear"
+    confusable = ("actuator_saturation", "contact_friction")
+    nonlinear = True
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model) ** 2
+        return (EffectParameter("k3_N_per_m3", "N/m^3", "cubic stiffness of each mount", 0.0, -1e4 * size, 1e4 * size,
+                                size),)
+
+    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+        up = record.vertical
+        return -values["k3_N_per_m3"] * record.deflection[:, up] ** 3 @ record.rows[up]
+
+    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+        return "mounts that soften with amplitude" if values["k3_N_per_m3"] < 0 else ""
+
+
+def largest_rms(model: TableModel) -> float:
+    """Largest r.m.s. deflection of a mount [m] in any record; 10 micrometres where none is known."""
+    found = [float(np.sqrt(np.mean(one.deflection ** 2, axis=0)).max()) for one in model.motion.values()]
+    return max(found, default=1e-5) or 1e-5
+
+
+def median_rms(model: TableModel) -> float:
+    found = [float(np.median(np.sqrt(np.mean(one.deflection ** 2, axis=0)))) for one in model.motion.values()]
+    return float(np.median(found)) if found else 1e-5
+
+
+@register
+class ContactFriction(Effect):
+    """Dahl friction at every motor, along its axis: f' = sigma v (1 - sign(v) f/F_c), F_c = sigma times the slip.
+
+    P. R. Dahl, A solid friction model (1968): stiff and lossless for motion far below the slip, Coulomb far above.
+    """
+
+    name = "contact_friction"
+    title = "friction at the actuators' contact points: stiff at small amplitude, slipping at large"
+    looks_like = "stiffness and damping that depend on level: stiffer at the low one, lossier between"
+    confusable = ("cubic_stiffness", "structural_damping", "actuator_saturation")
+    nonlinear = True
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("actuators",) if has_mounts(model) else ()
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        rms, k = median_rms(model), float(np.mean(mount_geometry(model.rig).stiffness))
+        return (EffectParameter("stiffness_N_per_m", "N/m", "of a contact before it slips", 0.0, 0.0, 20 * k, 0.05 * k),
+                EffectParameter("slip_m", "m", "displacement at which a contact slips", 0.0, 1e-3 * rms, 1e3 * rms, rms,
+                                False, tuple(rms * x for x in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0))))
+
+    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+        own = record.driven_rows
+        f = dahl(np.ascontiguousarray(record.deflection[:, own]), values["slip_m"])
+        return -values["stiffness_N_per_m"] * f @ record.rows[own]
+
+    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+                 ) -> dict[str, Reported]:
+        k, slip = values["stiffness_N_per_m"], values["slip_m"]
+        slope = np.array([slip, k])
+        return {"force_N": Reported(k * slip, float(np.sqrt(max(slope @ covariance @ slope, 0.0))), "N"),
+                **super().reported(model, place, values, covariance)}
+
+
+@njit(cache=True)
+def dahl(deflection, slip):
+    """(samples, m) friction force over stiffness [m] for a deflection (samples, m), exact between samples.
+
+    While the motion keeps its direction, f -> +-slip as exp(-|dx|/slip).
+    """
+    n, m = deflection.shape
+    out = np.zeros((n, m))
+    for j in range(m):
+        f, before = 0.0, 0.0
+        for k in range(n):
+            step = deflection[k, j] - before
+            before = deflection[k, j]
+            end = slip if step > 0 else -slip
+            f = end + (f - end) * np.exp(-abs(step) / slip)
+            out[k, j] = f
+    return out
+
+
+@register
+class StiffnessDrift(Effect):
+    """Every stiffness times 1 + change (t - middle)/(length of the campaign)."""
+
+    name = "stiffness_drift"
+    title = "the mounts' stiffness changes over the campaign"
+    looks_like = "resonances move from record to record, in the order of time and not of level"
+    confusable = ("cubic_stiffness",)
+    nonlinear = True
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("isolators",) if has_mounts(model) else ()
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        return (EffectParameter("relative_change", "1", "of every stiffness over the campaign", 0.0, -0.9, 0.9, 0.02),)
+
+    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+        begin, end = record.campaign_s
+        when = (record.time_s - (begin + end) / 2) / (end - begin)
+        return -values["relative_change"] * (record.deflection * record.stiffness * when[:, None]) @ record.rows
+
+    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+                 ) -> dict[str, Reported]:
+        found = super().reported(model, place, values, covariance)
+        one = found["relative_change"]
+        spans = [record.campaign_s for record in model.motion.values()]
+        if spans:
+            hours = (spans[0][1] - spans[0][0]) / 3600
+            found["rate_per_hour"] = Reported(one.value / hours, one.std / hours, "1/h")
+        return found
+
+
+@register
+class BaseCompliance(Effect):
+    """The chassis, a mass on something soft: it recoils from mounts and motors, and filters the floor.
+
+    B = inv(s^2 m + s c + k) along each axis; with rocking, the same about each axis.
+    """
+
+    name = "base_compliance"
+    title = "the chassis stands on something soft and recoils"
+    looks_like = "one more resonance in every channel, and less floor motion above it"
+    confusable = ("payload_flexible_mode", "attached_oscillator", "mount_surge")
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("chassis/translation", "chassis/rocking") if has_mounts(model) else ()
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        m = model.rig.mounted_body().mass
+        found = (EffectParameter("mass_kg", "kg", "of the chassis", 0.0, 0.05 * m, 200 * m, m, False, (m, 6 * m)),
+                 EffectParameter("vertical_Hz", "Hz", "of the chassis on its base, along z", 0.0, 1.0, 300.0, 10.0, False,
+                                 (7.0, 14.0, 28.0, 50.0)),
+                 EffectParameter("horizontal_Hz", "Hz", "of the chassis on its base, along x and y", 0.0, 1.0, 300.0,
+                                 10.0, False, (7.0, 14.0, 28.0, 50.0)),
+                 EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 1.0, 0.05, False, (0.06,)))
+        if place.endswith("translation"):
+            return found
+        return (*found, EffectParameter("rocking_Hz", "Hz", "of the chassis on its base, about each axis", 0.0, 1.0, 300.0,
+                                        10.0, False, (20.0,)),
+                EffectParameter("gyration_m", "m", "radius of gyration of the chassis", 0.0, 0.05, 3.0, 0.5, False, (0.5,)))
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        n, m = len(ops.s), values["mass_kg"]
+        B, H = np.zeros((n, 6, 6), complex), np.zeros((n, 6, 3), complex)
+        for a, f in enumerate((values["horizontal_Hz"], values["horizontal_Hz"], values["vertical_Hz"])):
+            dynamic = second_order(ops.s, f, values["damping"])
+            B[:, a, a] = 1 / (m * dynamic)
+            H[:, a, a] = (dynamic - ops.s ** 2) / dynamic
+        if "rocking_Hz" in values:
+            inertia = m * values["gyration_m"] ** 2
+            for a in range(3, 6):
+                B[:, a, a] = 1 / (inertia * second_order(ops.s, values["rocking_Hz"], values["damping"]))
+        ops.recoil, ops.follow = B, H

@@ -1,0 +1,147 @@
+"""What a model may lack of the sensors: corner, sensitivity, direction, gravity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, register
+
+if TYPE_CHECKING:
+    from avis_ctrl.gap.operators import Operators
+    from avis_ctrl.gap.table_model import TableModel
+
+GRAVITY = 9.80665
+
+
+def second_order(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
+    """s^2 + 2 zeta w s + w^2, (n,)."""
+    w = 2 * np.pi * frequency_Hz
+    return s ** 2 + 2 * damping * w * s + w ** 2
+
+
+def axis_of(model: TableModel, sensor: str) -> str:
+    """x, y or z: the earth axis that a sensor lies along; empty where it lies along none."""
+    direction = model.rig.sensor_axes()[sensor][1]
+    along = np.flatnonzero(np.abs(direction) > 1 - 1e-9)
+    return "xyz"[along[0]] if len(along) else ""
+
+
+class _OfSensor(Effect):
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return model.sensors.names
+
+
+@register
+class GeophoneCorner(_OfSensor):
+    """Output times (s^2 + 2 z0 w0 s + w0^2)/(s^2 + 2 z w s + w^2): the filter undoes a corner that is not there.
+
+    Rademakers, section 2.1.1: the geophone is S s^2/(s^2 + 2 zn wn s + wn^2), the compensation has its zeros at wn, zn.
+    """
+
+    name = "geophone_corner"
+    title = "a geophone's suspension frequency is not the one that its compensation filter assumes"
+    looks_like = "one output is off around and below the suspension frequency, by the same factor from every input"
+    confusable = ("sensor_gain",)
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return model.sensors.names if model.rig.geophones is not None and model.sensors.unit == "V" else ()
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        g = model.rig.geophones
+        assert g is not None
+        f, z = g.suspension_Hz, g.suspension_damping
+        return (EffectParameter("corner_Hz", "Hz", "suspension frequency", f, f / 5, 5 * f, f),
+                EffectParameter("damping", "1", "damping ratio of the suspension", z, z / 5, 5 * z, z))
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        g = ops.base.rig.geophones
+        assert g is not None
+        assumed = second_order(ops.s, g.suspension_Hz, g.suspension_damping)
+        ops.sense[:, ops.sensor(place)] *= assumed / second_order(ops.s, values["corner_Hz"], values["damping"])
+
+
+@register
+class SensorGain(_OfSensor):
+    """One sensitivity times a factor."""
+
+    name = "sensor_gain"
+    title = "a sensor's sensitivity is not the one of the rig file"
+    looks_like = "one output is off by the same real factor at every frequency and from every input"
+    confusable = ("geophone_corner",)
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        return (EffectParameter("gain", "1", "sensitivity over that of the rig file", 1.0, 0.1, 10.0, 1.0),)
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        ops.sensor_gain[ops.sensor(place)] *= values["gain"]
+
+
+@register
+class SensorMisalignment(_OfSensor):
+    """Direction (e + a e1 + b e2)/norm in the place of e: tan of the tilt towards the two other earth axes."""
+
+    name = "sensor_misalignment"
+    title = "a sensor's axis is tilted, so that it sees another axis too"
+    looks_like = "one output holds a share of the motion along another axis at its place, at every frequency"
+    confusable = ("sensor_gain", "com_offset")
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return tuple(name for name in model.sensors.names if axis_of(model, name))
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        own = axis_of(model, place)
+        return tuple(EffectParameter(f"towards_{axis}_deg", "deg", f"tilt of the axis towards {axis}", 0.0, -60.0, 60.0,
+                                     5.0) for axis in "xyz" if axis != own)
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        from avis_ctrl.rigs.rigid_body import point_map
+
+        position, own = ops.base.rig.sensor_axes()[place]
+        direction = own.copy()
+        for name, angle in values.items():
+            direction = direction + np.tan(np.radians(angle)) * np.eye(3)["xyz".index(name.split("_")[1])]
+        rows = ops.rows.copy()
+        rows[:, ops.sensor(place)] += direction / np.linalg.norm(direction) @ point_map(position) - own @ point_map(
+            position)
+        ops.rows = rows
+
+
+@register
+class TiltCoupling(Effect):
+    """A horizontal inertial sensor reads a - g along its axis: a_x - g phi_y, a_y + g phi_x (equations.md, axes).
+
+    The strength of gravity is free: it must come out as 9.8 m/s^2, of one sign or the other by the sensor's polarity.
+    """
+
+    name = "tilt_coupling"
+    title = "gravity: the horizontal sensors read g times the tilt as an acceleration"
+    looks_like = "horizontal outputs rise towards low frequency where the payload tilts, as g over the frequency squared"
+    confusable = ("leveling_loop", "com_offset")
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        horizontal = [name for name in model.sensors.names if axis_of(model, name) in ("x", "y")]
+        return ("horizontal geophones",) if horizontal and model.sensors.unit in ("V", "m/s^2") else ()
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        return (EffectParameter("gravity_m_per_s2", "m/s^2", "acceleration read for a tilt of 1 rad", 0.0, -30.0, 30.0,
+                                GRAVITY),)
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        n = len(ops.omega)
+        rows = np.broadcast_to(ops.rows, (n, *ops.rows.shape[1:])).astype(complex)
+        per_tilt = values["gravity_m_per_s2"] / ops.s ** 2
+        axes = ops.base.rig.sensor_axes()
+        for k, name in enumerate(ops.base.sensors.names):
+            direction = axes[name][1]
+            rows[:, k, 3] += direction[1] * per_tilt
+            rows[:, k, 4] -= direction[0] * per_tilt
+        ops.rows = rows
+
+    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+        miss = abs(abs(values["gravity_m_per_s2"]) - GRAVITY)
+        if miss > 0.1 * GRAVITY + 3 * std["gravity_m_per_s2"]:
+            return f"gravity would have to be {values['gravity_m_per_s2']:.3g} m/s^2"
+        return ""

@@ -1,0 +1,279 @@
+"""The table line by line: what effects change before its response is formed.
+
+    D x = T v + F_w w + transient - internal forces,     D = s^2 M + G^T z_pp G + Z_0 + G^T z_pf G_c B s^2 M
+    F_w = G^T z_pf G_c H_w + Z_f,        y = S sense (rows x) + aliases
+
+x holds the six coordinates q of the payload and those that effects add (its modes); G (n_g, n_q) takes x to the
+displacement of every mount along x, y, z at the payload, G_c that of the chassis. z_pp and z_pf (n, n_g) are the
+mounts' complex stiffnesses: force on the payload by its own displacement, and by that of the chassis; without mass inside the
+mount they are equal. Z_0 is whatever else holds the payload, Z_f the part of it that moves with the floor. The chassis
+follows the floor displacement w through H_w and recoils with B: zero and one on a stiff floor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from avis_ctrl.identification.response import N_Q, ResponseModel
+from avis_ctrl.identification.sampling import aliases, hold
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rigid_body import point_map
+
+POWER = {"displacement": 0, "velocity": 1, "acceleration": 2}
+
+
+@dataclass(frozen=True, eq=False)
+class MountGeometry:
+    """Mounts along the earth axes: names "isolator1.x", rows from q (n_g, 6) at payload and chassis, and values.
+
+    stiffness [N/m] and damping [N s/m], (n_g,). rest_K, rest_C (6, 6): what the rig has beside its mounts.
+    """
+
+    names: tuple[str, ...]
+    position: np.ndarray
+    payload: np.ndarray
+    chassis: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+    rest_K: np.ndarray
+    rest_C: np.ndarray
+
+    @staticmethod
+    def of(rig: Rig) -> MountGeometry:
+        """Of a rig whose mounts have parameters of their own along the earth axes; any other keeps all as the rest."""
+        body = rig.mounted_body()
+        if "isolator1.k_z" not in rig.parameters():
+            eom = rig.equations_of_motion()
+            none = np.zeros((0, 6))
+            return MountGeometry((), np.zeros((0, 3)), none, none, np.zeros(0), np.zeros(0), eom.K, eom.C)
+        names, rows, below, k, c, place = [], [], [], [], [], []
+        for mount in body.mounts:
+            G, G_c = point_map(mount.position), point_map(mount.chassis_point)
+            for a, axis in enumerate("xyz"):
+                names.append(f"{mount.name}.{axis}")
+                place.append(mount.position)
+                rows.append(G[a])
+                below.append(G_c[a])
+                k.append(mount.stiffness[a, a])
+                c.append(mount.damping[a, a])
+        return MountGeometry(tuple(names), np.array(place), np.array(rows), np.array(below), np.array(k), np.array(c),
+                             np.array(body.stiffness), np.array(body.damping))
+
+    def along(self, axis: str) -> np.ndarray:
+        """Which of the rows are along an axis."""
+        return np.array([name.endswith("." + axis) for name in self.names])
+
+    def numbers(self) -> np.ndarray:
+        """(n_g,) which mount each row is of, from 1."""
+        order = list(dict.fromkeys(name.rpartition(".")[0] for name in self.names))
+        return np.array([1 + order.index(name.rpartition(".")[0]) for name in self.names])
+
+
+@dataclass(frozen=True, eq=False)
+class AddedCoordinate:
+    """A coordinate beside the six: shape over mounts (n_g,), actuators (n_u,) and sensors (n_y,), and its own dynamic
+    stiffness (n,) without mounts [N/m], for a displacement of 1 m where the shape is 1."""
+
+    stiffness: np.ndarray
+    at_mounts: np.ndarray
+    at_actuators: np.ndarray
+    at_sensors: np.ndarray
+
+
+@dataclass(eq=False)
+class Operators:
+    """Of a rig on lines omega (n,) rad/s, open to be changed by effects.
+
+    Attributes
+    ----------
+    s : (n,) j omega. base : rig, sensors, actuators. mounts : their geometry.
+    stiffness_factor, damping_factor : (n, n_g) complex, multiply the mounts' k and c.
+    internal_mass : (n_g,) kg inside each mount. payload_share : (n_g,) of the mount's compliance between that mass and
+        the payload. outer_damping : (n_g,) share of c that bypasses the mass.
+    extra, extra_floor : (n, 6, 6) and (n, 6, 3) N/m, dynamic stiffness on q, and force by floor displacement.
+    rows : (1 or n, n_y, 6) displacement seen by each sensor. sense : (n, n_y) chain and s^p, without sensitivity.
+    sensor_gain : (n_y,) factors. drive : (n, n_u) factors on the volts. delay_s, amplifier_corner_Hz : of the drives.
+    added : coordinates beside the six. recoil, follow : (n, 6, 6) B and (n, 6, 3) H_w, None for a stiff floor.
+    """
+
+    base: ResponseModel
+    omega: np.ndarray
+    s: np.ndarray = field(init=False)
+    mounts: MountGeometry = field(init=False)
+    stiffness_factor: np.ndarray = field(init=False)
+    damping_factor: np.ndarray = field(init=False)
+    internal_mass: np.ndarray = field(init=False)
+    payload_share: np.ndarray = field(init=False)
+    outer_damping: np.ndarray = field(init=False)
+    extra: np.ndarray | None = None
+    extra_floor: np.ndarray | None = None
+    rows: np.ndarray = field(init=False)
+    sense: np.ndarray = field(init=False)
+    sensor_gain: np.ndarray = field(init=False)
+    drive: np.ndarray = field(init=False)
+    delay_s: float = field(init=False)
+    amplifier_corner_Hz: float | None = field(init=False)
+    added: list[AddedCoordinate] = field(default_factory=list)
+    recoil: np.ndarray | None = None
+    follow: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        n, base = len(self.omega), self.base
+        self.s = 1j * self.omega
+        self.mounts = mount_geometry(base.rig)
+        n_g = len(self.mounts.names)
+        self.stiffness_factor, self.damping_factor = np.ones((1, n_g), complex), np.ones((1, n_g), complex)
+        self.internal_mass, self.outer_damping, self.payload_share = np.zeros(n_g), np.zeros(n_g), np.full(n_g, 0.5)
+        self.rows = base.matrices.R[None]
+        chain = base.sensors.chain
+        sense = np.ones(n, complex) if chain is None else chain.frequency_response(self.omega)[:, 0, 0]
+        self.sense = np.repeat((sense * self.s ** POWER[base.sensors.motion])[:, None], len(base.sensors.names), axis=1)
+        self.sensor_gain = np.ones(len(base.sensors.names))
+        self.drive = np.ones((1, len(base.actuators)), complex)
+        self.delay_s, self.amplifier_corner_Hz = base.delay_s, base.amplifier_corner_Hz
+
+    def sensor(self, name: str) -> int:
+        return self.base.sensors.names.index(name)
+
+    def actuator(self, name: str) -> int:
+        return self.base.actuators.index(name)
+
+    def add_impedance(self, dynamic_stiffness: np.ndarray, rows: np.ndarray,
+                      grounded: np.ndarray | None = None) -> None:
+        """Elements along rows (m, 6) of dynamic stiffness (n, m) [N/m]; grounded (n, m): the part tied to the floor."""
+        Z = np.einsum("nm,mi,mj->nij", dynamic_stiffness, rows, rows)
+        self.extra = Z if self.extra is None else self.extra + Z
+        if grounded is not None:
+            F = np.einsum("nm,mi,mj->nij", grounded, rows, rows[:, :3])
+            self.extra_floor = F if self.extra_floor is None else self.extra_floor + F
+
+    def volts(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n, n_u) commanded volts to acting ones, and (n,) their aliases."""
+        base, corner = self.base, self.amplifier_corner_Hz
+        if base.period_s:
+            a = hold(self.omega, base.period_s, self.delay_s)
+            folded = aliases(self.omega, base.period_s, self.delay_s, base.sensors.motion, corner)
+        else:
+            a, folded = np.exp(-1j * self.omega * self.delay_s), np.zeros(len(self.omega), complex)
+        if corner:
+            a = a / (1 + self.s / (2 * np.pi * corner))
+        return a[:, None] * self.drive, folded * base._passband()
+
+
+_geometry: list[tuple[Rig, MountGeometry]] = []
+
+
+def mount_geometry(rig: Rig) -> MountGeometry:
+    """`MountGeometry.of`, kept for the rigs asked for last: a fit asks for the same one again and again."""
+    for known, found in _geometry:
+        if known is rig:
+            return found
+    found = MountGeometry.of(rig)
+    _geometry.append((rig, found))
+    del _geometry[:-8]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Assembled:
+    """The table as `Operators` left it, ready to answer.
+
+    D (n, n_q, n_q) and its inverse, empty where it was not asked for; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp, slope_pf (n, n_g): the slopes are
+    derivatives by the mount's own complex stiffness k + s c. T (n_q, n_u) N/V with the factors of the drives apart.
+    """
+
+    ops: Operators
+    D: np.ndarray
+    inverse: np.ndarray
+    M: np.ndarray
+    G: np.ndarray
+    z_pp: np.ndarray
+    z_pf: np.ndarray
+    slope_pp: np.ndarray
+    slope_pf: np.ndarray
+    T: np.ndarray
+    rows: np.ndarray
+    volts: np.ndarray
+    folded: np.ndarray
+
+    @property
+    def n_q(self) -> int:
+        return self.G.shape[1]
+
+    def floor_force(self, w: np.ndarray) -> np.ndarray:
+        """(n, n_q, m) force of floor displacement w (n, 3, m)."""
+        ops = self.ops
+        chassis = self.follow(w)
+        force = np.swapaxes(self.G, 0, 1) @ (self.z_pf[:, :, None] * (ops.mounts.chassis @ chassis))
+        if np.any(ops.mounts.rest_K) or np.any(ops.mounts.rest_C):
+            mat = ops.base.matrices
+            rest_K = mat.K_floor - ops.mounts.payload.T @ (ops.mounts.stiffness[:, None] * ops.mounts.chassis)
+            rest_C = mat.C_floor - ops.mounts.payload.T @ (ops.mounts.damping[:, None] * ops.mounts.chassis)
+            force[:, :N_Q] += (rest_K + ops.s[:, None, None] * rest_C) @ chassis
+        if ops.extra_floor is not None:
+            force[:, :N_Q] += ops.extra_floor @ w
+        return force
+
+    def follow(self, w: np.ndarray) -> np.ndarray:
+        """(n, 6, m) chassis displacement by the floor alone."""
+        if self.ops.follow is not None:
+            return self.ops.follow @ w
+        return np.concatenate([w, np.zeros_like(w)], axis=1)
+
+    def chassis(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """(n, 6, m) chassis displacement, its recoil included."""
+        moved = self.follow(w)
+        if self.ops.recoil is not None:
+            moved = moved - self.ops.s[:, None, None] ** 2 * (self.ops.recoil @ (self.M @ x[:, :N_Q]))
+        return moved
+
+
+def assemble(ops: Operators, invert: bool = True) -> Assembled:
+    """Form D, and invert it where asked for."""
+    base, mounts, s = ops.base, ops.mounts, ops.s[:, None]
+    z = mounts.stiffness * ops.stiffness_factor + s * mounts.damping * ops.damping_factor
+    z_pp, z_pf, slope_pp, slope_pf = _with_internal_mass(z, s, ops)
+    mat = base.matrices
+    T, rows = mat.T.astype(complex), ops.rows
+    G = mounts.payload
+    if ops.added:
+        G = np.hstack([G, np.array([one.at_mounts for one in ops.added]).T])
+        constants = np.linalg.norm(mat.T[:3], axis=0)  # N/V: a motor's force along its own axis
+        T = np.vstack([T, np.array([one.at_actuators for one in ops.added]) * constants])
+        shapes = np.array([one.at_sensors for one in ops.added]).T[None]
+        rows = np.concatenate([rows, np.broadcast_to(shapes, (len(rows), *shapes.shape[1:]))], axis=2)
+    n_q, M = G.shape[1], mat.M
+    D = np.zeros((len(s), n_q, n_q), complex)
+    outer = (G[:, :, None] * G[:, None, :]).reshape(len(G), n_q * n_q)
+    D += (z_pp @ outer).reshape(-1, n_q, n_q)
+    S = s[:, :, None]
+    D[:, :N_Q, :N_Q] += S ** 2 * M + mounts.rest_K + S * mounts.rest_C
+    if ops.extra is not None:
+        D[:, :N_Q, :N_Q] += ops.extra
+    for k, one in enumerate(ops.added):
+        D[:, N_Q + k, N_Q + k] += one.stiffness
+    if ops.recoil is not None:
+        D[:, :, :N_Q] += (G.T @ (z_pf[:, :, None] * (mounts.chassis @ ops.recoil))) @ (S ** 2 * M)
+    volts, folded = ops.volts()
+    inverse = np.linalg.inv(D) if invert else np.empty(0)
+    return Assembled(ops, D, inverse, M, G, z_pp, z_pf, slope_pp, slope_pf, T, rows, volts, folded)
+
+
+def _with_internal_mass(z: np.ndarray, s: np.ndarray, ops: Operators):
+    """z_pp, z_pf and their slopes by z, for a mass m between springs a z and b z in series, 1/a + 1/b = 1.
+
+    z_pf = a b z^2/d, z_pp = a z - a^2 z^2/d with d = (a + b) z + s^2 m; damping that bypasses the mass is added after.
+    """
+    m, share = ops.internal_mass, ops.outer_damping
+    if not np.any(m):
+        one = np.ones_like(z)
+        return z, z, one, one
+    a, b = 1 / ops.payload_share, 1 / (1 - ops.payload_share)
+    around = s * ops.mounts.damping * ops.damping_factor * share
+    inner = z - around
+    d = (a + b) * inner + s ** 2 * m
+    bent = (2 * inner * d - (a + b) * inner ** 2) / d ** 2
+    return (a * inner - a ** 2 * inner ** 2 / d + around, a * b * inner ** 2 / d + around, a - a ** 2 * bent,
+            a * b * bent)

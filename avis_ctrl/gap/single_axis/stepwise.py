@@ -1,0 +1,176 @@
+"""Effects one by one: which candidate, how sure, and when to stop.
+
+Posterior probabilities are stacking-free pseudo-BMA weights with the Bayesian bootstrap over blocks (Yao, Vehtari,
+Simpson and Gelman, Bayesian Analysis 13 (2018) 917, section 3.4): with Dirichlet weights over the blocks, the softmax
+of the summed log scores, averaged over draws. A candidate that wins by one lucky block alone gets no certainty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from avis_ctrl.gap.single_axis.machine import (
+    AxisProblem,
+    Fitted,
+    HeldOut,
+    correlation_time,
+    fit,
+    held_out,
+    held_out_refitted,
+)
+from avis_ctrl.gap.single_axis.terms import Term
+
+# Chance of naming something on data whose model is complete, over all candidates of a stage.
+FALSE_ALARM = 0.01
+# Candidates that together hold this probability are not told apart.
+CREDIBLE = 0.95
+# Halves may differ by this part of a value even where their deviations are smaller: re-identified parameters of one rig
+# scatter as much (the contract's damping: +-20 %), and no physical law holds to a per cent on a real machine.
+AGREEMENT = 0.2
+MOST_EFFECTS = 5
+DRAWS = 2000
+RIDGES = (1e-6, 1e-4, 1e-2, 1.0, 100.0)
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A term added to a model: the fit, its held-out score, why it may not be named (empty: it may)."""
+
+    term: Term
+    fitted: Fitted
+    judged: HeldOut
+    gain: float = 0.0
+    probability: float = 0.0
+    refused: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A stage: the model kept, its held-out figures from refits, the candidates of this stage with the best first.
+
+    named : the candidate that led here, None of the base. rivals : that share the credible set with it.
+    """
+
+    fitted: Fitted
+    judged: HeldOut
+    named: Candidate | None = None
+    rivals: tuple[Candidate, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
+
+
+def search(problem: AxisProblem, library: Sequence[Term], rng: np.random.Generator, progress: Progress
+           ) -> tuple[list[Step], tuple[Candidate, ...]]:
+    """The ladder of stages, and the candidates of the stage at which nothing helped any more."""
+    progress("base model")
+    base = fit(problem, (), np.array([p.start for p in problem.base]))
+    steps = [Step(base, held_out_refitted(problem, base))]
+    while len(steps) <= MOST_EFFECTS:
+        candidates = _candidates(problem, steps, library, rng, progress)
+        accepted = [c for c in candidates if not c.refused]
+        if not accepted:
+            return steps, candidates
+        best = accepted[0]
+        rivals, held = [], best.probability
+        for other in candidates:
+            if other is not best and held < CREDIBLE and other.probability > 0:
+                rivals.append(other)
+                held += other.probability
+        progress(f"refit with {best.term.name}")
+        steps.append(Step(best.fitted, held_out_refitted(problem, best.fitted), best, tuple(rivals), candidates))
+    return steps, ()
+
+
+def _candidates(problem: AxisProblem, steps: Sequence[Step], library: Sequence[Term], rng: np.random.Generator,
+                progress: Progress) -> tuple[Candidate, ...]:
+    """All terms that may be added, by probability; the first ones with their refusals."""
+    now = steps[-1].fitted
+    names = {term.name for term in now.terms}
+    keys = {term.key for term in now.terms}
+    open_ = [term for term in library if term.key not in keys and set(term.needs) <= names]
+    progress(f"{len(open_)} candidates on top of {' + '.join(sorted(names)) or 'the base'}")
+    found = [_added(problem, now, term) for term in open_]
+    if not found:
+        return ()
+    current = held_out(problem, now)
+    best = min(found, key=lambda c: float(np.sum((c.judged.e / now.sigma) ** 2)))
+    # Nothing more against something: residuals as correlated as those of the present model. Among candidates: as
+    # those of the best one, which is the noise if one of them is right.
+    tau_now, tau_best = correlation_time(problem, current), correlation_time(problem, best.judged)
+    block = problem.block
+    gain = np.array([c.judged.blocks(block, tau_now) - current.blocks(block, tau_now) for c in found])
+    among = np.array([c.judged.blocks(block, tau_best) - best.judged.blocks(block, tau_best) for c in found])
+    draws = rng.dirichlet(np.ones(gain.shape[1]), DRAWS) * gain.shape[1]
+    sure = np.mean(draws @ gain.T > 0, axis=0)
+    weight = _softmax(draws @ among.T).mean(axis=0)
+    nothing = float(np.mean(1 / (1 + np.exp(np.clip((draws @ gain.T).max(axis=1), -500, 500)))))
+    least = float(np.log(len(found) / FALSE_ALARM))
+    judged = [Candidate(c.term, c.fitted, c.judged, float(g.sum()), float(w) * (1 - nothing),
+                        _too_small(float(g.sum()), float(s), least))
+              for c, g, w, s in zip(found, gain, weight, sure, strict=True)]
+    judged.sort(key=lambda c: (-c.probability, -c.gain))
+    return tuple(_checked(problem, judged, len(now.theta)))
+
+
+def _added(problem: AxisProblem, now: Fitted, term: Term) -> Candidate:
+    fits = [fit(problem, (*now.terms, term), np.r_[now.theta, start]) for start in term.starts(problem, now.e)]
+    best = min(fits, key=lambda f: float(np.sum((f.e / now.sigma) ** 2)))
+    return Candidate(term, best, held_out(problem, best))
+
+
+def _softmax(x: np.ndarray) -> np.ndarray:
+    y = np.exp(x - x.max(axis=1, keepdims=True))
+    return y / y.sum(axis=1, keepdims=True)
+
+
+def _too_small(gain: float, sure: float, least: float) -> str:
+    """Likelihood ratio on unseen data: by Markov's inequality a complete model loses by log(1/alpha) with chance alpha
+    at most; all candidates share alpha."""
+    if gain < least:
+        return f"gains {gain:.1f} in the held-out log likelihood, {least:.1f} are needed"
+    if sure < 1 - FALSE_ALARM:
+        return f"its gain hangs on few blocks: {100 * sure:.0f} % of their resamplings keep it"
+    return ""
+
+
+def _checked(problem: AxisProblem, candidates: list[Candidate], first: int) -> list[Candidate]:
+    """The leader must be physical and agree with itself; where it does not, no other takes its place unless it is in
+    the same credible set: the second best of a wrong explanation is no explanation."""
+    found, held = [], 0.0
+    for c in candidates:
+        reason = c.refused
+        if not reason and held >= CREDIBLE:
+            reason = "less probable than what leads"
+        if not reason and c.fitted.at_bound(first):
+            reason = "a parameter ends at the limit of its physical range"
+        if not reason:
+            reason = disagreement(problem, c.fitted, first)
+        held += c.probability
+        found.append(Candidate(c.term, c.fitted, c.judged, c.gain, c.probability, reason))
+    return found
+
+
+def disagreement(problem: AxisProblem, found: Fitted, first: int) -> str:
+    """In words, where a parameter from `first` on differs between halves of the data; empty where none does."""
+    for name, one, other in problem.splits:
+        halves = [fit(problem, found.terms, found.theta, np.isin(problem.block, part)) for part in (one, other)]
+        dof = max(min(len(one), len(other)) - 1, 1)
+        limit = float(stats.t.ppf(1 - FALSE_ALARM / 2, dof))
+        for j in range(first, len(found.theta)):
+            (a, va), (b, vb) = ((half.theta[j], half.covariance[j, j]) for half in halves)
+            if abs(a - b) > limit * np.sqrt(va + vb) and abs(a - b) > AGREEMENT * abs(found.theta[j]):
+                p = found.parameters[j]
+                return f"{p.name} is {a:.4g} in one half and {b:.4g} {p.unit} in the other ({name})"
+    return ""
+
+
+def reference(problem: AxisProblem, found: Fitted, columns: np.ndarray) -> HeldOut:
+    """The fitted model with regressors that have no physics; of several ridges the one that predicts best, which
+    favours the reference and so the refusal."""
+    tried = [held_out(problem, found, columns, ridge) for ridge in RIDGES]
+    return max(tried, key=lambda judged: float(judged.score.sum()))

@@ -1,0 +1,356 @@
+"""A rig with effects added: the model that `gap` fits, with the interface of `identification.ResponseModel`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.effects.base import Effect, EffectParameter
+from avis_ctrl.gap.motion import RecordMotion
+from avis_ctrl.gap.operators import Assembled, Operators, assemble
+from avis_ctrl.identification.response import N_Q, Driven, Matrices, ResponseModel, SensorModel
+from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.rigs.rig import Parameter, Rig
+
+_MOUNT = re.compile(r"isolator(\d+)\.([kc])_([xyz])")
+# Relative step of differences by an effect's parameters, in units of their size.
+STEP = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class ActiveEffect:
+    """An effect at a place with values (n,) of its parameters, in the order of `Effect.parameters`."""
+
+    effect: Effect
+    place: str
+    parameters: tuple[EffectParameter, ...]
+    values: tuple[float, ...]
+
+    @property
+    def label(self) -> str:
+        return f"{self.effect.name}@{self.place}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"{self.label}.{one.name}" for one in self.parameters)
+
+    @property
+    def by_name(self) -> dict[str, float]:
+        return dict(zip((one.name for one in self.parameters), self.values, strict=True))
+
+    def at(self, values: Sequence[float]) -> ActiveEffect:
+        return replace(self, values=tuple(float(v) for v in values))
+
+
+def active(effect: Effect, model: TableModel, place: str, values: Sequence[float] | None = None) -> ActiveEffect:
+    """An effect at a place of a model, without strength where no values are given."""
+    parameters = effect.parameters(model, place)
+    if values is None:
+        values = effect.starts(model, place)[0]
+    if len(values) != len(parameters):
+        raise InputError(f"expected {len(parameters)} values", field=effect.name, value=list(values))
+    return ActiveEffect(effect, place, parameters, tuple(float(v) for v in values))
+
+
+@dataclass(frozen=True, eq=False)
+class TableModel:
+    """`ResponseModel` with effects.
+
+    base : the rig and its free parameters. effects : added, all their parameters free but those in `fixed`.
+    motion : records in time by name, which effects that depend on amplitude or time need.
+    """
+
+    base: ResponseModel
+    effects: tuple[ActiveEffect, ...] = ()
+    motion: Mapping[str, RecordMotion] = field(default_factory=dict)
+    fixed: frozenset[str] = frozenset()
+
+    # What a fit and its blocks ask of a model.
+    @property
+    def rig(self) -> Rig:
+        return self.base.rig
+
+    @property
+    def sensors(self) -> SensorModel:
+        return self.base.sensors
+
+    @property
+    def actuators(self) -> tuple[str, ...]:
+        return self.base.actuators
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return self.base.inputs
+
+    @property
+    def period_s(self) -> float:
+        return self.base.period_s
+
+    @property
+    def delay_s(self) -> float:
+        return self.base.delay_s
+
+    @property
+    def amplifier_corner_Hz(self) -> float | None:
+        return self.base.amplifier_corner_Hz
+
+    @property
+    def _free(self) -> list[tuple[int, int]]:
+        """(effect, parameter) of each free parameter of the effects."""
+        return [(k, j) for k, one in enumerate(self.effects) for j, name in enumerate(one.names)
+                if name not in self.fixed]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (*self.base.names, *(self.effects[k].names[j] for k, j in self._free))
+
+    @property
+    def values(self) -> np.ndarray:
+        return np.concatenate([self.base.values, [self.effects[k].values[j] for k, j in self._free]])
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return (*self.base.units, *(self.effects[k].parameters[j].unit for k, j in self._free))
+
+    def scales(self) -> np.ndarray:
+        """(n_p,) one relative unit of each parameter."""
+        return np.concatenate([self.base.scales(), [self.effects[k].parameters[j].size for k, j in self._free]])
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n_p,) lowest and highest values that physics allows."""
+        low, high = self.base.bounds()
+        own = [self.effects[k].parameters[j] for k, j in self._free]
+        return np.concatenate([low, [one.low for one in own]]), np.concatenate([high, [one.high for one in own]])
+
+    def all_parameters(self) -> dict[str, Parameter]:
+        found = self.base.all_parameters()
+        for one in self.effects:
+            for name, parameter, value in zip(one.names, one.parameters, one.values, strict=True):
+                found[name] = Parameter(value, parameter.unit, parameter.description)
+        return found
+
+    def at(self, theta: Sequence[float] | np.ndarray) -> TableModel:
+        """The model with its free parameters at theta. Raises InputError where no rig has them."""
+        theta = np.asarray(theta, float)
+        n = len(self.base.names)
+        values = [list(one.values) for one in self.effects]
+        for value, (k, j) in zip(theta[n:], self._free, strict=True):
+            values[k][j] = float(value)
+        moved = tuple(one.at(v) for one, v in zip(self.effects, values, strict=True))
+        return replace(self, base=self.base.at(theta[:n]), effects=moved)
+
+    def with_effect(self, effect: ActiveEffect) -> TableModel:
+        return replace(self, effects=(*self.effects, effect))
+
+    def without(self, label: str) -> TableModel:
+        return replace(self, effects=tuple(one for one in self.effects if one.label != label))
+
+    @cached_property
+    def effective(self) -> ResponseModel:
+        """The base with what effects set of the rig's parameters."""
+        changes: dict[str, float] = {}
+        for one in self.effects:
+            changes |= one.effect.rig_changes(self, one.place, one.by_name)
+        return replace(self.base, rig=self.base.rig.with_parameters(changes)) if changes else self.base
+
+    @property
+    def matrices(self) -> Matrices:
+        return self.effective.matrices
+
+    @property
+    def derivative_matrices(self) -> Matrices:
+        return self.effective.derivative_matrices
+
+    @property
+    def nonlinear(self) -> bool:
+        return any(one.effect.nonlinear for one in self.effects)
+
+    def operators(self, omega: np.ndarray) -> Operators:
+        ops = Operators(self.effective, np.asarray(omega, float))
+        for one in self.effects:
+            one.effect.change(ops, one.place, one.by_name)
+        return ops
+
+    def response(self, omega: np.ndarray) -> np.ndarray:
+        """G, (n, n_y, n_u + 3), as `ResponseModel.response`; effects that depend on amplitude left out."""
+        n, n_in = len(omega), len(self.inputs)
+        return self.driven(omega, np.broadcast_to(np.eye(n_in, dtype=complex), (n, n_in, n_in)), False).Y
+
+    def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
+        """As `ResponseModel.driven`: y by spectra of the inputs, and its derivative by the free parameters."""
+        return self._driven(np.asarray(omega, float), U, None, derivative)
+
+    def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True) -> Driven:
+        """As `ResponseModel.answer`: of a record, with what depends on its motion in time."""
+        U = block.U if body is None else np.concatenate([block.U, body], axis=1)
+        if not self.nonlinear:
+            return self._driven(block.omega, U, None, derivative)
+        return self._driven(block.omega, U, block, derivative)
+
+    def _driven(self, omega: np.ndarray, U: np.ndarray, block: SpectralBlock | None, derivative: bool) -> Driven:
+        made = assemble(self.operators(omega))
+        U, force = self._acting(U, block)
+        answer = _Answer(made, U, force)
+        if not derivative:
+            return Driven(answer.Y, np.empty(0))
+        dY = np.zeros((len(self.names), *answer.Y.shape), complex)
+        answer.by_rig(self.effective, dY)
+        self._by_effects(omega, U, block, made, answer, dY)
+        return Driven(answer.Y, dY)
+
+    def _acting(self, U: np.ndarray, block: SpectralBlock | None) -> tuple[np.ndarray, np.ndarray | None]:
+        """Inputs with the volts that act, and internal forces (n, 6, 1) of effects that depend on the record."""
+        if block is None:
+            return U, None
+        record = self.motion.get(block.name)
+        if record is None:
+            raise InputError("expected the record's motion in time for an effect that depends on it",
+                             field=f"block {block.name}")
+        total: np.ndarray | None = None
+        for one in self.effects:
+            volts = one.effect.volts(record, one.place, one.by_name)
+            if volts is not None:
+                U = U.copy()
+                U[:, :len(self.actuators), 0] = record.spectrum(volts, block.omega)
+            force = one.effect.force(record, one.place, one.by_name)
+            if force is not None:
+                spectrum = record.spectrum(force, block.omega)[:, :, None]
+                total = spectrum if total is None else total + spectrum
+        return U, total
+
+    def _by_effects(self, omega, U, block, made: Assembled, answer: _Answer, dY: np.ndarray) -> None:
+        """Central differences of the whole response by the effects' parameters."""
+        n, theta, (low, high) = len(self.base.names), self.values, self.bounds()
+        scale = self.scales()
+        for row in range(n, len(theta)):
+            step = STEP * scale[row]
+            ends = [min(max(theta[row] + sign * step, low[row]), high[row]) for sign in (1, -1)]
+            sides = []
+            for end in ends:
+                moved = theta.copy()
+                moved[row] = end
+                other = replace(self, effects=self.at(moved).effects)
+                other_U, force = other._acting(U, block)
+                own = made if self.effects[self._free[row - n][0]].effect.nonlinear else assemble(
+                    other.operators(omega), invert=False)
+                sides.append(_Side(own, other_U, force, answer.x))
+            # d x = inv(D) (d F - d D x): no second inverse.
+            push, seen = ((sides[0].push - sides[1].push) / (ends[0] - ends[1]),
+                          (sides[0].Y - sides[1].Y) / (ends[0] - ends[1]))
+            dY[row] = seen + answer.left @ push
+
+
+class _Side:
+    """Y that an assembled table would read of a motion x, and the force that is missing for that motion."""
+
+    def __init__(self, made: Assembled, U: np.ndarray, force: np.ndarray | None, x: np.ndarray):
+        drive = _Drive(made, U, force)
+        self.push = drive.total - made.D @ x
+        self.Y = _read(made, x, drive)
+
+
+class _Drive:
+    """Forces (n, n_q, m) on an assembled table by U (n, n_u + 3 [+ 12], m) and internal force (n, 6, 1 or m)."""
+
+    def __init__(self, made: Assembled, U: np.ndarray, force: np.ndarray | None):
+        ops, n_u = made.ops, len(made.ops.base.actuators)
+        s = ops.s[:, None, None]
+        commanded = U[:, :n_u]
+        self.volts = made.volts[:, :, None] * commanded
+        self.w = U[:, n_u:n_u + 3] / s
+        self.folded = made.folded[:, None, None] * commanded * ops.drive[:, :, None]
+        total = made.T @ self.volts
+        if np.any(self.w):
+            total = total + made.floor_force(self.w)
+        if U.shape[1] > n_u + 3:
+            total[:, :N_Q] += U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
+        if force is not None:
+            total[:, :N_Q] += force
+        self.total = total
+
+
+def _gain(made: Assembled) -> np.ndarray:
+    return (made.ops.base.sensors.sensitivity * made.ops.sensor_gain)[:, None]
+
+
+def _read(made: Assembled, x: np.ndarray, drive: _Drive) -> np.ndarray:
+    """(n, n_y, m) of a motion x; aliases pass the chain far above its corners."""
+    mat = made.ops.base.matrices
+    alias = (mat.R @ np.linalg.inv(mat.M) @ mat.T) @ drive.folded
+    return _gain(made) * (made.ops.sense[:, :, None] * (made.rows @ x) + alias)
+
+
+class _Answer:
+    """Response of an assembled table to U (n, n_u + 3 [+ 12], m) and internal force (n, 6, 1 or m)."""
+
+    def __init__(self, made: Assembled, U: np.ndarray, force: np.ndarray | None):
+        ops, drive = made.ops, _Drive(made, U, force)
+        self.made, self.s = made, ops.s[:, None, None]
+        self.volts, self.w, self.folded = drive.volts, drive.w, drive.folded
+        self.x = made.inverse @ drive.total
+        self.Minv = np.linalg.inv(ops.base.matrices.M)
+        self.sense, self.gain = ops.sense[:, :, None], _gain(made)
+        self.Y = _read(made, self.x, drive)
+
+    @cached_property
+    def left(self) -> np.ndarray:
+        """(n, n_y, n_q) y by a force on the coordinates."""
+        return self.gain * self.sense * (self.made.rows @ self.made.inverse)
+
+    def by_rig(self, model: ResponseModel, dY: np.ndarray) -> None:
+        """Derivatives by the rig's free parameters into the first rows of dY."""
+        made, ops, s = self.made, self.made.ops, self.s
+        left = self.left
+        d, mat = model.derivative_matrices, model.matrices
+        rows = {name: k for k, name in enumerate(ops.mounts.names)}
+        own = made.G @ self.x
+        chassis = ops.mounts.chassis @ made.chassis(self.x, self.w)
+        through = left @ made.G.T
+        folded_q = self.Minv @ mat.T @ self.folded
+        for j, name in enumerate(model.names):
+            if name.startswith("sensor."):
+                k = model.sensors.names.index(name.removeprefix("sensor."))
+                dY[j, :, k] = self.Y[:, k] / model.sensors.sensitivity[k]
+            elif match := _MOUNT.fullmatch(name):
+                k = rows[f"isolator{match[1]}.{match[3]}"]
+                pp, pf = made.slope_pp[:, k, None], made.slope_pf[:, k, None]
+                if match[2] == "k":
+                    factor = ops.stiffness_factor[:, k, None]
+                else:
+                    factor = s[:, :, 0] * ops.damping_factor[:, k, None]
+                    if (share := ops.outer_damping[k]) and ops.internal_mass[k]:
+                        pp, pf = pp * (1 - share) + share, pf * (1 - share) + share
+                push = -factor * (pp * own[:, k] - pf * chassis[:, k])
+                dY[j] = through[:, :, k, None] * push[:, None, :]
+            elif name == "loop_delay_s":
+                raise InputError("expected the effect loop_delay in the place of this parameter", field="parameters",
+                                 value=name)
+            else:
+                dY[j] = self._by_matrices(d, j, left, folded_q, mat)
+
+    def _by_matrices(self, d: Matrices, j: int, left, folded_q, mat: Matrices) -> np.ndarray:
+        """By a parameter of M, T, R, or of stiffness and damping beside the mounts."""
+        made, s, q = self.made, self.s, self.x[:, :N_Q]
+        push = np.zeros_like(self.x)
+        changed = np.zeros_like(self.Y)
+        if np.any(d.T[j]):
+            push[:, :N_Q] += d.T[j] @ self.volts
+            changed += self.gain * (mat.R @ self.Minv @ d.T[j] @ self.folded)
+        if np.any(d.M[j]):
+            inertia = s ** 2 * (d.M[j] @ q)
+            push[:, :N_Q] -= inertia
+            if made.ops.recoil is not None:
+                moved = made.ops.mounts.chassis @ (made.ops.recoil @ inertia)
+                push -= made.G.T @ (made.z_pf[:, :, None] * moved)
+            changed -= self.gain * (mat.R @ self.Minv @ d.M[j] @ folded_q)
+        if np.any(d.K[j]) or np.any(d.C[j]):
+            floor = made.follow(self.w)
+            push[:, :N_Q] += d.K_floor[j] @ floor + d.C_floor[j] @ (s * floor) - (d.K[j] + s * d.C[j]) @ q
+        if np.any(d.R[j]):
+            changed += self.gain * (self.sense * (d.R[j] @ q) + d.R[j] @ folded_q)
+        return left @ push + changed
