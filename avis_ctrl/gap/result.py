@@ -1,0 +1,138 @@
+"""What `gap` found: verdict, named effects, the ladder of stages, what remains and what to measure next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.measurement.gates.finding import Picture
+
+Verdict = Literal["none", "explained", "partly explained", "unexplained"]
+VERDICTS: tuple[str, ...] = ("none", "explained", "partly explained", "unexplained")
+
+
+@dataclass(frozen=True, eq=False)
+class NamedEffect:
+    """An effect that the data call for.
+
+    name, location : of the contract. title : in words. parameters : with standard deviations.
+    probability : of this effect among the library's, given the data. indistinguishable_from : names that this data
+    cannot tell from it. confirmed : by how much the held-out log-likelihood rises with it.
+    label : of the active effect in the updated model; empty for one that acts on the signals alone (hum, converter,
+    ground motion). confirmation : in words, how it was found.
+    """
+
+    name: str
+    location: str
+    title: str
+    parameters: Mapping[str, Reported]
+    probability: float
+    indistinguishable_from: tuple[str, ...] = ()
+    confirmed: float = 0.0
+    label: str = ""
+    confirmation: str = ""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One rung of the ladder, on held-out data: r.m.s. of what the model leaves over that of y, and chi-square."""
+
+    name: str
+    nrmse: float
+    chi2_per_dof: float
+
+
+@dataclass(frozen=True)
+class Where:
+    """A band and path that holds a share of the excess of the residual over the noise. input "" for none in particular.
+
+    excess : power of the residual over that of the noise. p_value : of as much by chance, family-wise over all places.
+    """
+
+    from_Hz: float
+    to_Hz: float
+    input: str
+    output: str
+    share: float
+    excess: float = float("nan")
+    p_value: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class Considered:
+    """A candidate that was refitted: held-out chi-square per degree of freedom and why it was not named."""
+
+    name: str
+    location: str
+    chi2_per_dof: float
+    probability: float
+    reason: str
+    parameters: Mapping[str, Reported] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class HeatMap:
+    """Residual power over noise power, (n_bands, n_columns), before and after naming, on held-out records.
+
+    bands_Hz : (n_bands + 1,) edges. columns : "output" or "record: output".
+    """
+
+    bands_Hz: np.ndarray
+    columns: tuple[str, ...]
+    before: np.ndarray
+    after: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Gap:
+    """Everything that was found.
+
+    Attributes
+    ----------
+    verdict : one of VERDICTS. effects : named. stages : on held-out data, "nominal", "re-identified", then one for each
+        effect. where : of the gap after re-identification. remaining : the same after the named effects.
+    noise_nrmse : what noise alone would leave of the held-out records. next_experiment : None or a sentence.
+    baseline, updated : models (updated is the baseline where nothing was named).
+    considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.
+    pictures : plain data for plots. held_out : how the records were divided. seed, seconds.
+    """
+
+    verdict: Verdict
+    effects: tuple[NamedEffect, ...]
+    stages: tuple[Stage, ...]
+    where: tuple[Where, ...]
+    remaining: tuple[Where, ...]
+    noise_nrmse: float
+    next_experiment: str | None
+    baseline: TableModel
+    updated: TableModel
+    considered: tuple[Considered, ...]
+    heat: HeatMap | None
+    sentences: tuple[str, ...]
+    pictures: tuple[Picture, ...]
+    held_out: str
+    seed: int
+    seconds: float
+    covariance: np.ndarray | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """gap.json of the contract, format "avis-gap" version 1."""
+        return {
+            "format": "avis-gap", "version": 1, "verdict": self.verdict,
+            "effects": [{"name": one.name, "location": one.location,
+                         "parameters": {key: {"value": p.value, "std": p.std, "unit": p.unit}
+                                        for key, p in one.parameters.items()},
+                         "probability": one.probability,
+                         "indistinguishable_from": list(one.indistinguishable_from)} for one in self.effects],
+            "gap": [{"stage": one.name, "nrmse": one.nrmse, "chi2_per_dof": one.chi2_per_dof} for one in self.stages],
+            "where": [{"from_Hz": one.from_Hz, "to_Hz": one.to_Hz, "input": one.input, "output": one.output,
+                       "share": one.share} for one in (self.where if self.verdict != "partly explained"
+                                                       else self.remaining)],
+            "next_experiment": self.next_experiment,
+            "seconds": self.seconds,
+        }
