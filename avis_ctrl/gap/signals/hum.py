@@ -1,0 +1,279 @@
+"""Lines of the mains in what a model leaves: one fundamental near 50 or 60 Hz, its harmonics, all records and channels.
+
+A line at k f0 is compared with lines near it that hold the same mixture of noise, misfit and distortion. For a
+periodic record with P periods these are the lines 2 P j further: they lie alike on (or beside) the harmonics of the
+period, odd ones with odd ones. For others they are the next ones beyond the main lobe of the Hann window. With z the
+line's power over the mean of the louder side of m lines, noise gives z ~ F(2, 2m), whose tail is (1 + z/m)^-m; so
+m log(1 + z/m) is exponential with mean 1, and its sum over records is gamma distributed (Fisher 1925). The search
+over f0, harmonics and channels is paid for by Bonferroni.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize, stats
+
+from avis_ctrl.gap.signals.leftover import Estimate, Leftover, check_common
+from avis_ctrl.measurement.gates.finding import Limit, Picture, Series, thinned
+
+MAINS_HZ = (50.0, 60.0)
+SEARCH_HZ = 0.3
+# Chance of a false alarm in a whole campaign.
+FALSE_ALARM = 1e-3
+# A line's mean power by that of its neighbours, at least: floors are not quite flat.
+RATIO = 3.0
+# Neighbours on either side, and lines left out next to the tested one.
+REFERENCE, GUARD = 12, 3
+# Half width [lines] of a polluted band in a transform without window, by default.
+POLLUTED_LINES = 3
+
+
+@dataclass(frozen=True)
+class HumLine:
+    """A harmonic in one channel: peak amplitude [unit of y] over the records, weighted by their noise; p of its own test."""
+
+    channel: str
+    harmonic: int
+    amplitude: Estimate
+    p: float
+    ratio: float
+
+
+@dataclass(frozen=True, eq=False)
+class HumFinding:
+    """Mains hum.
+
+    Attributes
+    ----------
+    frequency_Hz : the fundamental, common to all records. nominal_Hz : 50 or 60.
+    lines : harmonics and channels that stand out, the largest first.
+    parameters : "frequency_Hz", and "amplitude_V" of the largest line (in the unit of y).
+    confidence : 1 - p, p the chance of a line like the most significant one anywhere in a campaign without hum.
+    """
+
+    nominal_Hz: float
+    frequency_Hz: Estimate
+    lines: tuple[HumLine, ...]
+    parameters: dict[str, Estimate]
+    confidence: float
+    sentence: str
+    picture: Picture
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return tuple(sorted({line.channel for line in self.lines}))
+
+    @property
+    def harmonics(self) -> tuple[int, ...]:
+        return tuple(sorted({line.harmonic for line in self.lines}))
+
+
+@dataclass(frozen=True, eq=False)
+class _Score:
+    """For a nominal frequency: f0 grid (n,); score, ratio (n, harmonics, channels); tests: records in each score."""
+
+    nominal_Hz: float
+    f0: np.ndarray
+    score: np.ndarray
+    ratio: np.ndarray
+    tests: np.ndarray
+
+    @property
+    def p(self) -> np.ndarray:
+        """Of each line by itself."""
+        return np.where(self.tests > 0, stats.gamma.sf(self.score, np.maximum(self.tests, 1)), 1.0)
+
+
+def find_hum(left: Sequence[Leftover], false_alarm: float = FALSE_ALARM) -> HumFinding | None:
+    """The hum in what a model leaves, None where no line stands out.
+
+    Works on the residual at every harmonic below 0.98 of half the sample rate, driven or not; a driven line whose
+    neighbours are not driven is passed over. Costs a transform of each record and some 10 ms.
+
+    Raises
+    ------
+    InputError : no residual, records of different channels.
+    """
+    first = check_common(left)
+    scores = [_scores(left, nominal) for nominal in MAINS_HZ]
+    trials = sum(int(np.count_nonzero(one.tests)) for one in scores)
+    best = min(scores, key=lambda one: float(np.min(np.where(one.ratio > RATIO, one.p, 1.0))))
+    p = np.where(best.ratio > RATIO, best.p, 1.0)
+    # A line shows next to its own frequency too, so that neighbours on the grid are not tests of their own.
+    at, _, _ = np.unravel_index(np.argmin(p), p.shape)
+    chance = min(1.0, float(p.min()) * trials)
+    if chance > false_alarm:
+        return None
+    # With the frequency known, what else stands out is judged among the lines there.
+    own = p[at]
+    hits = np.argwhere(own < false_alarm / own.size)
+    frequency = _refined(left, float(best.f0[at]), hits)
+    lines = _lines(left, frequency.value, hits, own, best.ratio[at])
+    return _finding(left, best.nominal_Hz, frequency, lines, chance, first.y_unit)
+
+
+def polluted(finding: HumFinding, samples: int, sample_rate_Hz: float, half_lines: int = POLLUTED_LINES) -> np.ndarray:
+    """(samples // 2 + 1,) True at lines of a record's transform that hum reaches, to be left out of a fit.
+
+    half_lines : on either side of each harmonic that was found in any channel; a transform without window leaks as
+    1/distance, so that what is left is 1/(pi half_lines) of the amplitude, or less.
+    """
+    mask = np.zeros(samples // 2 + 1, bool)
+    for k in finding.harmonics:
+        middle = k * finding.frequency_Hz.value * samples / sample_rate_Hz
+        low, high = int(np.ceil(middle - half_lines)), int(np.floor(middle + half_lines))
+        mask[max(low, 0):high + 1] = True
+    return mask
+
+
+def subtract(finding: HumFinding, e: np.ndarray, y: np.ndarray, sample_rate_Hz: float, channels: Sequence[str]
+             ) -> np.ndarray:
+    """(samples, n_y) y less the sines of the lines found, whose amplitude and phase fit e (samples, n_y) best.
+
+    e : the residual of the same record, so that what u drives at these frequencies stays.
+    """
+    cleaned = np.array(y, float)
+    f0 = finding.frequency_Hz.value
+    for j, name in enumerate(channels):
+        ks = [line.harmonic for line in finding.lines if line.channel == name]
+        if ks:
+            A = _sines(f0, ks, len(e), sample_rate_Hz)
+            cleaned[:, j] -= A @ _fitted(A, e[:, j])
+    return cleaned
+
+
+def _scores(left: Sequence[Leftover], nominal: float) -> _Score:
+    h = left[0].header
+    duration = max(one.header.duration_s for one in left)
+    top = int(0.49 * h.sample_rate_Hz / (nominal + SEARCH_HZ))
+    n = int(np.ceil(2 * SEARCH_HZ * 2 * duration * max(top, 1))) + 1
+    f0 = np.linspace(nominal - SEARCH_HZ, nominal + SEARCH_HZ, n)
+    shape = (n, top, len(h.y_names))
+    score, tests, ratio = np.zeros(shape), np.zeros(shape, int), np.zeros(shape)
+    for one in left:
+        _add(one, f0, score, tests, ratio)
+    return _Score(nominal, f0, score, ratio / np.maximum(tests, 1), tests)
+
+
+def _add(one: Leftover, f0: np.ndarray, score: np.ndarray, tests: np.ndarray, ratio: np.ndarray) -> None:
+    """A record's part, harmonic by harmonic; lines are looked at once however many f0 fall on them."""
+    power, df = np.abs(one.E) ** 2, one.frequency_Hz[1]
+    stride = 2 * one.periods if one.periods >= 2 else 1
+    first = stride if stride > GUARD else GUARD + 1
+    offsets = first + stride * np.arange(REFERENCE)
+    for k in range(1, score.shape[1] + 1):
+        bins, back = np.unique(np.rint(k * f0 / df).astype(int), return_inverse=True)
+        inside = (bins - offsets[-1] >= 1) & (bins + offsets[-1] < len(power) - 1)
+        b = np.where(inside, bins, offsets[-1] + 1) if inside.any() else None
+        if b is None or 2 * offsets[-1] + 2 >= len(power):
+            continue
+        sides = [power[b[:, None] + sign * offsets].mean(axis=1) for sign in (-1, 1)]
+        floor = np.maximum(*sides)
+        z = power[b] / np.maximum(floor, 1e-300)
+        usable = inside[:, None] & (floor > 0)
+        if one.header.excitation != "noise":
+            # The experiment's own line among silent ones is no hum.
+            alike = (one.driven[b[:, None] + offsets].mean(1) + one.driven[b[:, None] - offsets].mean(1)) / 2
+            usable &= ~(one.driven[b] & (alike < 0.5))[:, None]
+        s = REFERENCE * np.log1p(z / REFERENCE)
+        score[:, k - 1] += np.where(usable, s, 0.0)[back]
+        ratio[:, k - 1] += np.where(usable, z, 0.0)[back]
+        tests[:, k - 1] += usable[back]
+
+
+def _sines(f0: float, harmonics: Sequence[int], samples: int, rate: float) -> np.ndarray:
+    """(samples, 2 n) cosines and sines."""
+    phase = 2 * np.pi * f0 / rate * np.arange(samples)[:, None] * np.asarray(harmonics)
+    return np.hstack([np.cos(phase), np.sin(phase)])
+
+
+def _fitted(A: np.ndarray, e: np.ndarray) -> np.ndarray:
+    return np.linalg.solve(A.T @ A, A.T @ e)
+
+
+def _spread(one: Leftover, f: float) -> np.ndarray:
+    """(n_y,) variance of either part of a sine's amplitude: 2 s^2 / N, s^2 of the lines near f that are like it."""
+    b = round(f / one.frequency_Hz[1])
+    stride = 2 * one.periods if one.periods >= 2 else 1
+    offsets = (stride if stride > GUARD else GUARD + 1) + stride * np.arange(REFERENCE)
+    near = np.clip(np.concatenate([b - offsets, b + offsets]), 1, len(one.E) - 1)
+    return 2 * np.mean(np.abs(one.E[near]) ** 2, axis=0) / one.header.samples
+
+
+def _refined(left: Sequence[Leftover], start: float, hits: np.ndarray) -> Estimate:
+    """f0 by least squares of all lines that stand out, amplitudes and phases free in each record.
+
+    Its standard error is that of a sine in white noise of the local level, 2 pi std(f) = sqrt(12) s / (A T sqrt(N))
+    times sqrt(2) (Rife and Boorstyn 1974), all lines together.
+    """
+    rate = left[0].header.sample_rate_Hz
+    pieces = []
+    for one in left:
+        n = one.header.samples
+        window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(n) / n)
+        for k, j in hits:
+            k = int(k) + 1
+            # Shifted to zero frequency and averaged down to about 60 values: the fine search is cheap there.
+            block = max(n // 64, 1)
+            turned = one.e[:, j] * window * np.exp(-2j * np.pi * k * start / rate * np.arange(n))
+            coarse = turned[:n // block * block].reshape(-1, block).mean(axis=1)
+            t = (np.arange(len(coarse)) * block + (block - 1) / 2) / rate
+            pieces.append((k, t, coarse, float(_spread(one, k * start)[j]), n / rate))
+
+    def power(shift: float) -> float:
+        return -sum(abs(np.mean(c * np.exp(-2j * np.pi * k * shift * t))) ** 2 / s for k, t, c, s, _ in pieces)
+    reach = 1.0 / max(one.header.duration_s for one in left)
+    shift = float(optimize.minimize_scalar(power, bounds=(-reach, reach), method="bounded",
+                                           options={"xatol": 1e-5 * reach}).x)
+    information = 0.0
+    for k, t, c, s, duration in pieces:
+        # The window's mean is 1/2; s is the variance of either part of the amplitude.
+        A2 = (4 * abs(np.mean(c * np.exp(-2j * np.pi * k * shift * t)))) ** 2
+        information += (2 * np.pi * k * duration) ** 2 * max(A2 - 2 * s, 0.0) / s / 12
+    return Estimate(start + shift, float(1 / np.sqrt(max(information, 1e-30))), "Hz")
+
+
+def _lines(left: Sequence[Leftover], f0: float, hits: np.ndarray, p: np.ndarray, ratio: np.ndarray
+           ) -> tuple[HumLine, ...]:
+    names, unit, rate = left[0].header.y_names, left[0].header.y_unit, left[0].header.sample_rate_Hz
+    found = []
+    ks = sorted({int(k) + 1 for k, _ in hits})
+    power, weight = np.zeros((len(ks), len(names))), np.zeros((len(ks), len(names)))
+    for one in left:
+        A = _sines(f0, ks, one.header.samples, rate)
+        c = _fitted(A, one.e)
+        v = np.maximum(np.array([_spread(one, k * f0) for k in ks]), 1e-300)
+        # Noise adds 2 v to |a|^2 = a_c^2 + a_s^2; the radial part alone moves the amplitude.
+        power += (c[:len(ks)] ** 2 + c[len(ks):] ** 2 - 2 * v) / v
+        weight += 1 / v
+    for k, j in hits:
+        i = ks.index(int(k) + 1)
+        A = Estimate(float(np.sqrt(max(power[i, j] / weight[i, j], 0.0))), float(1 / np.sqrt(weight[i, j])), unit)
+        found.append(HumLine(names[j], int(k) + 1, A,
+                             float(p[k, j]), float(ratio[k, j])))
+    return tuple(sorted(found, key=lambda line: -line.amplitude.value))
+
+
+def _finding(left: Sequence[Leftover], nominal: float, frequency: Estimate, lines: tuple[HumLine, ...], chance: float,
+             unit: str) -> HumFinding:
+    largest = lines[0]
+    names = left[0].header.y_names
+    j = names.index(largest.channel)
+    shown = max(left, key=lambda one: one.header.samples)
+    f, a = shown.frequency_Hz[1:], np.abs(shown.E[1:, j]) * np.sqrt(2 / shown.header.sample_rate_Hz)
+    ks = sorted({line.harmonic for line in lines})
+    picture = Picture(f"Record {shown.header.name}, {largest.channel}: what the model leaves", "frequency [Hz]",
+                      f"amplitude density [{unit}/sqrt(Hz)]", (Series(largest.channel, *thinned(f, a)),),
+                      tuple(Limit(f"{k * nominal:g} Hz", k * frequency.value, "x") for k in ks), "log", "log")
+    at = ", ".join(f"{k * nominal:g}" for k in ks)
+    channels = sorted({line.channel for line in lines}, key=names.index)
+    A = largest.amplitude
+    sentence = (f"Mains hum of {frequency.value:.4f} +- {frequency.std:.1g} Hz with lines at {at} Hz in"
+                f" {', '.join(channels)}; the largest, at {largest.harmonic * nominal:g} Hz in {largest.channel}, has"
+                f" {1e3 * A.value:.4g} +- {1e3 * A.std:.2g} m{unit} peak, {10 * np.log10(largest.ratio):.0f} dB above"
+                " the lines next to it.")
+    return HumFinding(nominal, frequency, lines, {"frequency_Hz": frequency, "amplitude_V": A}, 1 - chance, sentence,
+                      picture)
