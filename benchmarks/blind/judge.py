@@ -1,0 +1,137 @@
+"""What an answer is worth, case by case: hidden effects against named ones.
+
+A named effect is right where it is a hidden one, or where a hidden one is in its `indistinguishable_from`. Entries of
+that list are names, or names with a place ("sensor_gain at Sz2", "sensor_gain@Sz2", "sensor_gain (Sz2)").
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from benchmarks.blind.lines import Hidden, Line, Named
+
+# Effects of the contract with their places; those in PLACED have a place that can be wrong.
+PLACED = ("geophone_corner", "sensor_gain", "sensor_misalignment", "sensor_quantisation", "actuator_gain",
+          "product_of_inertia")
+LIBRARY = ("geophone_corner", "sensor_gain", "sensor_misalignment", "tilt_coupling", "mains_hum", "sensor_quantisation",
+           "actuator_gain", "actuator_lag", "actuator_saturation", "loop_delay", "contact_friction", "com_offset",
+           "product_of_inertia", "payload_flexible_mode", "attached_oscillator", "base_compliance", "mount_relaxation",
+           "structural_damping", "mount_surge", "cubic_stiffness", "leveling_loop", "cable_stiffness", "ground_motion",
+           "stiffness_drift")
+
+# Outcomes, the best first.
+OUTCOMES = {
+    "none": ("quiet", "alarm without a name", "false name", "crash"),
+    "one": ("right", "right and an extra", "refused", "missed", "wrong", "crash"),
+    "two": ("both right", "both right and an extra", "one right", "one right, one wrong", "refused", "missed", "wrong",
+            "crash"),
+    "outside": ("refused", "missed", "named as something else", "crash"),
+}
+
+
+def split_name(entry: str) -> tuple[str, str | None]:
+    """Name and place of an entry of `indistinguishable_from`."""
+    name, *place = re.split(r"\s+at\s+|\s*@\s*|\s*\(", entry.strip(), maxsplit=1)
+    return name, place[0].rstrip(") ") if place else None
+
+
+@dataclass(frozen=True)
+class Match:
+    """A hidden effect and the named one that stands for it.
+
+    exact : by its own name, not only through its group. place : the place is right too.
+    """
+
+    hidden: Hidden
+    named: Named
+    exact: bool
+    place: bool
+
+
+def match(hidden: Hidden, named: Named) -> Match | None:
+    """None where the names do not meet."""
+    group = [split_name(entry) for entry in named.indistinguishable_from]
+    places = {place for name, place in group if name == hidden.name}
+    if named.name == hidden.name:
+        return Match(hidden, named, True, named.location == hidden.location)
+    if not places:
+        return None
+    return Match(hidden, named, False, hidden.location in {named.location if one is None else one for one in places})
+
+
+def matches(hidden: Sequence[Hidden], named: Sequence[Named]) -> list[Match]:
+    """As many pairs as there are, each effect in one at most; among those, most exact names, then most places."""
+    if not hidden:
+        return []
+    first, rest = hidden[0], hidden[1:]
+    options = [matches(rest, named)]
+    for k, candidate in enumerate(named):
+        if (pair := match(first, candidate)) is not None:
+            options.append([pair, *matches(rest, [*named[:k], *named[k + 1:]])])
+    return max(options, key=lambda pairs: (len(pairs), sum(p.exact for p in pairs), sum(p.place for p in pairs)))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A line with its outcome (one of OUTCOMES[line.kind]) and the pairs of hidden and named effects."""
+
+    line: Line
+    outcome: str
+    pairs: tuple[Match, ...]
+
+    @property
+    def named(self) -> Sequence[Named]:
+        return self.line.answer.effects if self.line.answer is not None else []
+
+    @property
+    def verdict(self) -> str:
+        return self.line.answer.verdict if self.line.answer is not None else "crash"
+
+    def right(self, named: Named, *, exact: bool) -> bool:
+        """Whether a named effect is hidden in this case; with `exact` a right group is not enough."""
+        return any(one.named is named and (one.exact or not exact) for one in self.pairs)
+
+    @property
+    def answered(self) -> str:
+        """Column of the confusion matrix: the name, where right through its group the hidden one's; or a word."""
+        if not self.named:
+            return self.verdict if self.verdict in ("none", "crash") else "unexplained"
+        if len(self.named) > 1:
+            return "several"
+        return self.pairs[0].hidden.name if self.pairs else self.named[0].name
+
+
+def judge(line: Line) -> Judged:
+    if line.answer is None:
+        return Judged(line, "crash", ())
+    named = line.answer.effects
+    pairs = tuple(matches(line.hidden, named))
+    extra, quiet = len(named) - len(pairs), line.answer.verdict == "none"
+    if line.kind == "none":
+        return Judged(line, "false name" if named else "quiet" if quiet else "alarm without a name", pairs)
+    if line.kind == "outside":
+        outcome = "named as something else" if extra else "missed" if quiet and not named else "refused"
+        return Judged(line, outcome, pairs)
+    if not named:
+        return Judged(line, "missed" if quiet else "refused", pairs)
+    if not pairs:
+        return Judged(line, "wrong", pairs)
+    if len(pairs) == len(line.hidden):
+        head = "right" if line.kind == "one" else "both right"
+        return Judged(line, head + " and an extra" * bool(extra), pairs)
+    return Judged(line, "one right" + ", one wrong" * bool(extra), pairs)
+
+
+def contradiction(line: Line) -> str | None:
+    """Where an answer breaks the contract's own rules."""
+    if line.answer is None:
+        return None
+    verdict, named = line.answer.verdict, line.answer.effects
+    if verdict in ("none", "unexplained") and named:
+        return f"verdict {verdict!r} with named effects"
+    if verdict in ("explained", "partly explained") and not named:
+        return f"verdict {verdict!r} without a named effect"
+    unknown = [one.name for one in named if one.name not in LIBRARY]
+    return f"effect {unknown[0]!r} is not in the contract's library" if unknown else None

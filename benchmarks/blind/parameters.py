@@ -1,0 +1,100 @@
+"""Reported parameters against those that the truth was built with."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import pi
+
+from scipy.stats import norm
+
+from benchmarks.blind.judge import PLACED, Judged
+
+QUANTILE = float(norm.ppf(0.975))
+
+# A unit at the end of a parameter's name, in SI. Per cent is one hundredth: of a departure, and of nothing else.
+UNITS = {"Hz": 1.0, "kHz": 1e3, "rad_per_s": 1 / (2 * pi), "s": 1.0, "ms": 1e-3, "us": 1e-6, "m": 1.0, "mm": 1e-3,
+         "um": 1e-6, "N": 1.0, "mN": 1e-3, "V": 1.0, "mV": 1e-3, "rad": 1.0, "mrad": 1e-3, "deg": pi / 180,
+         "percent": 0.01, "kg": 1.0, "g": 1e-3, "N_per_m": 1.0, "kN_per_m": 1e3}
+
+
+@dataclass(frozen=True)
+class Equivalent:
+    """reported = scale * hidden + offset, for an effect whose truth and report use other words."""
+
+    effect: str
+    hidden: str
+    reported: str
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+# Words of the truth (tests/truth) for parameters of the library (avis_ctrl/gap/effects).
+EQUIVALENTS: tuple[Equivalent, ...] = ()
+
+
+@dataclass(frozen=True)
+class Error:
+    """A reported parameter whose truth is known: error and standard deviation in the reported unit."""
+
+    effect: str
+    parameter: str
+    error: float
+    std: float
+
+    @property
+    def inside(self) -> bool:
+        """Within its own 95 % interval."""
+        return abs(self.error) <= QUANTILE * self.std
+
+    @property
+    def deviations(self) -> float:
+        return abs(self.error) / self.std if self.std else (0.0 if self.error == 0 else float("inf"))
+
+
+def unit_of(name: str) -> tuple[str, float | None]:
+    """Stem and factor to SI of a parameter's name; the name itself and None where it ends in no unit."""
+    for unit in sorted(UNITS, key=len, reverse=True):
+        if stem := re.fullmatch(rf"(.+)_{unit}", name):
+            return stem[1], UNITS[unit]
+    return name, None
+
+
+def true_value(effect: str, reported: str, hidden: dict, table: Sequence[Equivalent] = EQUIVALENTS) -> float | None:
+    """The truth of a reported parameter: by the table, under the same name, or under its name with another unit."""
+    for one in table:
+        if (one.effect, one.reported) == (effect, reported) and is_number(hidden.get(one.hidden)):
+            return one.scale * hidden[one.hidden] + one.offset
+    if is_number(hidden.get(reported)):
+        return float(hidden[reported])
+    stem, unit = unit_of(reported)
+    for name, value in hidden.items():
+        other, factor = unit_of(name)
+        if unit is not None and factor is not None and other == stem and is_number(value):
+            return float(value) * factor / unit
+    return None
+
+
+def is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def parameter_errors(cases: Sequence[Judged], table: Sequence[Equivalent] = EQUIVALENTS
+                     ) -> tuple[list[Error], list[str]]:
+    """Errors that can be compared, and "effect.parameter" of each reported one that cannot.
+
+    Counted are effects named rightly: by their own name and, where the place is a choice, at the right place.
+    """
+    errors, unknown = [], []
+    for case in cases:
+        for pair in case.pairs:
+            if not pair.exact or (pair.hidden.name in PLACED and not pair.place):
+                continue
+            for name, estimate in pair.named.parameters.items():
+                value = true_value(pair.named.name, name, pair.hidden.parameters, table)
+                if value is None or estimate.std is None:
+                    unknown.append(f"{pair.named.name}.{name}")
+                else:
+                    errors.append(Error(pair.named.name, name, estimate.value - value, estimate.std))
+    return errors, unknown
