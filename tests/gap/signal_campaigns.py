@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "identification"))
 from exact import _run, discrete_avis, floor_velocity, multisine  # noqa: E402
 
 FS, LSB = 1000.0, 20.0 / 2 ** 14
-LEVELS = (0.1, 0.1, 0.3, 0.3, 0.8, 0.8)
+LEVELS = (0.1, 0.1, 0.25, 0.25, 0.5, 0.5)
 
 
 @cache

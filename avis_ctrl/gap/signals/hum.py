@@ -33,7 +33,10 @@ POLLUTED_LINES = 3
 
 @dataclass(frozen=True)
 class HumLine:
-    """A harmonic in one channel: peak amplitude [unit of y] over the records, weighted by their noise; p of its own test."""
+    """A harmonic in one channel: peak amplitude [unit of y] over the records, weighted by their noise.
+
+    p : of its own test. ratio : power to that of the lines next to it, mean of the records.
+    """
 
     channel: str
     harmonic: int
@@ -251,8 +254,8 @@ def _lines(left: Sequence[Leftover], f0: float, hits: np.ndarray, p: np.ndarray,
         weight += 1 / v
     for k, j in hits:
         i = ks.index(int(k) + 1)
-        A = Estimate(float(np.sqrt(max(power[i, j] / weight[i, j], 0.0))), float(1 / np.sqrt(weight[i, j])), unit)
-        found.append(HumLine(names[j], int(k) + 1, A,
+        size = Estimate(float(np.sqrt(max(power[i, j] / weight[i, j], 0.0))), float(1 / np.sqrt(weight[i, j])), unit)
+        found.append(HumLine(names[j], int(k) + 1, size,
                              float(p[k, j]), float(ratio[k, j])))
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
 

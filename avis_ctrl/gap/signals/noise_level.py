@@ -1,0 +1,356 @@
+"""How much the floor and the sensors' own noise are, against what the rig file calls ambient.
+
+Sensor noise: variance of each channel on quiet lines far above the modes, where the mounts pass nothing of the floor.
+
+Floor: on quiet lines e = G v + n with G (n_y, 3) of the model and n of the variance D just found, so that
+
+    v_hat = (G^H D^-1 G)^-1 G^H D^-1 e,    E|v_hat|^2 = S_v + diag (G^H D^-1 G)^-1
+
+gives the density S_v of each direction without bias whatever its shape (generalised least squares). The mounts hide the
+floor from the sensors above some 15 Hz; there a power law that fits below is carried on, with what it is uncertain by.
+What the floor cannot explain, the part of e outside the range of G, says whether it is the floor at all.
+
+The floor's power must not depend on u. It is taken as S + c L^2 in the level L of the records, c >= 0, where that is
+significant: what the model lacks, and distortion, vanish towards L = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.signals.converter import nominal_converter
+from avis_ctrl.gap.signals.hum import HumFinding, polluted
+from avis_ctrl.gap.signals.leftover import HANN_SHARED, Estimate, Leftover, check_common
+from avis_ctrl.gap.signals.quiet_lines import QuietLines, quiet_lines
+from avis_ctrl.measurement.gates.finding import Limit, Picture, Series
+from avis_ctrl.rigs.rig import Rig
+
+FLOOR_BAND_HZ = (0.5, 60.0)
+DIRECTIONS = ("x", "y", "z")
+# Band of the sensors' own noise, in parts of the sample rate; 100 Hz to 490 Hz at 1 kHz.
+SENSOR_BAND = (0.1, 0.49)
+# Standard errors above ambient that count as significant: 2e-4 one-sided, for three directions and their mean.
+SIGNIFICANT = 3.5
+# The floor counts as clearly above ambient if its r.m.s. in the band where sensors see it is 1.25 times the figure for
+# the whole band, which no shape of an ambient spectrum explains but a model some per cent wrong may; or if the whole
+# band, by a power law, has twice as much: an ambient floor that is flat where it is seen and ends there would be taken
+# for sqrt(59.5 / 14.5) = 2.0 times what it is.
+SEEN_FACTOR, TOTAL_FACTOR = 1.25, 2.0
+# Sensor noise counts as raised from here: a converter that is not dithered, or noise not quite white, makes less.
+SENSOR_FACTOR = 1.15
+# Part of the excess outside the range of G above which it is not the floor; a force anywhere would have a half.
+FOREIGN = 0.25
+# Bands per octave; a direction is seen where the density's error is below half of a white ambient floor's density.
+PER_OCTAVE, SEEN = 3, 0.5
+NARROWEST_HZ = 0.4
+
+FloorResponse = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class FloorLevel:
+    """Velocity of the floor that was not measured.
+
+    Attributes
+    ----------
+    rms : of each direction in 0.5-60 Hz, a power law beyond `seen_to_Hz`. seen : in 0.5 Hz to seen_to_Hz only.
+    ambient : of the rig file [m/s].
+    foreign : part of the excess over sensor noise that no floor motion makes, 0 to 1.
+    frequency_Hz (n,), density (n, 3), density_std : one-sided [m^2/s^2/Hz] in bands of a third of an octave.
+    clear, significant : whether the floor is above ambient clearly, and beyond doubt of statistics.
+    """
+
+    rms: dict[str, Estimate]
+    seen: dict[str, Estimate]
+    seen_to_Hz: dict[str, float]
+    mean_rms: Estimate
+    mean_seen: Estimate
+    ambient: float
+    foreign: float
+    frequency_Hz: np.ndarray
+    density: np.ndarray
+    density_std: np.ndarray
+    significant: bool
+    clear: bool
+
+    @property
+    def ground_motion(self) -> bool:
+        """The floor moves clearly more than the rig file says, and it is the floor."""
+        return self.significant and self.clear and self.foreign <= FOREIGN
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFinding:
+    """Noise of a sensor above ambient; no effect of the library.
+
+    parameters : "noise_rms_V". ratio : to what rig file and converter give.
+    """
+
+    channel: str
+    parameters: dict[str, Estimate]
+    ratio: float
+    sentence: str
+    picture: Picture
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return (self.channel,)
+
+
+@dataclass(frozen=True, eq=False)
+class GroundMotionFinding:
+    """Unmeasured floor motion clearly above ambient.
+
+    parameters : "velocity_rms" (mean over directions) and "velocity_rms_x" ... [m/s] in 0.5-60 Hz.
+    """
+
+    channels: tuple[str, ...]
+    parameters: dict[str, Estimate]
+    ratio: float
+    sentence: str
+    picture: Picture
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLevels:
+    """Floor (None where every record has it measured, or no line shows it) and sensors, with what is above ambient.
+
+    sensors : r.m.s. of each channel with its converter's rounding, at the lowest level of the drives.
+    by_record : the same of each record. ways : how each record's noise was told from what u drives.
+    """
+
+    floor: FloorLevel | None
+    sensors: dict[str, Estimate]
+    by_record: dict[str, dict[str, Estimate]]
+    expected_sensor: dict[str, float]
+    ground_motion: GroundMotionFinding | None
+    raised: tuple[NoiseFinding, ...]
+    ways: dict[str, str]
+
+
+def noise_levels(left: Sequence[Leftover], floor_response: FloorResponse, rig: Rig, hum: HumFinding | None = None,
+                 steps_V: dict[str, float] | None = None) -> NoiseLevels:
+    """Levels of floor and sensor noise, and what is above the rig's [ambient].
+
+    Parameters
+    ----------
+    left : y minus the prediction, which should include the floor of records that have it measured.
+    floor_response : omega (n,) rad/s -> (n, n_y, 3), unit of y per m/s; of a ResponseModel the last three columns of
+        `response`.
+    hum : lines to leave out. steps_V : resolution of channels whose converter was found coarser.
+
+    Raises
+    ------
+    InputError : no residual, a rig file without [ambient], too few quiet lines for the sensors' noise.
+    """
+    first = check_common(left)
+    ambient = getattr(rig, "ambient", None)
+    if ambient is None:
+        raise InputError("the rig file does not say what is normal on site", field="ambient")
+    masks = None if hum is None else [polluted(hum, one.header.samples, one.header.sample_rate_Hz, 4) for one in left]
+    rate = first.sample_rate_Hz
+    high = quiet_lines(left, (SENSOR_BAND[0] * rate, SENSOR_BAND[1] * rate), False, masks)
+    if not any(len(one.left) for one in high):
+        raise InputError("expected lines that hold noise alone, above a tenth of the sample rate; records are too short"
+                         " to tell the noise from what u drives", field="residuals")
+    by_record, sensors = _sensor_noise(high, first.y_names, first.y_unit)
+    lsb = {name: (steps_V or {}).get(name, nominal_converter(rig).lsb_V) for name in first.y_names}
+    expected = {name: float(np.hypot(ambient.sensor_noise_rms_V, lsb[name] / np.sqrt(12))) for name in first.y_names}
+    raised = tuple(_raised(name, sensors[name], expected[name], by_record)
+                   for name in first.y_names
+                   if sensors[name].value > SENSOR_FACTOR * expected[name]
+                   and sensors[name].value - SIGNIFICANT * sensors[name].std > expected[name])
+    unknown = [k for k, one in enumerate(left) if not one.header.floor_names]
+    floor = None
+    if unknown:
+        low = quiet_lines([left[k] for k in unknown], FLOOR_BAND_HZ, True,
+                          None if masks is None else [masks[k] for k in unknown])
+        D = np.array([sensors[name].value ** 2 for name in first.y_names])
+        floor = _floor(low, floor_response, D, ambient.floor_velocity_rms_m_per_s, rate)
+    made = None if floor is None or not floor.ground_motion else _ground_motion(floor, first.y_names)
+    return NoiseLevels(floor, sensors, by_record, expected, made, raised, {one.record: one.kind for one in high})
+
+
+def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str
+                  ) -> tuple[dict[str, dict[str, Estimate]], dict[str, Estimate]]:
+    """By record, and of the records at the lowest level: distortion and misfit raise what others show."""
+    def estimates(of: Sequence[QuietLines]) -> dict[str, Estimate]:
+        power = np.concatenate([one.power for one in of])
+        weight = np.concatenate([one.left for one in of])
+        rms = np.sqrt(weight @ power / weight.sum())
+        std = rms / 2 * np.sqrt(HANN_SHARED / weight.sum())
+        return {name: Estimate(float(a), float(s), unit) for name, a, s in zip(names, rms, std, strict=True)}
+    some = [one for one in high if len(one.left)]
+    least = min(one.level for one in some)
+    quiet = [one for one in some if one.level <= 1.05 * least]
+    return {one.record: estimates([one]) for one in some}, estimates(quiet)
+
+
+def _floor(low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarray, ambient: float, rate: float
+           ) -> FloorLevel | None:
+    """From v_hat of every line, band by band."""
+    edges = _edges()
+    count = len(edges) - 1
+    estimated = [_floor_lines(one, floor_response, D) for one in low if len(one.left)]
+    if not estimated:
+        return None
+    white = ambient ** 2 / (FLOOR_BAND_HZ[1] - FLOOR_BAND_HZ[0]) * rate / 2
+    S, std = np.full((count, 3), np.nan), np.full((count, 3), np.inf)
+    for b in range(count):
+        rows = [r for r in (_band(one, edges[b], edges[b + 1], white) for one in estimated) if r is not None]
+        if rows:
+            S[b], std[b] = _at_zero_level(rows)
+    # Variance per line to one-sided density.
+    S, std = S * 2 / rate, std * 2 / rate
+    visible = std < SEEN * white * 2 / rate + 0.5 * np.maximum(np.nan_to_num(S), 0.0)
+    parallel, outside = (np.concatenate([one[k] for one in estimated]) for k in (3, 4))
+    # Medians, which the few lines on a resonance do not lead; that of a gamma distribution is its shape less 1/3.
+    n_out = len(D) - 3
+    foreign = 0.0
+    if n_out > 0:
+        excess = [max(float(np.median(p)) / (n - 1 / 3) - 1, 0.0) for p, n in ((parallel, 3), (outside, n_out))]
+        foreign = excess[1] / max(sum(excess), 1e-12) if excess[1] > 0.05 else 0.0
+    return _level(S, std, visible, edges, ambient, foreign)
+
+
+def _edges() -> np.ndarray:
+    """Thirds of an octave, but no band narrower than NARROWEST_HZ."""
+    edges = [FLOOR_BAND_HZ[0]]
+    while edges[-1] < FLOOR_BAND_HZ[1] * 0.9:
+        edges.append(max(edges[-1] * 2 ** (1 / PER_OCTAVE), edges[-1] + NARROWEST_HZ))
+    return np.array([*edges[:-1], FLOOR_BAND_HZ[1]])
+
+
+def _floor_lines(one: QuietLines, floor_response: FloorResponse, D: np.ndarray) -> tuple:
+    """frequency, |v_hat|^2 and its noise (n, 3), e^H D^-1 e inside and outside the range of G (n,); left, level."""
+    G = floor_response(2 * np.pi * one.frequency_Hz)
+    W = np.conj(G.swapaxes(1, 2)) / D
+    covariance = np.linalg.inv(W @ G)
+    v = (covariance @ (W @ one.e[:, :, None]))[:, :, 0]
+    fitted = (G @ v[:, :, None])[:, :, 0]
+    # Scaled by the largest variance of the channels, so that the projections are of unit noise.
+    inside = np.sum(np.abs(fitted) ** 2 / D, axis=1) / one.left
+    outside = np.sum(np.abs(one.e - fitted) ** 2 / D, axis=1) / one.left
+    noise = np.real(np.einsum("nii->ni", covariance))
+    return one.frequency_Hz, np.abs(v) ** 2 / one.left[:, None], noise, inside, outside, one.left, one.level
+
+
+def _band(one: tuple, low: float, high: float, white: float) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """S (3,), its variance, and the record's level; None with fewer than four lines."""
+    f, power, noise, _, _, left, level = one
+    inside = (f >= low) & (f < high)
+    if np.count_nonzero(inside) < 4:
+        return None
+    P, N, h = power[inside], noise[inside], left[inside][:, None]
+    S = np.full(3, white)
+    for _ in range(3):
+        w = h / (S + N) ** 2
+        S = np.maximum(np.sum(w * (P - N), axis=0) / w.sum(axis=0), 0.25 * white)
+    total = w.sum(axis=0)
+    raw = np.sum(w * (P - N), axis=0) / total
+    return raw, np.sum(w ** 2 * (S + N) ** 2 / h, axis=0) / total ** 2 * HANN_SHARED, level
+
+
+def _at_zero_level(rows: list[tuple[np.ndarray, np.ndarray, float]]) -> tuple[np.ndarray, np.ndarray]:
+    """S (3,) and std of S + c L^2 over the records, c only where it is above twice its error."""
+    value, variance = np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows])
+    # Of each record's variance its own estimate is part; the mean of all is steadier and does not favour low draws.
+    steady = np.maximum(np.median(variance, axis=0), 1e-300) * np.ones((len(rows), 1))
+    L2 = np.array([r[2] for r in rows]) ** 2
+    S, std = np.zeros(3), np.zeros(3)
+    for j in range(3):
+        w = 1 / steady[:, j]
+        S[j], std[j] = np.sum(w * value[:, j]) / w.sum(), 1 / np.sqrt(w.sum())
+        if np.ptp(L2) > 0:
+            A = np.column_stack([np.ones(len(L2)), L2 / L2.max()])
+            # Records whose own scatter is large, since misfit is most of it, count less here.
+            w = 1 / np.maximum(variance[:, j], steady[:, j])
+            covariance = np.linalg.inv((A.T * w) @ A)
+            c = covariance @ (A.T @ (w * value[:, j]))
+            if c[1] > 2 * np.sqrt(covariance[1, 1]):
+                S[j], std[j] = c[0], np.sqrt(covariance[0, 0])
+    return S, std
+
+
+def _level(S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarray, ambient: float, foreign: float
+           ) -> FloorLevel | None:
+    width, centre = np.diff(edges), np.sqrt(edges[1:] * edges[:-1])
+    seen2, seen_v, all2, all_v = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    ends = {}
+    for j, axis in enumerate(DIRECTIONS):
+        m = int(np.argmin(np.append(visible[:, j], False)))
+        if m < 3:
+            return None
+        ends[axis] = float(edges[m])
+        seen2[j], seen_v[j] = np.sum(S[:m, j] * width[:m]), np.sum((std[:m, j] * width[:m]) ** 2)
+        tail, tail_std = _tail(centre[:m], S[:m, j], std[:m, j], edges[m])
+        all2[j], all_v[j] = seen2[j] + tail, seen_v[j] + tail_std ** 2
+
+    def root(square: float, variance: float) -> Estimate:
+        rms = np.sqrt(max(square, 1e-30))
+        return Estimate(float(rms), float(np.sqrt(variance) / (2 * rms)), "m/s")
+    rms = {axis: root(all2[j], all_v[j]) for j, axis in enumerate(DIRECTIONS)}
+    seen = {axis: root(seen2[j], seen_v[j]) for j, axis in enumerate(DIRECTIONS)}
+    mean, mean_seen = root(all2.mean(), all_v.sum() / 9), root(seen2.mean(), seen_v.sum() / 9)
+
+    def above(one: Estimate, factor: float) -> bool:
+        return one.value > factor * ambient and one.value - SIGNIFICANT * one.std > ambient
+    significant = any(one.value - SIGNIFICANT * one.std > ambient for one in (mean, mean_seen, *seen.values()))
+    clear = (any(above(one, SEEN_FACTOR) for one in (mean_seen, *seen.values()))
+             or any(above(one, TOTAL_FACTOR) for one in (mean, *rms.values())))
+    return FloorLevel(rms, seen, ends, mean, mean_seen, ambient, foreign, centre, S, std, significant, clear)
+
+
+def _tail(f: np.ndarray, S: np.ndarray, std: np.ndarray, end: float) -> tuple[float, float]:
+    """Power above `end` of a power law a f^-s fitted below, and its standard error over slopes that fit."""
+    if end >= FLOOR_BAND_HZ[1] * (1 - 1e-9):
+        return 0.0, 0.0
+    slopes = np.linspace(0.0, 6.0, 61)
+    shape = f[None, :] ** -slopes[:, None]
+    x = np.geomspace(end, FLOOR_BAND_HZ[1], 200)
+    integral = np.trapezoid(x[None, :] ** -slopes[:, None], x, axis=1)
+    w = 1 / std ** 2
+    a_var = 1 / (shape ** 2 @ w)
+    a = np.maximum((shape * S) @ w * a_var, 0.0)
+    chi2 = ((S - a[:, None] * shape) ** 2) @ w
+    # A spectrum that is no power law widens everything.
+    scale = max(float(chi2.min()) / max(len(f) - 2, 1), 1.0)
+    weight = np.exp(-(chi2 - chi2.min()) / (2 * scale))
+    weight /= weight.sum()
+    tail = a * integral
+    mean = float(weight @ tail)
+    return mean, float(np.sqrt(weight @ (a_var * scale * integral ** 2 + (tail - mean) ** 2)))
+
+
+def _raised(name: str, found: Estimate, expected: float, by_record: dict[str, dict[str, Estimate]]) -> NoiseFinding:
+    records = np.arange(len(by_record))
+    picture = Picture(f"Noise of {name} by record", "record", f"r.m.s. of a sample [{found.unit}]",
+                      (Series(name, records, np.array([one[name].value for one in by_record.values()]), "bars"),),
+                      (Limit("ambient and converter", expected),), x_names=tuple(by_record))
+    ratio = found.value / expected
+    return NoiseFinding(name, {"noise_rms_V": found}, ratio,
+                        f"Sensor {name} has noise of {1e3 * found.value:.4g} +- {1e3 * found.std:.2g} m{found.unit}"
+                        f" r.m.s., {ratio:.3g} times the {1e3 * expected:.4g} m{found.unit} of the rig file's ambient"
+                        " noise and converter; no effect of the library.", picture)
+
+
+def _ground_motion(floor: FloorLevel, names: tuple[str, ...]) -> GroundMotionFinding:
+    flat = floor.ambient ** 2 / (FLOOR_BAND_HZ[1] - FLOOR_BAND_HZ[0])
+    density = np.sqrt(np.maximum(np.nan_to_num(floor.density), 1e-30))
+    series = tuple(Series(f"floor {axis}", floor.frequency_Hz, density[:, j]) for j, axis in enumerate(DIRECTIONS))
+    picture = Picture("Floor velocity that explains what u and sensor noise do not", "frequency [Hz]",
+                      "amplitude density [m/s/sqrt(Hz)]", series, (Limit("ambient, if white", float(np.sqrt(flat))),),
+                      "log", "log")
+    each = ", ".join(f"{axis} {1e6 * one.value:.3g}" for axis, one in floor.rms.items())
+    m, seen, ratio = floor.mean_rms, floor.mean_seen, floor.mean_rms.value / floor.ambient
+    end = min(floor.seen_to_Hz.values())
+    sentence = (f"The floor, not measured, moves with {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
+                f" ({each}), {ratio:.3g} times the rig file's ambient {1e6 * floor.ambient:.3g} um/s;"
+                f" {1e6 * seen.value:.3g} +- {1e6 * seen.std:.2g} um/s of it are seen up to {end:.3g} Hz, the rest is a"
+                " power law carried on.")
+    parameters = {"velocity_rms": m} | {f"velocity_rms_{axis}": one for axis, one in floor.rms.items()}
+    return GroundMotionFinding(names, parameters, ratio, sentence, picture)

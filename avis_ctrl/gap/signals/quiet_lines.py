@@ -1,0 +1,129 @@
+"""Lines of a record that hold noise alone, whatever the drives do and whatever the model lacks.
+
+Periodic records: lines at least two away from every harmonic of the period, which a Hann window keeps free of all that
+answers u periodically, nonlinear or not. Records at rest: all lines. Others: what a local linear regression of the
+residual on u leaves, jointly over the records, with a response that is a parabola in frequency over each window
+(Pintelon and Schoukens 2012, section 7.2), so that dynamics that the model lacks are not taken for noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.gap.signals.leftover import Leftover
+
+# Periods from which lines between the harmonics are used.
+LEAST_PERIODS = 4
+# Windows [lines], and order of the response over them: narrow where modes are, wide far above.
+NARROW, WIDE, ORDER = 15, 120, 2
+# A line counts if the regression leaves this part of its noise at least.
+LEAST_LEFT = 0.2
+# Rounds of weighting records by their noise, and windows over which that is averaged.
+ROUNDS, SMOOTHED = 3, 9
+
+
+@dataclass(frozen=True, eq=False)
+class QuietLines:
+    """Noise of one record: e (n, n_y) at frequency_Hz (n,), with E[e e^H] = left C of the noise; left (n,) from 0 to 1.
+
+    level : r.m.s. of u [V], over its channels. kind : "rest", "between harmonics" or "regression on u".
+    """
+
+    record: str
+    kind: str
+    level: float
+    frequency_Hz: np.ndarray
+    e: np.ndarray
+    left: np.ndarray
+
+    @property
+    def power(self) -> np.ndarray:
+        """(n, n_y) unbiased for the noise's variance, white noise of variance s^2 having s^2."""
+        return np.abs(self.e) ** 2 / self.left[:, None]
+
+
+def quiet_lines(left: Sequence[Leftover], band_Hz: tuple[float, float], narrow: bool,
+                polluted: Sequence[np.ndarray] | None = None) -> tuple[QuietLines, ...]:
+    """Of each record, in a band.
+
+    narrow : windows for the band of the modes; otherwise wide ones.
+    polluted : masks (lines,) of lines to leave out, one a record.
+    """
+    found: dict[int, QuietLines] = {}
+    regressed: dict[tuple[int, float], list[int]] = {}
+    inside = []
+    for k, one in enumerate(left):
+        keep = (one.frequency_Hz >= band_Hz[0]) & (one.frequency_Hz <= band_Hz[1])
+        if polluted is not None:
+            keep &= ~polluted[k]
+        inside.append(keep)
+        level = float(np.sqrt(np.mean(one.u ** 2)))
+        if one.silent:
+            found[k] = _plain(one, "rest", level, keep)
+        elif one.periods >= LEAST_PERIODS:
+            away = np.arange(len(keep)) % one.periods
+            found[k] = _plain(one, "between harmonics", level, keep & (away >= 2) & (away <= one.periods - 2))
+        else:
+            regressed.setdefault((len(keep), one.header.sample_rate_Hz), []).append(k)
+    for ks in regressed.values():
+        for k, made in zip(ks, _regression([left[k] for k in ks], [inside[k] for k in ks], narrow), strict=True):
+            found[k] = made
+    return tuple(found[k] for k in range(len(left)))
+
+
+def _plain(one: Leftover, kind: str, level: float, keep: np.ndarray) -> QuietLines:
+    return QuietLines(one.header.name, kind, level, one.frequency_Hz[keep], one.E[keep], np.ones(int(keep.sum())))
+
+
+def _regression(left: Sequence[Leftover], keep: Sequence[np.ndarray], narrow: bool) -> list[QuietLines]:
+    """Residuals of e on u, (1, x, x^2) u over each window of lines common to the records, with what they are left."""
+    lines = np.flatnonzero(np.any(keep, axis=0))
+    n_u, R = left[0].u.shape[1], len(left)
+    order = ORDER if narrow else 1
+    width = NARROW if narrow else WIDE
+    # Three parameters in four data at most, so that noise is left.
+    width = max(width, int(np.ceil(4 / 3 * (order + 1) * n_u / R)))
+    blocks = len(lines) // width
+    empty = [QuietLines(one.header.name, "regression on u", float(np.sqrt(np.mean(one.u ** 2))), np.empty(0),
+                        np.empty((0, one.e.shape[1]), complex), np.empty(0)) for one in left]
+    if not blocks:
+        return empty
+    at = lines[:blocks * width].reshape(blocks, width)
+    x = np.linspace(-1, 1, width)[:, None] ** np.arange(order + 1)
+    U = np.stack([one.U[at] for one in left], axis=1)
+    # Scaled line by line only by powers that all records share, so that columns of silent bands stay harmless.
+    A = (U[:, :, :, None, :] * x[None, None, :, :, None]).reshape(blocks, R * width, -1)
+    A = A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
+    E = np.stack([one.E[at] for one in left], axis=1).reshape(blocks, R * width, -1)
+    size = np.ones((blocks, R))
+    # Records that clip or distort are louder: weighted by what they leave, they do not spoil the others.
+    for _ in range(ROUNDS):
+        rest, share = _residual(A, E, np.repeat(1 / size, width, axis=1), R)
+        power = np.sum(np.abs(rest) ** 2, axis=(2, 3)) / np.maximum(share.sum(axis=2), 1e-3 * width)
+        size = np.sqrt(_running_mean(power, SMOOTHED)) + 1e-300
+    made = []
+    for k, one in enumerate(left):
+        good = (share[:, k] > LEAST_LEFT) & keep[k][at]
+        made.append(QuietLines(one.header.name, "regression on u", empty[k].level, one.frequency_Hz[at[good]],
+                               rest[:, k][good], share[:, k][good]))
+    return made
+
+
+def _residual(A: np.ndarray, E: np.ndarray, weight: np.ndarray, records: int) -> tuple[np.ndarray, np.ndarray]:
+    """What a weighted regression leaves, (blocks, records, width, n_y), and the part of the noise left in each."""
+    Q, _ = np.linalg.qr(A * weight[:, :, None])
+    W = E * weight[:, :, None]
+    rest = (W - Q @ (np.conj(Q.swapaxes(1, 2)) @ W)) / weight[:, :, None]
+    share = 1 - np.sum(np.abs(Q) ** 2, axis=2)
+    return rest.reshape(len(A), records, -1, E.shape[2]), share.reshape(len(A), records, -1)
+
+
+def _running_mean(power: np.ndarray, width: int) -> np.ndarray:
+    """(n, m) over `width` rows, fewer at the ends."""
+    total = np.concatenate([np.zeros((1, power.shape[1])), np.cumsum(power, axis=0)])
+    row = np.arange(len(power))
+    low, high = np.maximum(row - width // 2, 0), np.minimum(row + width // 2 + 1, len(power))
+    return (total[high] - total[low]) / (high - low)[:, None]
