@@ -1,0 +1,398 @@
+"""Newton-Euler equations of the table and its electronics, integrated by the classical Runge-Kutta scheme.
+
+State: X (3, centre of mass, earth axes), quaternion (4), V (3, earth), omega (3, body), per geophone (coil
+displacement, coil velocity, two states of the compensation filter), then the states of the effects that are present.
+Gravity is balanced by the mounts at rest and does not enter the mechanics (design/equations.md).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+SENSOR_STATES = 13
+FIRST_EFFECT_STATE = SENSOR_STATES + 24
+
+
+class Physics(NamedTuple):
+    """Numbers of one table. Points are body-fixed, from the centre of mass; arrays of length 0: effect absent."""
+
+    m: float
+    J: np.ndarray            # (3, 3) kg m^2 about the centre of mass
+    Ji: np.ndarray           # its inverse
+    rotor: np.ndarray        # (3,) N m s, angular momentum of a spinning rotor
+    drag: float              # N s^2/m^2, quadratic damping of the payload
+    r: np.ndarray            # (4, 3) mounts on the payload
+    k: np.ndarray            # (4, 3) N/m
+    c: np.ndarray            # (4, 3) N s/m
+    k2: np.ndarray           # (4,) N/m^2, vertical
+    k3: np.ndarray           # (4,) N/m^3, vertical
+    motor_at: np.ndarray     # (8,) mount of each motor
+    motor_axis: np.ndarray   # (8,)
+    motor: np.ndarray        # (8,) N/V
+    motor_b1: np.ndarray     # (8,) 1/m, change of the force constant with displacement
+    motor_b2: np.ndarray     # (8,) 1/m^2
+    sensor_at: np.ndarray    # (6,)
+    sensor_n: np.ndarray     # (6, 3) axis in the body
+    S: np.ndarray            # (6,) V s/m, preamplifier included
+    wn: np.ndarray           # (6,) rad/s suspension
+    zn: np.ndarray           # (6,)
+    b1: np.ndarray           # (6,) numerator minus denominator of the compensation filter, s^1
+    b0: np.ndarray           # (6,) s^0
+    wc: float
+    zc: float
+    g: float                 # m/s^2 that a tilted sensor feels
+    lag: np.ndarray          # (8,) rad/s or (0,)
+    mode_shape: np.ndarray   # (modes, 4, 3) 1/sqrt(kg), at the mounts
+    mode_w: np.ndarray
+    mode_z: np.ndarray
+    osc_r: np.ndarray        # (oscillators, 3)
+    osc_d: np.ndarray        # (oscillators, 3)
+    osc_m: np.ndarray
+    osc_k: np.ndarray
+    osc_c: np.ndarray
+    base_dof: int            # 0, 3 or 6
+    base_r: np.ndarray       # (4, 3) mounts on the chassis, from its centre of mass
+    base_Mi: np.ndarray      # (6,) 1/kg, 1/(kg m^2)
+    base_K: np.ndarray       # (6, 6)
+    base_C: np.ndarray       # (6, 6)
+    max_k: np.ndarray        # (4,) Maxwell branch, vertical, N/m, or (0,)
+    max_c: np.ndarray        # (4,) N s/m
+    max_q: np.ndarray        # (4,) N s^2/m^2, orifice
+    ladder_k: np.ndarray     # (rungs,) stiffness of each rung over that of the mount
+    ladder_w: np.ndarray     # (rungs,) rad/s
+    surge_m: np.ndarray      # (4,) kg or (0,)
+    surge_c: np.ndarray      # (4,) N s/m
+    level_w: np.ndarray      # (3,) rad/s or (0,)
+    level_tau: float         # s
+    cable_r: np.ndarray      # (cables, 3)
+    cable_d: np.ndarray      # (cables, 3)
+    cable_k: np.ndarray
+    cable_c: np.ndarray
+    fric_s0: np.ndarray      # (8,) N/m or (0,)
+    fric_s1: float           # N s/m
+    fric_s2: float           # N s/m
+    fric_Fc: np.ndarray      # (8,) N
+    fric_Fs: np.ndarray      # (8,) N
+    fric_vs: float           # m/s
+
+
+def state_size(P: Physics) -> int:
+    """Number of states that the effects present in P need."""
+    return (FIRST_EFFECT_STATE + len(P.lag) + 2 * len(P.mode_w) + 2 * len(P.osc_m) + 12 * (P.base_dof > 0)
+            + len(P.max_k) + 12 * len(P.ladder_k) + 2 * len(P.surge_m) + 2 * len(P.level_w) + len(P.fric_s0))
+
+
+@njit(cache=True, fastmath=False, inline="never")
+def rhs(P, x, u, fd, fv, ks, dx, W):
+    """dx of the state x under held voltages u (8), floor displacement and velocity fd, fv (3), stiffness factor ks.
+
+    W : (40, 3) workspace.
+    """
+    R, F, G = W[0:3], W[3:7], W[7:11]       # rotation; forces on payload and chassis at the mounts, earth axes
+    E, Ed = W[11:15], W[15:19]              # relative displacement and velocity over the mounts, earth axes
+    B, A = W[19:23], W[23:27]               # forces at the mounts, and accelerations there, body axes
+    q0, q1, q2, q3 = x[3], x[4], x[5], x[6]
+    s = 1.0 / (q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    R[0, 0] = 1 - 2 * s * (q2 * q2 + q3 * q3)
+    R[0, 1] = 2 * s * (q1 * q2 - q0 * q3)
+    R[0, 2] = 2 * s * (q1 * q3 + q0 * q2)
+    R[1, 0] = 2 * s * (q1 * q2 + q0 * q3)
+    R[1, 1] = 1 - 2 * s * (q1 * q1 + q3 * q3)
+    R[1, 2] = 2 * s * (q2 * q3 - q0 * q1)
+    R[2, 0] = 2 * s * (q1 * q3 - q0 * q2)
+    R[2, 1] = 2 * s * (q2 * q3 + q0 * q1)
+    R[2, 2] = 1 - 2 * s * (q1 * q1 + q2 * q2)
+    w0, w1, w2 = x[10], x[11], x[12]
+    dx[3] = 0.5 * (-q1 * w0 - q2 * w1 - q3 * w2)
+    dx[4] = 0.5 * (q0 * w0 + q2 * w2 - q3 * w1)
+    dx[5] = 0.5 * (q0 * w1 + q3 * w0 - q1 * w2)
+    dx[6] = 0.5 * (q0 * w2 + q1 * w1 - q2 * w0)
+
+    # places of the effects' states
+    n_mode, n_osc, rungs = P.mode_w.size, P.osc_m.size, P.ladder_k.size
+    o_lag = FIRST_EFFECT_STATE
+    o_mode = o_lag + P.lag.size
+    o_osc = o_mode + 2 * n_mode
+    o_base = o_osc + 2 * n_osc
+    o_max = o_base + (12 if P.base_dof > 0 else 0)
+    o_lad = o_max + P.max_k.size
+    o_sur = o_lad + 12 * rungs
+    o_lev = o_sur + 2 * P.surge_m.size
+    o_fri = o_lev + 2 * P.level_w.size
+
+    for i in range(4):
+        ra, rb, rc = P.r[i, 0], P.r[i, 1], P.r[i, 2]
+        va, vb, vc = w1 * rc - w2 * rb, w2 * ra - w0 * rc, w0 * rb - w1 * ra
+        da, db, dc = 0.0, 0.0, 0.0
+        for j in range(n_mode):
+            y, yd = x[o_mode + 2 * j], x[o_mode + 2 * j + 1]
+            da += P.mode_shape[j, i, 0] * y
+            db += P.mode_shape[j, i, 1] * y
+            dc += P.mode_shape[j, i, 2] * y
+            va += P.mode_shape[j, i, 0] * yd
+            vb += P.mode_shape[j, i, 1] * yd
+            vc += P.mode_shape[j, i, 2] * yd
+        for a in range(3):
+            e = R[a, 0] * (ra + da) + R[a, 1] * (rb + db) + R[a, 2] * (rc + dc) - P.r[i, a]
+            E[i, a] = x[a] + e - fd[a]
+            Ed[i, a] = x[7 + a] + R[a, 0] * va + R[a, 1] * vb + R[a, 2] * vc - fv[a]
+        W[29 + i, 0], W[29 + i, 1] = fd[2], fv[2]       # vertical motion of the chassis point
+        if P.base_dof > 0:      # here the chassis moves by its own coordinates instead of with the floor
+            pa, pb, pc = P.base_r[i, 0], P.base_r[i, 1], P.base_r[i, 2]
+            for h in range(2):
+                o = o_base + 6 * h
+                T = E if h == 0 else Ed
+                f = fd if h == 0 else fv
+                T[i, 0] += f[0] - (x[o] + x[o + 4] * pc - x[o + 5] * pb)
+                T[i, 1] += f[1] - (x[o + 1] + x[o + 5] * pa - x[o + 3] * pc)
+                W[29 + i, h] = x[o + 2] + x[o + 3] * pb - x[o + 4] * pa
+                T[i, 2] += f[2] - W[29 + i, h]
+
+    for i in range(4):
+        for a in range(3):
+            k, e = ks * P.k[i, a], E[i, a]
+            force = -P.c[i, a] * Ed[i, a]
+            if not (a == 2 and P.surge_m.size > 0):
+                force -= k * e
+            for j in range(rungs):
+                o = o_lad + (3 * i + a) * rungs + j
+                stretch = e - x[o]
+                force -= P.ladder_k[j] * k * stretch
+                dx[o] = P.ladder_w[j] * stretch
+            F[i, a] = force
+            G[i, a] = -force
+        z, zd = E[i, 2], Ed[i, 2]
+        force = -P.k2[i] * z * z - P.k3[i] * z * z * z
+        if P.max_k.size > 0:
+            branch = ks * P.max_k[i] * (z - x[o_max + i])
+            force -= branch
+            if P.max_q[i] > 0:
+                flow = (np.sqrt(P.max_c[i] ** 2 + 4 * P.max_q[i] * abs(branch)) - P.max_c[i]) / (2 * P.max_q[i])
+                dx[o_max + i] = flow if branch > 0 else -flow
+            else:
+                dx[o_max + i] = branch / P.max_c[i]
+        if P.level_w.size > 0 and i < 3:
+            o = o_lev + 2 * i
+            force -= P.level_w[i] * P.k[i, 2] * x[o]
+            if P.level_tau > 0:
+                dx[o] = x[o + 1]
+                dx[o + 1] = (z - x[o + 1]) / P.level_tau
+            else:
+                dx[o] = z
+                dx[o + 1] = 0.0
+        F[i, 2] += force
+        G[i, 2] -= force
+        if P.surge_m.size > 0:  # the mass sits between two springs of twice the stiffness; its motion is absolute
+            o = o_sur + 2 * i
+            k = 2 * ks * P.k[i, 2]
+            below, below_d = x[o] - W[29 + i, 0], x[o + 1] - W[29 + i, 1]
+            upper = k * (z - below) + P.surge_c[i] * (zd - below_d)
+            lower = k * below + P.surge_c[i] * below_d
+            F[i, 2] -= upper
+            G[i, 2] += lower
+            dx[o] = x[o + 1]
+            dx[o + 1] = (upper - lower) / P.surge_m[i]
+
+    for j in range(8):
+        i, a = P.motor_at[j], P.motor_axis[j]
+        drive = u[j]
+        if P.lag.size > 0:
+            if P.lag[j] > 0:
+                drive = x[o_lag + j]
+                dx[o_lag + j] = P.lag[j] * (u[j] - drive)
+            else:
+                dx[o_lag + j] = 0.0
+        e = E[i, a]
+        force = P.motor[j] * (1 + P.motor_b1[j] * e + P.motor_b2[j] * e * e) * drive
+        if P.fric_s0.size > 0:
+            v, z = Ed[i, a], x[o_fri + j]
+            level = P.fric_Fc[j] + (P.fric_Fs[j] - P.fric_Fc[j]) * np.exp(-(v / P.fric_vs) ** 2)
+            zd = v - P.fric_s0[j] * abs(v) * z / level
+            dx[o_fri + j] = zd
+            force -= P.fric_s0[j] * z + P.fric_s1 * zd + P.fric_s2 * v
+        F[i, a] += force
+        G[i, a] -= force
+
+    fx, fy, fz, tx, ty, tz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0     # earth force, body torque
+    for i in range(4):
+        fx += F[i, 0]
+        fy += F[i, 1]
+        fz += F[i, 2]
+        for a in range(3):
+            B[i, a] = R[0, a] * F[i, 0] + R[1, a] * F[i, 1] + R[2, a] * F[i, 2]
+        tx += P.r[i, 1] * B[i, 2] - P.r[i, 2] * B[i, 1]
+        ty += P.r[i, 2] * B[i, 0] - P.r[i, 0] * B[i, 2]
+        tz += P.r[i, 0] * B[i, 1] - P.r[i, 1] * B[i, 0]
+
+    bx, by, bz, b3, b4, b5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0     # reaction on the chassis
+    for j in range(P.cable_k.size):
+        p, d = P.cable_r[j], P.cable_d[j]
+        va, vb, vc = w1 * p[2] - w2 * p[1], w2 * p[0] - w0 * p[2], w0 * p[1] - w1 * p[0]
+        e, v = 0.0, 0.0
+        for a in range(3):
+            e += d[a] * (x[a] + R[a, 0] * p[0] + R[a, 1] * p[1] + R[a, 2] * p[2] - p[a]
+                         - (x[o_base + a] if P.base_dof > 0 else fd[a]))
+            v += d[a] * (x[7 + a] + R[a, 0] * va + R[a, 1] * vb + R[a, 2] * vc
+                         - (x[o_base + 6 + a] if P.base_dof > 0 else fv[a]))
+        force = -P.cable_k[j] * e - P.cable_c[j] * v
+        fx += force * d[0]
+        fy += force * d[1]
+        fz += force * d[2]
+        bx -= force * d[0]
+        by -= force * d[1]
+        bz -= force * d[2]
+        n0 = force * (R[0, 0] * d[0] + R[1, 0] * d[1] + R[2, 0] * d[2])
+        n1 = force * (R[0, 1] * d[0] + R[1, 1] * d[1] + R[2, 1] * d[2])
+        n2 = force * (R[0, 2] * d[0] + R[1, 2] * d[1] + R[2, 2] * d[2])
+        tx += p[1] * n2 - p[2] * n1
+        ty += p[2] * n0 - p[0] * n2
+        tz += p[0] * n1 - p[1] * n0
+    for j in range(n_osc):
+        p, d = P.osc_r[j], P.osc_d[j]
+        force = P.osc_k[j] * x[o_osc + 2 * j] + P.osc_c[j] * x[o_osc + 2 * j + 1]
+        n0, n1, n2 = force * d[0], force * d[1], force * d[2]
+        fx += R[0, 0] * n0 + R[0, 1] * n1 + R[0, 2] * n2
+        fy += R[1, 0] * n0 + R[1, 1] * n1 + R[1, 2] * n2
+        fz += R[2, 0] * n0 + R[2, 1] * n1 + R[2, 2] * n2
+        tx += p[1] * n2 - p[2] * n1
+        ty += p[2] * n0 - p[0] * n2
+        tz += p[0] * n1 - p[1] * n0
+    if P.drag > 0:
+        fx -= P.drag * abs(x[7]) * x[7]
+        fy -= P.drag * abs(x[8]) * x[8]
+        fz -= P.drag * abs(x[9]) * x[9]
+
+    J, Ji = P.J, P.Ji
+    h0 = J[0, 0] * w0 + J[0, 1] * w1 + J[0, 2] * w2 + P.rotor[0]
+    h1 = J[1, 0] * w0 + J[1, 1] * w1 + J[1, 2] * w2 + P.rotor[1]
+    h2 = J[2, 0] * w0 + J[2, 1] * w1 + J[2, 2] * w2 + P.rotor[2]
+    tx -= w1 * h2 - w2 * h1
+    ty -= w2 * h0 - w0 * h2
+    tz -= w0 * h1 - w1 * h0
+    g0 = Ji[0, 0] * tx + Ji[0, 1] * ty + Ji[0, 2] * tz
+    g1 = Ji[1, 0] * tx + Ji[1, 1] * ty + Ji[1, 2] * tz
+    g2 = Ji[2, 0] * tx + Ji[2, 1] * ty + Ji[2, 2] * tz
+    ax, ay, az = fx / P.m, fy / P.m, fz / P.m
+    for a in range(3):
+        dx[a] = x[7 + a]
+    dx[7], dx[8], dx[9] = ax, ay, az
+    dx[10], dx[11], dx[12] = g0, g1, g2
+
+    for j in range(n_mode):
+        o = o_mode + 2 * j
+        drive = 0.0
+        for i in range(4):
+            for a in range(3):
+                drive += P.mode_shape[j, i, a] * B[i, a]
+        dx[o] = x[o + 1]
+        dx[o + 1] = drive - 2 * P.mode_z[j] * P.mode_w[j] * x[o + 1] - P.mode_w[j] ** 2 * x[o]
+
+    a0 = R[0, 0] * ax + R[1, 0] * ay + R[2, 0] * az
+    a1 = R[0, 1] * ax + R[1, 1] * ay + R[2, 1] * az
+    a2 = R[0, 2] * ax + R[1, 2] * ay + R[2, 2] * az
+    for i in range(4):
+        p = P.r[i]
+        v0, v1, v2 = w1 * p[2] - w2 * p[1], w2 * p[0] - w0 * p[2], w0 * p[1] - w1 * p[0]
+        A[i, 0] = a0 + g1 * p[2] - g2 * p[1] + w1 * v2 - w2 * v1
+        A[i, 1] = a1 + g2 * p[0] - g0 * p[2] + w2 * v0 - w0 * v2
+        A[i, 2] = a2 + g0 * p[1] - g1 * p[0] + w0 * v1 - w1 * v0
+        for j in range(n_mode):
+            for a in range(3):
+                A[i, a] += P.mode_shape[j, i, a] * dx[o_mode + 2 * j + 1]
+    for j in range(n_osc):
+        p, d = P.osc_r[j], P.osc_d[j]
+        o = o_osc + 2 * j
+        along = (d[0] * (a0 + g1 * p[2] - g2 * p[1]) + d[1] * (a1 + g2 * p[0] - g0 * p[2])
+                 + d[2] * (a2 + g0 * p[1] - g1 * p[0]))
+        dx[o] = x[o + 1]
+        dx[o + 1] = -(P.osc_k[j] * x[o] + P.osc_c[j] * x[o + 1]) / P.osc_m[j] - along
+
+    if P.base_dof > 0:
+        for i in range(4):
+            p = P.base_r[i]
+            bx += G[i, 0]
+            by += G[i, 1]
+            bz += G[i, 2]
+            b3 += p[1] * G[i, 2] - p[2] * G[i, 1]
+            b4 += p[2] * G[i, 0] - p[0] * G[i, 2]
+            b5 += p[0] * G[i, 1] - p[1] * G[i, 0]
+        W[27, 0], W[27, 1], W[27, 2] = bx, by, bz
+        W[28, 0], W[28, 1], W[28, 2] = b3, b4, b5
+        for a in range(6):
+            force = W[27 + a // 3, a % 3]
+            for b in range(6):
+                e, v = x[o_base + b], x[o_base + 6 + b]
+                if b < 3:
+                    e -= fd[b]
+                    v -= fv[b]
+                force -= P.base_K[a, b] * e + P.base_C[a, b] * v
+            dx[o_base + a] = x[o_base + 6 + a]
+            dx[o_base + 6 + a] = force * P.base_Mi[a] if a < P.base_dof else 0.0
+
+    for j in range(6):
+        i, n = P.sensor_at[j], P.sensor_n[j]
+        a = n[0] * A[i, 0] + n[1] * A[i, 1] + n[2] * A[i, 2]
+        if P.g > 0:             # specific force; the part at rest hangs in the suspension spring
+            a += P.g * (n[0] * R[2, 0] + n[1] * R[2, 1] + n[2] * (R[2, 2] - 1.0))
+        o = SENSOR_STATES + 4 * j
+        dx[o] = x[o + 1]
+        dx[o + 1] = a - 2 * P.zn[j] * P.wn[j] * x[o + 1] - P.wn[j] ** 2 * x[o]
+        dx[o + 2] = x[o + 3]
+        dx[o + 3] = P.S[j] * x[o + 1] - 2 * P.zc * P.wc * x[o + 3] - P.wc ** 2 * x[o + 2]
+
+
+@njit(cache=True)
+def integrate(P, x, u, first, switch, floor, ks, dt, y, trace):
+    """March over all samples; y[k] is the analogue sensor voltage at the start of sample interval k.
+
+    x : initial state, overwritten by the last one. u : (n_u, 8) held voltages after clipping. first : (N,) index of
+    the voltage held at the start of interval k, negative or beyond the end: zero volts; at the fraction switch[k] of
+    the interval the next one takes over. floor : (N + 1, 9) displacement, velocity, acceleration of the floor.
+    ks : (N,) stiffness factor. y : (N, 6). trace : (N or 0, states).
+    """
+    n, N = x.size, y.shape[0]
+    k1, k2, k3, k4, xs = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    W, held = np.zeros((40, 3)), np.zeros(8)
+    f = np.zeros((3, 2, 3))
+    edge = np.zeros(4)
+    for k in range(N):
+        for j in range(6):
+            o = SENSOR_STATES + 4 * j
+            y[k, j] = P.S[j] * x[o + 1] + P.b1[j] * x[o + 3] + P.b0[j] * x[o + 2]
+        if trace.shape[0] > 0:
+            trace[k, :] = x
+        edges = 3
+        edge[0], edge[1], edge[2] = 0.0, 0.5, 1.0
+        sw = switch[k]
+        if 1e-9 < sw < 1 - 1e-9 and abs(sw - 0.5) > 1e-9:
+            edges = 4
+            edge[1], edge[2], edge[3] = min(sw, 0.5), max(sw, 0.5), 1.0
+        for step in range(edges - 1):
+            t0, t1 = edge[step], edge[step + 1]
+            h = (t1 - t0) * dt
+            row = first[k] + (1 if t0 >= sw - 1e-9 else 0)
+            for j in range(8):
+                held[j] = u[row, j] if 0 <= row < u.shape[0] else 0.0
+            for stage in range(3):      # cubic Hermite interpolation of the floor: 60 Hz at 1 kHz to 5e-5
+                t = t0 + 0.5 * stage * (t1 - t0)
+                a, b = 2 * t**3 - 3 * t * t + 1, (t**3 - 2 * t * t + t) * dt
+                c, d = 1 - a, (t**3 - t * t) * dt
+                for i in range(3):
+                    for o in range(2):
+                        f[stage, o, i] = (a * floor[k, 3 * o + i] + b * floor[k, 3 * o + 3 + i]
+                                          + c * floor[k + 1, 3 * o + i] + d * floor[k + 1, 3 * o + 3 + i])
+            rhs(P, x, held, f[0, 0], f[0, 1], ks[k], k1, W)
+            for i in range(n):
+                xs[i] = x[i] + 0.5 * h * k1[i]
+            rhs(P, xs, held, f[1, 0], f[1, 1], ks[k], k2, W)
+            for i in range(n):
+                xs[i] = x[i] + 0.5 * h * k2[i]
+            rhs(P, xs, held, f[1, 0], f[1, 1], ks[k], k3, W)
+            for i in range(n):
+                xs[i] = x[i] + h * k3[i]
+            rhs(P, xs, held, f[2, 0], f[2, 1], ks[k], k4, W)
+            for i in range(n):
+                x[i] += h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i])

@@ -1,0 +1,147 @@
+"""Effects of the library in sensors, converter, amplifiers and loop."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .effect import Draw, Effect, Hidden
+from .table import Plant
+
+Drawn = tuple[str, dict[str, float], dict[str, Any]]
+
+
+def _geophone_corner(d: Draw) -> Drawn:
+    nominal = d.plant.rig.geophones
+    corner = nominal.suspension_Hz * (1 + d.sign() * d.size(0.004, 0.25))
+    constant_damper = d.rng.random() < 0.5      # otherwise the damping ratio stays
+    zeta = nominal.suspension_damping * (nominal.suspension_Hz / corner if constant_damper else 1.0)
+    return d.one(d.plant.sensors), {"corner_Hz": corner}, {"damping_ratio": zeta}
+
+
+def _apply_geophone_corner(plant: Plant, h: Hidden) -> None:
+    j = plant.sensors.index(h.location)
+    plant.wn[j], plant.zn[j] = 2 * np.pi * h.parameters["corner_Hz"], h.details["damping_ratio"]
+
+
+def _sensor_gain(d: Draw) -> Drawn:
+    return d.one(d.plant.sensors), {"gain": 1 + d.sign() * d.size(0.002, 0.10)}, {}
+
+
+def _apply_sensor_gain(plant: Plant, h: Hidden) -> None:
+    plant.S[plant.sensors.index(h.location)] *= h.parameters["gain"]
+
+
+def _sensor_misalignment(d: Draw) -> Drawn:
+    name = d.one(d.plant.sensors)
+    axis = d.plant.sensor_n[d.plant.sensors.index(name)]
+    away = np.cross(axis, d.direction())
+    return name, {"angle_rad": d.size(0.003, 0.15)}, {"towards": (away / np.linalg.norm(away)).tolist()}
+
+
+def _apply_sensor_misalignment(plant: Plant, h: Hidden) -> None:
+    j, angle = plant.sensors.index(h.location), h.parameters["angle_rad"]
+    plant.sensor_n[j] = np.cos(angle) * plant.sensor_n[j] + np.sin(angle) * np.array(h.details["towards"])
+
+
+def _tilt_coupling(d: Draw) -> Drawn:
+    return "horizontal geophones", {"gravity_m_per_s2": 9.81}, {}
+
+
+def _apply_tilt_coupling(plant: Plant, h: Hidden) -> None:
+    plant.extra["g"] = h.parameters["gravity_m_per_s2"]
+
+
+def _mains_hum(d: Draw) -> Drawn:
+    frequency = float(d.rng.choice([50.0, 60.0])) + d.rng.uniform(-0.02, 0.02)
+    harmonics = [1, *(n for n in (2, 3, 4, 5, 7) if d.rng.random() < 0.5)]
+    largest = d.size(5e-4, 0.3)
+    fundamental = d.between(0.15, 1.0, 6)
+    amplitude = largest * fundamental / fundamental.max()
+    fall = [1.0, *(d.between(0.05, 0.6) for _ in harmonics[1:])]
+    return "geophones", {"frequency_Hz": frequency, "amplitude_V": largest}, {
+        "harmonics": harmonics, "amplitudes_V": (amplitude[:, None] * fall).tolist(),
+        "phases": d.rng.uniform(0, 2 * np.pi, (6, len(harmonics))).tolist()}
+
+
+def _apply_mains_hum(plant: Plant, h: Hidden) -> None:
+    def hum(y: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        out = y.copy()
+        for n, number in enumerate(h.details["harmonics"]):
+            angle = 2 * np.pi * number * h.parameters["frequency_Hz"] * t
+            for j in range(6):
+                out[:, j] += h.details["amplitudes_V"][j][n] * np.sin(angle + h.details["phases"][j][n])
+        return out
+    plant.analogue.append(hum)
+
+
+def _sensor_quantisation(d: Draw) -> Drawn:
+    name = d.one(d.plant.sensors)
+    if d.rng.random() < 0.5:
+        return name, {"step_V": d.size(4e-3, 0.3)}, {}
+    return name, {"range_V": float(d.high.y[d.plant.sensors.index(name)]) * d.size(3.2, 1.3)}, {}
+
+
+def _apply_sensor_quantisation(plant: Plant, h: Hidden) -> None:
+    j = plant.sensors.index(h.location)
+    plant.step_V[j] = h.parameters.get("step_V", plant.step_V[j])
+    plant.range_V[j] = h.parameters.get("range_V", plant.range_V[j])
+
+
+def _actuator_gain(d: Draw) -> Drawn:
+    return d.one(d.plant.motors), {"gain": 1 + d.sign() * d.size(0.003, 0.15)}, {}
+
+
+def _apply_actuator_gain(plant: Plant, h: Hidden) -> None:
+    plant.motor[plant.motors.index(h.location)] *= h.parameters["gain"]
+
+
+def _actuator_lag(d: Draw) -> Drawn:
+    return "actuators", {"corner_Hz": d.size(1500.0, 25.0)}, {}
+
+
+def _apply_actuator_lag(plant: Plant, h: Hidden) -> None:
+    plant.extra["lag"] = np.full(8, 2 * np.pi * h.parameters["corner_Hz"])
+
+
+def _actuator_saturation(d: Draw) -> Drawn:
+    return "actuators", {"limit_V": d.high.level * d.size(3.2, 1.4)}, {}
+
+
+def _apply_actuator_saturation(plant: Plant, h: Hidden) -> None:
+    limit = h.parameters["limit_V"]
+    plant.drive.append(lambda u, t, rng: np.clip(u, -limit, limit))
+
+
+def _loop_delay(d: Draw) -> Drawn:
+    return "loop", {"delay_s": d.size(3e-5, 4e-3)}, {}
+
+
+def _apply_loop_delay(plant: Plant, h: Hidden) -> None:
+    plant.delay_s += h.parameters["delay_s"]
+
+
+def _ground_motion(d: Draw) -> Drawn:
+    factor = d.size(5.0, 30.0)
+    ambient = d.plant.rig.ambient.floor_velocity_rms_m_per_s
+    return "floor", {"velocity_rms_m_per_s": factor * ambient}, {"factor": factor}
+
+
+def _apply_ground_motion(plant: Plant, h: Hidden) -> None:
+    plant.floor_factor *= h.details["factor"]
+
+
+SIGNALS = tuple(Effect(name, family, draw, apply) for name, family, draw, apply in (
+    ("geophone_corner", "sensor", _geophone_corner, _apply_geophone_corner),
+    ("sensor_gain", "sensor", _sensor_gain, _apply_sensor_gain),
+    ("sensor_misalignment", "sensor", _sensor_misalignment, _apply_sensor_misalignment),
+    ("tilt_coupling", "sensor", _tilt_coupling, _apply_tilt_coupling),
+    ("mains_hum", "disturbance", _mains_hum, _apply_mains_hum),
+    ("sensor_quantisation", "converter", _sensor_quantisation, _apply_sensor_quantisation),
+    ("actuator_gain", "actuator", _actuator_gain, _apply_actuator_gain),
+    ("actuator_lag", "loop", _actuator_lag, _apply_actuator_lag),
+    ("actuator_saturation", "drive", _actuator_saturation, _apply_actuator_saturation),
+    ("loop_delay", "loop", _loop_delay, _apply_loop_delay),
+    ("ground_motion", "floor", _ground_motion, _apply_ground_motion),
+))
