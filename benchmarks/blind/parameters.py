@@ -75,18 +75,22 @@ def unit_of(name: str) -> tuple[str, float | None]:
     return name, None
 
 
-def true_value(effect: str, reported: str, hidden: dict, table: Sequence[Equivalent] = EQUIVALENTS) -> float | None:
-    """The truth of a reported parameter: by the table, under the same name, or under its name with another unit."""
+def true_value(effect: str, reported: str, hidden: dict, table: Sequence[Equivalent] = EQUIVALENTS
+               ) -> tuple[str, float] | None:
+    """The truth of a reported parameter and the name it has there; None where there is none.
+
+    By the table, under the same name, or under its name with another unit.
+    """
     for one in table:  # first, since a word can mean something else in the truth
         if (one.effect, one.reported) == (effect, reported) and is_number(hidden.get(one.hidden)):
-            return one.scale * hidden[one.hidden] + one.offset
+            return one.hidden, one.scale * hidden[one.hidden] + one.offset
     if is_number(hidden.get(reported)):
-        return float(hidden[reported])
+        return reported, float(hidden[reported])
     stem, unit = unit_of(reported)
     for name, value in hidden.items():
         other, factor = unit_of(name)
         if unit is not None and factor is not None and other == stem and is_number(value):
-            return float(value) * factor / unit
+            return name, float(value) * factor / unit
     return None
 
 
@@ -98,17 +102,20 @@ def parameter_errors(cases: Sequence[Judged], table: Sequence[Equivalent] = EQUI
                      ) -> tuple[list[Error], list[str]]:
     """Errors that can be compared, and "effect.parameter" of each reported one that cannot.
 
-    Counted are effects named rightly: by their own name and, where the place is a choice, at the right place.
+    Counted are effects named rightly: by their own name and, where the place is a choice, at the right place. A
+    parameter of the truth counts once, however many reported ones follow from it.
     """
     errors, unknown = [], []
     for case in cases:
         for pair in case.pairs:
             if not pair.exact or (pair.hidden.name in PLACED and not pair.place):
                 continue
+            seen = set()
             for name, estimate in pair.named.parameters.items():
-                value = true_value(pair.named.name, name, pair.hidden.parameters, table)
-                if value is None or estimate.std is None:
+                truth = true_value(pair.named.name, name, pair.hidden.parameters, table)
+                if truth is None or estimate.std is None:
                     unknown.append(f"{pair.named.name}.{name}")
-                else:
-                    errors.append(Error(pair.named.name, name, estimate.value - value, estimate.std))
+                elif truth[0] not in seen:
+                    seen.add(truth[0])
+                    errors.append(Error(pair.named.name, name, estimate.value - truth[1], estimate.std))
     return errors, unknown

@@ -27,7 +27,9 @@ from avis_ctrl.errors import AvisError, InputError
 from benchmarks.blind.case import Task, work
 from benchmarks.blind.lines import KINDS, STRENGTHS, Line, Settings, finished
 
-TRUTH, FINDER = "tests.truth.cases", "avis_ctrl.study.gap"
+# The truth is imported as its tests do, from the folder tests/: the names of its compiled functions hang on that.
+TRUTH, FINDER = "truth.cases", "avis_ctrl.study.gap"
+TESTS = Path(__file__).resolve().parents[2] / "tests"
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -153,8 +155,10 @@ def run(settings: Settings, seeds: Iterable[int], out: Path, *, resume: bool = F
                 line, count = line_of(one, settings), count + 1
                 if line is None:
                     failed.append(one.seed)
+                    text = one.told.get("truth_failed", one.told.get("crash", "its worker was killed")).strip()
+                    # In full once: if the truth is broken, every case says the same.
                     say(f"seed {one.seed}: the truth failed, no line written: "
-                        f"{one.told.get('truth_failed', one.told.get('crash', 'its worker was killed'))}")
+                        f"{text if len(failed) == 1 else text.splitlines()[-1]}")
                 else:
                     file.write(line.model_dump_json() + "\n")
                     file.flush()
@@ -235,6 +239,8 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 
 def main(words: list[str] | None = None) -> None:
     given = arguments(words)
+    if str(TESTS) not in sys.path:
+        sys.path.append(str(TESTS))  # workers get this list too
     settings = Settings(duration_s=given.duration, jobs=given.jobs, kind=given.kind, effect=given.effect,
                         strength=given.strength, unseen=given.unseen, commit=commit())
     try:

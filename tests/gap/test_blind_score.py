@@ -201,12 +201,12 @@ def test_noise_ratio():
 
 def test_parameters_in_other_words_and_units():
     table = (Equivalent("actuator_gain", "change_percent", "gain", 0.01, 1.0),)
-    assert true_value("actuator_gain", "gain", {"change_percent": 5.0}, table) == pytest.approx(1.05)
-    assert true_value("actuator_lag", "time_constant_ms", {"time_constant_s": 2e-3}) == pytest.approx(2.0)
-    assert true_value("actuator_lag", "corner_Hz", {"corner_rad_per_s": 2 * 3.141592653589793}) == pytest.approx(1.0)
+    assert true_value("actuator_gain", "gain", {"change_percent": 5.0}, table)[1] == pytest.approx(1.05)
+    assert true_value("actuator_lag", "time_constant_ms", {"time_constant_s": 2e-3})[1] == pytest.approx(2.0)
+    assert true_value("actuator_lag", "corner_Hz", {"corner_rad_per_s": 2 * 3.141592653589793})[1] == pytest.approx(1.0)
     # A table's entry goes before the same name: the truth's delay comes on top of the nominal 1 ms.
-    assert true_value("loop_delay", "delay_s", {"delay_s": 2e-3}) == pytest.approx(3e-3)
-    assert true_value("loop_delay", "extra_delay_s", {"delay_s": 2e-3}) == pytest.approx(2e-3)
+    assert true_value("loop_delay", "delay_s", {"delay_s": 2e-3})[1] == pytest.approx(3e-3)
+    assert true_value("loop_delay", "extra_delay_s", {"delay_s": 2e-3})[1] == pytest.approx(2e-3)
     assert true_value("actuator_gain", "gain", {"shape": [1.0]}) is None
     assert true_value("cubic_stiffness", "gain", {"gain": True}) is None
 
@@ -215,6 +215,15 @@ def test_parameters_of_a_wrong_place_are_not_compared():
     errors, unknown = parameter_errors([judge(one) for one in campaign()])
     assert sorted(round(one.error, 6) for one in errors) == [0.0, 0.1]  # seeds 8 and 3, not 4
     assert [one.deviations for one in errors] == pytest.approx([1.0, 0.0])
+    assert unknown == []
+
+
+def test_a_parameter_counts_once():
+    """The report gives the extra delay and the sum with the nominal one: one truth, one error."""
+    truth = hidden("loop_delay", "loop", delay_s=2e-3)
+    given = answer("explained", named("loop_delay", "loop", extra_delay_s=(2.1e-3, 1e-4), delay_s=(3.1e-3, 1e-4)))
+    errors, unknown = parameter_errors([judge(line(1, "one", [truth], given))])
+    assert [(one.parameter, pytest.approx(1.0)) for one in errors] == [("extra_delay_s", errors[0].deviations)]
     assert unknown == []
 
 
