@@ -1,0 +1,162 @@
+"""A table on the lines of a whole record: the linear part of a simulation in time.
+
+A record from rest is put before silence of at least its own length and QUIET_s, so that what the discrete Fourier
+transform wraps around has died out. The responses are those of `TableModel`: hold, delay and aliases included, the
+floor's velocity band-limited between its samples. At frequency zero, where displacement by velocity of the floor and
+an integrating loop are infinite while what is read is not, the line is taken at LOWEST_LINE of the line spacing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.fft
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.operators import Assembled, assemble
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.response import N_Q
+
+# Silence behind a record [s]: with 1 % of damping at 1.5 Hz, motion falls to 0.4 % of itself.
+QUIET_s = 60.0
+# Lines above this [Hz] are taken as zero: a table moves there by its mass alone, and little.
+HIGHEST_Hz = 500.0
+LOWEST_LINE = 0.01
+# Lines of which the dynamic stiffness is formed at once.
+CHUNK = 8192
+# Samples of a record beyond which it does not fit into memory in one piece (padded: some 1.5 kB a sample).
+MOST_SAMPLES = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class LineResponse:
+    """The table on lines of a padded record.
+
+    Attributes
+    ----------
+    samples, padded : of a record, without and with silence. omega : (n,) rad/s of the lines kept, from zero on.
+    compliance : (n, n_q, n_q) inverse dynamic stiffness. read : (1 or n, n_y, n_q) sensors by x, sensitivity included.
+    volts : (n, n_u) commanded to acting volts. alias : (n, n_y, n_u) or None, what sampling folds to y.
+    floor : (n, n_q, 3) force, chassis : (n, 6, 3) displacement by velocity of the floor. recoil : (n, 6, n_q) or None.
+    T : (n_q, n_u). G, G_c : (n_g, n_q) and (n_g, 6), deflection by x and chassis.
+    """
+
+    samples: int
+    padded: int
+    sample_rate_Hz: float
+    omega: np.ndarray
+    compliance: np.ndarray
+    read: np.ndarray
+    volts: np.ndarray
+    alias: np.ndarray
+    alias_map: np.ndarray
+    floor: np.ndarray
+    chassis: np.ndarray
+    recoil: np.ndarray | None
+    T: np.ndarray
+    G: np.ndarray
+    G_c: np.ndarray
+
+    def spectrum(self, samples: np.ndarray) -> np.ndarray:
+        """(n, m) of (samples, m) from rest."""
+        return scipy.fft.rfft(samples, self.padded, axis=0)[:len(self.omega)]
+
+    def in_time(self, spectrum: np.ndarray) -> np.ndarray:
+        """(samples, m) of (n, m)."""
+        return scipy.fft.irfft(spectrum, self.padded, axis=0)[:self.samples]
+
+    def drive(self, u: np.ndarray, floor: np.ndarray | None) -> np.ndarray:
+        """(n, n_q) force of commanded volts (samples, n_u) and floor velocity (samples, 3)."""
+        force = (self.volts * self.spectrum(u)) @ self.T.T
+        if floor is not None:
+            force += (self.floor @ self.spectrum(floor)[:, :, None])[:, :, 0]
+        return force
+
+    def motion(self, force: np.ndarray) -> np.ndarray:
+        """(n, n_q) of a force."""
+        return (self.compliance @ force[:, :, None])[:, :, 0]
+
+    def deflection(self, x: np.ndarray, floor: np.ndarray | None) -> np.ndarray:
+        """(n, n_g) payload less chassis at the mounts; floor velocity in time."""
+        d = x @ self.G.T
+        if self.recoil is not None:
+            d = d + (self.recoil @ x[:, :, None])[:, :, 0] @ self.G_c.T
+        if floor is not None:
+            d = d - (self.chassis @ self.spectrum(floor)[:, :, None])[:, :, 0] @ self.G_c.T
+        return d
+
+    def sensed(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """(n, n_y) y of a motion x; the aliases are those of volts u (samples, n_u)."""
+        y = x @ self.read[0].T if len(self.read) == 1 else (self.read @ x[:, :, None])[:, :, 0]
+        return y + (self.alias * self.spectrum(u)) @ self.alias_map.T
+
+
+_kept: list[tuple[TableModel, int, float, LineResponse]] = []
+
+
+def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> LineResponse:
+    """The linear part of a model for records of one length; the last two are kept.
+
+    Raises
+    ------
+    InputError : a record too long for one piece, a rate that is not the model's.
+    """
+    for known, length, rate, found in _kept:
+        if _same(known, model) and (length, rate) == (samples, sample_rate_Hz):
+            return found
+    if samples > MOST_SAMPLES:
+        raise InputError(f"expected a record of at most {MOST_SAMPLES} samples, which is simulated in one piece",
+                         field="samples", value=samples)
+    if model.period_s and abs(sample_rate_Hz * model.period_s - 1) > 1e-6:
+        raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", field="sample_rate_Hz",
+                         value=sample_rate_Hz)
+    padded = scipy.fft.next_fast_len(max(2 * samples, samples + int(np.ceil(QUIET_s * sample_rate_Hz))), True)
+    found = _formed(model, samples, padded, sample_rate_Hz)
+    _kept.append((model, samples, sample_rate_Hz, found))
+    del _kept[:-2]
+    return found
+
+
+def _same(one: TableModel, other: TableModel) -> bool:
+    """Whether two models are made of the very same parts."""
+    return (one.base is other.base and len(one.effects) == len(other.effects)
+            and all(a is b for a, b in zip(one.effects, other.effects, strict=True)))
+
+
+def _formed(model: TableModel, samples: int, padded: int, sample_rate_Hz: float) -> LineResponse:
+    spacing = 2 * np.pi * sample_rate_Hz / padded
+    n = min(padded // 2 + 1, int(HIGHEST_Hz * padded / sample_rate_Hz) + 1)
+    omega = spacing * np.arange(n)
+    omega[0] = LOWEST_LINE * spacing
+    parts = [_lines(assemble(model.operators(omega[k:k + CHUNK]))) for k in range(0, n, CHUNK)]
+    made = {name: np.concatenate([part[name] for part in parts]) for name in parts[0] if parts[0][name] is not None}
+    mat = model.matrices
+    first = assemble(model.operators(omega[:1]), invert=False)
+    gain = (first.ops.base.sensors.sensitivity * first.ops.sensor_gain)[:, None]
+    return LineResponse(samples, padded, sample_rate_Hz, omega, made["compliance"], made["read"], made["volts"],
+                        made["alias"], gain * (mat.R @ np.linalg.inv(mat.M) @ mat.T), made["floor"], made["chassis"],
+                        made.get("recoil"), first.T.real, first.G, first.ops.mounts.chassis)
+
+
+def _lines(made: Assembled) -> dict[str, np.ndarray | None]:
+    """What `LineResponse` keeps of some lines."""
+    ops, n = made.ops, len(made.ops.omega)
+    s = ops.s[:, None, None]
+    w = np.broadcast_to(np.eye(3, dtype=complex), (n, 3, 3)) / s
+    gain = (ops.base.sensors.sensitivity * ops.sensor_gain)[:, None]
+    recoil = None
+    if ops.recoil is not None:
+        recoil = np.zeros((n, N_Q, made.n_q), complex)
+        recoil[:, :, :N_Q] = s ** 2 * (ops.recoil @ made.M)
+    return {"compliance": made.inverse, "read": gain * ops.sense[:, :, None] * made.rows,
+            "volts": np.broadcast_to(made.volts, (n, len(ops.base.actuators))),
+            "alias": made.folded[:, None] * ops.drive, "floor": made.floor_force(w), "chassis": made.follow(w),
+            "recoil": recoil}
+
+
+def linear_part(model: TableModel) -> TableModel:
+    """The model without effects that depend on amplitude or time."""
+    if not model.nonlinear:
+        return model
+    return replace(model, effects=tuple(one for one in model.effects if not one.effect.nonlinear))

@@ -1,0 +1,148 @@
+"""The motion of the mounts in a measured record: simulated by a model, corrected by what the sensors say.
+
+    d = d_model + G q_e,    q_e = K (y - y_model)
+
+y - y_model is taken for the answer to a force e that the model lacks, white within a third of an octave, and to white
+noise of the sensors. The most likely q_e is then K = P H^H S (H S H^H + N)^-1 (Wiener), with H = (y by force) and
+P = D^-1 S: the inverse of the sensors' chain where they see more than noise, nothing where they do not.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.fft
+
+from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
+from avis_ctrl.gap.motion import RecordMotion
+from avis_ctrl.gap.operators import mount_geometry
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.campaign_fit import Portion
+from avis_ctrl.identification.prediction import model_inputs
+from avis_ctrl.identification.response import N_Q
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
+
+# Band [Hz] in which the sensors correct the model, with the edges over which that fades.
+LOW_Hz, HIGH_Hz = (0.4, 0.8), (120.0, 150.0)
+# Part of the band, at its upper end, where only noise is left: its power is that of the sensors.
+NOISE_FROM = 0.6
+
+
+def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = None) -> dict[str, RecordMotion]:
+    """Motion of every record of a campaign by its name, from its measured y.
+
+    Parameters
+    ----------
+    campaign : its records may be portions of others: these are taken whole, so that the portion starts in motion.
+    model : effects that depend on amplitude or time do not act in the simulation; the sensors say what they did.
+    whole : the campaign that sets the clock, where `campaign` is a part of it.
+
+    Raises
+    ------
+    InputError : channels or rates that are not the model's, a record too long for one piece.
+    """
+    clock = (whole or campaign).records
+    ends = [(one.header.start_s, one.header.start_s + one.header.duration_s) for one in clock]
+    campaign_s = (min(start for start, _ in ends), max(end for _, end in ends))
+    linear = linear_part(model)
+    known: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    found = {}
+    for record in campaign.records:
+        source, begin, stop = _origin(record)
+        if id(source) not in known:
+            known[id(source)] = _volts_and_deflection(source.load(), linear)
+        volts, deflection = known[id(source)]
+        h = record.header
+        found[h.name] = RecordMotion(h.name, h.sample_rate_Hz, h.start_s, campaign_s, volts[:stop], deflection[:stop],
+                                     *mount_rows(model), h.level_V, begin)
+    return found
+
+
+def _origin(record: RecordSource) -> tuple[RecordSource, int, int]:
+    """The whole record, and which samples of it a record is."""
+    begin, stop = 0, record.header.samples
+    while isinstance(record, Portion):
+        begin, stop = begin + record.start, stop + record.start
+        record = record.whole
+    return record, begin, stop
+
+
+def mount_rows(model: TableModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rows from q (n_g, 6), stiffness (n_g,) N/m, which are vertical (n_g,), row of each motor (n_u,)."""
+    mounts = mount_geometry(model.effective.rig)
+    motors = {one.name: f"isolator{one.isolator}.{one.axis}" for one in getattr(model.rig, "motors", ())}
+    rows = [mounts.names.index(motors[name]) for name in model.actuators if motors.get(name) in mounts.names]
+    return mounts.payload, mounts.stiffness, mounts.along("z"), np.array(rows, int)
+
+
+def limited_inputs(model: TableModel, record: Record) -> tuple[np.ndarray, np.ndarray | None]:
+    """u (samples, n_u) within the drives' limit and floor, in the model's order."""
+    u, floor = model_inputs(model.base, record)
+    limit = model.rig.drive_limit_V
+    return np.clip(u, -limit, limit), floor
+
+
+def _volts_and_deflection(record: Record, linear: TableModel) -> tuple[np.ndarray, np.ndarray]:
+    h = record.header
+    u, floor = limited_inputs(linear, record)
+    lines = line_response(linear, h.samples, h.sample_rate_Hz)
+    x = lines.motion(lines.drive(u, floor))
+    deflection = lines.in_time(lines.deflection(x, floor))
+    rows = [h.y_names.index(name) for name in linear.sensors.names if name in h.y_names]
+    if not rows or not deflection.size:
+        return u, deflection
+    seen = np.array([name in h.y_names for name in linear.sensors.names])
+    left = record.y[:, rows] - lines.in_time(lines.sensed(x, u))[:, seen]
+    return u, deflection + _unmodelled(left - left.mean(0), lines, seen)
+
+
+def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.ndarray:
+    """(samples, n_g) deflection that explains what the sensors read beyond the model."""
+    samples, fs, n_y = len(left), lines.sample_rate_Hz, left.shape[1]
+    margin = min(round(5 * fs), (lines.padded - samples) // 2, samples - 1)
+    spectrum = scipy.fft.rfft(_beyond_ends(left, margin), lines.padded, axis=0)[:len(lines.omega)]
+    frequency = lines.omega / (2 * np.pi)
+    noise = np.median(np.abs(spectrum[frequency > NOISE_FROM * frequency[-1]]) ** 2, axis=0) / np.log(2)
+    noise = np.maximum(noise, 1e-8 * np.mean(np.abs(spectrum) ** 2))
+    fade = _fade(frequency)
+    at = np.flatnonzero(fade)
+    by_force = (lines.read if len(lines.read) == 1 else lines.read[at])[:, seen] @ lines.compliance[at]
+    # A force on the payload, as much moment as its size makes of it.
+    size = np.array([1.0, 1.0, 1.0, *np.sqrt(np.mean(lines.G[:, 3:N_Q] ** 2, axis=0))])
+    H = by_force[:, :, :N_Q] * size / np.sqrt(noise)[:, None]
+    white = spectrum[at] / np.sqrt(noise)
+    strength = _strength(frequency[at], white, H)
+    HH = np.conj(np.swapaxes(H, 1, 2))
+    inner = strength[:, None, None] * (H @ HH) + np.eye(n_y)
+    e = strength[:, None, None] * (HH @ np.linalg.solve(inner, white[:, :, None]))
+    x = lines.compliance[at][:, :, :N_Q] @ (size[:, None] * e)
+    d = np.zeros((len(frequency), len(lines.G)), complex)
+    d[at] = x[:, :, 0] @ lines.G.T
+    if lines.recoil is not None:
+        d[at] += (lines.recoil[at] @ x)[:, :, 0] @ lines.G_c.T
+    return scipy.fft.irfft(d * fade[:, None], lines.padded, axis=0)[margin:margin + samples]
+
+
+def _beyond_ends(left: np.ndarray, margin: int) -> np.ndarray:
+    """(samples + 2 margin, n_y): continued by its reflection at both ends, which fades."""
+    before, after = left[margin:0:-1], left[-2:-2 - margin:-1]
+    fade = 0.5 - 0.5 * np.cos(np.pi * (np.arange(margin) + 0.5) / margin)[:, None]
+    return np.concatenate([before * fade, left, after * fade[::-1]])
+
+
+def _fade(frequency: np.ndarray) -> np.ndarray:
+    """(n,) one between LOW_Hz and HIGH_Hz, zero outside."""
+    up = np.clip((frequency - LOW_Hz[0]) / (LOW_Hz[1] - LOW_Hz[0]), 0, 1)
+    down = np.clip((HIGH_Hz[1] - frequency) / (HIGH_Hz[1] - HIGH_Hz[0]), 0, 1)
+    return np.sin(np.pi / 2 * up) ** 2 * np.sin(np.pi / 2 * down) ** 2
+
+
+def _strength(frequency: np.ndarray, white: np.ndarray, H: np.ndarray) -> np.ndarray:
+    """(n,) variance of the force, a third of an octave at a time, that makes what exceeds unit noise."""
+    band = np.floor(3 * np.log2(frequency / frequency[0])).astype(int)
+    lines = np.bincount(band) * white.shape[1]
+    excess = np.bincount(band, np.sum(np.abs(white) ** 2, axis=1)) - lines
+    made = np.bincount(band, np.sum(np.abs(H) ** 2, axis=(1, 2)))
+    # What noise alone would leave of the excess: two standard deviations are no force.
+    least = 0.02 * np.sqrt(np.maximum(lines, 1))
+    strength = np.maximum(excess, least) / np.maximum(made, np.finfo(float).tiny)
+    return strength[band]
