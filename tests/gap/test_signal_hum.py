@@ -1,0 +1,120 @@
+"""Mains hum in residuals: false alarms, amplitudes and frequency against what was put in, masks and subtraction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from signal_campaigns import FS, draw, hum, rig
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.signals.hum import find_hum, polluted, subtract
+from avis_ctrl.gap.signals.leftover import Leftover, leftovers
+from avis_ctrl.measurement.campaign import RecordHeader
+
+
+def white(seed: int, records: int = 6, samples: int = 10_000, added=0.0) -> list[Leftover]:
+    rng = np.random.default_rng(seed)
+    names = tuple(m.name for m in rig().motors), rig().geophones.names
+    return [Leftover(RecordHeader(f"{k:02d}", FS, samples, *names, "rest"), np.zeros((samples, 8)),
+                     rng.normal(size=(samples, 6)) + added) for k in range(records)]
+
+
+def test_white_noise_raises_no_alarm_at_five_per_cent_in_more_than_its_share():
+    """60 campaigns: 3 expected at most, 10 or more have a chance of 1e-3."""
+    assert sum(find_hum(white(seed), 0.05) is not None for seed in range(60)) < 10
+
+
+@pytest.mark.parametrize("kind", ["multisine", "noise"])
+@pytest.mark.parametrize("seed", range(4))
+def test_misfit_of_the_model_is_no_hum(kind, seed):
+    """10 % in gain and 1 ms: residuals of a tenth of the signal at every driven line, 50 Hz among them."""
+    campaign, predicted = draw(seed, kind, levels=(0.1, 0.2, 0.4), samples=20_000)
+    wrong = {name: 0.9 * np.roll(y, 1, 0) for name, y in predicted.items()}
+    assert find_hum(leftovers(campaign, wrong)) is None
+
+
+@pytest.mark.parametrize("kind", ["multisine", "noise"])
+@pytest.mark.parametrize(("f0", "amplitudes"), [
+    (50.013, {(0, 1): 5e-3, (1, 1): 2e-3, (0, 3): 1e-3}),
+    (59.98, {(2, 2): 3e-4, (2, 3): 2e-4}),
+    (50.0, {(j, 1): 3e-4 for j in range(6)})])
+def test_lines_are_found_and_measured(kind, f0, amplitudes):
+    campaign, predicted = draw(3, kind, levels=(0.1, 0.2, 0.4), samples=30_000,
+                               added=lambda n, rng: hum(n, f0, amplitudes, rng))
+    found = find_hum(leftovers(campaign, predicted))
+    assert found is not None and found.confidence > 0.999
+    assert abs(found.frequency_Hz.value - f0) < 4 * found.frequency_Hz.std
+    names = campaign.y_names
+    assert {(names.index(line.channel), line.harmonic) for line in found.lines} == set(amplitudes)
+    for line in found.lines:
+        true = amplitudes[names.index(line.channel), line.harmonic]
+        assert abs(line.amplitude.value - true) < 5 * line.amplitude.std
+        assert line.amplitude.std < 0.1 * true
+
+
+def test_frequency_error_is_as_large_as_it_says():
+    """50 draws of a weak line in white noise: the pull has unit variance."""
+    t, pull = np.arange(10_000) / FS, []
+    for seed in range(50):
+        added = np.zeros((10_000, 6))
+        added[:, 2] = 0.3 * np.sin(2 * np.pi * 50.07 * t + seed)
+        found = find_hum(white(seed, 2, added=added))
+        assert found is not None
+        pull.append((found.frequency_Hz.value - 50.07) / found.frequency_Hz.std)
+    # Chi-square of 50: 0.6 to 1.55 hold 99.9 %.
+    assert 0.6 < np.mean(np.square(pull)) < 1.55
+
+
+def test_a_driven_line_among_silent_ones_is_no_hum():
+    """A multisine with 50 Hz alone above 40 Hz, and a model that misses it."""
+    n = 30_000
+    t = np.arange(n) / FS
+    header = RecordHeader("00", FS, n, ("A",), ("S",), "multisine", 1.0, 0.0, 10.0)
+    line = np.sin(2 * np.pi * 50.0 * t)[:, None]
+    e = 0.1 * line + np.random.default_rng(0).normal(size=(n, 1)) * 1e-3
+    assert find_hum([Leftover(header, line, e)]) is None
+    rest = RecordHeader("00", FS, n, ("A",), ("S",), "rest")
+    assert find_hum([Leftover(rest, 0 * line, e)]) is not None
+
+
+def test_subtraction_leaves_noise_and_the_driven_signal():
+    amplitudes = {(0, 1): 5e-3, (4, 2): 2e-3}
+    given = {"levels": (0.1, 0.2), "samples": 30_000}
+    campaign, predicted = draw(4, "noise", **given, added=lambda n, rng: hum(n, 50.02, amplitudes, rng))
+    found = find_hum(leftovers(campaign, predicted))
+    assert found is not None
+    for record in campaign.records:
+        y = record.y
+        e = y - predicted[record.header.name]
+        left = subtract(found, e, y, FS, campaign.y_names) - predicted[record.header.name]
+        n = len(e)
+        for j, k in amplitudes:
+            tone = np.exp(-2j * np.pi * k * 50.02 * np.arange(n) / FS)
+            assert abs(np.mean(left[:, j] * tone)) < 0.02 * abs(np.mean(e[:, j] * tone))
+        untouched = [1, 2, 3, 5]
+        assert np.array_equal(left[:, untouched], y[:, untouched] - predicted[record.header.name][:, untouched])
+
+
+def test_the_mask_holds_the_lines_power():
+    campaign, predicted = draw(4, "noise", levels=(0.1, 0.2), samples=30_000,
+                               added=lambda n, rng: hum(n, 50.02, {(0, 1): 5e-2}, rng))
+    left = leftovers(campaign, predicted)
+    found = find_hum(left)
+    assert found is not None
+    mask = polluted(found, 30_000, FS)
+    power = np.abs(np.fft.rfft(left[0].e[:, 0])) ** 2
+    near = np.abs(np.fft.rfftfreq(30_000, 1 / FS) - 50.02) < 1
+    assert power[near & ~mask].sum() < 0.1 * power[near & mask].sum()
+    assert 5 <= mask.sum() <= 8
+
+
+def test_wrong_residuals_are_refused():
+    campaign, predicted = draw(1, levels=(0.1,), samples=10_000)
+    with pytest.raises(InputError, match="record 00: prediction"):
+        leftovers(campaign, {"00": predicted["00"][:-1]})
+    with pytest.raises(InputError, match="one record"):
+        leftovers(campaign, {})
+    with pytest.raises(InputError, match="record 00: residual"):
+        leftovers(campaign, {"00": np.full_like(predicted["00"], np.inf)})
+    with pytest.raises(InputError, match="residual of one record"):
+        find_hum([])
