@@ -148,6 +148,7 @@ def command(tmp_path, *words):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
+@pytest.mark.slow
 def test_a_kill_leaves_whole_lines_and_no_worker(modules, tmp_path):
     """Seed 91 sleeps: killed while it does, the other job's lines are there, and its worker ends by itself."""
     running = command(tmp_path, "--seed", "91", "--cases", "5")
