@@ -13,7 +13,7 @@ from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.rigs import load_rig
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "identification"))
-from exact import _run, discrete_avis, floor_velocity, multisine  # noqa: E402
+from exact import _run, discrete_avis, floor_velocity, multisine
 
 FS, LSB = 1000.0, 20.0 / 2 ** 14
 LEVELS = (0.1, 0.1, 0.25, 0.25, 0.5, 0.5)

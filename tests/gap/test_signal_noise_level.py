@@ -7,9 +7,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from signal_campaigns import LSB, draw, rig
+from signal_campaigns import LSB, draw, hum, rig
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.gap.signals.hum import find_hum
 from avis_ctrl.gap.signals.leftover import leftovers
 from avis_ctrl.gap.signals.noise_level import NoiseLevels, noise_levels
 from avis_ctrl.gap.signals.quiet_lines import quiet_lines
@@ -78,13 +79,27 @@ def test_noise_of_one_sensor_is_raised_and_is_no_effect_of_the_floor(kind):
     assert abs(value.value - np.hypot(2e-3, LSB / np.sqrt(12))) < 4.5 * value.std
 
 
-def test_drift_of_the_sensors_is_no_ground_motion():
-    """A random walk of every channel: low frequency like the floor, but outside the range of its response."""
+@pytest.mark.parametrize("size", [3e-5, 1e-4, 1e-3])
+def test_drift_of_the_sensors_is_no_ground_motion(size):
+    """A random walk of every channel: low frequency like the floor, but outside the range of its response too."""
     campaign, predicted = drawn(5, "rest")
     rng = np.random.default_rng(5)
-    found = levels(campaign, {name: y - 1e-4 * np.cumsum(rng.normal(size=y.shape), 0) for name, y in predicted.items()})
-    assert found.floor is not None and found.floor.significant and found.floor.foreign > 0.25
+    found = levels(campaign, {name: y - size * np.cumsum(rng.normal(size=y.shape), 0) for name, y in predicted.items()})
     assert found.ground_motion is None
+    # The largest hides the floor altogether.
+    assert (found.floor is None) == (size > 1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_lines_in_the_sensors_are_no_ground_motion(kind):
+    """5 mV at 50.01 Hz and at 29 Hz in every channel, with the hum found and without."""
+    both = {(j, k): 5e-3 for j in range(6) for k in (1,)}
+    campaign, predicted = drawn(9, kind, added=lambda n, rng: hum(n, 50.01, both, rng) + hum(n, 29.0, both, rng))
+    left = leftovers(campaign, predicted)
+    found = find_hum(left)
+    assert found is not None
+    for given in (None, found):
+        assert noise_levels(left, floor_response, rig(), given).ground_motion is None
 
 
 def test_a_coarse_converter_is_not_noise_of_the_sensor():

@@ -29,6 +29,8 @@ RATIO = 3.0
 REFERENCE, GUARD = 12, 3
 # Half width [lines] of a polluted band in a transform without window, by default.
 POLLUTED_LINES = 3
+# int w^2 t^2 dt / (int w t^2 dt)^2 of a Hann window over the same of none: 28.1 / 12.
+HANN_COST = 2.34
 
 
 @dataclass(frozen=True)
@@ -105,16 +107,19 @@ def find_hum(left: Sequence[Leftover], false_alarm: float = FALSE_ALARM) -> HumF
     trials = sum(int(np.count_nonzero(one.tests)) for one in scores)
     best = min(scores, key=lambda one: float(np.min(np.where(one.ratio > RATIO, one.p, 1.0))))
     p = np.where(best.ratio > RATIO, best.p, 1.0)
-    # A line shows next to its own frequency too, so that neighbours on the grid are not tests of their own.
-    at, _, _ = np.unravel_index(np.argmin(p), p.shape)
     chance = min(1.0, float(p.min()) * trials)
     if chance > false_alarm:
         return None
+    # p underflows where lines are strong, so that the sum of the scores tells where they are strongest.
+    sure = p * trials <= false_alarm
+    at = int(np.argmax(np.sum(np.where(sure, best.score, 0.0), axis=(1, 2))))
+    frequency = _refined(left, float(best.f0[at]), np.argwhere(sure[at]))
     # With the frequency known, what else stands out is judged among the lines there.
-    own = p[at]
-    hits = np.argwhere(own < false_alarm / own.size)
-    frequency = _refined(left, float(best.f0[at]), hits)
-    lines = _lines(left, frequency.value, hits, own, best.ratio[at])
+    there = _scores(left, best.nominal_Hz, np.array([frequency.value]))
+    own = np.where(there.ratio > RATIO, there.p, 1.0)[0]
+    hits = np.argwhere((own < false_alarm / own.size) | sure[at])
+    frequency = _refined(left, frequency.value, hits)
+    lines = _lines(left, frequency.value, hits, own, there.ratio[0])
     return _finding(left, best.nominal_Hz, frequency, lines, chance, first.y_unit)
 
 
@@ -148,13 +153,15 @@ def subtract(finding: HumFinding, e: np.ndarray, y: np.ndarray, sample_rate_Hz: 
     return cleaned
 
 
-def _scores(left: Sequence[Leftover], nominal: float) -> _Score:
+def _scores(left: Sequence[Leftover], nominal: float, f0: np.ndarray | None = None) -> _Score:
+    """At f0 (n,), by default everywhere within SEARCH_HZ of the nominal frequency."""
     h = left[0].header
     duration = max(one.header.duration_s for one in left)
     top = int(0.49 * h.sample_rate_Hz / (nominal + SEARCH_HZ))
-    n = int(np.ceil(2 * SEARCH_HZ * 2 * duration * max(top, 1))) + 1
-    f0 = np.linspace(nominal - SEARCH_HZ, nominal + SEARCH_HZ, n)
-    shape = (n, top, len(h.y_names))
+    if f0 is None:
+        n = int(np.ceil(2 * SEARCH_HZ * 2 * duration * max(top, 1))) + 1
+        f0 = np.linspace(nominal - SEARCH_HZ, nominal + SEARCH_HZ, n)
+    shape = (len(f0), top, len(h.y_names))
     score, tests, ratio = np.zeros(shape), np.zeros(shape, int), np.zeros(shape)
     for one in left:
         _add(one, f0, score, tests, ratio)
@@ -209,8 +216,8 @@ def _spread(one: Leftover, f: float) -> np.ndarray:
 def _refined(left: Sequence[Leftover], start: float, hits: np.ndarray) -> Estimate:
     """f0 by least squares of all lines that stand out, amplitudes and phases free in each record.
 
-    Its standard error is that of a sine in white noise of the local level, 2 pi std(f) = sqrt(12) s / (A T sqrt(N))
-    times sqrt(2) (Rife and Boorstyn 1974), all lines together.
+    Its variance is that of a sine in white noise of the local level, var(2 pi f) = 12 v / (A T)^2 with v the variance
+    of either part of the amplitude (Rife and Boorstyn 1974), times what the window costs, all lines together.
     """
     rate = left[0].header.sample_rate_Hz
     pieces = []
@@ -235,7 +242,7 @@ def _refined(left: Sequence[Leftover], start: float, hits: np.ndarray) -> Estima
     for k, t, c, s, duration in pieces:
         # The window's mean is 1/2; s is the variance of either part of the amplitude.
         A2 = (4 * abs(np.mean(c * np.exp(-2j * np.pi * k * shift * t)))) ** 2
-        information += (2 * np.pi * k * duration) ** 2 * max(A2 - 2 * s, 0.0) / s / 12
+        information += (2 * np.pi * k * duration) ** 2 * max(A2 - 2 * s, 0.0) / s / 12 / HANN_COST
     return Estimate(start + shift, float(1 / np.sqrt(max(information, 1e-30))), "Hz")
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -47,6 +48,9 @@ FOREIGN = 0.25
 # Bands per octave; a direction is seen where the density's error is below half of a white ambient floor's density.
 PER_OCTAVE, SEEN = 3, 0.5
 NARROWEST_HZ = 0.4
+# Power outside the range of G by its median in the band, above which a line is none of the floor; a gamma distribution
+# of shape 3 is above 20 times its median once in 1e20.
+LINE = 20.0
 
 FloorResponse = Callable[[np.ndarray], np.ndarray]
 
@@ -200,21 +204,35 @@ def _floor(low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarr
         return None
     white = ambient ** 2 / (FLOOR_BAND_HZ[1] - FLOOR_BAND_HZ[0]) * rate / 2
     S, std = np.full((count, 3), np.nan), np.full((count, 3), np.inf)
+    louder, foreign = _foreign(estimated, edges, len(D) - 3)
     for b in range(count):
-        rows = [r for r in (_band(one, edges[b], edges[b + 1], white) for one in estimated) if r is not None]
+        rows = [r for r in (_band(one, edges[b], edges[b + 1], white, louder[b]) for one in estimated) if r is not None]
         if rows:
             S[b], std[b] = _at_zero_level(rows)
     # Variance per line to one-sided density.
     S, std = S * 2 / rate, std * 2 / rate
     visible = std < SEEN * white * 2 / rate + 0.5 * np.maximum(np.nan_to_num(S), 0.0)
-    parallel, outside = (np.concatenate([one[k] for one in estimated]) for k in (3, 4))
-    # Medians, which the few lines on a resonance do not lead; that of a gamma distribution is its shape less 1/3.
-    n_out = len(D) - 3
-    foreign = 0.0
-    if n_out > 0:
-        excess = [max(float(np.median(p)) / (n - 1 / 3) - 1, 0.0) for p, n in ((parallel, 3), (outside, n_out))]
-        foreign = excess[1] / max(sum(excess), 1e-12) if excess[1] > 0.05 else 0.0
     return _level(S, std, visible, edges, ambient, foreign)
+
+
+def _foreign(estimated: Sequence[tuple], edges: np.ndarray, n_out: int) -> tuple[np.ndarray, float]:
+    """Noise outside the range of G by that of the sensors, (bands,), 1 at least; and the part of the excess that it is.
+
+    The part is the mean over bands that hold more than noise. By medians of each band, which the few lines on a
+    resonance do not lead; that of a gamma distribution is its shape less 1/3.
+    """
+    louder, shares = np.ones(len(edges) - 1), []
+    f, parallel, outside = (np.concatenate([one[k] for one in estimated]) for k in (0, 3, 4))
+    for b, (low, high) in enumerate(pairwise(edges)):
+        band = (f >= low) & (f < high)
+        if n_out < 1 or np.count_nonzero(band) < 10:
+            continue
+        inside, beyond = (max(float(np.median(p[band])) / (n - 1 / 3) - 1, 0.0)
+                          for p, n in ((parallel, 3), (outside, n_out)))
+        louder[b] += beyond
+        if inside + beyond > 1:
+            shares.append(beyond / (inside + beyond))
+    return louder, float(np.mean(shares)) if shares else 0.0
 
 
 def _edges() -> np.ndarray:
@@ -239,13 +257,17 @@ def _floor_lines(one: QuietLines, floor_response: FloorResponse, D: np.ndarray) 
     return one.frequency_Hz, np.abs(v) ** 2 / one.left[:, None], noise, inside, outside, one.left, one.level
 
 
-def _band(one: tuple, low: float, high: float, white: float) -> tuple[np.ndarray, np.ndarray, float] | None:
+def _band(one: tuple, low: float, high: float, white: float, louder: float
+          ) -> tuple[np.ndarray, np.ndarray, float] | None:
     """S (3,), its variance, and the record's level; None with fewer than four lines."""
-    f, power, noise, _, _, left, level = one
+    f, power, noise, _, outside, left, level = one
     inside = (f >= low) & (f < high)
     if np.count_nonzero(inside) < 4:
         return None
-    P, N, h = power[inside], noise[inside], left[inside][:, None]
+    # Lines of machines or mains in the sensors' signals stand out where no floor motion is seen.
+    inside &= outside <= LINE * np.median(outside[inside])
+    # Noise that is no floor's is as loud in the range of G as outside it, seen from the sensors.
+    P, N, h = power[inside], louder * noise[inside], left[inside][:, None]
     S = np.full(3, white)
     for _ in range(3):
         w = h / (S + N) ** 2

@@ -22,7 +22,7 @@ NARROW, WIDE, ORDER = 15, 120, 2
 # A line counts if the regression leaves this part of its noise at least.
 LEAST_LEFT = 0.2
 # Rounds of weighting records by their noise, and windows over which that is averaged.
-ROUNDS, SMOOTHED = 3, 9
+ROUNDS, SMOOTHED = 2, 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +84,8 @@ def _regression(left: Sequence[Leftover], keep: Sequence[np.ndarray], narrow: bo
     n_u, R = left[0].u.shape[1], len(left)
     order = ORDER if narrow else 1
     width = NARROW if narrow else WIDE
-    # Three parameters in four data at most, so that noise is left.
-    width = max(width, int(np.ceil(4 / 3 * (order + 1) * n_u / R)))
+    # One parameter in two data at most, so that noise is left.
+    width = max(width, int(np.ceil(2 * (order + 1) * n_u / R)))
     blocks = len(lines) // width
     empty = [QuietLines(one.header.name, "regression on u", float(np.sqrt(np.mean(one.u ** 2))), np.empty(0),
                         np.empty((0, one.e.shape[1]), complex), np.empty(0)) for one in left]
@@ -116,9 +116,23 @@ def _residual(A: np.ndarray, E: np.ndarray, weight: np.ndarray, records: int) ->
     """What a weighted regression leaves, (blocks, records, width, n_y), and the part of the noise left in each."""
     Q, _ = np.linalg.qr(A * weight[:, :, None])
     W = E * weight[:, :, None]
-    rest = (W - Q @ (np.conj(Q.swapaxes(1, 2)) @ W)) / weight[:, :, None]
-    share = 1 - np.sum(np.abs(Q) ** 2, axis=2)
+    adjoint = np.conj(Q.swapaxes(1, 2))
+    rest = (W - Q @ (adjoint @ W)) / weight[:, :, None]
+    # Diagonal of (I - P) Sigma (I - P), P = Q Q^H: the window makes neighbouring lines of noise alike as it does those
+    # of u, so that a regression takes more of the noise than its number of parameters says.
+    SQ = _hann_covariance(Q.reshape(len(A), records, -1, Q.shape[2])).reshape(Q.shape)
+    middle = adjoint @ SQ
+    share = 1 - 2 * np.real(np.sum(SQ * np.conj(Q), axis=2)) + np.real(np.sum((Q @ middle) * np.conj(Q), axis=2))
     return rest.reshape(len(A), records, -1, E.shape[2]), share.reshape(len(A), records, -1)
+
+
+def _hann_covariance(Q: np.ndarray) -> np.ndarray:
+    """Sigma Q along the lines (axis 2): white noise under a Hann window, -2/3 one line apart and 1/6 two."""
+    out = Q.copy()
+    for lag, rho in ((1, -2 / 3), (2, 1 / 6)):
+        out[:, :, lag:] += rho * Q[:, :, :-lag]
+        out[:, :, :-lag] += rho * Q[:, :, lag:]
+    return out
 
 
 def _running_mean(power: np.ndarray, width: int) -> np.ndarray:
