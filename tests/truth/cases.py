@@ -34,6 +34,7 @@ LIBRARY: dict[str, Effect] = {effect.name: effect for effect in (*SIGNALS, *MECH
 OUTSIDE_LIBRARY: dict[str, Effect] = {effect.name: effect for effect in OUTSIDE}
 KINDS = {"none": 0.20, "one": 0.45, "two": 0.15, "outside": 0.20}
 STRENGTH_SHARES = {"faint": 0.25, "clear": 0.45, "gross": 0.30}
+UNSIZED = {"tilt_coupling"}     # given by gravity: always called clear
 SETTLE_S = 12.0         # ambient motion before a record; the table's slowest mode decays by e^-3.8 within it
 _PARAMETERS, _PLAN, _EFFECTS, _SIGNAL, _FLOOR, _NOISE, _HOOKS, _PAUSES = range(8)
 
@@ -133,7 +134,7 @@ def draw_case(seed: int, kind: str | None = None, effect: str | None = None, str
         draw = Draw(rng, plant, pilot(plant, case.band_Hz, levels[len(levels) // 2]),
                     pilot(plant, case.band_Hz, levels[-1]), chosen, case.starts_s[-1] + duration_s, case.band_Hz)
         location, parameters, details = (LIBRARY | OUTSIDE_LIBRARY)[name].draw(draw)
-        hidden.append(Hidden(name, location, parameters, chosen, details))
+        hidden.append(Hidden(name, location, parameters, "clear" if name in UNSIZED else chosen, details))
     unmeasured = "ground_motion" in names
     return replace(case, kind=kind, effects=tuple(hidden), floor_recorded=case.floor_recorded and not unmeasured)
 

@@ -44,7 +44,7 @@ class Physics(NamedTuple):
     wc: float
     zc: float
     g: float                 # m/s^2 that a tilted sensor feels
-    lag: np.ndarray          # (8,) rad/s or (0,)
+    lag: np.ndarray          # (8,) rad/s of the amplifiers, 0: none; or (0,)
     mode_shape: np.ndarray   # (modes, 4, 3) 1/sqrt(kg), at the mounts
     mode_w: np.ndarray
     mode_z: np.ndarray
@@ -81,13 +81,13 @@ class Physics(NamedTuple):
 
 def state_size(P: Physics) -> int:
     """Number of states that the effects present in P need."""
-    return (FIRST_EFFECT_STATE + len(P.lag) + 2 * len(P.mode_w) + 2 * len(P.osc_m) + 12 * (P.base_dof > 0)
+    return (FIRST_EFFECT_STATE + 2 * len(P.mode_w) + 2 * len(P.osc_m) + 12 * (P.base_dof > 0)
             + len(P.max_k) + 12 * len(P.ladder_k) + 2 * len(P.surge_m) + 2 * len(P.level_w) + len(P.fric_s0))
 
 
 @njit(cache=True, fastmath=False, inline="never")
 def rhs(P, x, u, fd, fv, ks, dx, W):
-    """dx of the state x under held voltages u (8), floor displacement and velocity fd, fv (3), stiffness factor ks.
+    """dx of the state x. u : (8,) motor currents as volts. fd, fv : (3,) floor m, m/s. ks : factor of the stiffness.
 
     W : (40, 3) workspace.
     """
@@ -113,8 +113,7 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
 
     # places of the effects' states
     n_mode, n_osc, rungs = P.mode_w.size, P.osc_m.size, P.ladder_k.size
-    o_lag = FIRST_EFFECT_STATE
-    o_mode = o_lag + P.lag.size
+    o_mode = FIRST_EFFECT_STATE
     o_osc = o_mode + 2 * n_mode
     o_base = o_osc + 2 * n_osc
     o_max = o_base + (12 if P.base_dof > 0 else 0)
@@ -198,15 +197,8 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
 
     for j in range(8):
         i, a = P.motor_at[j], P.motor_axis[j]
-        drive = u[j]
-        if P.lag.size > 0:
-            if P.lag[j] > 0:
-                drive = x[o_lag + j]
-                dx[o_lag + j] = P.lag[j] * (u[j] - drive)
-            else:
-                dx[o_lag + j] = 0.0
         e = E[i, a]
-        force = P.motor[j] * (1 + P.motor_b1[j] * e + P.motor_b2[j] * e * e) * drive
+        force = P.motor[j] * (1 + P.motor_b1[j] * e + P.motor_b2[j] * e * e) * u[j]
         if P.fric_s0.size > 0:
             v, z = Ed[i, a], x[o_fri + j]
             level = P.fric_Fc[j] + (P.fric_Fs[j] - P.fric_Fc[j]) * np.exp(-(v / P.fric_vs) ** 2)
@@ -355,7 +347,7 @@ def integrate(P, x, u, first, switch, floor, ks, dt, y, trace):
     """
     n, N = x.size, y.shape[0]
     k1, k2, k3, k4, xs = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    W, held = np.zeros((40, 3)), np.zeros(8)
+    W, drive, lagged = np.zeros((40, 3)), np.zeros((3, 8)), np.zeros(8)
     f = np.zeros((3, 2, 3))
     edge = np.zeros(4)
     for k in range(N):
@@ -375,7 +367,15 @@ def integrate(P, x, u, first, switch, floor, ks, dt, y, trace):
             h = (t1 - t0) * dt
             row = first[k] + (1 if t0 >= sw - 1e-9 else 0)
             for j in range(8):
-                held[j] = u[row, j] if 0 <= row < u.shape[0] else 0.0
+                held = u[row, j] if 0 <= row < u.shape[0] else 0.0
+                decay = np.exp(-0.5 * h * P.lag[j]) if P.lag.size > 0 and P.lag[j] > 0 else 0.0
+                if decay > 0:               # first-order lag under a held voltage, exactly
+                    drive[0, j] = lagged[j]
+                    drive[1, j] = held + (lagged[j] - held) * decay
+                    drive[2, j] = held + (lagged[j] - held) * decay * decay
+                    lagged[j] = drive[2, j]
+                else:
+                    drive[0, j] = drive[1, j] = drive[2, j] = held
             for stage in range(3):      # cubic Hermite interpolation of the floor: 60 Hz at 1 kHz to 5e-5
                 t = t0 + 0.5 * stage * (t1 - t0)
                 a, b = 2 * t**3 - 3 * t * t + 1, (t**3 - 2 * t * t + t) * dt
@@ -384,15 +384,15 @@ def integrate(P, x, u, first, switch, floor, ks, dt, y, trace):
                     for o in range(2):
                         f[stage, o, i] = (a * floor[k, 3 * o + i] + b * floor[k, 3 * o + 3 + i]
                                           + c * floor[k + 1, 3 * o + i] + d * floor[k + 1, 3 * o + 3 + i])
-            rhs(P, x, held, f[0, 0], f[0, 1], ks[k], k1, W)
+            rhs(P, x, drive[0], f[0, 0], f[0, 1], ks[k], k1, W)
             for i in range(n):
                 xs[i] = x[i] + 0.5 * h * k1[i]
-            rhs(P, xs, held, f[1, 0], f[1, 1], ks[k], k2, W)
+            rhs(P, xs, drive[1], f[1, 0], f[1, 1], ks[k], k2, W)
             for i in range(n):
                 xs[i] = x[i] + 0.5 * h * k2[i]
-            rhs(P, xs, held, f[1, 0], f[1, 1], ks[k], k3, W)
+            rhs(P, xs, drive[1], f[1, 0], f[1, 1], ks[k], k3, W)
             for i in range(n):
                 xs[i] = x[i] + h * k3[i]
-            rhs(P, xs, held, f[2, 0], f[2, 1], ks[k], k4, W)
+            rhs(P, xs, drive[2], f[2, 0], f[2, 1], ks[k], k4, W)
             for i in range(n):
                 x[i] += h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i])

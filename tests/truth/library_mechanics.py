@@ -16,7 +16,7 @@ LADDER_HZ = np.geomspace(0.04, 400.0, 7)     # corners of the Maxwell rungs
 def _contact_friction(d: Draw) -> Drawn:
     stretch = float(np.mean(d.middle.stretch))
     sliding = stretch * d.between(0.1, 1.0)              # displacement after which a contact slips
-    stuck = 3.3e4 * d.size(0.004, 0.5)                   # N/m, against 2e4-5e4 of a mount
+    stuck = 3.3e4 * d.size(0.001, 0.5)                   # N/m, against 2e4-5e4 of a mount
     coulomb = stuck * sliding
     uneven = d.rng.uniform(0.8, 1.2, 8)
     lugre = d.rng.random() < 0.35
@@ -34,7 +34,7 @@ def _apply_contact_friction(plant: Plant, h: Hidden) -> None:
 
 def _com_offset(d: Draw) -> Drawn:
     direction = np.eye(3)[d.rng.integers(3)] * d.sign() if d.rng.random() < 0.5 else d.direction()
-    x, y, z = direction * d.size(5e-4, 0.03)
+    x, y, z = direction * d.size(2e-4, 0.03)
     return "payload", {"x_m": float(x), "y_m": float(y), "z_m": float(z)}, {}
 
 
@@ -43,7 +43,7 @@ def _apply_com_offset(plant: Plant, h: Hidden) -> None:
 
 
 def _product_of_inertia(d: Draw) -> Drawn:
-    return d.one(("Jxy", "Jxz", "Jyz")), {"product_kgm2": d.sign() * d.size(0.1, 6.0)}, {}
+    return d.one(("Jxy", "Jxz", "Jyz")), {"product_kgm2": d.sign() * d.size(0.04, 6.0)}, {}
 
 
 def _apply_product_of_inertia(plant: Plant, h: Hidden) -> None:
@@ -57,7 +57,7 @@ _PATTERNS = np.array([[1, -1, 1, -1], [1, 1, 1, 1], [1, -1, -1, 1], [1, 1, -1, -
 def _payload_flexible_mode(d: Draw) -> Drawn:
     count = int(d.rng.choice([1, 2, 3], p=[0.5, 0.3, 0.2]))
     f = float(d.between(14.0, 0.8 * d.band_Hz[1])) * np.cumprod([1.0, *d.rng.uniform(1.25, 1.9, count - 1)])
-    size = d.size(0.06, 1.0) / np.sqrt(d.plant.m)        # of a mass-normalised shape at the mounts
+    size = d.size(0.03, 1.0) / np.sqrt(d.plant.m)        # of a mass-normalised shape at the mounts
     shapes = []
     for pattern in d.rng.permutation(4)[:count]:
         shape = np.zeros((4, 3))
@@ -75,7 +75,7 @@ def _apply_payload_flexible_mode(plant: Plant, h: Hidden) -> None:
 
 
 def _attached_oscillator(d: Draw) -> Drawn:
-    mass, f, zeta = d.size(0.2, 25.0), d.between(5.0, 45.0), d.between(0.005, 0.08)
+    mass, f, zeta = d.size(0.08, 25.0), d.between(5.0, 45.0), d.between(0.005, 0.08)
     if d.rng.random() < 0.5:
         axes, ratios = [d.direction() if d.rng.random() < 0.5 else np.eye(3)[d.rng.integers(3)]], [1.0]
     else:
@@ -94,7 +94,7 @@ def _apply_attached_oscillator(plant: Plant, h: Hidden) -> None:
 
 
 def _base_compliance(d: Draw) -> Drawn:
-    mass, f, zeta = d.between(400.0, 3000.0), d.size(70.0, 7.0), d.between(0.01, 0.10)
+    mass, f, zeta = d.between(400.0, 3000.0), d.size(120.0, 7.0), d.between(0.01, 0.10)
     ratios = [*d.rng.uniform(0.6, 1.3, 2), 1.0, *d.rng.uniform(0.8, 1.5, 3)]
     return "chassis", {"mass_kg": mass, "frequency_Hz": f, "damping_ratio": zeta}, {
         "dof": int(d.rng.choice([3, 6])), "frequencies_Hz": [f * float(ratio) for ratio in ratios],
@@ -115,7 +115,7 @@ def _apply_base_compliance(plant: Plant, h: Hidden) -> None:
 
 
 def _mount_relaxation(d: Draw) -> Drawn:
-    ratio, corner = d.size(0.01, 1.0), d.between(0.4, 20.0)
+    ratio, corner = d.size(0.002, 1.0), d.between(0.4, 20.0)
     orifice = d.rng.random() < 0.4
     return "isolators z", {"stiffness_ratio": ratio, "corner_Hz": corner}, {
         "orifice": d.between(0.02, 0.3) * orifice, "stretch_m": float(np.mean(d.high.stretch[:, 2]))}
@@ -129,7 +129,7 @@ def _apply_mount_relaxation(plant: Plant, h: Hidden) -> None:
 
 
 def _structural_damping(d: Draw) -> Drawn:
-    share = d.size(0.04, 1.5)
+    share = d.size(0.01, 1.5)
     eta = share * 2 * 0.033 * d.rng.uniform(0.8, 1.2)
     viscous = float(max(1 - share * d.rng.uniform(0.7, 1.0), 0.1)) if d.rng.random() < 0.6 else 1.0
     return "isolators", {"loss_factor": eta}, {"viscous_left": viscous}
@@ -146,7 +146,7 @@ def _apply_structural_damping(plant: Plant, h: Hidden) -> None:
 
 
 def _mount_surge(d: Draw) -> Drawn:
-    f, zeta = d.size(100.0, 15.0), d.between(0.01, 0.1)
+    f, zeta = d.size(150.0, 15.0), d.between(0.01, 0.1)
     mass = 4 * float(np.mean(d.plant.k[:, 2])) / (2 * np.pi * f) ** 2
     return "isolators z", {"frequency_Hz": f, "mass_kg": mass, "damping_ratio": zeta}, {
         "uneven": d.rng.uniform(0.97, 1.03, 4).tolist()}
@@ -158,7 +158,7 @@ def _apply_mount_surge(plant: Plant, h: Hidden) -> None:
 
 
 def _cubic_stiffness(d: Draw) -> Drawn:
-    relative = d.size(0.002, 0.3)               # stiffening by statistical linearisation at the highest level
+    relative = d.size(0.0005, 0.3)              # stiffening by statistical linearisation at the highest level
     cubic = relative * float(np.mean(d.plant.k[:, 2])) / (3 * float(np.mean(d.high.stretch[:, 2])) ** 2)
     return "isolators z", {"cubic_N_per_m3": cubic}, {"uneven": d.rng.uniform(0.9, 1.1, 4).tolist()}
 
@@ -169,7 +169,7 @@ def _apply_cubic_stiffness(plant: Plant, h: Hidden) -> None:
 
 def _leveling_loop(d: Draw) -> Drawn:
     stable = float(-2 * d.middle.poles.real.max())      # an integral of that rate would undo the least damping
-    rate = stable * d.size(0.01, 0.7)
+    rate = stable * d.size(0.02, 0.7)
     return "isolators 1-3 z", {"rate_Hz": rate / (2 * np.pi)}, {"lag_s": d.between(0.05, 2.0) * (d.rng.random() < 0.4)}
 
 
@@ -194,7 +194,7 @@ def _apply_cable_stiffness(plant: Plant, h: Hidden) -> None:
 
 def _stiffness_drift(d: Draw) -> Drawn:
     exponential = d.rng.random() < 0.5
-    return "isolators", {"change": d.sign() * d.size(0.002, 0.05)}, {
+    return "isolators", {"change": d.sign() * d.size(0.0005, 0.05)}, {
         "span_s": d.span_s, "time_constant_s": d.between(0.2, 1.0) * d.span_s * exponential}
 
 

@@ -14,7 +14,7 @@ Drawn = tuple[str, dict[str, float], dict[str, Any]]
 
 def _geophone_corner(d: Draw) -> Drawn:
     nominal = d.plant.rig.geophones
-    corner = nominal.suspension_Hz * (1 + d.sign() * d.size(0.004, 0.25))
+    corner = nominal.suspension_Hz * (1 + d.sign() * d.size(0.001, 0.25))
     constant_damper = d.rng.random() < 0.5      # otherwise the damping ratio stays
     zeta = nominal.suspension_damping * (nominal.suspension_Hz / corner if constant_damper else 1.0)
     return d.one(d.plant.sensors), {"corner_Hz": corner}, {"damping_ratio": zeta}
@@ -26,7 +26,7 @@ def _apply_geophone_corner(plant: Plant, h: Hidden) -> None:
 
 
 def _sensor_gain(d: Draw) -> Drawn:
-    return d.one(d.plant.sensors), {"gain": 1 + d.sign() * d.size(0.002, 0.10)}, {}
+    return d.one(d.plant.sensors), {"gain": 1 + d.sign() * d.size(0.0007, 0.10)}, {}
 
 
 def _apply_sensor_gain(plant: Plant, h: Hidden) -> None:
@@ -37,7 +37,7 @@ def _sensor_misalignment(d: Draw) -> Drawn:
     name = d.one(d.plant.sensors)
     axis = d.plant.sensor_n[d.plant.sensors.index(name)]
     away = np.cross(axis, d.direction())
-    return name, {"angle_rad": d.size(0.003, 0.15)}, {"towards": (away / np.linalg.norm(away)).tolist()}
+    return name, {"angle_rad": d.size(0.002, 0.15)}, {"towards": (away / np.linalg.norm(away)).tolist()}
 
 
 def _apply_sensor_misalignment(plant: Plant, h: Hidden) -> None:
@@ -56,7 +56,7 @@ def _apply_tilt_coupling(plant: Plant, h: Hidden) -> None:
 def _mains_hum(d: Draw) -> Drawn:
     frequency = float(d.rng.choice([50.0, 60.0])) + d.rng.uniform(-0.02, 0.02)
     harmonics = [1, *(n for n in (2, 3, 4, 5, 7) if d.rng.random() < 0.5)]
-    largest = d.size(5e-4, 0.3)
+    largest = d.size(3e-4, 0.3)
     fundamental = d.between(0.15, 1.0, 6)
     amplitude = largest * fundamental / fundamental.max()
     fall = [1.0, *(d.between(0.05, 0.6) for _ in harmonics[1:])]
@@ -79,8 +79,8 @@ def _apply_mains_hum(plant: Plant, h: Hidden) -> None:
 def _sensor_quantisation(d: Draw) -> Drawn:
     name = d.one(d.plant.sensors)
     if d.rng.random() < 0.5:
-        return name, {"step_V": d.size(4e-3, 0.3)}, {}
-    return name, {"range_V": float(d.high.y[d.plant.sensors.index(name)]) * d.size(3.2, 1.3)}, {}
+        return name, {"step_V": d.size(2.5e-3, 0.3)}, {}
+    return name, {"range_V": float(d.high.y[d.plant.sensors.index(name)]) * d.size(3.8, 1.3)}, {}
 
 
 def _apply_sensor_quantisation(plant: Plant, h: Hidden) -> None:
@@ -90,7 +90,7 @@ def _apply_sensor_quantisation(plant: Plant, h: Hidden) -> None:
 
 
 def _actuator_gain(d: Draw) -> Drawn:
-    return d.one(d.plant.motors), {"gain": 1 + d.sign() * d.size(0.003, 0.15)}, {}
+    return d.one(d.plant.motors), {"gain": 1 + d.sign() * d.size(0.001, 0.15)}, {}
 
 
 def _apply_actuator_gain(plant: Plant, h: Hidden) -> None:
@@ -98,7 +98,7 @@ def _apply_actuator_gain(plant: Plant, h: Hidden) -> None:
 
 
 def _actuator_lag(d: Draw) -> Drawn:
-    return "actuators", {"corner_Hz": d.size(1500.0, 25.0)}, {}
+    return "actuators", {"corner_Hz": d.size(600.0, 25.0)}, {}
 
 
 def _apply_actuator_lag(plant: Plant, h: Hidden) -> None:
@@ -106,7 +106,7 @@ def _apply_actuator_lag(plant: Plant, h: Hidden) -> None:
 
 
 def _actuator_saturation(d: Draw) -> Drawn:
-    return "actuators", {"limit_V": d.high.level * d.size(3.2, 1.4)}, {}
+    return "actuators", {"limit_V": d.high.level * d.size(3.8, 1.4)}, {}
 
 
 def _apply_actuator_saturation(plant: Plant, h: Hidden) -> None:
@@ -115,7 +115,7 @@ def _apply_actuator_saturation(plant: Plant, h: Hidden) -> None:
 
 
 def _loop_delay(d: Draw) -> Drawn:
-    return "loop", {"delay_s": d.size(3e-5, 4e-3)}, {}
+    return "loop", {"delay_s": d.size(2e-5, 4e-3)}, {}
 
 
 def _apply_loop_delay(plant: Plant, h: Hidden) -> None:

@@ -24,7 +24,7 @@ def _on_channel(j: int, change: Any) -> Signal:
 
 def _air_drag(d: Draw) -> Drawn:
     speed = float(np.mean(d.high.speed))
-    return "payload", {"drag_Ns2_per_m2": 650.0 * d.size(0.01, 1.0) / speed}, {}
+    return "payload", {"drag_Ns2_per_m2": 650.0 * d.size(0.003, 1.0) / speed}, {}
 
 
 def _apply_air_drag(plant: Plant, h: Hidden) -> None:
@@ -33,7 +33,7 @@ def _apply_air_drag(plant: Plant, h: Hidden) -> None:
 
 def _sensor_crosstalk(d: Draw) -> Drawn:
     name, source = d.rng.permutation(np.array(d.plant.sensors))[:2]
-    return str(name), {"share": d.sign() * d.size(0.003, 0.15)}, {"source": str(source)}
+    return str(name), {"share": d.sign() * d.size(0.001, 0.15)}, {"source": str(source)}
 
 
 def _apply_sensor_crosstalk(plant: Plant, h: Hidden) -> None:
@@ -47,7 +47,7 @@ def _apply_sensor_crosstalk(plant: Plant, h: Hidden) -> None:
 
 
 def _sensor_low_pass(d: Draw) -> Drawn:
-    return d.one(d.plant.sensors), {"corner_Hz": d.size(400.0, 20.0)}, {}
+    return d.one(d.plant.sensors), {"corner_Hz": d.size(2000.0, 20.0)}, {}
 
 
 def _apply_sensor_low_pass(plant: Plant, h: Hidden) -> None:
@@ -58,7 +58,7 @@ def _apply_sensor_low_pass(plant: Plant, h: Hidden) -> None:
 
 def _sensor_spurious_resonance(d: Draw) -> Drawn:
     return d.one(d.plant.sensors), {"frequency_Hz": d.between(15.0, 40.0)}, {
-        "share": d.size(0.003, 0.3), "damping_ratio": d.between(0.01, 0.05)}
+        "share": d.size(0.002, 0.3), "damping_ratio": d.between(0.01, 0.05)}
 
 
 def _apply_sensor_spurious_resonance(plant: Plant, h: Hidden) -> None:
@@ -68,7 +68,7 @@ def _apply_sensor_spurious_resonance(plant: Plant, h: Hidden) -> None:
 
 
 def _one_amplifier_lag(d: Draw) -> Drawn:
-    return d.one(d.plant.motors), {"corner_Hz": d.size(800.0, 20.0)}, {}
+    return d.one(d.plant.motors), {"corner_Hz": d.size(600.0, 20.0)}, {}
 
 
 def _apply_one_amplifier_lag(plant: Plant, h: Hidden) -> None:
@@ -79,7 +79,8 @@ def _apply_one_amplifier_lag(plant: Plant, h: Hidden) -> None:
 
 def _force_constant_of_displacement(d: Draw) -> Drawn:
     rms = float(np.mean(d.high.stretch))
-    return "actuators", {"slope_per_m": d.sign() * d.size(0.01, 0.5) / rms}, {"curvature": -d.size(0.01, 0.4) / rms**2}
+    slope, curvature = d.sign() * d.size(0.002, 0.5) / rms, -d.size(0.002, 0.4) / rms**2
+    return "actuators", {"slope_per_m": slope}, {"curvature": curvature}
 
 
 def _apply_force_constant_of_displacement(plant: Plant, h: Hidden) -> None:
@@ -87,7 +88,7 @@ def _apply_force_constant_of_displacement(plant: Plant, h: Hidden) -> None:
 
 
 def _force_constant_of_drive(d: Draw) -> Drawn:
-    return "actuators", {"slope_per_V": d.sign() * d.size(0.004, 0.25) / d.high.level}, {}
+    return "actuators", {"slope_per_V": d.sign() * d.size(0.001, 0.25) / d.high.level}, {}
 
 
 def _apply_force_constant_of_drive(plant: Plant, h: Hidden) -> None:
@@ -96,7 +97,7 @@ def _apply_force_constant_of_drive(plant: Plant, h: Hidden) -> None:
 
 def _sensor_quadratic(d: Draw) -> Drawn:
     name = d.one(d.plant.sensors)
-    return name, {"slope_per_V": d.sign() * d.size(0.002, 0.15) / float(d.high.y[d.plant.sensors.index(name)])}, {}
+    return name, {"slope_per_V": d.sign() * d.size(0.0005, 0.15) / float(d.high.y[d.plant.sensors.index(name)])}, {}
 
 
 def _apply_sensor_quadratic(plant: Plant, h: Hidden) -> None:
@@ -105,7 +106,7 @@ def _apply_sensor_quadratic(plant: Plant, h: Hidden) -> None:
 
 
 def _clock_rate_error(d: Draw) -> Drawn:
-    return "loop", {"relative": d.sign() * d.size(1e-6, 1e-3)}, {}
+    return "loop", {"relative": d.sign() * d.size(3e-7, 1e-3)}, {}
 
 
 def _apply_clock_rate_error(plant: Plant, h: Hidden) -> None:
@@ -126,7 +127,7 @@ def _apply_dropped_samples(plant: Plant, h: Hidden) -> None:
 
 def _asymmetric_stiffness(d: Draw) -> Drawn:
     rms = float(np.mean(d.high.stretch[:, 2]))
-    return "isolators z", {"quadratic_N_per_m2": d.sign() * 4.5e4 * d.size(0.004, 0.15) / rms}, {}
+    return "isolators z", {"quadratic_N_per_m2": d.sign() * 4.5e4 * d.size(0.001, 0.15) / rms}, {}
 
 
 def _apply_asymmetric_stiffness(plant: Plant, h: Hidden) -> None:
@@ -134,7 +135,7 @@ def _apply_asymmetric_stiffness(plant: Plant, h: Hidden) -> None:
 
 
 def _actuator_gain_drift(d: Draw) -> Drawn:
-    return "actuators", {"change": d.sign() * d.size(0.003, 0.08)}, {"span_s": d.span_s}
+    return "actuators", {"change": d.sign() * d.size(0.001, 0.08)}, {"span_s": d.span_s}
 
 
 def _apply_actuator_gain_drift(plant: Plant, h: Hidden) -> None:
@@ -143,7 +144,7 @@ def _apply_actuator_gain_drift(plant: Plant, h: Hidden) -> None:
 
 def _gyroscope(d: Draw) -> Drawn:
     axis = np.eye(3)[2] if d.rng.random() < 0.7 else d.direction()
-    return "payload", {"momentum_Nms": d.size(0.5, 100.0)}, {"axis": axis.tolist()}
+    return "payload", {"momentum_Nms": d.size(0.15, 100.0)}, {"axis": axis.tolist()}
 
 
 def _apply_gyroscope(plant: Plant, h: Hidden) -> None:
@@ -151,7 +152,7 @@ def _apply_gyroscope(plant: Plant, h: Hidden) -> None:
 
 
 def _dead_zone(d: Draw) -> Drawn:
-    return d.one(d.plant.motors), {"half_width_V": d.middle.level * d.size(0.005, 0.6)}, {}
+    return d.one(d.plant.motors), {"half_width_V": d.middle.level * d.size(0.003, 0.6)}, {}
 
 
 def _apply_dead_zone(plant: Plant, h: Hidden) -> None:
@@ -165,7 +166,7 @@ def _apply_dead_zone(plant: Plant, h: Hidden) -> None:
 
 
 def _noisy_sensor(d: Draw) -> Drawn:
-    return d.one(d.plant.sensors), {"noise_rms_V": 1e-3 * d.size(2.0, 60.0)}, {}
+    return d.one(d.plant.sensors), {"noise_rms_V": 1e-3 * d.size(1.5, 60.0)}, {}
 
 
 def _apply_noisy_sensor(plant: Plant, h: Hidden) -> None:
@@ -173,7 +174,7 @@ def _apply_noisy_sensor(plant: Plant, h: Hidden) -> None:
 
 
 def _sensor_delay(d: Draw) -> Drawn:
-    return d.one(d.plant.sensors), {"delay_s": d.size(1e-4, 5e-3)}, {}
+    return d.one(d.plant.sensors), {"delay_s": d.size(3e-5, 5e-3)}, {}
 
 
 def _apply_sensor_delay(plant: Plant, h: Hidden) -> None:

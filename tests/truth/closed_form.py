@@ -1,0 +1,92 @@
+"""Frequency response of a table in closed form, from matrices: what the time-domain simulator is checked against.
+
+Assembled as dynamic stiffness Z(s), with every linear effect as an extra coordinate or a complex stiffness. Nothing of
+the integrator is used; the sampled response follows from the continuous one by summing its aliases.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .kernel import Physics
+
+
+def carry(p: np.ndarray) -> np.ndarray:
+    """(3, 6) motion of a body-fixed point at p per (translation, rotation)."""
+    x, y, z = p
+    return np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
+
+
+def mount_stiffness(P: Physics, s: complex) -> np.ndarray:
+    """(4, 3) complex stiffness of the mounts."""
+    k = P.k + P.c * s
+    k = k + P.k * sum(g * s / (s + w) for g, w in zip(P.ladder_k, P.ladder_w, strict=True))
+    if len(P.surge_m):
+        half = 2 * P.k[:, 2] + P.surge_c * s
+        k[:, 2] += half - half**2 / (2 * half + P.surge_m * s**2) - P.k[:, 2]
+    if len(P.max_k):
+        k[:, 2] += P.max_k * s / (s + P.max_k / P.max_c)
+    if len(P.level_w):
+        k[:3, 2] += P.level_w * P.k[:3, 2] / (s * (1 + s * P.level_tau))
+    return k
+
+
+def response(P: Physics, f_Hz: float) -> np.ndarray:
+    """(6, 8) from held motor voltage to sensor voltage, without delay and hold."""
+    s = 2j * np.pi * f_Hz
+    modes, chassis = len(P.mode_w), P.base_dof
+    n = 6 + modes + chassis
+    stretch = np.zeros((4, 3, n))       # of the mounts, per coordinate
+    motion = np.zeros((4, 3, n))        # of the payload at the mounts
+    for i in range(4):
+        motion[i, :, :6] = carry(P.r[i])
+        for j in range(modes):
+            motion[i, :, 6 + j] = P.mode_shape[j, i]
+        stretch[i] = motion[i]
+        if chassis:
+            stretch[i, :, 6 + modes:] -= carry(P.base_r[i])[:, :chassis]
+    Z = np.zeros((n, n), complex)
+    Z[:3, :3] = s**2 * P.m * np.eye(3)
+    h = P.rotor
+    Z[3:6, 3:6] = s**2 * P.J + s * np.array([[0, h[2], -h[1]], [-h[2], 0, h[0]], [h[1], -h[0], 0]])
+    for j in range(modes):
+        Z[6 + j, 6 + j] = s**2 + 2 * P.mode_z[j] * P.mode_w[j] * s + P.mode_w[j] ** 2
+    if chassis:
+        own = np.diag(s**2 / P.base_Mi) + s * P.base_C + P.base_K
+        Z[6 + modes:, 6 + modes:] = own[:chassis, :chassis]
+    k = mount_stiffness(P, s)
+    for i in range(4):
+        Z += stretch[i].T @ np.diag(k[i]) @ stretch[i]
+    for p, d, kc, cc in zip(P.cable_r, P.cable_d, P.cable_k, P.cable_c, strict=True):
+        row = np.zeros(n)
+        row[:6] = d @ carry(p)
+        if chassis:
+            row[6 + modes:9 + modes] -= d
+        Z += np.outer(row, row) * (kc + cc * s)
+    for p, d, m, ko, co in zip(P.osc_r, P.osc_d, P.osc_m, P.osc_k, P.osc_c, strict=True):
+        row = np.zeros(n)
+        row[:6] = d @ carry(p)
+        Z += np.outer(row, row) * m * s**2 * (ko + co * s) / (m * s**2 + co * s + ko)
+    lag = P.lag if len(P.lag) else np.zeros(8)
+    T = np.array([stretch[i, a] * tau * (w / (s + w) if w > 0 else 1.0)
+                  for i, a, tau, w in zip(P.motor_at, P.motor_axis, P.motor, lag, strict=True)]).T
+    q = np.linalg.solve(Z, T)
+    out = np.empty((6, 8), complex)
+    for j in range(6):
+        tilt = np.zeros(n)
+        tilt[3:6] = P.g * np.array([P.sensor_n[j, 1], -P.sensor_n[j, 0], 0.0])   # of y by +phi_x, of x by -phi_y
+        acceleration = (s**2 * P.sensor_n[j] @ motion[P.sensor_at[j]] + tilt) @ q
+        coil = P.S[j] * s / (s**2 + 2 * P.zn[j] * P.wn[j] * s + P.wn[j] ** 2)
+        compensation = 1 + (P.b1[j] * s + P.b0[j]) / (s**2 + 2 * P.zc * P.wc * s + P.wc**2)
+        out[j] = coil * compensation * acceleration
+    return out
+
+
+def sampled_response(P: Physics, f_Hz: float, rate_Hz: float, delay_s: float, aliases: int = 8) -> np.ndarray:
+    """(6, 8) from voltage samples, held and delayed, to samples of the sensors: the sum over aliases."""
+    total = np.zeros((6, 8), complex)
+    for n in range(-aliases, aliases + 1):
+        s = 2j * np.pi * (f_Hz + n * rate_Hz)
+        hold = (1 - np.exp(-s / rate_Hz)) / (s / rate_Hz)
+        total += response(P, f_Hz + n * rate_Hz) * hold * np.exp(-s * delay_s)
+    return total
