@@ -1,5 +1,136 @@
-"""Simulation in time of a table with effects."""
+"""Simulation in time of a table with effects: what its sensors read in a record, from u and floor alone.
 
-from avis_ctrl.gap.record_motion import motion_of
+The linear part acts on the lines of the padded record (`line_response`). Forces that depend on amplitude or time are
+found from sample to sample (`marching`) and then act on the same lines. A band of 500 Hz, or half the sample rate, is
+kept: a table moves above by its mass alone.
 
-__all__ = ["motion_of"]
+Limits: a record starts at rest, with nothing before it. Volts that an effect changes by the motion see the motion
+without them. Records of more than `line_response.MOST_SAMPLES` samples are refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
+from avis_ctrl.gap.marching import Answer, march
+from avis_ctrl.gap.motion import RecordMotion
+from avis_ctrl.gap.record_motion import motion_of, mount_rows
+from avis_ctrl.gap.table_model import TableModel
+
+__all__ = ["Simulated", "motion_of", "simulate"]
+
+# Largest r.m.s. of what the equation of motion leaves, over that of the deflection.
+DEFECT = 1e-5
+MOST_PASSES = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """y (samples, n_y) in the model's unit and order; deflection (samples, n_g) m of the mounts.
+
+    passes : over the record, 0 where nothing depends on amplitude or time. defect : r.m.s. of d - d_0 - h * f(d), over
+    that of d.
+    """
+
+    y: np.ndarray
+    deflection: np.ndarray
+    passes: int = 0
+    defect: float = 0.0
+
+
+def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_rate_Hz: float, *,
+             start_s: float = 0.0, campaign_s: tuple[float, float] = (0.0, 1.0)) -> Simulated:
+    """What the sensors read, before the converter: nothing is rounded or clipped.
+
+    Parameters
+    ----------
+    u : (samples, n_u) V, clipped here to the rig's drive limit. floor : (samples, 3) m/s, None for a floor at rest.
+    start_s : of the first sample on the campaign's clock. campaign_s : (first, last) time of the campaign, for effects
+        that depend on time.
+
+    Raises
+    ------
+    InputError : arrays of other shapes, numbers that are not finite, a rate that is not the rig's, a record too long.
+    ComputationError : a motion that grows without bound, or an answer that does not settle.
+    """
+    u, floor = _checked(model, u, floor)
+    lines = line_response(linear_part(model), len(u), sample_rate_Hz)
+    record = RecordMotion("", sample_rate_Hz, start_s, campaign_s, u, np.zeros((len(u), len(lines.G))),
+                          *mount_rows(model))
+    acting = u
+    effects = [one for one in model.effects if one.effect.nonlinear]
+    x = lines.motion(lines.drive(u, floor))
+    if effects:
+        record.deflection[:] = lines.in_time(lines.deflection(x, floor))
+        for one in effects:
+            volts = one.effect.volts(record, one.place, one.by_name)
+            acting = acting if volts is None else volts
+        if acting is not u:
+            x = lines.motion(lines.drive(acting, floor))
+            record.deflection[:] = lines.in_time(lines.deflection(x, floor))
+    pushing = [one for one in effects if one.effect.force(record, one.place, one.by_name) is not None]
+    if not pushing:
+        return Simulated(lines.in_time(lines.sensed(x, acting)), lines.in_time(lines.deflection(x, floor)))
+    return _with_forces(model, lines, replace(record, volts=acting), x, floor, pushing)
+
+
+def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    u = np.asarray(u, float)
+    if u.ndim != 2 or u.shape[1] != len(model.actuators) or len(u) < 2:
+        raise InputError(f"expected (samples, {len(model.actuators)}) volts, two samples at least", field="u",
+                         value=u.shape)
+    if floor is not None:
+        floor = np.asarray(floor, float)
+        if floor.shape != (len(u), 3):
+            raise InputError(f"expected {(len(u), 3)}", field="floor", value=floor.shape)
+    for field, array in (("u", u), ("floor", floor)):
+        if array is not None and not np.all(np.isfinite(array)):
+            raise InputError("expected finite numbers", field=field)
+    limit = model.rig.drive_limit_V
+    return np.clip(u, -limit, limit), floor
+
+
+_answers: list[tuple[LineResponse, Answer]] = []
+
+
+def _answer(lines: LineResponse, mass: np.ndarray) -> Answer:
+    """`Answer`, the last one kept: records of one length share it."""
+    for known, found in _answers:
+        if known is lines:
+            return found
+    _answers[:] = [(lines, Answer(lines, mass))]
+    return _answers[0][1]
+
+
+def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x: np.ndarray,
+                 floor: np.ndarray | None, effects) -> Simulated:
+    """March, then let the forces act over the whole record; what differs (an answer before its cause, as of a constant
+    loss factor) enters the next pass."""
+    answer = _answer(lines, model.matrices.M)
+    linear = lines.deflection(x, floor)
+    # Free motion in the coordinates of the answer: any that gives the linear deflection.
+    to_z = np.linalg.pinv(answer.shape)
+    free = lines.in_time(linear) @ to_z.T
+    beyond = lines.in_time(linear) - free @ answer.shape.T
+    defect = float("nan")
+    correction = np.zeros_like(free)
+    for passes in range(1, MOST_PASSES + 1):
+        marched = march(answer, free + correction, effects, record, beyond)
+        z = answer.whole(marched.force)
+        left = free + lines.in_time(z) - marched.z
+        size = float(np.sqrt(np.mean(record.deflection ** 2))) or 1.0
+        defect = float(np.sqrt(np.mean((left @ answer.shape.T) ** 2))) / size
+        if defect <= DEFECT:
+            total = x + z[:, :answer.n_x]
+            return Simulated(lines.in_time(lines.sensed(total, record.volts)),
+                             lines.in_time(linear + z @ answer.shape.T), passes, defect)
+        correction = correction + left
+    raise ComputationError("the forces of " + ", ".join(one.label for one in effects) + " do not settle",
+                           measured=f"the equation of motion leaves {defect:.2g} of the deflection after "
+                                    f"{MOST_PASSES} passes",
+                           cause="a force of an effect that depends on what comes later",
+                           next_step="leave the effect out of the simulation")

@@ -1,0 +1,246 @@
+"""Forces that depend on the motion that they make: d = d_0 + h * f(d), solved from sample to sample.
+
+d_0 is the deflection without the forces, h the answer of the linear part to a force that runs straight between samples.
+A fixed point over a whole record diverges wherever f is not small beside a lightly damped mount. Here time is cut into
+windows so short that within one the fixed point contracts, whatever f; what earlier windows leave for later ones is
+added in blocks that double in length (fast convolution of a sequence that is only known up to now: Hairer, Lubich and
+Schlichte, SIAM J. Sci. Stat. Comput. 6, 1985).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.fft
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.gap.effects.mounts import ContactFriction, dahl
+from avis_ctrl.gap.line_response import LineResponse
+from avis_ctrl.gap.motion import RecordMotion
+from avis_ctrl.gap.table_model import ActiveEffect
+from avis_ctrl.identification.response import N_Q
+
+# Length of a window [s]: about a radian of the fastest motion of a mount with friction at rest.
+WINDOW_s = 0.05
+# A window is done when its deflection changes by less than this share of the largest one so far.
+WINDOW_TOLERANCE = 1e-9
+MOST_ITERATIONS = 40
+# Into so many pieces a window is cut where it does not contract; 2^20 for single samples.
+PIECES = (1, 8, 1 << 20)
+
+
+class Answer:
+    """Motion z (c,) by a force (6,) at the samples; z holds x, and the chassis where it recoils.
+
+    lines : (n, c, 6) on the lines of a padded record. shape : (n_g, c) deflection by z.
+    The force is a straight line between samples: sinc^2 of the continuous answer, and what sampling folds, known in
+    closed form for the mass alone: T^2/6 (z + 4 + 1/z)/(z - 2 + 1/z) in the place of 1/s^2.
+    """
+
+    def __init__(self, response: LineResponse, mass: np.ndarray):
+        by_force = response.compliance[:, :, :N_Q]
+        self.shape = response.G
+        if response.recoil is not None:
+            by_force = np.concatenate([by_force, response.recoil @ by_force], axis=1)
+            self.shape = np.hstack([response.G, response.G_c])
+        period = 1 / response.sample_rate_Hz
+        theta = response.omega * period
+        self.lines = by_force * (np.sinc(theta / (2 * np.pi)) ** 2)[:, None, None]
+        self.lines[:, :N_Q] += period ** 2 * _folded(theta)[:, None, None] * np.linalg.inv(mass)
+        self.response = response
+        self.n_x = response.G.shape[1]
+        window = 1 << max(4, round(np.log2(WINDOW_s * response.sample_rate_Hz)))
+        impulse = scipy.fft.irfft(self.lines, response.padded, axis=0)[:response.samples]
+        self.own = scipy.fft.rfft(impulse[:window], 2 * window, axis=0)
+        self.window, self.levels, length = window, [], window
+        while length < max(response.samples, 2 * window):
+            self.levels.append(scipy.fft.rfft(impulse[:2 * length], 2 * length, axis=0))
+            length *= 2
+
+    def whole(self, force: np.ndarray) -> np.ndarray:
+        """(n, c) spectrum of the motion by a force (samples, 6)."""
+        return (self.lines @ self.response.spectrum(force)[:, :, None])[:, :, 0]
+
+    def after(self, force: np.ndarray, level: int) -> np.ndarray:
+        """(B, c) what a force over B = window 2^level samples leaves in the B samples after it."""
+        B = self.window << level
+        spectrum = scipy.fft.rfft(force, 2 * B, axis=0)
+        return scipy.fft.irfft((self.levels[level] @ spectrum[:, :, None])[:, :, 0], 2 * B, axis=0)[B:]
+
+    def within(self, force: np.ndarray, length: int) -> np.ndarray:
+        """(length, c) of a force at the first samples of a window, in it."""
+        spectrum = scipy.fft.rfft(force, 2 * self.window, axis=0)
+        return scipy.fft.irfft((self.own @ spectrum[:, :, None])[:, :, 0], 2 * self.window, axis=0)[:length]
+
+
+def _folded(theta: np.ndarray) -> np.ndarray:
+    """(n,) sampled double integrator behind a straight-line hold less its continuous term, over T^2."""
+    safe = np.maximum(theta, 0.1)
+    exact = -(4 + 2 * np.cos(safe)) / (12 * (1 - np.cos(safe))) + np.sinc(safe / (2 * np.pi)) ** 2 / safe ** 2
+    return np.where(theta < 0.1, -theta ** 2 / 720, exact)
+
+
+class WindowForce:
+    """Force of an effect, window after window: of those samples alone, or with all that came before."""
+
+    def __init__(self, one: ActiveEffect, record: RecordMotion):
+        self.one, self.record = one, record
+        self.local = self._is_local()
+
+    def _is_local(self) -> bool:
+        """Whether the force at a sample depends on that sample alone: tried out on half a record."""
+        whole = self._of(0, len(self.record.volts))
+        half = len(whole) // 2
+        return bool(np.allclose(whole[half:], self._of(half, len(whole)), 1e-9, 1e-12 * np.max(np.abs(whole), initial=0)))
+
+    def _of(self, start: int, stop: int) -> np.ndarray:
+        r = self.record
+        part = replace(r, start_s=r.start_s + start / r.sample_rate_Hz, volts=r.volts[start:stop],
+                       deflection=r.deflection[start:stop])
+        force = self.one.effect.force(part, self.one.place, self.one.by_name)
+        return np.zeros((stop - start, N_Q)) if force is None else force
+
+    def __call__(self, start: int, stop: int) -> np.ndarray:
+        """(stop - start, 6) by the deflection that the record holds now."""
+        return self._of(start, stop) if self.local else self._of(0, stop)[start:]
+
+    def accept(self, start: int, stop: int) -> None:
+        """The deflection up to stop is final."""
+
+
+class FrictionForce(WindowForce):
+    """Dahl friction, its state kept from window to window.
+
+    The force depends on how the deflection changes alone, so that a deflection from which the law starts at rest stands
+    for the state: f = slip (1 - exp(-|a|/slip)) gives back a.
+    """
+
+    def __init__(self, one: ActiveEffect, record: RecordMotion):
+        super().__init__(one, record)
+        own = record.driven_rows
+        self.state, self.last = np.zeros(len(own)), np.zeros(len(own))
+
+    def _is_local(self) -> bool:
+        return False
+
+    def _friction(self, start: int, stop: int) -> np.ndarray:
+        """(stop - start, n_u) m, force over stiffness."""
+        slip = self.one.by_name["slip_m"]
+        share = np.minimum(np.abs(self.state) / slip, 1 - 1e-15)
+        origin = -np.sign(self.state) * slip * np.log1p(-share)
+        moved = self.record.deflection[start:stop, self.record.driven_rows] - self.last + origin
+        return dahl(np.ascontiguousarray(np.vstack([origin, moved])), slip)[1:]
+
+    def __call__(self, start: int, stop: int) -> np.ndarray:
+        f = self._friction(start, stop)
+        return -self.one.by_name["stiffness_N_per_m"] * f @ self.record.rows[self.record.driven_rows]
+
+    def accept(self, start: int, stop: int) -> None:
+        self.state = self._friction(start, stop)[-1]
+        self.last = self.record.deflection[stop - 1, self.record.driven_rows].copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Marched:
+    """z (samples, c), the force (samples, 6) that it makes, and iterations a window at most."""
+
+    z: np.ndarray
+    force: np.ndarray
+    iterations: int
+
+
+def march(answer: Answer, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,
+          beyond: np.ndarray | float = 0.0) -> Marched:
+    """Solve z = free + h * f(z) from rest.
+
+    Parameters
+    ----------
+    free : (samples, c) motion without the forces of the effects. record : its deflection is overwritten.
+    beyond : (samples, n_g) deflection that no z has.
+
+    Raises
+    ------
+    ComputationError : a motion that grows without bound.
+    """
+    forces = [(FrictionForce if type(one.effect) is ContactFriction else WindowForce)(one, record) for one in effects]
+    beyond = np.broadcast_to(beyond, (len(free), len(answer.shape)))
+    z, W, samples = free.copy(), answer.window, len(free)
+    total, most, largest = np.zeros((samples, N_Q)), 0, float(np.max(np.abs(record.deflection), initial=0.0))
+    for start in range(0, samples, W):
+        stop = min(start + W, samples)
+        if start:
+            level = (start // W & -(start // W)).bit_length() - 1
+            B = W << level
+            end = min(start + B, samples)
+            z[start:end] += answer.after(total[start - B:start], level)[:end - start]
+        window = _Window(answer, record, forces, beyond, start, stop, WINDOW_TOLERANCE * largest)
+        for piece in PIECES:
+            if (done := window.solve(z[start:stop], max(W // piece, 1))) is not None:
+                break
+        else:
+            raise _without_bound(effects, record, start)
+        z[start:stop], total[start:stop], iterations = done
+        most = max(most, iterations)
+        for force in forces:
+            force.accept(start, stop)
+    return Marched(z, total, most)
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """Samples start .. stop, solved whole or in pieces one after the other."""
+
+    answer: Answer
+    record: RecordMotion
+    forces: Sequence[WindowForce]
+    beyond: np.ndarray
+    start: int
+    stop: int
+    tolerance: float
+
+    def solve(self, free: np.ndarray, piece: int) -> tuple[np.ndarray, np.ndarray, int] | None:
+        """z, the force on it, and iterations of the worst piece; None where the fixed point does not contract."""
+        length, most = self.stop - self.start, 0
+        push = np.zeros((length, N_Q))
+        z = free
+        for a in range(0, length, piece):
+            b = min(a + piece, length)
+            here = slice(self.start + a, self.start + b)
+            before = None
+            for iteration in range(1, MOST_ITERATIONS + 1):
+                z = free + self.answer.within(push[:b], length)
+                deflection = z[a:b] @ self.answer.shape.T + self.beyond[here]
+                change = np.inf if before is None else float(np.max(np.abs(deflection - before)))
+                self.record.deflection[here] = before = deflection
+                if change <= self.tolerance:
+                    break
+                if not change < np.inf and iteration > 1:
+                    return None
+                push[a:b] = self._force(here)
+                if not np.max(np.abs(push[a:b])) < 1e12:
+                    return None
+            else:
+                return None
+            most = max(most, iteration)
+        return z, push, most
+
+    def _force(self, here: slice) -> np.ndarray:
+        """(samples, 6) of all effects."""
+        found = np.zeros((here.stop - here.start, N_Q))
+        for force in self.forces:
+            if force.local:
+                found += force(here.start, here.stop)
+            else:  # its state is that of the window's start
+                found += force(self.start, here.stop)[here.start - self.start:]
+        return found
+
+
+def _without_bound(effects: Sequence[ActiveEffect], record: RecordMotion, start: int) -> ComputationError:
+    peak = float(np.max(np.abs(record.deflection[:start]), initial=0.0))
+    values = ", ".join(f"{one.label} {one.by_name}" for one in effects)
+    return ComputationError(f"the table with {values} finds no motion at {start / record.sample_rate_Hz:.3g} s",
+                            measured=f"up to {peak:.3g} m of deflection before; {MOST_ITERATIONS} iterations a sample",
+                            cause="an effect that pushes harder the farther the table moves, or that is far stiffer "
+                                  "than a mount", next_step="other values of the effect's parameters, or a lower level")
