@@ -23,6 +23,8 @@ NARROW, WIDE, ORDER = 15, 120, 2
 LEAST_LEFT = 0.2
 # Rounds of weighting records by their noise, and windows over which that is averaged.
 ROUNDS, SMOOTHED = 2, 9
+# Power of a line by the median of its window above which it is no noise: exponential noise is once in 1e12.
+OUTLIER = 40.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,15 +100,19 @@ def _regression(left: Sequence[Leftover], keep: Sequence[np.ndarray], narrow: bo
     A = (U[:, :, :, None, :] * x[None, None, :, :, None]).reshape(blocks, R * width, -1)
     A = A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
     E = np.stack([one.E[at] for one in left], axis=1).reshape(blocks, R * width, -1)
-    size = np.ones((blocks, R))
+    size, lines_of_noise = np.ones((blocks, R)), np.ones((blocks, R, width), bool)
     # Records that clip or distort are louder: weighted by what they leave, they do not spoil the others.
     for _ in range(ROUNDS):
-        rest, share = _residual(A, E, np.repeat(1 / size, width, axis=1), R)
-        power = np.sum(np.abs(rest) ** 2, axis=(2, 3)) / np.maximum(share.sum(axis=2), 1e-3 * width)
+        weight = np.where(lines_of_noise, 1 / size[:, :, None], 1e-4 / size[:, :, None]).reshape(blocks, -1)
+        rest, share = _residual(A, E, weight, R)
+        line = np.sum(np.abs(rest) ** 2, axis=3)
+        # Lines of machines or mains would be spread over their window.
+        lines_of_noise &= line <= OUTLIER * np.median(line, axis=2, keepdims=True)
+        power = np.sum(line * lines_of_noise, axis=2) / np.maximum(np.sum(share * lines_of_noise, axis=2), 1e-3 * width)
         size = np.sqrt(_running_mean(power, SMOOTHED)) + 1e-300
     made = []
     for k, one in enumerate(left):
-        good = (share[:, k] > LEAST_LEFT) & keep[k][at]
+        good = (share[:, k] > LEAST_LEFT) & keep[k][at] & lines_of_noise[:, k]
         made.append(QuietLines(one.header.name, "regression on u", empty[k].level, one.frequency_Hz[at[good]],
                                rest[:, k][good], share[:, k][good]))
     return made
