@@ -82,11 +82,17 @@ def response(P: Physics, f_Hz: float) -> np.ndarray:
     return out
 
 
-def sampled_response(P: Physics, f_Hz: float, rate_Hz: float, delay_s: float, aliases: int = 8) -> np.ndarray:
-    """(6, 8) from voltage samples, held and delayed, to samples of the sensors: the sum over aliases."""
-    total = np.zeros((6, 8), complex)
-    for n in range(-aliases, aliases + 1):
+def sampled_response(P: Physics, f_Hz: float, rate_Hz: float, delay_s: float, aliases: int = 6) -> np.ndarray:
+    """(6, 8) from voltage samples, held and delayed, to samples of the sensors: the sum over aliases.
+
+    Beyond the first `aliases` the response falls as 1/s (a velocity per force), and their sum is taken as that.
+    """
+    def hold(n: np.ndarray | int) -> np.ndarray:
         s = 2j * np.pi * (f_Hz + n * rate_Hz)
-        hold = (1 - np.exp(-s / rate_Hz)) / (s / rate_Hz)
-        total += response(P, f_Hz + n * rate_Hz) * hold * np.exp(-s * delay_s)
+        return (1 - np.exp(-s / rate_Hz)) / (s / rate_Hz) * np.exp(-s * delay_s)
+    total = sum(response(P, f_Hz + n * rate_Hz) * hold(n) for n in range(-aliases, aliases + 1))
+    for sign in (-1, 1):
+        n = sign * np.arange(aliases + 1, 4000)
+        last = f_Hz + sign * aliases * rate_Hz
+        total = total + response(P, last) * np.sum(hold(n) * last / (f_Hz + n * rate_Hz))
     return total
