@@ -36,9 +36,11 @@ class LineResponse:
     Attributes
     ----------
     samples, padded : of a record, without and with silence. omega : (n,) rad/s of the lines kept, from zero on.
-    compliance : (n, n_q, n_q) inverse dynamic stiffness. read : (1 or n, n_y, n_q) sensors by x, sensitivity included.
-    volts : (n, n_u) commanded to acting volts. alias : (n, n_y, n_u) or None, what sampling folds to y.
-    floor : (n, n_q, 3) force, chassis : (n, 6, 3) displacement by velocity of the floor. recoil : (n, 6, n_q) or None.
+    compliance : (n, n_q, n_q) inverse dynamic stiffness. rows : (1 or n, n_y, n_q) what each sensor sees of x, and
+        sense : (n, n_y) its chain, sensitivity included.
+    volts : (n, n_u) commanded to acting volts. alias : (n, n_u) of volts, alias_map : (n_y, n_u) what sampling folds.
+    floor : (n, n_q, 3) force, chassis : (n, 6, 3) displacement by velocity of the floor. recoil : (n, 6, n_q) or None,
+        displacement of the chassis towards the payload by x.
     T : (n_q, n_u). G, G_c : (n_g, n_q) and (n_g, 6), deflection by x and chassis.
     """
 
@@ -47,7 +49,8 @@ class LineResponse:
     sample_rate_Hz: float
     omega: np.ndarray
     compliance: np.ndarray
-    read: np.ndarray
+    rows: np.ndarray
+    sense: np.ndarray
     volts: np.ndarray
     alias: np.ndarray
     alias_map: np.ndarray
@@ -88,8 +91,8 @@ class LineResponse:
 
     def sensed(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """(n, n_y) y of a motion x; the aliases are those of volts u (samples, n_u)."""
-        y = x @ self.read[0].T if len(self.read) == 1 else (self.read @ x[:, :, None])[:, :, 0]
-        return y + (self.alias * self.spectrum(u)) @ self.alias_map.T
+        seen = x @ self.rows[0].T if len(self.rows) == 1 else (self.rows @ x[:, :, None])[:, :, 0]
+        return self.sense * seen + (self.alias * self.spectrum(u)) @ self.alias_map.T
 
 
 _kept: list[tuple[TableModel, int, float, LineResponse]] = []
@@ -129,30 +132,33 @@ def _formed(model: TableModel, samples: int, padded: int, sample_rate_Hz: float)
     n = min(padded // 2 + 1, int(HIGHEST_Hz * padded / sample_rate_Hz) + 1)
     omega = spacing * np.arange(n)
     omega[0] = LOWEST_LINE * spacing
-    parts = [_lines(assemble(model.operators(omega[k:k + CHUNK]))) for k in range(0, n, CHUNK)]
-    made = {name: np.concatenate([part[name] for part in parts]) for name in parts[0] if parts[0][name] is not None}
+    made: dict[str, np.ndarray] = {}
+    for k in range(0, n, CHUNK):
+        for name, part in _lines(assemble(model.operators(omega[k:k + CHUNK]))).items():
+            if name not in made:
+                made[name] = np.empty((n if len(part) > 1 else 1, *part.shape[1:]), part.dtype)
+            made[name][k:k + CHUNK] = part
     mat = model.matrices
     first = assemble(model.operators(omega[:1]), invert=False)
     gain = (first.ops.base.sensors.sensitivity * first.ops.sensor_gain)[:, None]
-    return LineResponse(samples, padded, sample_rate_Hz, omega, made["compliance"], made["read"], made["volts"],
-                        made["alias"], gain * (mat.R @ np.linalg.inv(mat.M) @ mat.T), made["floor"], made["chassis"],
+    return LineResponse(samples, padded, sample_rate_Hz, omega, made["compliance"], made["rows"], made["sense"],
+                        made["volts"], made["alias"], gain * (mat.R @ np.linalg.inv(mat.M) @ mat.T), made["floor"], made["chassis"],
                         made.get("recoil"), first.T.real, first.G, first.ops.mounts.chassis)
 
 
-def _lines(made: Assembled) -> dict[str, np.ndarray | None]:
+def _lines(made: Assembled) -> dict[str, np.ndarray]:
     """What `LineResponse` keeps of some lines."""
     ops, n = made.ops, len(made.ops.omega)
     s = ops.s[:, None, None]
     w = np.broadcast_to(np.eye(3, dtype=complex), (n, 3, 3)) / s
-    gain = (ops.base.sensors.sensitivity * ops.sensor_gain)[:, None]
-    recoil = None
+    found = {"compliance": made.inverse, "rows": made.rows,
+             "sense": ops.sense * ops.base.sensors.sensitivity * ops.sensor_gain,
+             "volts": np.broadcast_to(made.volts, (n, len(ops.base.actuators))),
+             "alias": made.folded[:, None] * ops.drive, "floor": made.floor_force(w), "chassis": made.follow(w)}
     if ops.recoil is not None:
-        recoil = np.zeros((n, N_Q, made.n_q), complex)
-        recoil[:, :, :N_Q] = s ** 2 * (ops.recoil @ made.M)
-    return {"compliance": made.inverse, "read": gain * ops.sense[:, :, None] * made.rows,
-            "volts": np.broadcast_to(made.volts, (n, len(ops.base.actuators))),
-            "alias": made.folded[:, None] * ops.drive, "floor": made.floor_force(w), "chassis": made.follow(w),
-            "recoil": recoil}
+        found["recoil"] = np.zeros((n, N_Q, made.n_q), complex)
+        found["recoil"][:, :, :N_Q] = s ** 2 * (ops.recoil @ made.M)
+    return found
 
 
 def linear_part(model: TableModel) -> TableModel:

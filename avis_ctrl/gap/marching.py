@@ -34,25 +34,30 @@ PIECES = (1, 8, 1 << 20)
 class Answer:
     """Motion z (c,) by a force (6,) at the samples; z holds x, and the chassis where it recoils.
 
-    lines : (n, c, 6) on the lines of a padded record. shape : (n_g, c) deflection by z.
+    shape : (n_g, c) deflection by z.
     The force is a straight line between samples: sinc^2 of the continuous answer, and what sampling folds, known in
     closed form for the mass alone: T^2/6 (z + 4 + 1/z)/(z - 2 + 1/z) in the place of 1/s^2.
     """
 
     def __init__(self, response: LineResponse, mass: np.ndarray):
-        by_force = response.compliance[:, :, :N_Q]
+        self.response, self.n_x = response, response.G.shape[1]
+        period = 1 / response.sample_rate_Hz
+        theta = response.omega * period
+        self.hold = np.sinc(theta / (2 * np.pi)) ** 2
+        self.alias = period ** 2 * _folded(theta)
+        self.by_mass = np.linalg.inv(mass)
         self.shape = response.G
+        by_force = response.compliance[:, :, :N_Q]
         if response.recoil is not None:
             by_force = np.concatenate([by_force, response.recoil @ by_force], axis=1)
             self.shape = np.hstack([response.G, response.G_c])
-        period = 1 / response.sample_rate_Hz
-        theta = response.omega * period
-        self.lines = by_force * (np.sinc(theta / (2 * np.pi)) ** 2)[:, None, None]
-        self.lines[:, :N_Q] += period ** 2 * _folded(theta)[:, None, None] * np.linalg.inv(mass)
-        self.response = response
-        self.n_x = response.G.shape[1]
+        impulse = np.empty((response.samples, by_force.shape[1], N_Q))
+        for k in range(by_force.shape[1]):
+            column = self.hold[:, None] * by_force[:, k]
+            if k < N_Q:
+                column += self.alias[:, None] * self.by_mass[k]
+            impulse[:, k] = scipy.fft.irfft(column, response.padded, axis=0)[:response.samples]
         window = 1 << max(4, round(np.log2(WINDOW_s * response.sample_rate_Hz)))
-        impulse = scipy.fft.irfft(self.lines, response.padded, axis=0)[:response.samples]
         self.own = scipy.fft.rfft(impulse[:window], 2 * window, axis=0)
         self.window, self.levels, length = window, [], window
         while length < max(response.samples, 2 * window):
@@ -61,7 +66,12 @@ class Answer:
 
     def whole(self, force: np.ndarray) -> np.ndarray:
         """(n, c) spectrum of the motion by a force (samples, 6)."""
-        return (self.lines @ self.response.spectrum(force)[:, :, None])[:, :, 0]
+        F = self.response.spectrum(force)
+        z = (self.response.compliance[:, :, :N_Q] @ (self.hold[:, None] * F)[:, :, None])[:, :, 0]
+        if self.response.recoil is not None:
+            z = np.hstack([z, (self.response.recoil @ z[:, :, None])[:, :, 0]])
+        z[:, :N_Q] += self.alias[:, None] * (F @ self.by_mass)
+        return z
 
     def after(self, force: np.ndarray, level: int) -> np.ndarray:
         """(B, c) what a force over B = window 2^level samples leaves in the B samples after it."""
@@ -93,7 +103,7 @@ class WindowForce:
         """Whether the force at a sample depends on that sample alone: tried out on half a record."""
         whole = self._of(0, len(self.record.volts))
         half = len(whole) // 2
-        return bool(np.allclose(whole[half:], self._of(half, len(whole)), 1e-9, 1e-12 * np.max(np.abs(whole), initial=0)))
+        return bool(np.allclose(whole[half:], self._of(half, len(whole)), 1e-9, 1e-12 * np.max(np.abs(whole))))
 
     def _of(self, start: int, stop: int) -> np.ndarray:
         r = self.record

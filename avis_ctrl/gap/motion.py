@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -22,6 +23,8 @@ class RecordMotion:
         `MountGeometry.names`. rows : (n_g, 6) from q to it. stiffness : (n_g,) N/m of each.
     vertical : (n_g,) which are along z. driven_rows : (n_u,) which row each motor acts along.
     before : samples of the record before the block's first one, held in all arrays; cut off by `spectrum`.
+    large_force, turned_force, turned_reading : (samples, 6), (samples, 6) N and N m, (samples, n_y) m/s^2: second-order
+        terms of large rotations (`effects.large_motion`), empty where they were not asked for.
     """
 
     name: str
@@ -36,6 +39,10 @@ class RecordMotion:
     driven_rows: np.ndarray
     level_V: float = 0.0
     before: int = 0
+    large_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+    turned_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+    turned_reading: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    _spectra: dict[tuple, np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property
     def time_s(self) -> np.ndarray:
@@ -45,5 +52,14 @@ class RecordMotion:
     def spectrum(self, samples: np.ndarray, omega: np.ndarray) -> np.ndarray:
         """(n, channels) of (samples, channels) on the block's lines, scaled as a `SpectralBlock` is."""
         own = samples[self.before:]
+        if not len(own):
+            return np.zeros((len(omega), samples.shape[1]), complex)
         lines = np.rint(omega * len(own) / (2 * np.pi * self.sample_rate_Hz)).astype(int)
         return scipy.fft.rfft(own - own.mean(0), axis=0)[lines] / np.sqrt(len(own))
+
+    def kept(self, key: str, omega: np.ndarray, samples: Callable[[], np.ndarray]) -> np.ndarray:
+        """`spectrum` of samples that never change, under a key: computed once for each set of lines."""
+        where = (key, len(omega), float(omega[0]), float(omega[-1]), float(np.sum(omega)))
+        if where not in self._spectra:
+            self._spectra[where] = self.spectrum(samples(), omega)
+        return self._spectra[where]

@@ -9,9 +9,12 @@ P = D^-1 S: the inverse of the sensors' chain where they see more than noise, no
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import scipy.fft
 
+from avis_ctrl.gap.effects.large_motion import second_order
 from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
 from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.operators import mount_geometry
@@ -25,6 +28,8 @@ from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 LOW_Hz, HIGH_Hz = (0.4, 0.8), (120.0, 150.0)
 # Part of the band, at its upper end, where only noise is left: its power is that of the sensors.
 NOISE_FROM = 0.6
+# Length [s] to which a record is continued beyond its ends, and passes in which that continuation is found.
+MARGIN_s, PASSES = 5.0, 5
 
 
 def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = None) -> dict[str, RecordMotion]:
@@ -96,30 +101,53 @@ def _volts_and_deflection(record: Record, linear: TableModel) -> tuple[np.ndarra
 
 
 def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.ndarray:
-    """(samples, n_g) deflection that explains what the sensors read beyond the model."""
-    samples, fs, n_y = len(left), lines.sample_rate_Hz, left.shape[1]
-    margin = min(round(5 * fs), (lines.padded - samples) // 2, samples - 1)
-    spectrum = scipy.fft.rfft(_beyond_ends(left, margin), lines.padded, axis=0)[:len(lines.omega)]
+    """(samples, n_g) deflection that explains what the sensors read beyond the model.
+
+    Nothing is measured beyond the ends. There stands at first the reflection of what is, then what the force found so
+    far leaves: behind the record a motion that dies out, so that the last seconds are not bent by what never was.
+    """
+    samples, fs = len(left), lines.sample_rate_Hz
+    margin = min(round(MARGIN_s * fs), (lines.padded - samples) // 2, samples - 1)
+    inside = slice(margin, margin + samples)
     frequency = lines.omega / (2 * np.pi)
-    noise = np.median(np.abs(spectrum[frequency > NOISE_FROM * frequency[-1]]) ** 2, axis=0) / np.log(2)
-    noise = np.maximum(noise, 1e-8 * np.mean(np.abs(spectrum) ** 2))
     fade = _fade(frequency)
     at = np.flatnonzero(fade)
-    by_force = (lines.read if len(lines.read) == 1 else lines.read[at])[:, seen] @ lines.compliance[at]
+    rows = (lines.rows if len(lines.rows) == 1 else lines.rows[at])[:, seen]
     # A force on the payload, as much moment as its size makes of it.
     size = np.array([1.0, 1.0, 1.0, *np.sqrt(np.mean(lines.G[:, 3:N_Q] ** 2, axis=0))])
-    H = by_force[:, :, :N_Q] * size / np.sqrt(noise)[:, None]
-    white = spectrum[at] / np.sqrt(noise)
-    strength = _strength(frequency[at], white, H)
-    HH = np.conj(np.swapaxes(H, 1, 2))
-    inner = strength[:, None, None] * (H @ HH) + np.eye(n_y)
-    e = strength[:, None, None] * (HH @ np.linalg.solve(inner, white[:, :, None]))
-    x = lines.compliance[at][:, :, :N_Q] @ (size[:, None] * e)
-    d = np.zeros((len(frequency), len(lines.G)), complex)
-    d[at] = x[:, :, 0] @ lines.G.T
+    H = lines.sense[at][:, seen, None] * (rows @ lines.compliance[at, :, :N_Q]) * size
+
+    def in_time(spectrum: np.ndarray) -> np.ndarray:
+        whole = np.zeros((len(frequency), spectrum.shape[1]), complex)
+        whole[at] = spectrum
+        return scipy.fft.irfft(whole, lines.padded, axis=0)
+
+    continued = _beyond_ends(left, margin)
+    for k in range(PASSES):
+        spectrum = scipy.fft.rfft(continued, lines.padded, axis=0)[:len(frequency)]
+        e = _force(spectrum, H, at, frequency) * fade[at, None]
+        if k < PASSES - 1:
+            force = in_time(e)
+            force[margin + samples:] = 0
+            answer = in_time((H @ scipy.fft.rfft(force, axis=0)[at][:, :, None])[:, :, 0])
+            continued = answer[:len(continued)]
+            continued[inside] = left
+    x = (lines.compliance[at, :, :N_Q] @ (size * e)[:, :, None])
+    d = x[:, :, 0] @ lines.G.T
     if lines.recoil is not None:
-        d[at] += (lines.recoil[at] @ x)[:, :, 0] @ lines.G_c.T
-    return scipy.fft.irfft(d * fade[:, None], lines.padded, axis=0)[margin:margin + samples]
+        d = d + (lines.recoil[at] @ x)[:, :, 0] @ lines.G_c.T
+    return in_time(d)[inside]
+
+
+def _force(spectrum: np.ndarray, H: np.ndarray, at: np.ndarray, frequency: np.ndarray) -> np.ndarray:
+    """(n_at, 6) most likely force behind y (n, n_y) on the lines `at`, H (n_at, n_y, 6)."""
+    noise = np.median(np.abs(spectrum[frequency > NOISE_FROM * frequency[-1]]) ** 2, axis=0) / np.log(2)
+    noise = np.maximum(noise, 1e-8 * np.mean(np.abs(spectrum) ** 2))
+    white, H = spectrum[at] / np.sqrt(noise), H / np.sqrt(noise)[:, None]
+    strength = _strength(frequency[at], white, H)[:, None, None]
+    HH = np.conj(np.swapaxes(H, 1, 2))
+    inner = strength * (H @ HH) + np.eye(white.shape[1])
+    return (strength * (HH @ np.linalg.solve(inner, white[:, :, None])))[:, :, 0]
 
 
 def _beyond_ends(left: np.ndarray, margin: int) -> np.ndarray:
@@ -146,3 +174,17 @@ def _strength(frequency: np.ndarray, white: np.ndarray, H: np.ndarray) -> np.nda
     least = 0.02 * np.sqrt(np.maximum(lines, 1))
     strength = np.maximum(excess, least) / np.maximum(made, np.finfo(float).tiny)
     return strength[band]
+
+
+def with_large_motion(motion: dict[str, RecordMotion], model: TableModel) -> dict[str, RecordMotion]:
+    """The records with the second-order terms of large rotations, from their motion."""
+    found = {}
+    for name, one in motion.items():
+        back = np.linalg.pinv(one.rows)
+        q = one.deflection @ back.T
+        q_dot = np.gradient(q, 1 / one.sample_rate_Hz, axis=0)
+        late = round(model.delay_s * one.sample_rate_Hz)
+        u = np.concatenate([np.zeros((late, one.volts.shape[1])), one.volts])[:len(one.volts)]
+        large, turned, reading = second_order(model.effective.rig, q, q_dot, u, model.sensors.names)
+        found[name] = replace(one, large_force=large, turned_force=turned, turned_reading=reading)
+    return found

@@ -47,6 +47,16 @@ class ActiveEffect:
         return replace(self, values=tuple(float(v) for v in values))
 
 
+@dataclass(frozen=True, eq=False)
+class Acting:
+    """What acts on the table: U (n, n_u + 3 [+ 12], m), internal force (n, 6, m), and displacement (n, n_y, m) that the
+    sensors read beside the payload's own."""
+
+    U: np.ndarray
+    force: np.ndarray | None = None
+    reading: np.ndarray | None = None
+
+
 def active(effect: Effect, model: TableModel, place: str, values: Sequence[float] | None = None) -> ActiveEffect:
     """An effect at a place of a model, without strength where no values are given."""
     parameters = effect.parameters(model, place)
@@ -194,8 +204,7 @@ class TableModel:
 
     def _driven(self, omega: np.ndarray, U: np.ndarray, block: SpectralBlock | None, derivative: bool) -> Driven:
         made = assemble(self.operators(omega))
-        U, force = self._acting(U, block)
-        answer = _Answer(made, U, force)
+        answer = _Answer(made, self._acting(U, block))
         if not derivative:
             return Driven(answer.Y, np.empty(0))
         dY = np.zeros((len(self.names), *answer.Y.shape), complex)
@@ -203,25 +212,29 @@ class TableModel:
         self._by_effects(omega, U, block, made, answer, dY)
         return Driven(answer.Y, dY)
 
-    def _acting(self, U: np.ndarray, block: SpectralBlock | None) -> tuple[np.ndarray, np.ndarray | None]:
-        """Inputs with the volts that act, and internal forces (n, 6, 1) of effects that depend on the record."""
+    def _acting(self, U: np.ndarray, block: SpectralBlock | None) -> Acting:
+        """Inputs with the volts that act, and what effects that depend on the record add."""
         if block is None:
-            return U, None
+            return Acting(U)
         record = self.motion.get(block.name)
         if record is None:
             raise InputError("expected the record's motion in time for an effect that depends on it",
                              field=f"block {block.name}")
         total: np.ndarray | None = None
+        seen: np.ndarray | None = None
         for one in self.effects:
             volts = one.effect.volts(record, one.place, one.by_name)
             if volts is not None:
                 U = U.copy()
                 U[:, :len(self.actuators), 0] = record.spectrum(volts, block.omega)
-            force = one.effect.force(record, one.place, one.by_name)
+            force = one.effect.force_spectrum(record, one.place, one.by_name, block.omega)
             if force is not None:
-                spectrum = record.spectrum(force, block.omega)[:, :, None]
-                total = spectrum if total is None else total + spectrum
-        return U, total
+                total = force[:, :, None] if total is None else total + force[:, :, None]
+            reading = one.effect.reading_spectrum(record, one.place, one.by_name, block.omega)
+            if reading is not None:
+                moved = -reading[:, :, None] / (block.omega ** 2)[:, None, None]
+                seen = moved if seen is None else seen + moved
+        return Acting(U, total, seen)
 
     def _by_effects(self, omega, U, block, made: Assembled, answer: _Answer, dY: np.ndarray) -> None:
         """Central differences of the whole response by the effects' parameters."""
@@ -235,10 +248,10 @@ class TableModel:
                 moved = theta.copy()
                 moved[row] = end
                 other = replace(self, effects=self.at(moved).effects)
-                other_U, force = other._acting(U, block)
+                acting = other._acting(U, block)
                 own = made if self.effects[self._free[row - n][0]].effect.nonlinear else assemble(
                     other.operators(omega), invert=False)
-                sides.append(_Side(own, other_U, force, answer.x))
+                sides.append(_Side(own, acting, answer.x))
             # d x = inv(D) (d F - d D x): no second inverse.
             push, seen = ((sides[0].push - sides[1].push) / (ends[0] - ends[1]),
                           (sides[0].Y - sides[1].Y) / (ends[0] - ends[1]))
@@ -248,16 +261,17 @@ class TableModel:
 class _Side:
     """Y that an assembled table would read of a motion x, and the force that is missing for that motion."""
 
-    def __init__(self, made: Assembled, U: np.ndarray, force: np.ndarray | None, x: np.ndarray):
-        drive = _Drive(made, U, force)
+    def __init__(self, made: Assembled, acting: Acting, x: np.ndarray):
+        drive = _Drive(made, acting)
         self.push = drive.total - made.D @ x
         self.Y = _read(made, x, drive)
 
 
 class _Drive:
-    """Forces (n, n_q, m) on an assembled table by U (n, n_u + 3 [+ 12], m) and internal force (n, 6, 1 or m)."""
+    """Forces (n, n_q, m) on an assembled table."""
 
-    def __init__(self, made: Assembled, U: np.ndarray, force: np.ndarray | None):
+    def __init__(self, made: Assembled, acting: Acting):
+        U, force = acting.U, acting.force
         ops, n_u = made.ops, len(made.ops.base.actuators)
         s = ops.s[:, None, None]
         commanded = U[:, :n_u]
@@ -271,7 +285,7 @@ class _Drive:
             total[:, :N_Q] += U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
         if force is not None:
             total[:, :N_Q] += force
-        self.total = total
+        self.total, self.reading = total, acting.reading
 
 
 def _gain(made: Assembled) -> np.ndarray:
@@ -282,14 +296,17 @@ def _read(made: Assembled, x: np.ndarray, drive: _Drive) -> np.ndarray:
     """(n, n_y, m) of a motion x; aliases pass the chain far above its corners."""
     mat = made.ops.base.matrices
     alias = (mat.R @ np.linalg.inv(mat.M) @ mat.T) @ drive.folded
-    return _gain(made) * (made.ops.sense[:, :, None] * (made.rows @ x) + alias)
+    moved = made.rows @ x
+    if drive.reading is not None:
+        moved = moved + drive.reading
+    return _gain(made) * (made.ops.sense[:, :, None] * moved + alias)
 
 
 class _Answer:
-    """Response of an assembled table to U (n, n_u + 3 [+ 12], m) and internal force (n, 6, 1 or m)."""
+    """Response of an assembled table."""
 
-    def __init__(self, made: Assembled, U: np.ndarray, force: np.ndarray | None):
-        ops, drive = made.ops, _Drive(made, U, force)
+    def __init__(self, made: Assembled, acting: Acting):
+        ops, drive = made.ops, _Drive(made, acting)
         self.made, self.s = made, ops.s[:, None, None]
         self.volts, self.w, self.folded = drive.volts, drive.w, drive.folded
         self.x = made.inverse @ drive.total

@@ -234,11 +234,13 @@ class _Descent:
 
     def at_bound(self) -> np.ndarray:
         """(n_p,) parameters at the smallest value that physics allows."""
-        return self.model.values <= self.lowest + 1e-9 * np.abs(self.lowest)
+        slack = 1e-9 * np.abs(self.lowest, where=np.isfinite(self.lowest), out=np.zeros(len(self.lowest)))
+        return self.model.values <= self.lowest + slack
 
     def at_top(self) -> np.ndarray:
         """(n_p,) parameters at the largest."""
-        return self.model.values >= self.highest - 1e-9 * np.abs(self.highest)
+        slack = 1e-9 * np.abs(self.highest, where=np.isfinite(self.highest), out=np.zeros(len(self.highest)))
+        return self.model.values >= self.highest - slack
 
     def _try(self, step: np.ndarray) -> tuple[ResponseModel, float] | None:
         try:

@@ -26,6 +26,7 @@ from avis_ctrl.errors import InputError
 if TYPE_CHECKING:
     from avis_ctrl.gap.motion import RecordMotion
     from avis_ctrl.gap.operators import Operators
+    from avis_ctrl.gap.score import Score
     from avis_ctrl.gap.table_model import TableModel
 
 
@@ -35,7 +36,7 @@ class EffectParameter:
 
     none : value without the effect. low, high : what physics allows. size : one unit of it in a fit.
     linear : the effect vanishes as this goes to `none`, at first in proportion.
-    grid : for one that is not linear, where to look for it.
+    grid : for one that is not linear, where to look for it. optional : one that may end at its bounds.
     """
 
     name: str
@@ -47,6 +48,19 @@ class EffectParameter:
     size: float
     linear: bool = True
     grid: tuple[float, ...] = ()
+    optional: bool = False
+
+
+@dataclass(frozen=True)
+class Seed:
+    """Where a refit may begin: values of all parameters, and by how much chi2 falls there to first order.
+
+    directions : along how many the data could have made it fall.
+    """
+
+    values: tuple[float, ...]
+    chi2: float
+    directions: int
 
 
 @dataclass(frozen=True)
@@ -97,6 +111,22 @@ class Effect(ABC):
         """(samples, 6) generalised force on the payload, None for none."""
         return None
 
+    def reading(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+        """(samples, n_y) acceleration along the sensors beside the payload's own, None for none."""
+        return None
+
+    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
+                       ) -> np.ndarray | None:
+        """(n, 6) of `force` on lines omega; effects that are linear in their force keep that of a unit."""
+        force = self.force(record, place, values)
+        return None if force is None else record.spectrum(force, omega)
+
+    def reading_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
+                         ) -> np.ndarray | None:
+        """(n, n_y) of `reading` on lines omega."""
+        reading = self.reading(record, place, values)
+        return None if reading is None else record.spectrum(reading, omega)
+
     def starts(self, model: TableModel, place: str) -> Sequence[np.ndarray]:
         """Where to look: (n_parameters,) each, shape parameters on their grid and the linear ones at none."""
         parameters = self.parameters(model, place)
@@ -105,6 +135,29 @@ class Effect(ABC):
             values = (one.none,) if one.linear else one.grid
             points = [np.append(point, value) for point in points for value in values]
         return points
+
+    def seeds(self, score: Score, place: str) -> list[Seed]:
+        """Where refits may begin, the most promising first.
+
+        By default the score test at every point of `starts`; the linear parameters are as large as it says, within
+        what physics allows.
+        """
+        from avis_ctrl.gap.table_model import ActiveEffect
+
+        parameters, found = self.parameters(score.model, place), []
+        linear = [j for j, one in enumerate(parameters) if one.linear]
+        for point in self.starts(score.model, place):
+            effect = ActiveEffect(self, place, parameters, tuple(float(v) for v in point))
+            took = score.reduction(score.of_effect(effect))
+            values = list(effect.values)
+            for c, j in zip(took.coefficients, linear, strict=False):
+                one = parameters[j]
+                values[j] = float(np.clip(one.none + c, one.low, one.high))
+            wrong = any(values[j] == parameters[j].none for j in linear) and len(linear) == 1
+            backward = not linear and took.coefficients[0] <= 0
+            if not wrong and not backward:
+                found.append(Seed(tuple(values), took.chi2, took.rank))
+        return sorted(found, key=lambda seed: -seed.chi2)
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         """Why physics forbids these values, empty where it does not."""

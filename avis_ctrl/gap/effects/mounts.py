@@ -102,9 +102,9 @@ class MountSurge(_OfMounts):
         grid = tuple(4 * k / (2 * np.pi * f) ** 2 for f in (10.0, 14.0, 20.0, 28.0, 40.0, 56.0, 80.0))
         return (EffectParameter("mass_kg", "kg", "inside each mount", 0.0, 0.0, 500.0, grid[2], False, grid),
                 EffectParameter("payload_share", "1", "of the mount's compliance between mass and payload", 0.5, 0.05,
-                                0.95, 0.2, False, (0.5,)),
+                                0.95, 0.2, False, (0.5,), True),
                 EffectParameter("bypass", "1", "of the mount's damping that bypasses the mass", 0.0, 0.0, 1.0, 0.2,
-                                False, (0.0, 0.9)))
+                                False, (0.0, 0.9), True))
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         up = vertical(ops)
@@ -170,7 +170,12 @@ class CubicStiffness(_OfMounts):
 
     def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
         up = record.vertical
-        return -values["k3_N_per_m3"] * record.deflection[:, up] ** 3 @ record.rows[up]
+        return -values["k3_N_per_m3"] * (record.deflection[:, up] ** 3 @ record.rows[up])
+
+    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
+                       ) -> np.ndarray | None:
+        unit = record.kept("cubic", omega, lambda: np.asarray(self.force(record, place, {"k3_N_per_m3": 1.0})))
+        return values["k3_N_per_m3"] * unit
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         return "mounts that soften with amplitude" if values["k3_N_per_m3"] < 0 else ""
@@ -260,7 +265,12 @@ class StiffnessDrift(Effect):
     def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
         begin, end = record.campaign_s
         when = (record.time_s - (begin + end) / 2) / (end - begin)
-        return -values["relative_change"] * (record.deflection * record.stiffness * when[:, None]) @ record.rows
+        return -values["relative_change"] * ((record.deflection * record.stiffness * when[:, None]) @ record.rows)
+
+    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
+                       ) -> np.ndarray | None:
+        unit = record.kept("drift", omega, lambda: np.asarray(self.force(record, place, {"relative_change": 1.0})))
+        return values["relative_change"] * unit
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
@@ -295,7 +305,7 @@ class BaseCompliance(Effect):
                                  (7.0, 14.0, 28.0, 50.0)),
                  EffectParameter("horizontal_Hz", "Hz", "of the chassis on its base, along x and y", 0.0, 1.0, 300.0,
                                  10.0, False, (7.0, 14.0, 28.0, 50.0)),
-                 EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 1.0, 0.05, False, (0.06,)))
+                 EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 1.0, 0.05, False, (0.06,), True))
         if place.endswith("translation"):
             return found
         return (*found, EffectParameter("rocking_Hz", "Hz", "of the chassis on its base, about each axis", 0.0, 1.0, 300.0,

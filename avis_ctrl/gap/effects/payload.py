@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, register
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register
+from avis_ctrl.gap.effects.impedance import at_points, positions, project, residues
 from avis_ctrl.gap.effects.sensors import axis_of, second_order
 from avis_ctrl.gap.operators import AddedCoordinate, mount_geometry
+from avis_ctrl.gap.score_algebra import reduction
 from avis_ctrl.rigs.rigid_body import point_map
 
 if TYPE_CHECKING:
     from avis_ctrl.gap.operators import Operators
+    from avis_ctrl.gap.score import Score
     from avis_ctrl.gap.table_model import TableModel
 
 PRODUCTS = {"Jxy": "J12", "Jxz": "J13", "Jyz": "J23"}
@@ -84,7 +87,7 @@ class PayloadFlexibleMode(Effect):
         names = mount_geometry(model.rig).names
         grid = tuple(np.geomspace(7.0, 140.0, 22))
         return (EffectParameter("frequency_Hz", "Hz", "of the mode, free", 0.0, 3.0, 400.0, 20.0, False, grid),
-                EffectParameter("damping", "1", "damping ratio of the mode", 0.0, 1e-4, 0.5, 0.02, False, (0.02,)),
+                EffectParameter("damping", "1", "damping ratio of the mode", 0.0, 1e-4, 0.5, 0.02, False, (0.02,), True),
                 *(EffectParameter(f"shape_{name.replace('.', '_')}", "1/sqrt(kg)", f"mass-normalised shape at {name}",
                                   0.0, -1.0, 1.0, 0.01) for name in names))
 
@@ -95,6 +98,27 @@ class PayloadFlexibleMode(Effect):
         at_actuators, at_sensors = shape_rows(ops.base.rig, ops.base.actuators, ops.base.sensors.names)
         ops.added.append(AddedCoordinate(second_order(ops.s, values["frequency_Hz"], values["damping"]), shape,
                                          at_actuators @ shape, at_sensors @ shape))
+
+
+    def seeds(self, score: Score, place: str) -> list[Seed]:
+        """Residues over all paths at each frequency, of which the symmetric part of rank one is the shape."""
+        model, found = score.model, []
+        frequency, damping = self.parameters(model, place)[:2]
+        at_actuators, at_sensors = shape_rows(model.rig, model.actuators, model.sensors.names)
+        for f in frequency.grid:
+            for zeta in damping.grid:
+                took, Q = residues(score, lambda s, f=f, zeta=zeta: 1 / second_order(s, f, zeta))
+                # Q = a_s a_u^T with both from one shape: alternate between the two for the best of rank one.
+                U, sigma, Vt = np.linalg.svd(Q)
+                shape = at_actuators.T @ Vt[0]
+                sign = float(U[:, 0] @ (at_sensors @ shape))
+                size = float(np.sum((at_sensors @ shape) ** 2))
+                if sign <= 0 or size == 0:
+                    continue
+                shape = shape * np.sqrt(sigma[0] * sign / size)
+                share = float(sigma[0] ** 2 / np.sum(sigma ** 2))
+                found.append(Seed((f, zeta, *shape), took.chi2 * share, took.rank))
+        return sorted(found, key=lambda seed: -seed.chi2)
 
 
 def shape_points(model: TableModel) -> bool | None:
@@ -149,13 +173,35 @@ class AttachedOscillator(_AtPoint):
         return (EffectParameter("mass_kg", "kg", "sprung mass", 0.0, 0.0, mass, 0.01 * mass),
                 EffectParameter("frequency_Hz", "Hz", "of the mass on its spring", 0.0, 0.3, 300.0, 10.0, False,
                                 frequencies),
-                EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 2.0, 0.05, False, (0.05,)), *across)
+                EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 2.0, 0.05, False, (0.05,), True),
+                *across)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         h = oscillator(ops.s, values["frequency_Hz"], values["damping"])
         axes = ["xyz".index(axis) for axis in place.partition("/")[2]]
         Z = values["mass_kg"] * ops.s ** 2 * h
         ops.add_impedance(np.repeat(Z[:, None], len(axes), axis=1), point_map(place_of(values))[axes])
+
+
+    def seeds(self, score: Score, place: str) -> list[Seed]:
+        """Over frequency, damping and a grid of places; the mass follows."""
+        model, found = score.model, []
+        parameters = self.parameters(model, place)
+        axes = place.partition("/")[2]
+        points = positions(parameters)
+        for f in parameters[1].grid:
+            for zeta in (0.03, 0.15):
+                G, b = project(score, lambda s, f=f, zeta=zeta: s ** 2 * oscillator(s, f, zeta),
+                               (f, zeta))
+                along = at_points(points, axes).sum(1)
+                mass = along @ b / np.einsum("pi,ij,pj->p", along, G, along)
+                chi2 = mass * (along @ b)
+                k = int(np.argmax(np.where(mass > 0, chi2, -np.inf)))
+                if mass[k] > 0:
+                    at = [points[k]["xyz".index(one.name[0])] for one in parameters[3:]]
+                    found.append(Seed((min(float(mass[k]), 0.5 * parameters[0].high), f, zeta, *at), float(chi2[k]),
+                                      1 + len(at)))
+        return sorted(found, key=lambda seed: -seed.chi2)
 
 
 def oscillator(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
@@ -184,7 +230,7 @@ class CableStiffness(_AtPoint):
         if place.endswith("oblique"):
             own += [EffectParameter(f"k_{axes}_N_per_m", "N/m", f"stiffness between {axes[0]} and {axes[1]}", 0.0,
                                     -most, most, size) for axes in ("xy", "xz", "yz")]
-        return (*own, EffectParameter("damping_s", "s", "damping over stiffness", 0.0, 0.0, 0.1, 1e-3, False, (0.0,)),
+        return (*own, EffectParameter("damping_s", "s", "damping over stiffness", 0.0, 0.0, 0.1, 1e-3, False, (0.0,), True),
                 *self.position())
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -197,6 +243,26 @@ class CableStiffness(_AtPoint):
         Z = k * (1 + ops.s * values["damping_s"])[:, None]
         ops.add_impedance(Z, rows, Z)
 
+    def seeds(self, score: Score, place: str) -> list[Seed]:
+        """Over a grid of places; the stiffnesses follow, those that come out negative at zero."""
+        model, found = score.model, []
+        parameters = self.parameters(model, place)
+        points = positions(parameters)
+        G, b = project(score, lambda s: np.ones_like(s))
+        n_k = 6 if place.endswith("oblique") else 3
+        basis = at_points(points, "xyz", oblique=n_k == 6)
+        for point, rows in zip(points, basis, strict=True):
+            A, d = rows @ G @ rows.T, rows @ b
+            k = reduction(A, d).coefficients
+            own = k.copy()
+            own[:3] = np.maximum(own[:3], 0.0)
+            chi2 = float(2 * own @ d - own @ A @ own)
+            if np.any(own[:3] > 0):
+                found.append(Seed((*np.clip(own, [one.low for one in parameters[:n_k]],
+                                            [one.high for one in parameters[:n_k]]).tolist(), 0.0, *point), chi2,
+                                  n_k + 3))
+        return sorted(found, key=lambda seed: -seed.chi2)
+
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         if "k_xy_N_per_m" not in values:
             return ""
@@ -208,6 +274,3 @@ class CableStiffness(_AtPoint):
         slack = 3 * max((std[f"k_{axis}_N_per_m"] for axis in "xyz"), default=0.0)
         return f"a cable with a negative stiffness, {least:.3g} N/m" if least < -slack - 1e-3 * K.max() else ""
 
-
-def vertical_sensors(model: TableModel) -> list[str]:
-    return [name for name in model.sensors.names if axis_of(model, name) == "z"]

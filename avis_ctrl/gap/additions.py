@@ -1,0 +1,325 @@
+"""Effects on the table's motion as state-space systems beside the rig, in any of its coordinates.
+
+    (r, v, v_c, u)  ->  (f, d)
+
+r displacement of the payload against the chassis, v and v_c velocities of payload and chassis in the kept coordinates
+(rotations as displacements of the edge), u the volts that act; f the force that the effect adds, d what it adds to the
+velocity along each sensor. All parts are passive impedances or poles and zeros of the effects' own formulas
+(`gap.effects`), but for the loss that is independent of frequency, which is fitted by a ladder of Maxwell branches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import nnls
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.effects.mounts import REFERENCE_Hz
+from avis_ctrl.gap.effects.payload import place_of, shape_rows
+from avis_ctrl.gap.operators import MountGeometry, mount_geometry
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.identification.response import Matrices
+from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.statespace import StateSpace, append, gain
+from avis_ctrl.rigs.rigid_body import COORDINATES, point_map
+
+# Band in which the ladder follows the power of s, and its largest relative error there.
+LADDER_Hz = (0.1, 200.0)
+LADDER_ERROR = 2e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """What an addition needs to know of a model in its kept coordinates.
+
+    model : with its effects. keep : coordinates that move. when : -0.5 .. 0.5 through the campaign.
+    """
+
+    model: TableModel
+    keep: tuple[str, ...]
+    when: float = 0.0
+
+    @cached_property
+    def kept(self) -> list[int]:
+        return [COORDINATES.index(name) for name in self.keep]
+
+    @cached_property
+    def scale(self) -> np.ndarray:
+        """(n,) from kept coordinates, rotations at the edge [m], to q."""
+        edge = self.model.rig.edge_m
+        return np.array([1 / edge if name.startswith("phi") else 1.0 for name in self.keep])
+
+    @property
+    def matrices(self) -> Matrices:
+        return self.model.matrices
+
+    @cached_property
+    def mounts(self) -> MountGeometry:
+        return mount_geometry(self.model.effective.rig)
+
+    def rows(self, of_q: np.ndarray) -> np.ndarray:
+        """(m, n) rows by kept coordinates from rows (m, 6) by q."""
+        return np.atleast_2d(of_q)[:, self.kept] * self.scale
+
+    @property
+    def G(self) -> np.ndarray:
+        """(n_g, n) deflection of every mount."""
+        return self.rows(self.mounts.payload)
+
+    @property
+    def inertia(self) -> np.ndarray:
+        """(n, n) mass matrix."""
+        return self.rows(self.rows(self.matrices.M).T)
+
+    @property
+    def n(self) -> int:
+        return len(self.keep)
+
+    @property
+    def n_y(self) -> int:
+        return len(self.model.sensors.names)
+
+    @property
+    def n_u(self) -> int:
+        return len(self.model.actuators)
+
+    # Columns of the inputs of an addition.
+    @property
+    def r(self) -> slice:
+        return slice(0, self.n)
+
+    @property
+    def v(self) -> slice:
+        return slice(self.n, 2 * self.n)
+
+    @property
+    def v_c(self) -> slice:
+        return slice(2 * self.n, 3 * self.n)
+
+    @property
+    def u(self) -> slice:
+        return slice(3 * self.n, 3 * self.n + self.n_u)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Outputs and inputs of an addition."""
+        return self.n + self.n_y, 3 * self.n + self.n_u
+
+
+Addition = Callable[[Table, str, Mapping[str, float]], StateSpace]
+
+
+def addition(table: Table, one: ActiveEffect) -> StateSpace | None:
+    """An effect's part of the motion; None where it has none (it acts on rig parameters, sensors or drives).
+
+    An effect of the user's own gives it as a method `addition(table, place, values)`.
+    """
+    made: Addition | None = _MADE.get(one.effect.name) or getattr(one.effect, "addition", None)
+    return None if made is None else made(table, one.place, one.by_name)
+
+
+def has_addition(one: ActiveEffect) -> bool:
+    return one.effect.name in _MADE or hasattr(one.effect, "addition")
+
+
+def impedance(table: Table, K: np.ndarray, h: StateSpace, of: str = "r") -> StateSpace:
+    """Force -K h(s) by displacement ("r"), or by absolute velocity ("v"), K (n, n) symmetric: as few states as K's rank.
+    """
+    sizes, V = np.linalg.eigh(K)
+    felt = np.abs(sizes) > 1e-12 * max(np.abs(sizes).max(), 1e-300)
+    V, sizes = V[:, felt], sizes[felt]
+    read, push = np.zeros((len(sizes), table.shape[1])), np.zeros((table.shape[0], len(sizes)))
+    read[:, getattr(table, of)] = V.T
+    push[:table.n] = -V * sizes
+    if not len(sizes):
+        return gain(np.zeros(table.shape))
+    parts = append(*(h.renamed([f"u{k}"], [f"y{k}"]) for k in range(len(sizes))))
+    return _plain(parts.scaled(push, read))
+
+
+def _plain(system: StateSpace) -> StateSpace:
+    return StateSpace(system.A, system.B, system.C, system.D)
+
+
+def _static(table: Table, K: np.ndarray, C: np.ndarray | None = None) -> StateSpace:
+    """Force -K r - C (v - v_c)."""
+    D = np.zeros(table.shape)
+    D[:table.n, table.r] = -K
+    if C is not None:
+        D[:table.n, table.v], D[:table.n, table.v_c] = -C, C
+    return gain(D)
+
+
+def _relaxation(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+    up = table.mounts.along("z")
+    G, k = table.G[up], table.mounts.stiffness[up]
+    h = cascade([0.0], [-2 * np.pi * values["corner_Hz"]], values["stiffness_ratio"])
+    return impedance(table, G.T @ (k[:, None] * G), h)
+
+
+def _structural(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+    """The causal law, for the complex constant too: no causal system has that."""
+    G, k = table.G, table.mounts.stiffness
+    rest, branches = ladder(2 / np.pi * np.arctan(values["loss_factor"]))
+    corners = np.array([w for w, _ in branches])
+    ratios = np.array([ratio for _, ratio in branches])
+    # rest - 1 + sum of ratio s/(s + w) = rest - 1 + sum(ratio) - sum of ratio w/(s + w)
+    h = StateSpace(-np.diag(corners), np.sqrt(corners)[:, None], -(ratios * np.sqrt(corners))[None],
+                   [[rest - 1 + ratios.sum()]])
+    return impedance(table, G.T @ (k[:, None] * G), h)
+
+
+def ladder(power: float) -> tuple[float, list[tuple[float, float]]]:
+    """(s/w_ref)^power as rest + sum of ratio s/(s + w), all ratios positive: (rest, [(w, ratio)]).
+
+    As few branches, evenly spaced in log w, as keep the error below LADDER_ERROR in LADDER_Hz. Positive ratios make
+    it passive.
+    """
+    f = np.geomspace(*LADDER_Hz, 200)
+    s = 2j * np.pi * f
+    wanted = (s / (2 * np.pi * REFERENCE_Hz)) ** power
+    if power == 0:
+        return 1.0, []
+    for count in range(2, 24):
+        w = 2 * np.pi * np.geomspace(LADDER_Hz[0] / 3, LADDER_Hz[1] * 3, count)
+        basis = np.column_stack([np.ones(len(s)), s[:, None] / (s[:, None] + w)]) / wanted[:, None]
+        found, _ = nnls(np.vstack([basis.real, basis.imag]), np.concatenate([np.ones(len(s)), np.zeros(len(s))]))
+        if np.max(np.abs(basis @ found - 1)) < LADDER_ERROR:
+            break
+    return float(found[0]), [(float(a), float(b)) for a, b in zip(w, found[1:], strict=True) if b > 0]
+
+
+def _surge(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+    """A mass in every vertical mount: r_m = its displacement against the chassis, v_m its velocity.
+
+    r_m' = v_m - v_c,  m v_m' = a z (r - r_m) - b z r_m,  f = -(a - 1) z r + a z r_m beside the mount itself,
+    z = k + s c (1 - bypass), 1/a + 1/b = 1.
+    """
+    up = table.mounts.along("z")
+    G, k, c = table.G[up], table.mounts.stiffness[up], table.mounts.damping[up] * (1 - values["bypass"])
+    share, m, count = values["payload_share"], values["mass_kg"], int(np.sum(up))
+    total = gain(np.zeros(table.shape))
+    if m == 0:
+        return total
+    a, b = 1 / share, 1 / (1 - share)
+    for j in range(count):
+        g = G[j]
+        A = np.array([[0.0, 1.0], [-(a + b) * k[j] / m, -(a + b) * c[j] / m]])
+        B, D = np.zeros((2, table.shape[1])), np.zeros(table.shape)
+        B[0, table.v_c] = -g
+        B[1, table.r], B[1, table.v] = a * k[j] / m * g, a * c[j] / m * g
+        B[1, table.v_c] = -a * c[j] / m * g + (a + b) * c[j] / m * g
+        C = np.zeros((table.shape[0], 2))
+        C[:table.n] = np.outer(g, [a * k[j], a * c[j]])
+        outer = np.outer(g, g)
+        D[:table.n, table.r], D[:table.n, table.v] = -(a - 1) * k[j] * outer, -(a - 1) * c[j] * outer
+        D[:table.n, table.v_c] = (a - 1) * c[j] * outer - a * c[j] * outer
+        total = total + StateSpace(A, B, C, D)
+    return _plain(total)
+
+
+def _leveling(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+    G = table.rows(table.mounts.payload[table.mounts.along("z")][:3])
+    poles = [0.0]
+    size = values["integral_gain_N_per_ms"]
+    if "valve_corner_Hz" in values:
+        corner = 2 * np.pi * values["valve_corner_Hz"]
+        poles, size = [0.0, -corner], size * corner
+    return impedance(table, G.T @ G, cascade([], poles, size))
+
+
+def _friction(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+    """Far below the slip: a spring at every motor."""
+    at_actuators, _ = shape_rows(table.model.rig, table.model.actuators, table.model.sensors.names)
+    G = at_actuators @ table.G
+    return _static(table, values["stiffness_N_per_m"] * G.T @ G)
+
+
+def _drift(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+    G, k = table.G, table.mounts.stiffness
+    return _static(table, values["relative_change"] * table.when * G.T @ (k[:, None] * G))
+
+
+def _cable(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+    K = np.diag([values[f"k_{axis}_N_per_m"] for axis in "xyz"])
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        K[i, j] = K[j, i] = values.get(f"k_{'xyz'[i]}{'xyz'[j]}_N_per_m", 0.0)
+    G = table.rows(point_map(place_of(values)))
+    return _static(table, G.T @ K @ G, values["damping_s"] * G.T @ K @ G)
+
+
+def _oscillator(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+    """m s (2 z w s + w^2)/(s^2 + 2 z w s + w^2) on the velocity of its place."""
+    G = table.rows(point_map(place_of(values)))[["xyz".index(axis) for axis in place.partition("/")[2]]]
+    w, zeta, m = 2 * np.pi * values["frequency_Hz"], values["damping"], values["mass_kg"]
+    poles = np.roots([1.0, 2 * zeta * w, w ** 2])
+    h = cascade([0.0, -w / (2 * zeta)], poles, 2 * zeta * w * m)
+    return impedance(table, G.T @ G, h, "v")
+
+
+def _flexible(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+    """Mode coordinate e and its velocity; the mounts and motors push it, and it deflects them."""
+    shape = np.array(list(values.values())[2:])
+    at_actuators, at_sensors = shape_rows(table.model.rig, table.model.actuators, table.model.sensors.names)
+    w, zeta = 2 * np.pi * values["frequency_Hz"], values["damping"]
+    G, k, c = table.G, table.mounts.stiffness, table.mounts.damping
+    constants = np.linalg.norm(table.matrices.T[:3], axis=0)
+    A = np.array([[0.0, 1.0], [-w ** 2 - shape @ (k * shape), -2 * zeta * w - shape @ (c * shape)]])
+    B, C = np.zeros((2, table.shape[1])), np.zeros((table.shape[0], 2))
+    B[1, table.r], B[1, table.v], B[1, table.v_c] = -(shape * k) @ G, -(shape * c) @ G, (shape * c) @ G
+    B[1, table.u] = (at_actuators @ shape) * constants
+    C[:table.n, 0], C[:table.n, 1] = -G.T @ (k * shape), -G.T @ (c * shape)
+    C[table.n:, 1] = at_sensors @ shape
+    return StateSpace(A, B, C, np.zeros(table.shape))
+
+
+def _nothing(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+    """Vanishes as the amplitude does."""
+    return gain(np.zeros(table.shape))
+
+
+_MADE: dict[str, Addition] = {
+    "mount_relaxation": _relaxation, "structural_damping": _structural, "mount_surge": _surge,
+    "leveling_loop": _leveling, "contact_friction": _friction, "stiffness_drift": _drift, "cable_stiffness": _cable,
+    "attached_oscillator": _oscillator, "payload_flexible_mode": _flexible, "cubic_stiffness": _nothing,
+    "actuator_saturation": _nothing}
+
+
+def chassis(table: Table, values: Mapping[str, float], floor: list[str], accelerations: list[str], moves: list[str]
+            ) -> StateSpace:
+    """Velocity of a chassis on a soft base, from that of the floor and the acceleration of the payload.
+
+    v_c = H v_f - s B M a, with B = inv(s^2 m + s c + k) along each axis (about it with rocking), M the payload's.
+
+    Raises
+    ------
+    InputError : nothing to stand on.
+    """
+    if values["mass_kg"] <= 0:
+        raise InputError("expected a chassis with a mass", field="base_compliance.mass_kg", value=values["mass_kg"])
+    n, parts = table.n, []
+    read = np.zeros((0, 2 * n))
+    for a, name in enumerate(table.keep):
+        own = np.zeros((2, 2 * n))
+        own[0, a], own[1, n:] = 1.0, table.inertia[a]
+        read = np.vstack([read, own])
+        parts.append(_chassis_axis(name, table.scale[a], values).renamed([f"f{a}", f"a{a}"], [f"c{a}"]))
+    total = append(*parts).scaled(1.0, read)
+    return StateSpace(total.A, total.B, total.C, total.D, 0.0, (*floor, *accelerations), tuple(moves))
+
+
+def _chassis_axis(name: str, scale: float, values: Mapping[str, float]) -> StateSpace:
+    """(floor velocity, inertia force of the payload) -> velocity of the chassis in one coordinate."""
+    key = "vertical_Hz" if name == "z" else "rocking_Hz" if name.startswith("phi") else "horizontal_Hz"
+    if key not in values:
+        return gain([[1.0, 0.0]])
+    m = values["mass_kg"] * (values["gyration_m"] ** 2 if key == "rocking_Hz" else 1.0) * scale ** 2
+    w, zeta = 2 * np.pi * values[key], values["damping"]
+    # x = (deflection of the base, velocity of the chassis): x1' = x2 - v_f, m x2' = -k x1 - c (x2 - v_f) - M a
+    A = np.array([[0.0, 1.0], [-w ** 2, -2 * zeta * w]])
+    B = np.array([[-1.0, 0.0], [2 * zeta * w, -1 / m]])
+    return StateSpace(A, B, [[0.0, 1.0]], [[0.0, 0.0]])

@@ -1,0 +1,162 @@
+"""The campaign as `gap` uses it: what is fitted, what no fit sees, spectra with measured noise, and fewer lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import AvisError, InputError
+from avis_ctrl.identification.campaign_fit import Portion, driven_inputs, measured_noise
+from avis_ctrl.identification.maximum_likelihood import Residual
+from avis_ctrl.identification.noise import noise_from_residuals
+from avis_ctrl.identification.prediction_error import prediction_error
+from avis_ctrl.identification.spectra import SpectralBlock, record_block
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.measurement.campaign import Campaign, RecordSource
+
+# Records at levels within this factor are of one level.
+SAME_LEVEL = 1.25
+# Lines of a record on which candidates are compared; the models that are reported are fitted to all.
+THIN_LINES = 450
+# Below this [Hz] lie the resonances of a table: there no line is left out before the others.
+DENSE_BELOW_Hz = 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class Halves:
+    """Which records (or parts of them) are fitted and which no fit sees, and a sentence."""
+
+    fitted: Campaign
+    held_out: Campaign
+    how: str
+
+
+def divide(campaign: Campaign) -> Halves:
+    """Hold out records of which another one of the same level and kind is fitted; else the last third of each.
+
+    Highest level first, then the lowest: what depends on amplitude shows there. Never more than a third of the records.
+
+    Raises
+    ------
+    InputError : no record that drives an actuator.
+    """
+    driven = [record for record in campaign.records if driven_inputs(record)]
+    if not driven:
+        raise InputError("expected records that drive the actuators", field="records")
+    groups: list[list[RecordSource]] = []
+    for record in sorted(driven, key=lambda one: (one.header.excitation, one.header.level_V)):
+        last = groups[-1][0].header if groups else None
+        h = record.header
+        if last and h.excitation == last.excitation and h.level_V <= SAME_LEVEL * last.level_V:
+            groups[-1].append(record)
+        else:
+            groups.append([record])
+    groups.sort(key=lambda group: -group[0].header.level_V)
+    several = [group for group in groups if len(group) > 1]
+    order = several[:1] + several[:0:-1]
+    chosen = [group[-1].header.name for group in order][:max(len(driven) // 3, 1)]
+    if chosen and len(driven) - len(chosen) >= 2:
+        rest = tuple(record.header.name for record in campaign.records if record.header.name not in chosen)
+        return Halves(campaign.only(rest), campaign.only(tuple(sorted(chosen))),
+                      f"records {', '.join(sorted(chosen))} held out, each beside a fitted one of its level")
+    parts = [_parted(record) for record in driven]
+    quiet = tuple(record for record in campaign.records if record not in driven)
+    return Halves(_campaign(campaign, (*(first for first, _ in parts), *quiet)),
+                  _campaign(campaign, tuple(last for _, last in parts)),
+                  "the last third of every record held out, for no two records are alike")
+
+
+def _campaign(campaign: Campaign, records: tuple[RecordSource, ...]) -> Campaign:
+    return Campaign(campaign.rig, records, campaign.source, campaign.notes)
+
+
+def _parted(record: RecordSource) -> tuple[RecordSource, RecordSource]:
+    h = record.header
+    if h.samples < 300:
+        raise InputError("expected at least 300 samples, of which a third is held out", value=h.samples,
+                         field=f"record {h.name}")
+    at = 2 * h.samples // 3
+    if h.period_samples and h.periods >= 2:
+        at = max(round(2 * h.periods / 3), 1) * h.period_samples
+    return Portion(record, 0, at), Portion(record, at, h.samples)
+
+
+def blocks_of(campaign: Campaign, model: TableModel, band_Hz: tuple[float, float]) -> list[SpectralBlock]:
+    """Spectra of every record that drives something or knows its floor."""
+    found = [record_block(record.load(), model.base, band_Hz) for record in campaign.records]
+    return [block for block in found if np.any(block.U)]
+
+
+def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, model: TableModel, band_Hz: tuple[float, float]
+               ) -> tuple[list[SpectralBlock], str]:
+    """The blocks with noise that no error of the model's drives can enter, and a sentence.
+
+    Of records at rest, and of the lines between the harmonics of periodic ones, first period left out: there u is
+    silent. Without either, of what a local polynomial model of the records leaves (Schoukens, Vandersteen, Barbe,
+    Pintelon 2009).
+
+    Raises
+    ------
+    InputError : records from which no noise can be told.
+    """
+    quiet = [found for record in campaign.records if (found := _silent(record, model, band_Hz)) is not None]
+    kinds = {one.block.kind for one in quiet}
+    known: dict[tuple[str, int], SpectralBlock] = {}
+    found = []
+    for block in blocks:
+        key = (block.kind, len(block.omega))
+        if key not in known:
+            known[key] = (noise_from_residuals(quiet, [block], model=model)[0] if block.kind in kinds
+                          else _local(campaign, block, band_Hz))
+        like = known[key]
+        assert like.noise is not None
+        found.append(block.with_noise(like.noise, like.dof))
+    dof = f"{found[0].dof:.0f} degrees of freedom a line"
+    if kinds:
+        return found, f"noise measured where the drives are silent, at rest or between the harmonics: {dof}"
+    return found, f"noise measured by a local polynomial model of the records: {dof}"
+
+
+def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:
+    try:
+        return measured_noise(campaign, block, band_Hz)
+    except AvisError as error:
+        raise InputError(f"expected records that tell the noise apart from the response ({error})",
+                         field=f"record {block.name}") from None
+
+
+def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float]) -> Residual | None:
+    """What the model leaves on lines without drive: of a record at rest all, of a periodic one those between its
+    harmonics, once the first period has carried the transient of the start away. None where there are none."""
+    h = record.header
+    if h.period_samples and h.periods >= 3:
+        segment = record.load(h.period_samples, h.periods * h.period_samples)
+        block = record_block(segment, model.base, band_Hz)
+        lines = np.rint(block.omega * segment.header.samples / (2 * np.pi * h.sample_rate_Hz)).astype(int)
+        block = block.lines(np.flatnonzero(lines % (h.periods - 1)))
+        block.U[:, :len(model.actuators)] = 0
+    elif not driven_inputs(record):
+        block = record_block(record.load(), model.base, band_Hz)
+    else:
+        return None
+    flat = np.mean(np.abs(block.Y) ** 2, axis=(0, 2))
+    left = prediction_error(model, block.with_noise(np.broadcast_to(np.diag(flat), (len(block.omega), *2 * flat.shape))
+                                                    .copy()), derivative=False)
+    return Residual(block, left.error, left.white, np.zeros_like(left.error))
+
+
+def thinned(block: SpectralBlock, lines: int = THIN_LINES, seed: int = 0) -> SpectralBlock:
+    """Some lines of a block: those that the input drives, dense where the resonances are, drawn above."""
+    n = len(block.omega)
+    if n <= lines:
+        return block
+    rng = np.random.default_rng((seed, n))
+    power = np.sum(np.abs(block.U) ** 2, axis=(1, 2))
+    driven = power > 1e-3 * np.max(power)
+    frequency = block.omega / (2 * np.pi)
+    # Equal numbers per octave above DENSE_BELOW_Hz, all the same below it.
+    weight = np.where(frequency < DENSE_BELOW_Hz, 1.0, DENSE_BELOW_Hz / frequency) * np.where(driven, 1.0, 0.05)
+    keep = np.argsort(rng.exponential(size=n) / weight)[:lines]
+    return block.lines(np.sort(keep))

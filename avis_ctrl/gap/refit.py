@@ -1,0 +1,142 @@
+"""Full refits of a candidate with all parameters of the rig, and what they leave of data that no fit has seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from avis_ctrl.errors import AvisError
+from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, fit
+from avis_ctrl.identification.prediction_error import prediction_error
+from avis_ctrl.identification.spectra import SpectralBlock
+
+MOST_ITERATIONS = 25
+
+
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """A model fitted to `fitted` blocks, and its chi-square on `held_out` ones.
+
+    free : how many combinations of parameters the data determine.
+    """
+
+    model: TableModel
+    fit: LikelihoodFit
+    chi2_held: float
+    dof_held: int
+
+    @property
+    def chi2_fit(self) -> float:
+        return self.fit.chi2
+
+    @property
+    def free(self) -> int:
+        return self.fit.information.rank
+
+    @property
+    def held_per_dof(self) -> float:
+        return self.chi2_held / self.dof_held
+
+    @property
+    def criterion(self) -> float:
+        """-2 log of the evidence, up to a constant: Bayesian information criterion of the fit (G. Schwarz 1978), and
+        the held-out data, which need no penalty."""
+        return self.chi2_fit + self.free * np.log(self.fit.dof + self.free) + self.chi2_held
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(one.label for one in self.model.effects)
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """(n_p, n_p) of the parameters, units as theirs; directions that the data do not determine left out."""
+        information = self.fit.information
+        values, vectors = np.linalg.eigh(information.relative)
+        known = values > 1e-10 * values[-1]
+        C = (vectors[:, known] / values[known]) @ vectors[:, known].T
+        return C * np.outer(information.scale, information.scale)
+
+    def covariance_of(self, effect: ActiveEffect) -> np.ndarray:
+        """(n, n) of an effect's parameters, zero for those that are held."""
+        names = self.model.names
+        rows = [names.index(name) if name in names else -1 for name in effect.names]
+        C = np.zeros((len(rows), len(rows)))
+        for i, a in enumerate(rows):
+            for j, b in enumerate(rows):
+                if a >= 0 and b >= 0:
+                    C[i, j] = self.covariance[a, b]
+        return C
+
+    def reported(self, effect: ActiveEffect, inflation: float = 1.0) -> dict[str, Reported]:
+        """Parameters of one of its effects, as a person reads them."""
+        return effect.effect.reported(self.model, effect.place, effect.by_name, self.covariance_of(effect) * inflation)
+
+    def implausible(self) -> str:
+        """Why physics forbids the values of some effect; empty where it does not."""
+        for one in self.model.effects:
+            std = dict(zip((p.name for p in one.parameters), np.sqrt(np.maximum(np.diag(self.covariance_of(one)), 0)),
+                           strict=True))
+            if reason := one.effect.implausible(one.by_name, std):
+                return reason
+            if reason := at_the_edge(one):
+                return reason
+        return ""
+
+
+def at_the_edge(effect: ActiveEffect) -> str:
+    """A shape parameter that ran to the end of what physics allows: the effect has turned into something else."""
+    for parameter, value in zip(effect.parameters, effect.values, strict=True):
+        span = parameter.high - parameter.low
+        if not parameter.linear and not parameter.optional and (value > parameter.high - 1e-6 * span
+                                                                or value < parameter.low + 1e-6 * span):
+            return f"{parameter.name} of {effect.effect.name} runs to {value:.3g} {parameter.unit}, the end of its range"
+    return ""
+
+
+def refit(model: TableModel, fitted: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock],
+          iterations: int = MOST_ITERATIONS) -> Refit:
+    """Fit all free parameters of a model from where they are.
+
+    Raises
+    ------
+    InputError, ComputationError : as `fit`.
+    """
+    found = fit(model, fitted, max_iterations=iterations)
+    return judged(found, held_out)
+
+
+def judged(found: LikelihoodFit, held_out: Sequence[SpectralBlock]) -> Refit:
+    """A fit with what it leaves of held-out blocks."""
+    errors = [prediction_error(found.model, block, derivative=False) for block in held_out]
+    return Refit(found.model, found, sum(e.chi2 for e in errors), sum(e.dof for e in errors))
+
+
+def try_refit(model: TableModel, fitted: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock],
+              iterations: int = MOST_ITERATIONS) -> Refit | None:
+    """As `refit`; None where no fit came to an end."""
+    try:
+        return refit(model, fitted, held_out, iterations)
+    except (AvisError, np.linalg.LinAlgError, FloatingPointError):
+        return None
+
+
+def probabilities(refits: Sequence[Refit]) -> np.ndarray:
+    """(n,) posterior probabilities of models, equal beforehand.
+
+    Where even the best model leaves more than noise, its own misfit is the measure of how far a difference can be
+    trusted: all criteria are divided by it.
+    """
+    criteria = np.array([one.criterion for one in refits])
+    best = refits[int(np.argmin(criteria))]
+    misfit = max(1.0, best.held_per_dof, best.fit.chi2_per_dof)
+    weight = np.exp(-(criteria - criteria.min()) / (2 * misfit))
+    return weight / weight.sum()
+
+
+def with_motion(model: TableModel, motion: Mapping) -> TableModel:
+    return replace(model, motion=motion)

@@ -1,0 +1,135 @@
+"""Score test: what a small effect would take off the residual that no re-identification can take.
+
+At the fitted model the whitened residual e and the derivative J by the rig's parameters are known, with the transients
+of the records projected out. An effect that changes the response by c delta along directions delta (whitened) lowers
+chi2 by at most
+
+    b^T inv(A) b,   A = delta P delta^T,   b = delta P e,    P = I - J^T inv(J J^T) J
+
+(Rao's efficient score; C. R. Rao 1948, W. K. Newey 1985): of noise alone a chi-square of as many degrees of freedom as
+there are directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from avis_ctrl.gap.operators import assemble
+from avis_ctrl.gap.score_algebra import SYMMETRIC, Reduction, reduction
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel, _Answer, _Side
+from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
+from avis_ctrl.identification.response import N_Q
+from avis_ctrl.identification.spectra import SpectralBlock, transient_columns
+
+# Step of a linear parameter, in units of its size, at which its direction is taken.
+STEP = 1e-3
+
+
+class Part:
+    """One block at the model: response pieces, and the projection of its transient."""
+
+    def __init__(self, model: TableModel, block: SpectralBlock):
+        self.model, self.block = model, block
+        self.L = whitener(block)
+        self.made = assemble(model.operators(block.omega))
+        self.answer = _Answer(self.made, model._acting(block.U, block if model.nonlinear else None))
+        self.transient = np.zeros((0, 0))
+        if block.transient:
+            columns, _ = transient_columns(block, model)
+            T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
+            self.transient = np.linalg.qr(T.T)[0]
+
+    @property
+    def s(self) -> np.ndarray:
+        """(n, 1, 1) j omega."""
+        return self.answer.s
+
+    def real(self, dY: np.ndarray) -> np.ndarray:
+        """(k, n, n_y, m) of y to (k, N), whitened, free of the transient."""
+        out = as_real(whitened(self.L, dY))
+        if self.transient.size:
+            out -= (out @ self.transient) @ self.transient.T
+        return out
+
+    def side(self, model: TableModel) -> _Side:
+        """What a model near by misses of the motion of this one."""
+        block = self.block
+        return _Side(assemble(model.operators(block.omega), invert=False),
+                     model._acting(block.U, block if model.nonlinear else None), self.answer.x)
+
+    def by_impedance(self, dynamic: np.ndarray) -> np.ndarray:
+        """(21, n, n_y, m): y by each symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""
+        q, left = self.answer.x[:, :N_Q], self.answer.left[:, :, :N_Q]
+        out = []
+        for i, j in SYMMETRIC:
+            push = left[:, :, i, None] * q[:, None, j]
+            if i != j:
+                push = push + left[:, :, j, None] * q[:, None, i]
+            out.append(-dynamic[:, None, None] * push)
+        return np.array(out)
+
+
+class Score:
+    """The model at its fit, ready to weigh directions; its free parameters and the transients are projected out.
+
+    model : fitted. blocks : with noise. kept : what effects computed and may ask for again.
+    """
+
+    def __init__(self, model: TableModel, blocks: Sequence[SpectralBlock]):
+        self.model = model
+        self.kept: dict = {}
+        self.parts = [Part(model, block) for block in blocks]
+        self.e = np.concatenate([part.real((part.block.Y - part.answer.Y)[None])[0] for part in self.parts])
+        J = np.concatenate([part.real(model.answer(part.block).dY) for part in self.parts], axis=1)
+        J = J * model.scales()[:, None]
+        size = np.linalg.norm(J, axis=1)
+        U, s, Vt = np.linalg.svd(J / np.where(size > 0, size, 1.0)[:, None], full_matrices=False)
+        self.basis = Vt[s > 1e-6 * s[0]]
+        self.e = self.e - self.basis.T @ (self.basis @ self.e)
+
+    @property
+    def numbers(self) -> int:
+        return len(self.e)
+
+    @cached_property
+    def chi2(self) -> float:
+        return float(self.e @ self.e)
+
+    @cached_property
+    def dof(self) -> int:
+        return self.numbers - len(self.basis) - sum(part.transient.shape[-1] for part in self.parts)
+
+    def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
+        """(k, N) of one (k, n, n_y, m) a block, projected."""
+        A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
+        return A - (A @ self.basis.T) @ self.basis
+
+    def of_effect(self, effect: ActiveEffect) -> np.ndarray:
+        """(k, N): by each linear parameter of an effect without strength, or its whole change where it has none."""
+        linear = [j for j, one in enumerate(effect.parameters) if one.linear]
+        if not linear:
+            added = self.model.with_effect(effect)
+            return self.directions([(added.answer(part.block, None, False).Y - part.answer.Y)[None]
+                                    for part in self.parts])
+        models = []
+        for j in linear:
+            values = list(effect.values)
+            step = STEP * effect.parameters[j].size
+            values[j] += step
+            models.append((self.model.with_effect(effect.at(values)), step))
+        columns = []
+        for part in self.parts:
+            rest = part.answer.Y
+            own = []
+            for model, step in models:
+                side = part.side(model)
+                own.append((side.Y - rest + part.answer.left @ side.push) / step)
+            columns.append(np.array(own))
+        return self.directions(columns)
+
+    def reduction(self, A: np.ndarray) -> Reduction:
+        """Of chi2 by directions (k, N)."""
+        return reduction(A @ A.T, A @ self.e)

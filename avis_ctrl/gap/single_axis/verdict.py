@@ -1,0 +1,117 @@
+"""From the ladder of stages to a verdict, sentences and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.gap.single_axis.machine import AxisProblem, HeldOut, correlation_time, held_out
+from avis_ctrl.gap.single_axis.result import AxisEffect, AxisGap, AxisStage, Estimate
+from avis_ctrl.gap.single_axis.stepwise import FALSE_ALARM, Candidate, Progress, Step, reference, search
+from avis_ctrl.gap.single_axis.terms import AxisParameter, Term
+from avis_ctrl.measurement.gates.finding import Picture, Series, thinned
+
+# The contract: the gap is closed within 1.2 of the noise floor.
+AT_THE_NOISE = 1.2
+# Effects that take up less than this of what a model without physics can take up are neighbours of the truth, not it.
+LEAST_SHARE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Reference:
+    """A model without physics on top of a stage: rms ratio of the stage to it, and whether that is certain."""
+
+    name: str
+    judged: HeldOut
+    ratio: float
+    certain: bool
+
+
+def gap_of(problem: AxisProblem, library: Sequence[Term], seed: int, progress: Progress) -> AxisGap:
+    """Search, verdict and words."""
+    rng = np.random.default_rng(seed)
+    steps, last = search(problem, library, rng, progress)
+    progress("models without physics")
+    left = _references(problem, steps[-1], rng)
+    on_base = left if len(steps) == 1 else _references(problem, steps[0], rng)
+    steps, refused = _enough(problem, steps, on_base, left)
+    verdict = _verdict(problem, steps, left)
+    stages = tuple(AxisStage("base" if step.named is None else step.named.term.name, *_figures(problem, step.judged))
+                   for step in steps)
+    references = tuple(AxisStage(f"{where}, {one.name}", *_figures(problem, one.judged))
+                       for where, several in (("base", on_base), ("all named", left if len(steps) > 1 else ()))
+                       for one in several)
+    effects = tuple(_effect(step) for step in steps[1:])
+    first = steps[1].candidates if len(steps) > 1 else last
+    experiments = [text for step in steps[1:] if step.rivals
+                   for text in (step.named.term.separated_by if step.named else "",) if text]
+    return AxisGap(problem.kind, verdict, effects, stages, references, _where(problem, steps[-1].judged),
+                   tuple(_sentences(problem, verdict, steps, stages, references, left, last, refused)),
+                   "; ".join(dict.fromkeys(experiments)) or None,
+                   _estimates(steps[-1].fitted.parameters, steps[-1], 0, len(problem.base)),
+                   tuple((c.term.key, c.probability) for c in first), _pictures(problem, steps, stages))
+
+
+def _references(problem: AxisProblem, step: Step, rng: np.random.Generator) -> list[_Reference]:
+    found = []
+    plain = held_out(problem, step.fitted)
+    for name, columns in problem.references(step.fitted.terms, step.fitted.theta).items():
+        judged = reference(problem, step.fitted, columns)
+        tau = correlation_time(problem, plain)
+        gain = judged.blocks(problem.block, tau) - plain.blocks(problem.block, tau)
+        draws = rng.dirichlet(np.ones(len(gain)), 2000) * len(gain)
+        certain = bool(gain.sum() > np.log(1 / FALSE_ALARM) and np.mean(draws @ gain > 0) >= 1 - FALSE_ALARM)
+        found.append(_Reference(name, judged, float(np.linalg.norm(plain.e / plain.sigma)
+                                                    / np.linalg.norm(judged.e / plain.sigma)), certain))
+    return found
+
+
+def _enough(problem: AxisProblem, steps: list[Step], on_base: Sequence[_Reference], left: Sequence[_Reference]
+            ) -> tuple[list[Step], str]:
+    """No effects where all of them together take up too little of what is there to take up."""
+    if len(steps) == 1:
+        return steps, ""
+    before, after = (float(np.mean(step.judged.e ** 2)) for step in (steps[0], steps[-1]))
+    floors = [float(np.mean(one.judged.e ** 2)) for one in (*on_base, *left) if one.certain]
+    floors += [problem.noise] if problem.noise is not None else []
+    floor = min([*floors, after])
+    share = (before - after) / max(before - floor, np.finfo(float).tiny)
+    if share >= LEAST_SHARE:
+        return steps, ""
+    names = ", ".join(step.named.term.name for step in steps[1:] if step.named)
+    return steps[:1], (f"{names} would take up {100 * share:.0f} % of the squared error that can be taken up: a "
+                       "neighbour of what is missing, and not named")
+
+
+def _verdict(problem: AxisProblem, steps: Sequence[Step], left: Sequence[_Reference]) -> str:
+    judged = steps[-1].judged
+    chi = _figures(problem, judged)[1]
+    free = any(one.certain and one.ratio > AT_THE_NOISE for one in left)
+    if len(steps) == 1:
+        # Without named effects every certain disagreement counts.
+        missing = any(one.certain for one in left) or (chi is not None and chi > AT_THE_NOISE ** 2)
+        return "unexplained" if missing else "none"
+    return "partly explained" if free or (chi is not None and chi > AT_THE_NOISE ** 2) else "explained"
+
+
+def _figures(problem: AxisProblem, judged: HeldOut) -> tuple[float, float | None]:
+    power = float(np.mean(judged.e ** 2))
+    return (float(np.sqrt(power / np.mean(problem.size ** 2))),
+            None if problem.noise is None else power / problem.noise)
+
+
+def _estimates(parameters: Sequence[AxisParameter], step: Step, start: int, stop: int) -> tuple[Estimate, ...]:
+    deviation = np.sqrt(np.diag(step.fitted.covariance))
+    return tuple(Estimate(parameters[j].name, float(step.fitted.theta[j]), float(deviation[j]), parameters[j].unit)
+                 for j in range(start, stop))
+
+
+def _effect(step: Step) -> AxisEffect:
+    assert step.named is not None
+    count = len(step.fitted.parameters) - len(step.named.term.parameters_count)
+    return AxisEffect(step.named.term.name, step.named.term.location,
+                      _estimates(step.fitted.parameters, step, count, len(step.fitted.parameters)),
+                      step.named.probability, tuple(c.term.key for c in step.rivals))
