@@ -40,7 +40,7 @@ class Table:
         self.lag_s = 0.0
 
     def attach(self, row, A, into_A, stiffness_row):
-        """Internal states a' = A a + into_A[:, 0] d + into_A[:, 1] d', with d = row q; force stiffness_row (d, d', a)."""
+        """Internal states a' = A a + into_A (d, d') with d = row q; force on d: stiffness_row (d, d', a)."""
         self.extra.append((np.asarray(row, float), np.atleast_2d(A), np.atleast_2d(into_A), np.asarray(stiffness_row)))
 
     def system(self):
@@ -89,8 +89,9 @@ class Table:
 
 
 @njit(cache=True)
-def slope(x, f, drive, A, E, rows, stiffness, cubic, drift, t, friction, motor_rows):
+def slope(x, f, drive, t, given):
     """x' and f' (friction states)."""
+    A, E, rows, stiffness, cubic, drift, friction, motor_rows = given
     d, v = rows @ x[:6], rows @ x[6:12]
     push = np.zeros(12)
     for i in range(12):
@@ -113,17 +114,18 @@ def integrate(A, B, E, u, T, substeps, delay, rows, stiffness, cubic, drift, fri
     x, f = np.zeros(A.shape[0]), np.zeros(u.shape[1])
     out = np.zeros((n, A.shape[0]))
     h = T / substeps
-    rows, rowsT = np.ascontiguousarray(rows), rows
+    rows = np.ascontiguousarray(rows)
+    given = (A, E, rows, stiffness, cubic, drift, friction, motor_rows)
     for k in range(n):
         out[k] = x
         for j in range(substeps):
             at = k * substeps + j - delay
             drive = B @ u[at // substeps] if at >= 0 else np.zeros(A.shape[0])
             t = k * T + j * h
-            a1, b1 = slope(x, f, drive, A, E, rows, stiffness, cubic, drift, t, friction, motor_rows)
-            a2, b2 = slope(x + h / 2 * a1, f + h / 2 * b1, drive, A, E, rows, stiffness, cubic, drift, t + h / 2, friction, motor_rows)
-            a3, b3 = slope(x + h / 2 * a2, f + h / 2 * b2, drive, A, E, rows, stiffness, cubic, drift, t + h / 2, friction, motor_rows)
-            a4, b4 = slope(x + h * a3, f + h * b3, drive, A, E, rows, stiffness, cubic, drift, t + h, friction, motor_rows)
+            a1, b1 = slope(x, f, drive, t, given)
+            a2, b2 = slope(x + h / 2 * a1, f + h / 2 * b1, drive, t + h / 2, given)
+            a3, b3 = slope(x + h / 2 * a2, f + h / 2 * b2, drive, t + h / 2, given)
+            a4, b4 = slope(x + h * a3, f + h * b3, drive, t + h, given)
             x = x + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
             f = f + h / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
     return out
