@@ -1,0 +1,302 @@
+"""The linear content of a model with effects as one state-space system, and how well it follows the model's response.
+
+What is exact in state space: rig parameters, sensors' gains, directions and corners, gravity, amplifiers, added masses,
+springs, dampers and modes. What is not: delay and hold (Pade), loss independent of frequency (a ladder), aliases of
+sampling (left out), effects that depend on amplitude (taken at rest) or on time (at one moment). `Realised` carries
+the largest difference from `TableModel.response`, measured on a grid, so that nobody has to believe the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.additions import Table, addition, chassis, has_addition
+from avis_ctrl.gap.effects.sensors import GRAVITY
+from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.lti.connect import connect
+from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.statespace import StateSpace, append, gain
+from avis_ctrl.rigs.actuator import pade_delay, zero_order_hold
+from avis_ctrl.rigs.geophone import second_order_roots
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.uncertainty.uncertain_rig import edge_name, uncertain_rig
+
+# Grid on which a realisation is compared with the model's response.
+CHECK_Hz = np.geomspace(0.3, 100.0, 120)
+FLOOR = ("vx", "vy", "vz")
+# Effects that act through rig parameters, sensors or drives, and on signals alone.
+_ELSEWHERE = {"com_offset", "product_of_inertia", "geophone_corner", "sensor_gain", "sensor_misalignment",
+              "tilt_coupling", "actuator_gain", "actuator_lag", "loop_delay", "base_compliance"}
+_NOTES = {"cubic_stiffness": "linear at rest: without it", "actuator_saturation": "below its limit: without it",
+          "contact_friction": "far below its slip: a spring at every motor",
+          "structural_damping": "a ladder of passive branches, causal"}
+
+
+@dataclass(frozen=True, eq=False)
+class Realised:
+    """A realisation and its distance from the model.
+
+    Attributes
+    ----------
+    system : (actuators [V], "vx" "vy" "vz" floor [m/s]) to (velocity "COORD_dot" of each coordinate [m/s], rotations
+        at the edge, and the sensors in their own unit).
+    error : largest over `omega` (n,) [rad/s] of |G_realised - G| / |G|, Frobenius norms over the sensors and over the
+        actuators or the floor's axes, whichever is worse; without the effects that depend on amplitude or time, which
+        `TableModel.response` leaves out.
+    notes : what was approximated or left out.
+    """
+
+    system: StateSpace
+    omega: np.ndarray
+    error: float
+    notes: tuple[str, ...]
+
+
+def notes_on(model: TableModel) -> tuple[str, ...]:
+    """What a realisation of these effects approximates or leaves out."""
+    found = []
+    for one in model.effects:
+        name = one.effect.name
+        if name in _NOTES:
+            found.append(f"{one.label}: {_NOTES[name]}")
+        elif not (name in _ELSEWHERE or has_addition(one) or one.effect.rig_changes(model, one.place, one.by_name)):
+            found.append(f"{one.label}: it has no realisation and is left out")
+        if name == "structural_damping" and one.place.endswith("complex"):
+            found.append(f"{one.label}: no causal system has a constant loss at every frequency; the causal law "
+                         "with the same loss is in its place")
+    return tuple(found)
+
+
+def with_effects(rig: StateSpace, model: TableModel, keep: Sequence[str], when: float = 0.0) -> StateSpace:
+    """A rig's state space with a model's effects around it.
+
+    Parameters
+    ----------
+    rig : of `uncertain_rig` for the same rig (`model.effective.rig`) and coordinates; perturbations stay.
+    when : moment of the campaign at which what drifts is taken, -0.5 .. 0.5 from begin to end.
+
+    Returns
+    -------
+    StateSpace : inputs of the rig (w, actuators, floor and forces); outputs z, COORD_rel, COORD_dot, COORD_ddot, and
+        for every sensor "deviation_NAME", the velocity that it sees beyond the nominal row times COORD_dot, and
+        "tilt_NAME" [m/s^3], the rate of what gravity adds to its acceleration.
+
+    Raises
+    ------
+    InputError : values that no system has (a chassis without mass).
+    """
+    table = Table(model, tuple(keep), when)
+    names = [edge_name(name) for name in keep]
+    sensors, actuators = model.sensors.names, list(model.actuators)
+    parts = {"rig": _rig_part(rig, names, actuators), "additions": _additions(table, names)}
+    floor = [f"floor_{a}_dot" for a in names]
+    base = [one for one in model.effects if one.effect.name == "base_compliance"]
+    moves = [f"chassis_{a}_dot" for a in names]
+    parts["chassis"] = chassis(table, base[0].by_name, floor, [f"{a}_ddot" for a in names], moves) if base else gain(
+        np.eye(len(names)), floor, moves)
+    parts["drives"] = append(*(drive.renamed([name], [f"acting_{name}"])
+                               for name, drive in zip(actuators, _drives(model), strict=True)))
+    n = len(names)
+    parts["forces"] = gain(np.hstack([np.eye(n), np.eye(n)]), [f"force_{a}" for a in names] + [
+        f"added_{a}" for a in names], [f"total_{a}" for a in names])
+    parts["sensors"] = _sensors(table, names)
+    outputs = [name for name in rig.outputs if name.startswith("z:")]
+    outputs += [f"{a}_{kind}" for kind in ("rel", "dot", "ddot") for a in names]
+    outputs += [f"{kind}_{name}" for kind in ("deviation", "tilt") for name in sensors]
+    return connect(parts, [name for name in rig.inputs if not name.startswith(tuple(moves))], outputs)
+
+
+def _rig_part(rig: StateSpace, names: list[str], actuators: list[str]) -> StateSpace:
+    """The rig reads the chassis in the place of the floor, acting volts and all forces; other drives stay as they are."""
+    new = {f"floor_{a}_dot": f"chassis_{a}_dot" for a in names} | {f"force_{a}": f"total_{a}" for a in names}
+    new |= {name: f"acting_{name}" for name in actuators}
+    outputs = [n for n in rig.outputs if n.startswith("z:")] + [f"{a}_{k}" for k in ("rel", "dot", "ddot")
+                                                               for a in names]
+    return rig.select(outputs, None).renamed(new)
+
+
+def _additions(table: Table, names: list[str]) -> StateSpace:
+    total = gain(np.zeros(table.shape))
+    for one in table.model.effects:
+        made = addition(table, one)
+        if made is not None:
+            total = total + made
+    inputs = [f"{a}_rel" for a in names] + [f"{a}_dot" for a in names] + [f"chassis_{a}_dot" for a in names]
+    return StateSpace(total.A, total.B, total.C, total.D, 0.0,
+                      (*inputs, *(f"acting_{name}" for name in table.model.actuators)),
+                      (*(f"added_{a}" for a in names), *(f"bent_{name}" for name in table.model.sensors.names)))
+
+
+def _drives(model: TableModel) -> list[StateSpace]:
+    """Volts commanded to volts that act, one system an actuator; the first lag and all delay belong to the loop."""
+    factors = dict.fromkeys(model.actuators, 1.0)
+    first = model.amplifier_corner_Hz is None
+    lags = []
+    for one in model.effects:
+        if one.effect.name == "actuator_gain":
+            factors[one.place] *= one.by_name["gain"]
+        if one.effect.name == "actuator_lag" and one.by_name["time_constant_s"] > 1e-9:
+            if not first:
+                lags.append(1 / one.by_name["time_constant_s"])
+            first = False
+    lag = cascade([], [-w for w in lags], float(np.prod(lags))) if lags else gain([[1.0]])
+    return [lag.scaled(factors[name]) for name in model.actuators]
+
+
+def _sensors(table: Table, names: list[str]) -> StateSpace:
+    """(velocities, what bends) -> what each sensor sees beyond its nominal row, and its share of gravity's rate."""
+    model, n, n_y = table.model, table.n, table.n_y
+    ops = Operators(model.effective, np.ones(1))
+    for one in model.effects:
+        if one.effect.name in ("sensor_gain", "sensor_misalignment"):
+            one.effect.change(ops, one.place, one.by_name)
+    nominal, seen = table.rows(table.matrices.R), table.rows(ops.rows[0].real)
+    tilt = _tilt_rows(table)
+    filters = _sensor_filters(model, ops.sensor_gain)
+    sees = append(*(one.renamed([f"a{k}"], [f"b{k}"]) for k, one in enumerate(filters))).scaled(
+        1.0, np.hstack([seen, np.eye(n_y)]))
+    total = sees + gain(np.hstack([-nominal, np.zeros((n_y, n_y))]))
+    if np.any(tilt):
+        feels = append(*(one.renamed([f"a{k}"], [f"b{k}"]) for k, one in enumerate(filters))).scaled(
+            1.0, np.hstack([tilt, np.zeros((n_y, n_y))]))
+    else:
+        feels = gain(np.zeros((n_y, n + n_y)))
+    both = append(_numbered(total, "d"), _numbered(feels, "t")).scaled(1.0, np.vstack([np.eye(n + n_y)] * 2))
+    sensors = model.sensors.names
+    return StateSpace(both.A, both.B, both.C, both.D, 0.0,
+                      (*(f"{a}_dot" for a in names), *(f"bent_{name}" for name in sensors)),
+                      (*(f"deviation_{name}" for name in sensors), *(f"tilt_{name}" for name in sensors)))
+
+
+def _numbered(system: StateSpace, tag: str) -> StateSpace:
+    return StateSpace(system.A, system.B, system.C, system.D, 0.0,
+                      tuple(f"{tag}u{k}" for k in range(system.ninputs)),
+                      tuple(f"{tag}y{k}" for k in range(system.noutputs)))
+
+
+def _tilt_rows(table: Table) -> np.ndarray:
+    """(n_y, n) what gravity adds to the rate of each sensor's acceleration, by the velocities."""
+    model, of_q = table.model, np.zeros((table.n_y, len(COORDINATES)))
+    strength = sum(one.by_name["gravity_m_per_s2"] for one in model.effects if one.effect.name == "tilt_coupling")
+    axes = model.rig.sensor_axes()
+    for k, name in enumerate(model.sensors.names):
+        direction = axes[name][1]
+        of_q[k, 3], of_q[k, 4] = strength * direction[1], -strength * direction[0]
+    return table.rows(of_q)
+
+
+def _sensor_filters(model: TableModel, factors: np.ndarray) -> list[StateSpace]:
+    """Of each sensor over the nominal one: gain, and the corner that its filter does not undo."""
+    found = [gain([[float(factor)]]) for factor in factors]
+    g = model.rig.geophones
+    for one in model.effects:
+        if one.effect.name == "geophone_corner" and g is not None:
+            k = model.sensors.names.index(one.place)
+            assumed = second_order_roots(g.suspension_Hz, g.suspension_damping)
+            actual = second_order_roots(one.by_name["corner_Hz"], one.by_name["damping"])
+            found[k] = cascade(assumed, actual, 1.0) @ found[k]
+    return found
+
+
+def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: int = 6, when: float = 0.0,
+            check_Hz: np.ndarray = CHECK_Hz) -> Realised:
+    """One state space of a model, drives and sensors included; coordinates not kept are locked at rest.
+
+    pade_order : of the delay and of the hold (1-10). The error is measured where all six coordinates are kept, nan
+    otherwise: `TableModel.response` knows no locked ones.
+
+    Raises
+    ------
+    InputError : sensors that read a displacement or acceleration; mounts whose chassis points are not the payload's.
+    """
+    if model.sensors.motion != "velocity":
+        raise InputError("expected sensors of velocity", field="sensors", value=model.sensors.motion)
+    effective = model.effective
+    rig = uncertain_rig(effective.rig, [], keep).system
+    names = [edge_name(name) for name in keep]
+    table = Table(model, tuple(keep), when)
+    inner = with_effects(rig, model, keep, when)
+    parts = {"table": inner, "chains": _chains(table, names), "loop": _loop(model, pade_order)}
+    floor = [f"floor_{a}_dot" for a in names]
+    place = np.zeros((len(names), 3))
+    for k, name in enumerate(keep):
+        if name in "xyz":
+            place[k, "xyz".index(name)] = 1.0
+    parts["floor"] = gain(place, FLOOR, floor)
+    parts["no force"] = gain(np.zeros((len(names), 3)), FLOOR, [f"force_{a}" for a in names])
+    unused = [name for name in effective.rig.equations_of_motion().actuators if name not in model.actuators]
+    if unused:
+        parts["at rest"] = gain(np.zeros((len(unused), 3)), FLOOR, unused)
+    system = connect(parts, [*(f"{name}_command" for name in model.actuators), *FLOOR],
+                     [*(f"{a}_dot" for a in names), *model.sensors.names]
+                     ).renamed({f"{name}_command": name for name in model.actuators})
+    omega = 2 * np.pi * np.asarray(check_Hz, float)
+    linear = replace(model, effects=tuple(one for one in model.effects if not one.effect.nonlinear))
+    if set(keep) != set(COORDINATES):
+        error = float("nan")
+    elif len(linear.effects) == len(model.effects):
+        error = _error(system, model, omega)
+    else:
+        error = realise(linear, keep, pade_order, when, check_Hz).error
+    return Realised(system, omega, error, notes_on(model))
+
+
+def loop_lag(model: TableModel) -> tuple[float, float | None]:
+    """Delay [s] and first amplifier corner [Hz] of a model, its effects included."""
+    ops = Operators(model.effective, np.ones(1))
+    for one in model.effects:
+        if one.effect.name in ("actuator_lag", "loop_delay"):
+            one.effect.change(ops, one.place, one.by_name)
+    return ops.delay_s, ops.amplifier_corner_Hz
+
+
+def _loop(model: TableModel, order: int) -> StateSpace:
+    """Command of the digital side to volts: hold, delay, amplifier."""
+    delay, corner = loop_lag(model)
+    one = pade_delay(delay, order)
+    if model.period_s:
+        one = zero_order_hold(model.period_s, order) @ one
+    if corner:
+        one = cascade([], [-2 * np.pi * corner], 2 * np.pi * corner) @ one
+    return append(*(one.renamed([f"{name}_command"], [name]) for name in model.actuators))
+
+
+def _chains(table: Table, names: list[str]) -> StateSpace:
+    """Velocities, deviations and gravity's share to the sensors' own unit; the two zeros at rest cancel s^-2."""
+    model, n_y = table.model, table.n_y
+    nominal, chain = table.rows(table.matrices.R), model.sensors.chain
+    tilt = tilt_filter(list(np.roots(model.sensors.transient_poles[::-1]))) if chain is not None else gain([[0.0]])
+    if chain is None and np.any(_tilt_rows(table)):
+        raise InputError("expected sensors with a high-pass: ideal ones would integrate gravity twice",
+                         field="tilt_coupling", value=GRAVITY)
+    S = model.sensors.sensitivity
+    motion = append(*((chain if chain is not None else gain([[1.0]])).renamed([f"a{k}"], [f"b{k}"])
+                      for k in range(n_y))).scaled(np.diag(S), np.hstack([nominal, np.eye(n_y), np.zeros((n_y, n_y))]))
+    felt = append(*(tilt.renamed([f"a{k}"], [f"b{k}"]) for k in range(n_y))).scaled(
+        np.diag(S), np.hstack([np.zeros((n_y, len(names) + n_y)), np.eye(n_y)]))
+    total = motion + felt
+    sensors = model.sensors.names
+    return StateSpace(total.A, total.B, total.C, total.D, 0.0,
+                      (*(f"{a}_dot" for a in names), *(f"deviation_{k}" for k in sensors),
+                       *(f"tilt_{k}" for k in sensors)), tuple(sensors))
+
+
+def tilt_filter(poles: Sequence[complex]) -> StateSpace:
+    """A chain's poles without its two zeros at rest: from the rate of acceleration to what the chain makes of it."""
+    return cascade([], list(poles), 1.0)
+
+
+def _error(system: StateSpace, model: TableModel, omega: np.ndarray) -> float:
+    n_u, sensors = len(model.actuators), list(model.sensors.names)
+    made, asked = system.select(sensors, None).frequency_response(omega), model.response(omega)
+    worst = 0.0
+    for part in (slice(0, n_u), slice(n_u, None)):
+        size = np.linalg.norm(asked[:, :, part], axis=(1, 2))
+        away = np.linalg.norm((made - asked)[:, :, part], axis=(1, 2))
+        worst = max(worst, float(np.max(away / size)))
+    return worst
