@@ -94,6 +94,10 @@ class LineResponse:
         seen = x @ self.rows[0].T if len(self.rows) == 1 else (self.rows @ x[:, :, None])[:, :, 0]
         return self.sense * seen + (self.alias * self.spectrum(u)) @ self.alias_map.T
 
+    def read_beside(self, acceleration: np.ndarray) -> np.ndarray:
+        """(n, n_y) y of an acceleration (samples, n_y) along the sensors that no motion of x shows."""
+        return -self.sense * self.spectrum(acceleration) / (self.omega ** 2)[:, None]
+
 
 _kept: list[tuple[TableModel, int, float, LineResponse]] = []
 

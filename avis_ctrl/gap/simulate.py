@@ -10,16 +10,19 @@ without them. Records of more than `line_response.MOST_SAMPLES` samples are refu
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
 from avis_ctrl.gap.marching import Answer, march
 from avis_ctrl.gap.motion import RecordMotion
-from avis_ctrl.gap.record_motion import motion_of, mount_rows
-from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.gap.record_motion import motion_of, mount_rows, with_large_motion
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.identification.response import N_Q
 
 __all__ = ["Simulated", "motion_of", "simulate"]
 
@@ -72,10 +75,15 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
         if acting is not u:
             x = lines.motion(lines.drive(acting, floor))
             record.deflection[:] = lines.in_time(lines.deflection(x, floor))
-    pushing = [one for one in effects if one.effect.force(record, one.place, one.by_name) is not None]
+    still = with_large_motion({"": record}, model)[""] if _has_large_motion(effects) else record
+    pushing = [one for one in effects if one.effect.force(still, one.place, one.by_name) is not None]
     if not pushing:
         return Simulated(lines.in_time(lines.sensed(x, acting)), lines.in_time(lines.deflection(x, floor)))
     return _with_forces(model, lines, replace(record, volts=acting), x, floor, pushing)
+
+
+def _has_large_motion(effects: Sequence[ActiveEffect]) -> bool:
+    return any(isinstance(one.effect, LargeMotion) for one in effects)
 
 
 def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
@@ -107,30 +115,44 @@ def _answer(lines: LineResponse, mass: np.ndarray) -> Answer:
 
 
 def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x: np.ndarray,
-                 floor: np.ndarray | None, effects) -> Simulated:
-    """March, then let the forces act over the whole record; what differs (an answer before its cause, as of a constant
-    loss factor) enters the next pass."""
+                 floor: np.ndarray | None, effects: Sequence[ActiveEffect]) -> Simulated:
+    """March, then let the forces act over the whole record. What enters the next pass: what an answer before its cause
+    leaves (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
+    marching = [one for one in effects if not isinstance(one.effect, LargeMotion)]
+    weak = [one for one in effects if isinstance(one.effect, LargeMotion)]
     answer = _answer(lines, model.matrices.M)
+    # Free motion in coordinates of the answer: any that give the deflection.
+    to_z, n = np.linalg.pinv(answer.shape), len(record.volts)
+    defect, beside = float("nan"), record
+    slow, correction, size = np.zeros((n, N_Q)), np.zeros((n, answer.shape.shape[1])), 0.0
     linear = lines.deflection(x, floor)
-    # Free motion in the coordinates of the answer: any that gives the linear deflection.
-    to_z = np.linalg.pinv(answer.shape)
-    free = lines.in_time(linear) @ to_z.T
-    beyond = lines.in_time(linear) - free @ answer.shape.T
-    defect = float("nan")
-    correction = np.zeros_like(free)
     for passes in range(1, MOST_PASSES + 1):
-        marched = march(answer, free + correction, effects, record, beyond)
-        z = answer.whole(marched.force)
-        left = free + lines.in_time(z) - marched.z
+        free = linear + answer.whole(slow) @ answer.shape.T
+        in_time = lines.in_time(free)
+        z_free = in_time @ to_z.T
+        record.deflection[:] = in_time
+        push, left, missing = np.zeros((n, N_Q)), np.zeros_like(correction), np.zeros_like(correction)
+        if marching:
+            marched = march(answer, z_free + correction, marching, record, in_time - z_free @ answer.shape.T)
+            push = marched.force
+            left = z_free + lines.in_time(answer.whole(push)) - marched.z
+        if weak:
+            beside = with_large_motion({"": record}, model)[""]
+            more = sum((one.effect.force(beside, one.place, one.by_name) for one in weak), np.zeros((n, N_Q)))
+            missing, slow = lines.in_time(answer.whole(more - slow)), more
         size = float(np.sqrt(np.mean(record.deflection ** 2))) or 1.0
-        defect = float(np.sqrt(np.mean((left @ answer.shape.T) ** 2))) / size
+        defect = float(np.sqrt(np.mean(((left + missing) @ answer.shape.T) ** 2))) / size
         if defect <= DEFECT:
-            total = x + z[:, :answer.n_x]
-            return Simulated(lines.in_time(lines.sensed(total, record.volts)),
-                             lines.in_time(linear + z @ answer.shape.T), passes, defect)
+            z = answer.whole(push + slow)
+            y = lines.sensed(x + z[:, :answer.n_x], record.volts)
+            for one in weak:
+                y += lines.read_beside(one.effect.reading(beside, one.place, one.by_name))
+            return Simulated(lines.in_time(y), lines.in_time(linear + z @ answer.shape.T), passes, defect)
+        if not np.isfinite(defect):
+            break
         correction = correction + left
     raise ComputationError("the forces of " + ", ".join(one.label for one in effects) + " do not settle",
                            measured=f"the equation of motion leaves {defect:.2g} of the deflection after "
-                                    f"{MOST_PASSES} passes",
-                           cause="a force of an effect that depends on what comes later",
-                           next_step="leave the effect out of the simulation")
+                                    f"{passes} passes, deflection {size:.3g} m r.m.s.",
+                           cause="rotations that are not small, or a force that depends on what comes later",
+                           next_step="a lower level, or leave the effect out of the simulation")
