@@ -127,8 +127,7 @@ def has_addition(one: ActiveEffect) -> bool:
 
 
 def impedance(table: Table, K: np.ndarray, h: StateSpace, of: str = "r") -> StateSpace:
-    """Force -K h(s) by displacement ("r"), or by absolute velocity ("v"), K (n, n) symmetric: as few states as K's rank.
-    """
+    """Force -K h(s) by displacement ("r") or by absolute velocity ("v"), K (n, n) symmetric; states as few as its rank."""
     sizes, V = np.linalg.eigh(K)
     felt = np.abs(sizes) > 1e-12 * max(np.abs(sizes).max(), 1e-300)
     V, sizes = V[:, felt], sizes[felt]
@@ -322,4 +321,4 @@ def _chassis_axis(name: str, scale: float, values: Mapping[str, float]) -> State
     # x = (deflection of the base, velocity of the chassis): x1' = x2 - v_f, m x2' = -k x1 - c (x2 - v_f) - M a
     A = np.array([[0.0, 1.0], [-w ** 2, -2 * zeta * w]])
     B = np.array([[-1.0, 0.0], [2 * zeta * w, -1 / m]])
-    return StateSpace(A, B, [[0.0, 1.0]], [[0.0, 0.0]])
+    return StateSpace(A, B, np.array([[0.0, 1.0]]), np.zeros((1, 2)))

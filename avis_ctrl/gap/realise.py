@@ -18,6 +18,7 @@ from avis_ctrl.gap.additions import Table, addition, chassis, has_addition
 from avis_ctrl.gap.effects.sensors import GRAVITY
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.sampling import hold
 from avis_ctrl.lti.connect import connect
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, append, gain
@@ -46,14 +47,16 @@ class Realised:
     system : (actuators [V], "vx" "vy" "vz" floor [m/s]) to (velocity "COORD_dot" of each coordinate [m/s], rotations
         at the edge, and the sensors in their own unit).
     error : largest over `omega` (n,) [rad/s] of |G_realised - G| / |G|, Frobenius norms over the sensors and over the
-        actuators or the floor's axes, whichever is worse; without the effects that depend on amplitude or time, which
-        `TableModel.response` leaves out.
+        actuators or the floor's axes, whichever is worse; G with delay and hold but without aliases, and without the
+        effects that depend on amplitude or time, which `TableModel.response` leaves out.
+    aliases : largest share of G that they add, in the same norm; zero for a model that is not sampled.
     notes : what was approximated or left out.
     """
 
     system: StateSpace
     omega: np.ndarray
     error: float
+    aliases: float
     notes: tuple[str, ...]
 
 
@@ -112,7 +115,7 @@ def with_effects(rig: StateSpace, model: TableModel, keep: Sequence[str], when: 
 
 
 def _rig_part(rig: StateSpace, names: list[str], actuators: list[str]) -> StateSpace:
-    """The rig reads the chassis in the place of the floor, acting volts and all forces; other drives stay as they are."""
+    """The rig reads the chassis in the place of the floor, acting volts and all forces; other drives stay."""
     new = {f"floor_{a}_dot": f"chassis_{a}_dot" for a in names} | {f"force_{a}": f"total_{a}" for a in names}
     new |= {name: f"acting_{name}" for name in actuators}
     outputs = [n for n in rig.outputs if n.startswith("z:")] + [f"{a}_{k}" for k in ("rel", "dot", "ddot")
@@ -238,12 +241,16 @@ def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: in
     omega = 2 * np.pi * np.asarray(check_Hz, float)
     linear = replace(model, effects=tuple(one for one in model.effects if not one.effect.nonlinear))
     if set(keep) != set(COORDINATES):
-        error = float("nan")
+        error, folded = float("nan"), float("nan")
     elif len(linear.effects) == len(model.effects):
-        error = _error(system, model, omega)
+        sensors = list(model.sensors.names)
+        asked, without = model.response(omega), _without_aliases(model, omega)
+        error = _distance(system.select(sensors, None).frequency_response(omega), without, len(model.actuators))
+        folded = _distance(asked, without, len(model.actuators))
     else:
-        error = realise(linear, keep, pade_order, when, check_Hz).error
-    return Realised(system, omega, error, notes_on(model))
+        same = realise(linear, keep, pade_order, when, check_Hz)
+        error, folded = same.error, same.aliases
+    return Realised(system, omega, error, folded, notes_on(model))
 
 
 def loop_lag(model: TableModel) -> tuple[float, float | None]:
@@ -291,12 +298,20 @@ def tilt_filter(poles: Sequence[complex]) -> StateSpace:
     return cascade([], list(poles), 1.0)
 
 
-def _error(system: StateSpace, model: TableModel, omega: np.ndarray) -> float:
-    n_u, sensors = len(model.actuators), list(model.sensors.names)
-    made, asked = system.select(sensors, None).frequency_response(omega), model.response(omega)
+def _without_aliases(model: TableModel, omega: np.ndarray) -> np.ndarray:
+    """The response with the hold but nothing folded back."""
+    if not model.period_s:
+        return model.response(omega)
+    G = replace(model, base=replace(model.base, period_s=0.0)).response(omega)
+    G[:, :, :len(model.actuators)] *= hold(omega, model.period_s)[:, None, None]
+    return G
+
+
+def _distance(found: np.ndarray, asked: np.ndarray, n_u: int) -> float:
+    """Largest relative difference over frequency, of the answers to the actuators and to the floor."""
     worst = 0.0
     for part in (slice(0, n_u), slice(n_u, None)):
         size = np.linalg.norm(asked[:, :, part], axis=(1, 2))
-        away = np.linalg.norm((made - asked)[:, :, part], axis=(1, 2))
+        away = np.linalg.norm((found - asked)[:, :, part], axis=(1, 2))
         worst = max(worst, float(np.max(away / size)))
     return worst

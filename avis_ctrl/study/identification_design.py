@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -150,9 +150,17 @@ def _template(found: Identification, template: Path | Design | None) -> Design:
         return template
     if template is not None:
         return read_design(template)
-    shape = _AVIS if isinstance(found.rig, AvisTable) else _HALCYONICS
-    title = f"{found.rig.name}, identified: z and phi_x under one controller"
-    return design_from_table(shape | {"title": title, "rig": RIG_FILE})
+    return default_design(found.rig, f"{found.rig.name}, identified: z and phi_x under one controller")
+
+
+def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float] | None = None) -> Design:
+    """Of z and phi_x for this kind of rig, as designs/*.toml have it, to stand beside rig.toml.
+
+    parameters_percent : ranges of the rig's parameters; by default none, for an identification brings them.
+    """
+    shape = _AVIS if isinstance(rig, AvisTable) else _HALCYONICS
+    uncertainty = shape["uncertainty"] | {"parameters_percent": dict(parameters_percent or {})}
+    return design_from_table(shape | {"title": title, "rig": RIG_FILE, "uncertainty": uncertainty})
 
 
 def _not_identified(ranges: dict[str, float], content: UncertaintyFile, known: Collection[str]) -> dict[str, float]:

@@ -1,0 +1,267 @@
+"""What a named effect does to the controller: yesterday's on the updated model, and a new one.
+
+Every figure is computed on a closed loop in state space, as `avis design` computes it: mu and worst-case gains are
+bounds over all frequencies and the design's whole uncertainty, stability is by the eigenvalues. They hold for the
+realisation of the updated model (`gap.realise`), whose distance from the fitted response is given beside them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.gap.realise import Realised, realise
+from avis_ctrl.gap.result import Gap
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.lti.norms import hinf_norm
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.avis import AvisTable
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_writer import rig_toml
+from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
+from avis_ctrl.study.controllers import mu_optimal
+from avis_ctrl.study.design_file import Design, read_study
+from avis_ctrl.study.gap_plant import CARRIED, carried, plant_of
+from avis_ctrl.study.identification_design import default_design, design_toml
+from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
+from avis_ctrl.study.plant import DesignPlant
+
+Progress = Callable[[str], None]
+SLACK = 5e-3
+# As in designs/avis_z_phix.toml.
+PARAMETERS_PERCENT = {"mass": 10.0, "isolator*.k_z": 15.0, "isolator*.c_z": 30.0}
+
+
+@dataclass(frozen=True)
+class LoopFigures:
+    """A controller on a plant.
+
+    stable : nominally, all poles of the closed loop in the left half plane; where not, the figures are infinite.
+    mu_upper, mu_lower : robust performance of the design's weights. peak_dB, band_dB : largest nominal transmissibility
+    over all frequencies and over the design's band. worst_peak_dB, worst_band_dB : upper bounds of the same over the
+    design's uncertainty.
+    """
+
+    stable: bool
+    mu_upper: float
+    mu_lower: float
+    peak_dB: float
+    band_dB: float
+    worst_peak_dB: float
+    worst_band_dB: float
+    fastest_pole_Hz: float
+
+
+@dataclass(frozen=True, eq=False)
+class DesignEffect:
+    """What the effects do to a design.
+
+    Attributes
+    ----------
+    before : yesterday's controller on the baseline. after : the same controller on the updated model; None where no
+        effect of the model was named. new : a controller designed on the updated model, on it; None where none was
+        found.
+    K_before, K_new : the controllers.
+    realised : the updated model in state space, with its distance from the fitted response.
+    in_files, not_in_files : labels of effects that rig.toml and design.toml hold, and of those that only this holds.
+    files : contents of rig.toml and design.toml by name: `avis design` runs on them.
+    sentences : the outcome first. seconds : wall clock.
+    """
+
+    before: LoopFigures
+    after: LoopFigures | None
+    new: LoopFigures | None
+    K_before: StateSpace
+    K_new: StateSpace | None
+    realised: Realised
+    in_files: tuple[str, ...]
+    not_in_files: tuple[str, ...]
+    files: dict[str, str]
+    sentences: tuple[str, ...]
+    seconds: float
+
+    @property
+    def mu_before(self) -> float:
+        return self.before.mu_upper
+
+    @property
+    def mu_after(self) -> float | None:
+        return self.after.mu_upper if self.after else None
+
+    @property
+    def mu_new(self) -> float | None:
+        return self.new.mu_upper if self.new else None
+
+
+def design_effect(gap: Gap, design: Path | Design | None = None,
+                  progress: Progress = lambda text: None) -> DesignEffect:
+    """Design on the baseline, evaluate on the updated model, design anew.
+
+    Parameters
+    ----------
+    design : a design or its file, whose rig gives way to the gap's models; by default z and phi_x of the AVIS as
+        designs/avis_z_phix.toml has them.
+
+    Raises
+    ------
+    InputError : a design that does not fit the rig, or whose uncertainty is an identification's (it belongs to one
+        set of parameters only); no default for this rig.
+    ComputationError : no controller for the baseline.
+    """
+    with threadpool_limits(1):
+        return compare_designs(gap.baseline, gap.updated, _asked(design, gap.baseline.rig), progress)
+
+
+def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
+                    progress: Progress = lambda text: None) -> DesignEffect:
+    """`design_effect` of two models."""
+    began = time.monotonic()
+    progress("controller for the baseline: mu synthesis")
+    plant, asked, rig = plant_of(design, baseline)
+    K = mu_optimal(asked, plant, rig)[0].K
+    assert K is not None
+    before = figures(asked, plant, K)
+    progress(f"  mu {before.mu_upper:.3f} on the baseline")
+    after, new, K_new, when, notes = None, None, None, 0.0, []
+    if updated.effects:
+        after, when = _worst_moment(design, updated, plant.allocation, K)
+        progress(f"  mu {after.mu_upper:.3f} on the updated model")
+        progress("controller for the updated model: mu synthesis")
+        new_plant, new_design, new_rig = plant_of(design, updated, plant.allocation, when)
+        try:
+            K_new = mu_optimal(new_design, new_plant, new_rig)[0].K
+            assert K_new is not None
+            new = figures(new_design, new_plant, K_new)
+            progress(f"  mu {new.mu_upper:.3f} for the new controller")
+        except ComputationError as error:
+            notes.append(f"No controller was found for the updated model: {error}")
+    realised = realise(updated)
+    files, in_files, not_in_files = _files(design, updated, when)
+    words = (*_outcome(before, after, new), *notes, *_told(realised, updated, when, in_files, not_in_files))
+    return DesignEffect(before, after, new, K, K_new, realised, in_files, not_in_files, files, words,
+                        time.monotonic() - began)
+
+
+def _asked(design: Path | Design | None, rig: Rig) -> Design:
+    if design is None:
+        if not isinstance(rig, AvisTable):
+            raise InputError(f"there is a default for the AVIS only: give a design file for {rig.name}", field="design")
+        return default_design(rig, f"{rig.name}: z and phi_x under one controller", PARAMETERS_PERCENT)
+    asked = design if isinstance(design, Design) else read_study(design)[0]
+    if asked.uncertainty.identified is not None:
+        complaint = InputError("it belongs to the parameters of one identification; expected a design whose ranges are "
+                               "set by hand (parameters_percent)", field="uncertainty.identified")
+        raise complaint.in_file(design) if isinstance(design, Path) else complaint
+    return asked
+
+
+def _worst_moment(design: Design, model: TableModel, allocation: np.ndarray, K: StateSpace
+                  ) -> tuple[LoopFigures, float]:
+    """The controller on the model; where something drifts, at that end of the campaign which has the larger mu."""
+    drifts = any(one.effect.name == "stiffness_drift" for one in model.effects)
+    found = []
+    for when in (-0.5, 0.5) if drifts else (0.0,):
+        plant, asked, _ = plant_of(design, model, allocation, when)
+        found.append((figures(asked, plant, K), when))
+    return max(found, key=lambda one: one[0].mu_upper)
+
+
+def figures(design: Design, plant: DesignPlant, K: StateSpace) -> LoopFigures:
+    """Measure a controller on a plant."""
+    fastest = float(np.max(np.abs(K.poles()), initial=0.0)) / (2 * np.pi)
+    if not plant.full.closed(K).is_stable():
+        return LoopFigures(False, *(float("inf"),) * 6, fastest)
+    performance = plant.synthesis.closed(K)
+    motion = plant.full.restricted(plant.floor_velocities, plant.velocities).closed(K)
+    blocks = plant.synthesis.blocks
+    mu = mu_peak(performance, plant.synthesis.all_blocks, slack=SLACK)
+    low, high = design.transmissibility.band_Hz
+    nominal = motion.select(slice(blocks.n_z, None), slice(blocks.n_w, None))
+    in_band = nominal.frequency_response(2 * np.pi * np.geomspace(low, high, 400))
+    worst = worst_case_gain(motion, blocks, slack=SLACK)
+    worst_band = worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high), slack=SLACK)
+    return LoopFigures(True, mu.upper, mu.lower, _dB(hinf_norm(nominal).gain),
+                       _dB(float(np.max(np.linalg.norm(in_band, ord=2, axis=(1, 2))))), _dB(worst.upper),
+                       _dB(worst_band.upper), fastest)
+
+
+def _dB(value: float) -> float:
+    return float(20 * np.log10(value)) if value > 0 else -float("inf")
+
+
+def _files(design: Design, model: TableModel, when: float) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
+    found = carried(design, model, when)
+    held = ", ".join(found.inside) or "none"
+    header = f"{found.rig.name}, updated by avis gap\neffects in this folder's rig.toml and design.toml: {held}"
+    if found.outside:
+        header += f"\neffects that no rig or design file holds: {', '.join(found.outside)}"
+    asked = found.design.model_copy(update={"rig": RIG_FILE})
+    return ({RIG_FILE: rig_toml(found.rig, header=header), DESIGN_FILE: design_toml(asked)}, found.inside,
+            found.outside)
+
+
+def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | None) -> list[str]:
+    """mu of the three, in words."""
+    if after is None:
+        return [f"The controller designed on the baseline has mu {before.mu_upper:.3g} there; no named effect "
+                "changes the model, so nothing else was computed."]
+    said = "Yesterday's controller"
+    start = f"mu {before.mu_upper:.3g} on the baseline"
+    if not after.stable:
+        first = f"{said} has {start} and makes the updated model unstable."
+    else:
+        first = (f"{said} has {start} and {after.mu_upper:.3g} on the updated model: "
+                 f"{_verdict(before.mu_upper, after.mu_upper)}; {_worst_case(before, after)}.")
+    if new is None:
+        return [first]
+    if not new.stable:
+        return [first, "The controller designed on the updated model does not stabilise it."]
+    reach = "meets the specification" if new.mu_upper < 1 else "misses the specification too"
+    return [first, f"A controller designed on the updated model has mu {new.mu_upper:.3g} there and {reach} "
+                   f"(worst case {new.worst_peak_dB:.1f} dB at the peak, {new.worst_band_dB:.1f} dB in the band)."]
+
+
+def _worst_case(before: LoopFigures, after: LoopFigures) -> str:
+    if np.isfinite(before.worst_peak_dB) and not np.isfinite(after.worst_peak_dB):
+        return "stability is no longer proved for every table within the design's uncertainty"
+    if not np.isfinite(before.worst_peak_dB):
+        return "stability was not proved on the baseline for every table within the design's uncertainty"
+    return (f"worst-case transmissibility goes from {before.worst_peak_dB:.1f} to {after.worst_peak_dB:.1f} dB at its "
+            f"peak and from {before.worst_band_dB:.1f} to {after.worst_band_dB:.1f} dB in the band")
+
+
+def _verdict(before: float, after: float) -> str:
+    if before < 1 <= after:
+        return "robust performance is lost"
+    if after < 1 <= before:
+        return "robust performance is reached"
+    if abs(after - before) <= 0.02 * before:
+        return "the effect does not matter to it"
+    kept = "robust performance is kept" if after < 1 else "robust performance is missed on both"
+    return f"it is {'worse' if after > before else 'better'}, {kept}"
+
+
+def _told(realised: Realised, model: TableModel, when: float, inside: Sequence[str], outside: Sequence[str]
+          ) -> list[str]:
+    """How far to trust the figures and where the effects are."""
+    if not model.effects:
+        return []
+    said = [f"In state space the updated model differs from its own response by at most {100 * realised.error:.2g} % "
+            f"from {realised.omega[0] / 2 / np.pi:.3g} to {realised.omega[-1] / 2 / np.pi:.3g} Hz; aliases of "
+            f"sampling, up to {100 * realised.aliases:.2g} %, are left out.", *realised.notes]
+    if any(one.effect.name == "stiffness_drift" for one in model.effects):
+        said.append(f"Stiffness is taken at the {'begin' if when < 0 else 'end'} of the campaign, where mu is larger.")
+    by_label = {one.label: one.effect.name for one in model.effects}
+    if inside:
+        where = [f"{label} ({CARRIED[by_label[label]]})" if by_label[label] in CARRIED else label for label in inside]
+        said.append(f"rig.toml and design.toml hold {', '.join(where)}: `avis design` runs on the updated model.")
+    if outside:
+        said.append(f"No rig or design file holds {', '.join(outside)}: only the figures here have it in them, and "
+                    "`avis design` on these files does not.")
+    return said

@@ -1,0 +1,184 @@
+"""The generalized plant of a design on a model with effects, and what of it the files of `avis design` can carry.
+
+    floor -> (chassis) -> rig, its uncertain parameters -> + effects -> what the sensors really see -> decoding as before
+
+Uncertainty stays where the design has it. What the effects multiply (the branch of a mount, the recoil of the chassis)
+is taken with nominal values. Allocation and decoding are those of the first plant: the controller does not know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.gap.realise import loop_lag, with_effects
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.lti.connect import connect
+from avis_ctrl.lti.statespace import StateSpace, gain
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.uncertainty.generalized_plant import Part
+
+# Effects whose linear content a rig or design file holds, and where.
+CARRIED: Mapping[str, str] = {
+    "com_offset": "the rig's centre of mass", "product_of_inertia": "the rig's inertia",
+    "actuator_gain": "the motor's force constant in the rig file",
+    "sensor_gain": "the sensor's sensitivity in the rig file", "loop_delay": "the rig's loop delay",
+    "actuator_lag": "loop.amplifier_corner_Hz of the design", "actuator_saturation": "the rig's drive limit",
+    "stiffness_drift": "the rig's stiffness at that moment", "contact_friction": "the rig's stiffness far below the slip"}
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """What the files of `avis design` hold of a model: rig and design, labels of what is in them and of what is not."""
+
+    rig: Rig
+    design: Design
+    inside: tuple[str, ...]
+    outside: tuple[str, ...]
+
+
+def plant_of(design: Design, model: TableModel, allocation: np.ndarray | None = None, when: float = 0.0
+             ) -> tuple[DesignPlant, Design, Rig]:
+    """Plant of a design on a model with its effects; with it the design and rig whose loop it has.
+
+    Parameters
+    ----------
+    allocation : (n_actuators, n_axes) volts per newton; by default that of the model's own rig.
+    when : -0.5 .. 0.5 through the campaign, for what drifts.
+
+    Raises
+    ------
+    InputError : as `build_plant`; values of an effect that no system has.
+    """
+    rig, asked = _loop(model.effective.rig, design, model)
+    plant = build_plant(asked, rig)
+    if allocation is not None and allocation.shape == plant.allocation.shape:
+        plant = _with_allocation(plant, allocation)
+    if not model.effects:
+        return plant, asked, rig
+    wrapped = with_effects(plant.rig.system, model, asked.keep, when)
+    systems = {part.name: part for part in plant.full.parts}
+    systems["rig"] = Part("rig", "rig", _rig_part(plant, model, wrapped))
+    for axis in plant.axes:
+        name = f"sensor chain {axis}"
+        systems[name] = Part(name, "sensor", _sensor_chain(plant, axis))
+    return _rebuilt(plant, tuple(systems.values()), wrapped), asked, rig
+
+
+def _loop(rig: Rig, design: Design, model: TableModel) -> tuple[Rig, Design]:
+    """Delay, amplifiers and drive limit of the model; amplifiers that it does not know stay as the design assumes."""
+    delay, corner = loop_lag(model)
+    limits = [one.by_name["limit_V"] for one in model.effects if one.effect.name == "actuator_saturation"]
+    rig = _with_equipment(rig, delay, min([rig.drive_limit_V, *limits]))
+    if corner is not None:
+        design = design.model_copy(update={"loop": design.loop.model_copy(update={"amplifier_corner_Hz": corner})})
+    return rig, design
+
+
+def _with_equipment(rig: Any, delay_s: float, limit_V: float) -> Any:
+    if delay_s != rig.loop_delay_s:
+        holder = "acquisition" if hasattr(rig, "limit_V") else "accelerometers"
+        rig = replace(rig, **{holder: replace(getattr(rig, holder), loop_delay_s=delay_s)})
+    if limit_V != rig.drive_limit_V:
+        rig = replace(rig, limit_V=limit_V) if hasattr(rig, "limit_V") else replace(
+            rig, accelerometers=replace(rig.accelerometers, drive_limit_V=limit_V))
+    return rig
+
+
+def _with_allocation(plant: DesignPlant, allocation: np.ndarray) -> DesignPlant:
+    """The same volts for the same command as before."""
+    if np.array_equal(allocation, plant.allocation):
+        return plant
+    parts = tuple(replace(part, system=gain(allocation, part.system.inputs, part.system.outputs))
+                  if part.name in ("allocation", "identified response error") else part for part in plant.full.parts)
+    return replace(_rebuilt(plant, parts, plant.rig.system), allocation=allocation)
+
+
+def _rebuilt(plant: DesignPlant, parts: tuple[Part, ...], rig: StateSpace) -> DesignPlant:
+    """The connection with other parts; signals and blocks as they were."""
+    old = plant.full
+    P = connect({part.name: part.system for part in parts}, list(old.P.inputs), list(old.P.outputs))
+    full = replace(old, P=P, parts=parts)
+    return replace(plant, full=full, synthesis=full.restricted(plant.synthesis.w, plant.synthesis.z),
+                   rig=replace(plant.rig, system=rig))
+
+
+def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> StateSpace:
+    """Motion, and what decoding makes of the sensors' deviations and of gravity."""
+    old = next(part.system for part in plant.full.parts if part.name == "rig")
+    sensors, n = list(model.sensors.names), len(plant.axes)
+    known = [k for k, name in enumerate(plant.sensors) if name in sensors]
+    decoding = plant.decoding[:, known]
+    names = [plant.sensors[k] for k in known]
+    plain = wrapped.select(list(old.outputs), list(old.inputs))
+    dot = wrapped.select([f"{a}_dot" for a in plant.axes] + [f"{kind}_{k}" for kind in ("deviation", "tilt")
+                                                             for k in names], list(old.inputs))
+    left = np.block([[np.eye(n), decoding, np.zeros_like(decoding)],
+                     [np.zeros((n, n)), np.zeros_like(decoding), decoding]])
+    C, D = np.vstack([plain.C, left @ dot.C]), np.vstack([plain.D, left @ dot.D])
+    outputs = (*old.outputs, *(f"sensed_{a}_dot" for a in plant.axes), *(f"tilt_{a}" for a in plant.axes))
+    return StateSpace(wrapped.A, plain.B, C, D, 0.0, old.inputs, outputs)
+
+
+def _sensor_chain(plant: DesignPlant, axis: str) -> StateSpace:
+    """s^2/(s^2 + a s + b) on what is sensed and 1/(s^2 + a s + b) on gravity's rate, in two states."""
+    _, a, b = np.real(np.poly(plant.sensor_chain.poles()))
+    A, B = np.array([[-a, 1.0], [-b, 0.0]]), np.array([[-a, 0.0], [-b, 1.0]])
+    return StateSpace(A, B, np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]), 0.0,
+                      (f"sensed_{axis}_dot", f"tilt_{axis}"), (f"clean_{axis}_dot",))
+
+
+def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
+    """Rig and design from which `avis design` starts on a model, as far as the files have a place for its effects.
+
+    Sensitivities and force constants in the file are known to the controller: `avis design` calibrates them away.
+    """
+    rig, asked = _loop(model.effective.rig, design, model)
+    changes: dict[str, float] = {}
+    known = rig.parameters()
+
+    def add(name: str, value: float) -> None:
+        changes[name] = changes.get(name, known[name].value) + value
+    inside, outside = [], []
+    lag_known = model.amplifier_corner_Hz is not None
+    factors = dict.fromkeys(model.sensors.names, 1.0)
+    for one in model.effects:
+        name, values = one.effect.name, one.by_name
+        own = bool(one.effect.rig_changes(model, one.place, values))
+        fits = name in CARRIED and not (name == "actuator_lag" and lag_known) and not (
+            name == "sensor_gain" and getattr(rig, "geophones", None) is None)
+        (inside if own or fits else outside).append(one.label)
+        if name == "actuator_lag":
+            lag_known = True
+        elif name == "actuator_gain":
+            key = f"actuator.{one.place}"
+            changes[key] = changes.get(key, known[key].value) * values["gain"]
+        elif name == "sensor_gain":
+            factors[one.place] *= values["gain"]
+        elif name == "stiffness_drift":
+            for key in known:
+                if key.rpartition(".")[2].startswith("k_"):
+                    add(key, values["relative_change"] * when * known[key].value)
+        elif name == "contact_friction":
+            for motor in model.rig.motors:  # type: ignore[attr-defined]
+                add(f"isolator{motor.isolator}.k_{motor.axis}", values["stiffness_N_per_m"])
+    return Carried(_with_sensitivity(rig.with_parameters(changes), model, factors), asked, tuple(inside),
+                   tuple(outside))
+
+
+def _with_sensitivity(rig: Any, model: TableModel, factors: Mapping[str, float]) -> Any:
+    """Sensitivities of the model's geophones, their effects included."""
+    g = rig.geophones
+    if g is None or model.sensors.unit != "V":
+        return rig
+    new = dict(zip(g.names, g.sensitivity_Vs_per_m, strict=True))
+    for name, value in zip(model.sensors.names, model.sensors.sensitivity, strict=True):
+        new[name] = float(value) * factors[name] / g.preamplifier_gain
+    return replace(rig, geophones=replace(g, sensitivity_Vs_per_m=tuple(new[name] for name in g.names)))
+
+
