@@ -95,29 +95,40 @@ def identify(
 
 
 def predict(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="output folder of avis identify")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="output folder of avis identify or avis gap")],
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="another campaign of the same rig")],
     out: Annotated[Path, typer.Option("--out", metavar="PRED.h5", help="file to write")],
 ) -> None:
-    """What the identified rig would have measured: /records/NN/y from the campaign's u and floor alone."""
+    """What a found model would have measured, from the campaign's u and floor alone.
+
+    Of the identified rig /records/NN/y; of the models of avis gap /records/NN/y_baseline and /records/NN/y_updated.
+    """
     from rich.console import Console
 
     from avis_ctrl.measurement.campaign import Campaign
     from avis_ctrl.measurement.formats import read_measurements
-    from avis_ctrl.study.identification_output import read_identified, write_predictions
+    from avis_ctrl.study.gap_names import GAP_FILE
     from avis_ctrl.study.rig_channels import in_words_of
 
     console = Console(highlight=False)
     measured = read_measurements(campaign)
     if not isinstance(measured, Campaign):
         raise InputError("expected records, found frequency responses", file=campaign)
+    if (folder / GAP_FILE).exists():
+        from avis_ctrl.study.gap_files import gap_rig, write_gap_predictions
+
+        rig, write = gap_rig(folder), write_gap_predictions
+    else:
+        from avis_ctrl.study.identification_output import read_identified, write_predictions
+
+        rig, write = read_identified(folder)[0], write_predictions
     try:
-        measured = in_words_of(read_identified(folder)[0], measured)
+        measured = in_words_of(rig, measured)
     except InputError as error:
         raise error if error.file else error.in_file(campaign) from None
     assert isinstance(measured, Campaign)  # as it was
     with Progress(console) as progress:
-        write_predictions(folder, measured, out, progress)
+        write(folder, measured, out, progress)
     console.print(f"{out}: {len(measured.records)} records")
 
 

@@ -145,8 +145,9 @@ def _formed(model: TableModel, samples: int, padded: int, sample_rate_Hz: float)
     mat = model.matrices
     first = assemble(model.operators(omega[:1]), invert=False)
     gain = (first.ops.base.sensors.sensitivity * first.ops.sensor_gain)[:, None]
+    alias_map = gain * (mat.R @ np.linalg.inv(mat.M) @ mat.T)
     return LineResponse(samples, padded, sample_rate_Hz, omega, made["compliance"], made["rows"], made["sense"],
-                        made["volts"], made["alias"], gain * (mat.R @ np.linalg.inv(mat.M) @ mat.T), made["floor"], made["chassis"],
+                        made["volts"], made["alias"], alias_map, made["floor"], made["chassis"],
                         made.get("recoil"), first.T.real, first.G, first.ops.mounts.chassis)
 
 

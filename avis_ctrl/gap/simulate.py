@@ -82,6 +82,19 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
     return _with_forces(model, lines, replace(record, volts=acting), x, floor, pushing)
 
 
+def _large_rotations(weak: Sequence[ActiveEffect], record: RecordMotion, model: TableModel
+                     ) -> tuple[np.ndarray, np.ndarray]:
+    """Force (samples, 6) on the payload, and acceleration (samples, n_y) read beside its own."""
+    known = with_large_motion({"": record}, model)[""]
+    force, reading = np.zeros((len(record.volts), N_Q)), np.zeros((len(record.volts), len(model.sensors.names)))
+    for one in weak:
+        pushed = one.effect.force(known, one.place, one.by_name)
+        seen = one.effect.reading(known, one.place, one.by_name)
+        force = force if pushed is None else force + pushed
+        reading = reading if seen is None else reading + seen
+    return force, reading
+
+
 def _has_large_motion(effects: Sequence[ActiveEffect]) -> bool:
     return any(isinstance(one.effect, LargeMotion) for one in effects)
 
@@ -123,7 +136,7 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x
     answer = _answer(lines, model.matrices.M)
     # Free motion in coordinates of the answer: any that give the deflection.
     to_z, n = np.linalg.pinv(answer.shape), len(record.volts)
-    defect, beside = float("nan"), record
+    defect, reading = float("nan"), np.zeros((n, len(model.sensors.names)))
     slow, correction, size = np.zeros((n, N_Q)), np.zeros((n, answer.shape.shape[1])), 0.0
     linear = lines.deflection(x, floor)
     for passes in range(1, MOST_PASSES + 1):
@@ -137,16 +150,15 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x
             push = marched.force
             left = z_free + lines.in_time(answer.whole(push)) - marched.z
         if weak:
-            beside = with_large_motion({"": record}, model)[""]
-            more = sum((one.effect.force(beside, one.place, one.by_name) for one in weak), np.zeros((n, N_Q)))
+            more, reading = _large_rotations(weak, record, model)
             missing, slow = lines.in_time(answer.whole(more - slow)), more
         size = float(np.sqrt(np.mean(record.deflection ** 2))) or 1.0
         defect = float(np.sqrt(np.mean(((left + missing) @ answer.shape.T) ** 2))) / size
         if defect <= DEFECT:
             z = answer.whole(push + slow)
             y = lines.sensed(x + z[:, :answer.n_x], record.volts)
-            for one in weak:
-                y += lines.read_beside(one.effect.reading(beside, one.place, one.by_name))
+            if weak:
+                y += lines.read_beside(reading)
             return Simulated(lines.in_time(y), lines.in_time(linear + z @ answer.shape.T), passes, defect)
         if not np.isfinite(defect):
             break

@@ -1,0 +1,220 @@
+"""A table with effects as JSON, and back: rig as the text of a rig file, sensors, drives, effects with their values.
+
+What is not kept: the records in time of effects that depend on them, and which physically possible ranges followed from
+these. The clock of the campaign is kept, for effects that depend on time.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.effects.base import Effect, library
+from avis_ctrl.gap.effects.large_motion import LargeMotion
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.identification.response import ResponseModel, sensor_model
+from avis_ctrl.rigs.avis import INERTIA
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_file import rig_from
+from avis_ctrl.rigs.rig_writer import rig_toml
+
+FORMAT, VERSION = "avis-gap-model", 1
+Positive = Annotated[float, Field(gt=0)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class EffectFile(_Part):
+    """An effect in a file."""
+
+    name: str
+    place: str
+    values: dict[str, float]
+
+
+class ModelFile(_Part):
+    """A model in a file.
+
+    rig : text of a rig file. rig_values : parameters of the rig that no rig file may hold, such as an inertia that the
+    data gave and no body has. period_s : 0 for responses against the voltage itself.
+    """
+
+    format: Literal["avis-gap-model"]
+    version: Literal[1]
+    rig: str
+    rig_values: dict[str, float]
+    loaded: bool
+    free: list[str]
+    unit: str
+    sensors: Annotated[list[str], Field(min_length=1)]
+    sensitivity: list[Positive]
+    actuators: Annotated[list[str], Field(min_length=1)]
+    period_s: Annotated[float, Field(ge=0, le=1)]
+    delay_s: Annotated[float, Field(ge=0, lt=1)]
+    amplifier_corner_Hz: Positive | None
+    effects: list[EffectFile]
+    fixed: list[str]
+    campaign_s: Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+def model_to_dict(model: TableModel) -> dict[str, Any]:
+    """What `model_from_dict` reads back, every number with all its digits.
+
+    Raises InputError for a rig that no rig file describes.
+    """
+    base = model.base
+    text, values = _rig_text(base.rig)
+    return {
+        "format": FORMAT, "version": VERSION, "rig": text, "rig_values": values,
+        "loaded": getattr(base.rig, "load", None) is not None, "free": list(base.names), "unit": base.sensors.unit,
+        "sensors": list(base.sensors.names), "sensitivity": [float(one) for one in base.sensors.sensitivity],
+        "actuators": list(base.actuators), "period_s": float(base.period_s), "delay_s": float(base.delay_s),
+        "amplifier_corner_Hz": None if base.amplifier_corner_Hz is None else float(base.amplifier_corner_Hz),
+        "effects": [{"name": one.effect.name, "place": one.place,
+                     "values": {name: float(value) for name, value in one.by_name.items()}} for one in model.effects],
+        "fixed": sorted(model.fixed), "campaign_s": list(campaign_clock(model))}
+
+
+def _rig_text(rig: Rig) -> tuple[str, dict[str, float]]:
+    """Text of a rig file, and what it may not hold: products of inertia, and moments that no body has."""
+    text, loaded = rig_toml(rig), getattr(rig, "load", None) is not None
+    try:
+        rig_from(tomllib.loads(text), loaded)
+        return text, {}
+    except InputError:
+        values = {name: one.value for name, one in rig.parameters().items() if name in INERTIA}
+        if not values:
+            raise
+        round_body = dict.fromkeys(INERTIA[3:], 0.0) | dict.fromkeys(INERTIA[:3], max(values[n] for n in INERTIA[:3]))
+        text = rig_toml(rig.with_parameters(round_body))
+        rig_from(tomllib.loads(text), loaded)
+        return text, values
+
+
+def campaign_clock(model: TableModel) -> tuple[float, float]:
+    """First and last time [s] of the campaign that a model was found from; (0, 1) where it knows no record."""
+    for record in model.motion.values():
+        return float(record.campaign_s[0]), float(record.campaign_s[1])
+    return 0.0, 1.0
+
+
+def model_from_dict(content: Mapping[str, Any]) -> TableModel:
+    """The model that `model_to_dict` wrote.
+
+    Raises
+    ------
+    InputError : a field that is missing, unknown or wrong, an effect that the library does not have, a rig that no
+        table has.
+    """
+    return _made(_checked(content))
+
+
+def read_model(path: str | Path) -> tuple[TableModel, tuple[float, float]]:
+    """Model of a file, and the first and last time of the campaign that it was found from.
+
+    Raises InputError naming file and field.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"expected the model of avis gap ({error.strerror or error})", file=path) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"expected JSON; {error}", file=path) from None
+    try:
+        checked = _checked(content)
+        begin, end = checked.campaign_s
+        return _made(checked), (begin, end)
+    except InputError as error:
+        raise error.in_file(path) from None
+
+
+def _checked(content: Any) -> ModelFile:
+    if not isinstance(content, Mapping) or content.get("format") != FORMAT:
+        found = content.get("format") if isinstance(content, Mapping) else type(content).__name__
+        raise InputError(f"expected {FORMAT}, the model of avis gap", field="format", value=found)
+    try:
+        checked = ModelFile.model_validate(dict(content))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = "".join(f"[{one}]" if isinstance(one, int) else f".{one}" for one in first["loc"]).lstrip(".")
+        raise InputError(first["msg"], field=place or "model", value=_short(first.get("input"))) from None
+    if checked.campaign_s[0] >= checked.campaign_s[1]:
+        raise InputError("expected the first time before the last one", field="campaign_s", value=checked.campaign_s)
+    if len(checked.sensitivity) != len(checked.sensors):
+        raise InputError(f"expected {len(checked.sensors)} values, one for each sensor", field="sensitivity",
+                         value=checked.sensitivity)
+    for field in ("sensors", "actuators", "free"):
+        names = getattr(checked, field)
+        if len(set(names)) != len(names):
+            raise InputError("expected different names", field=field, value=names)
+    return checked
+
+
+def _short(value: Any) -> Any:
+    text = repr(value)
+    return value if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _made(file: ModelFile) -> TableModel:
+    try:
+        rig = rig_from(tomllib.loads(file.rig), file.loaded).with_parameters(file.rig_values)
+    except InputError as error:
+        raise InputError(error.expected, field=f"rig: {error.field}", value=error.value) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"expected the text of a rig file; {' '.join(str(error).split())}", field="rig") from None
+    sensors = sensor_model(rig, file.unit, file.sensors)
+    sensors = type(sensors)(sensors.names, sensors.motion, sensors.chain, np.array(file.sensitivity), sensors.unit,
+                            sensors.sensitivity_unit, sensors.transient_poles)
+    base = ResponseModel(rig, tuple(file.free), sensors, tuple(file.actuators), file.period_s, file.delay_s,
+                         file.amplifier_corner_Hz)
+    model = TableModel(base, fixed=frozenset(file.fixed))
+    for k, one in enumerate(file.effects):
+        model = model.with_effect(_effect(model, one, f"effects[{k}]"))
+    known = {name for one in model.effects for name in one.names}
+    if unknown := sorted(model.fixed - known):
+        raise InputError("expected names of parameters of the effects", field="fixed", value=unknown)
+    _require_answer(model)
+    return model
+
+
+def _require_answer(model: TableModel) -> None:
+    """Values that leave no finite response are no model."""
+    try:
+        with np.errstate(all="ignore"):
+            finite = bool(np.all(np.isfinite(model.response(2 * np.pi * np.array([0.3, 3.0, 30.0])))))
+    except (np.linalg.LinAlgError, ZeroDivisionError, OverflowError):
+        finite = False
+    if not finite:
+        raise InputError("expected values that leave a finite response", field="effects",
+                         value=[f"{one.label} {one.by_name}" for one in model.effects])
+
+
+def known_effects() -> dict[str, Effect]:
+    """The library, and what belongs to every model."""
+    return {**library(), LargeMotion.name: LargeMotion()}
+
+
+def _effect(model: TableModel, one: EffectFile, field: str) -> ActiveEffect:
+    known = known_effects()
+    if one.name not in known:
+        raise InputError(f"expected one of {', '.join(known)}; effects of your own must be registered before",
+                         field=f"{field}.name", value=one.name)
+    effect = known[one.name]
+    places = effect.places(model)
+    if one.place not in places:
+        raise InputError(f"expected one of {', '.join(places) or 'none: this rig has no place for it'}",
+                         field=f"{field}.place", value=one.place)
+    parameters = effect.parameters(model, one.place)
+    if set(one.values) != {parameter.name for parameter in parameters}:
+        raise InputError(f"expected {', '.join(parameter.name for parameter in parameters)}", field=f"{field}.values",
+                         value=list(one.values))
+    return ActiveEffect(effect, one.place, parameters, tuple(one.values[parameter.name] for parameter in parameters))

@@ -1,0 +1,219 @@
+"""Files of `avis gap`: what was found, both models, their rig files, and predictions of other campaigns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.line_response import MOST_SAMPLES
+from avis_ctrl.gap.model_files import model_to_dict, read_model
+from avis_ctrl.gap.result import Gap
+from avis_ctrl.gap.signals.converter import nominal_converter
+from avis_ctrl.gap.simulate import simulate
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.identification.prediction import model_inputs, predict
+from avis_ctrl.measurement.campaign import Campaign, Record
+from avis_ctrl.measurement.formats.hdf5 import replacing
+from avis_ctrl.rigs.avis import AvisTable
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_writer import rig_toml
+from avis_ctrl.study.files import write_json, write_whole
+from avis_ctrl.study.gap_names import (
+    BASELINE_FILE,
+    BASELINE_RIG,
+    GAP_FILE,
+    GAP_FILES,
+    GAP_REPORTS,
+    UPDATED_FILE,
+    UPDATED_RIG,
+)
+from avis_ctrl.study.identification_output import identified_rig
+
+# Named effects that act on signals alone and that u and floor do not tell.
+UNPREDICTABLE = {"mains_hum": "the hum's phase in another campaign is not known",
+                 "ground_motion": "floor motion that is not measured cannot be predicted"}
+
+
+def write_gap(folder: Path, gap: Gap, html: str | None = None, pdf: bytes | None = None) -> list[Path]:
+    """All files; gap.json last, so that its presence says that the others are complete.
+
+    Raises ComputationError where the disk refuses.
+    """
+    texts: dict[str, str | bytes | None] = {
+        BASELINE_RIG: _toml(gap.baseline, "the rig's own structure, its parameters re-identified", None),
+        UPDATED_RIG: _toml(gap.updated, "the rig with the named effects, all parameters refitted", gap.covariance),
+        BASELINE_FILE: json.dumps(model_to_dict(gap.baseline), indent=1, allow_nan=False),
+        UPDATED_FILE: json.dumps(model_to_dict(gap.updated), indent=1, allow_nan=False),
+        GAP_REPORTS[0]: html, GAP_REPORTS[1]: pdf}
+    for name in GAP_FILES:
+        (folder / name).unlink(missing_ok=True)
+    written = []
+    for name, content in texts.items():
+        if content is not None:
+            write_whole(folder / name, content.encode() if isinstance(content, str) else content)
+            written.append(folder / name)
+    write_json(folder / GAP_FILE, gap.to_json())
+    return [*written, folder / GAP_FILE]
+
+
+def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
+    """The rig file of a model, and in words what it cannot hold."""
+    rig, left = rig_with_effects(model)
+    names, known = model.base.names, rig.parameters()
+    comments = {}
+    if covariance is not None and covariance.shape == (len(model.names),) * 2:
+        for k, name in enumerate(names):
+            if name in known:
+                sigma = float(np.sqrt(max(covariance[k, k], 0.0)))
+                comments[name] = f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}"
+    header = [f"{rig.name}, {what} by avis gap", *(["standard deviations (1 sigma) beside the values: of the fit, "
+                                                     "conditional on what it took as known"] if comments else [])]
+    header += [f"not in this file, for a rig file has no place for it: {one.effect.title} ({one.effect.name}, "
+               f"{one.place}: " + ", ".join(f"{key} = {value:.6g}" for key, value in one.by_name.items()) + ")"
+               for one in left]
+    return rig_toml(rig, comments, "\n".join(header))
+
+
+def rig_with_effects(model: TableModel) -> tuple[Rig, list[ActiveEffect]]:
+    """The rig of a model with those of its effects that a rig file has a place for, and the others."""
+    rig, left = identified_rig(model.effective), []
+    for one in model.effects:
+        changes = one.effect.rig_changes(model, one.place, one.by_name)
+        if not changes:
+            taken = _in_rig(rig, one)
+            rig = taken or rig
+            if taken is None:
+                left.append(one)
+    return rig, left
+
+
+def _in_rig(rig: Rig, one: ActiveEffect) -> Rig | None:
+    """The rig with an effect that is one of its file's own numbers; None for any other."""
+    if not isinstance(rig, AvisTable):
+        return None
+    values = one.by_name
+    if one.effect.name == "actuator_gain":
+        name = f"actuator.{one.place}"
+        return rig.with_parameters({name: rig.parameters()[name].value * values["gain"]})
+    if one.effect.name == "sensor_gain":
+        g = rig.geophones
+        volts = tuple(s * values["gain"] if name == one.place else s
+                      for name, s in zip(g.names, g.sensitivity_Vs_per_m, strict=True))
+        return replace(rig, geophones=replace(g, sensitivity_Vs_per_m=volts))
+    if one.effect.name == "loop_delay":
+        return replace(rig, acquisition=replace(rig.acquisition, loop_delay_s=rig.acquisition.loop_delay_s
+                                                + values["extra_delay_s"]))
+    return None
+
+
+def read_gap(folder: Path) -> dict[str, Any]:
+    """gap.json of a folder.
+
+    Raises InputError where the folder holds no result of avis gap, or half of one.
+    """
+    path = folder / GAP_FILE
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"expected the folder of avis gap ({error.strerror or error})", file=path) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"expected JSON; {error}", file=path) from None
+    if not isinstance(found, dict) or found.get("format") != "avis-gap":
+        raise InputError("expected the result of avis gap", file=path, field="format",
+                         value=found.get("format") if isinstance(found, dict) else type(found).__name__)
+    effects = found.get("effects")
+    if not isinstance(effects, list) or not all(isinstance(one, dict) and isinstance(one.get("name"), str)
+                                                for one in effects):
+        raise InputError("expected a list of named effects", file=path, field="effects")
+    return found
+
+
+def gap_rig(folder: Path) -> Rig:
+    """The rig of a gap's re-identified model. Raises InputError as `read_model`."""
+    return read_model(folder / BASELINE_FILE)[0].rig
+
+
+def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
+                          progress: Callable[[str], None] = lambda text: None) -> None:
+    """/records/NN/y_baseline and y_updated of a campaign, simulated from its u and floor alone, in the unit of its y.
+
+    Records start at rest. y is clipped at the converter's range and not rounded; y_updated also where a converter was
+    found to clip earlier. What cannot be predicted stands in the attribute `not_predicted`.
+
+    Raises
+    ------
+    InputError : a folder or campaign that does not fit, a place that cannot be written.
+    ComputationError : an effect with which the table leaves every bound.
+    """
+    effects = read_gap(folder)["effects"]
+    models = {"y_baseline": read_model(folder / BASELINE_FILE), "y_updated": read_model(folder / UPDATED_FILE)}
+    for model, _ in models.values():
+        _require_fit(model, campaign)
+    with replacing(out) as file:
+        file.attrs.update({"format": "avis-prediction", "version": 1, "rig": models["y_baseline"][0].rig.name,
+                           "not_predicted": "; ".join(_not_predicted(effects, campaign))})
+        # Model by model: records of one length share the model's response.
+        for name, (model, clock) in models.items():
+            low, high = _limits(model, campaign, effects if name == "y_updated" else [])
+            for source in campaign.records:
+                h = source.header
+                progress(f"{name}, record {h.name}: {h.duration_s:.4g} s")
+                try:
+                    y = _predicted(model, source.load(), clock)
+                except InputError as error:
+                    raise InputError(error.expected, field=f"record {h.name}: {error.field}",
+                                     value=error.value) from None
+                y = y[:, [model.sensors.names.index(channel) for channel in h.y_names]]
+                group = file.require_group(f"records/{h.name}")
+                data = group.create_dataset(name, data=np.clip(y, low, high))
+                data.attrs.update({"names": np.array(h.y_names, dtype=object).astype("S"), "unit": h.y_unit})
+                group.attrs["sample_rate_Hz"] = h.sample_rate_Hz
+
+
+def _predicted(model: TableModel, record: Record, clock: tuple[float, float]) -> np.ndarray:
+    """(samples, n_y) in the model's order."""
+    if len(record.u) > MOST_SAMPLES and not model.effects:
+        limit = model.rig.drive_limit_V
+        return predict(model.base, replace(record, u=np.clip(record.u, -limit, limit)))
+    u, floor = model_inputs(model.base, record)
+    h = record.header
+    return simulate(model, u, floor, h.sample_rate_Hz, start_s=h.start_s, campaign_s=clock).y
+
+
+def _require_fit(model: TableModel, campaign: Campaign) -> None:
+    if campaign.y_unit != model.sensors.unit:
+        raise InputError(f"expected {model.sensors.unit}, as in the campaign that the model was found from",
+                         field="unit of y", value=campaign.y_unit)
+    if missing := [name for name in campaign.y_names if name not in model.sensors.names]:
+        raise InputError(f"the model's sensors are {', '.join(model.sensors.names)}", field="y names", value=missing)
+
+
+def _not_predicted(effects: Sequence[Mapping[str, Any]], campaign: Campaign) -> list[str]:
+    said = [f"{one['name']}: {UNPREDICTABLE[one['name']]}" for one in effects if one["name"] in UNPREDICTABLE]
+    still = [record.header.name for record in campaign.records if not record.header.floor_names]
+    if still:
+        said.append(f"floor of records {', '.join(still)}: not measured, taken as still")
+    return said
+
+
+def _limits(model: TableModel, campaign: Campaign, effects: Sequence[Mapping[str, Any]]
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """(n_y,) each, in the campaign's order: range of the converter, and where it was found to clip."""
+    n = len(campaign.y_names)
+    known = campaign.y_unit == "V" and model.rig.acquisition is not None
+    low, high = (np.full(n, one) for one in (nominal_converter(model.rig).limits_V if known else (-np.inf, np.inf)))
+    for one in effects:
+        if one["name"] != "sensor_quantisation" or one.get("location") not in campaign.y_names:
+            continue
+        k = campaign.y_names.index(one["location"])
+        for key, array, narrower in (("clip_low_V", low, max), ("clip_high_V", high, min)):
+            found = one.get("parameters", {}).get(key, {}).get("value")
+            if isinstance(found, (int, float)):
+                array[k] = narrower(array[k], found)
+    return low, high
