@@ -1,4 +1,4 @@
-"""The reports of a design and of an identification: one source of content each, an HTML and a PDF renderer."""
+"""Reports of a design, of an identification and of a gap: one source of content each, an HTML and a PDF renderer."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from avis_ctrl.report.content import document
 from avis_ctrl.study.model import DesignResult
 
 if TYPE_CHECKING:
+    from avis_ctrl.report.gap.finding import Found
     from avis_ctrl.study.identification import Identification
     from avis_ctrl.study.identified_uncertainty import InDesign
 
@@ -47,4 +48,26 @@ def identification_pdf(found: Identification, in_design: InDesign | None = None)
     return pdf.render(content(found, in_design))
 
 
-__all__ = ["identification_html", "identification_pdf", "render_html", "render_pdf"]
+def gap_html(found: Found) -> str:
+    """The report of a gap as one self-contained HTML file.
+
+    found : `study.gap.GapFinding`.
+    """
+    from avis_ctrl.report.gap.content import document as content
+
+    return html.render(content(found)).decode()
+
+
+def gap_pdf(found: Found) -> bytes:
+    """The same as PDF.
+
+    Raises
+    ------
+    ComputationError : the typesetter refuses.
+    """
+    from avis_ctrl.report.gap.content import document as content
+
+    return pdf.render(content(found))
+
+
+__all__ = ["gap_html", "gap_pdf", "identification_html", "identification_pdf", "render_html", "render_pdf"]

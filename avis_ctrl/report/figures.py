@@ -95,6 +95,46 @@ class Band:
 
 
 @dataclass(frozen=True, eq=False)
+class Heat:
+    """A field of coloured cells on a logarithmic colour scale; what is not finite and positive stays grey.
+
+    x_edges : (n + 1,). z : (rows, n), the rows at y = 0, 1, 2 ... label : of the colour bar. range : of the colours,
+    the same in all panels of a figure. neutral : value that is drawn white, between `low` (blue) and `high` (dark red).
+    """
+
+    x_edges: np.ndarray
+    z: np.ndarray
+    label: str
+    range: tuple[float, float]
+    neutral: float = 1.0
+
+    @property
+    def logarithm(self) -> np.ndarray:
+        """(rows, n) log10 z; nan where there is none."""
+        known = np.isfinite(self.z) & (self.z > 0)
+        return np.where(known, np.log10(np.where(known, self.z, 1.0)), np.nan)
+
+    @property
+    def colours(self) -> list[tuple[float, str]]:
+        """Place on the logarithmic scale, 0 to 1, and colour."""
+        low, high, middle = (float(np.log10(v)) for v in (*self.range, self.neutral))
+        white = (middle - low) / (high - low)
+        return [(0.0, "#9ecae1"), (white, "#ffffff"),
+                *((white + share * (1 - white), colour) for share, colour in WARM)]
+
+    @property
+    def decades(self) -> tuple[list[float], list[str]]:
+        """Ticks of the colour bar, in log10 z, with their words."""
+        places, text = ticks_log(*self.range)
+        return [float(np.log10(p)) for p in places], text
+
+
+# Shares of the way from white to the top of a colour scale; lightness falls steadily, so it reads in grey too.
+WARM = ((0.25, "#fed98e"), (0.5, "#fe9929"), (0.75, "#cc4c02"), (1.0, "#662506"))
+NO_DATA = "#d9d9d9"
+
+
+@dataclass(frozen=True, eq=False)
 class Panel:
     """One pair of axes."""
 
@@ -103,6 +143,7 @@ class Panel:
     curves: tuple[Curve, ...]
     bands: tuple[Band, ...] = ()
     title: str = ""
+    heat: Heat | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +170,10 @@ class Figure:
                 if thing.label:
                     seen.setdefault(thing.label, thing)
         return list(seen.values())
+
+    def heat(self) -> Heat | None:
+        """The first field, whose colour bar serves all."""
+        return next((panel.heat for panel in self.panels if panel.heat is not None), None)
 
 
 def hertz(low: float = 0.1, high: float = 100.0) -> Axis:

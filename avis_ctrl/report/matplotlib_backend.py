@@ -8,15 +8,19 @@ from typing import Any
 import matplotlib
 import matplotlib.ticker
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, log_range, ticks_log
+from avis_ctrl.report.figures import NO_DATA, Axis, Band, Curve, Figure, Heat, Panel, Style, log_range, ticks_log
 
 WIDTH_IN, LEFT_IN, RIGHT_IN, PLOT_IN = 6.7, 0.66, 0.14, 1.75
 TITLE_IN, FOOT_IN, LEGEND_IN = 0.2, 0.42, 0.18
 CHARACTER_IN, KEY_IN = 0.068, 0.5
+# A colour bar under the panels: with its numbers and label, and of itself.
+BAR_IN, BAR_HEIGHT_IN = 0.5, 0.09
 # Mean width of a letter over its height.
 LETTER = 0.54
 LINES = {"solid": "-", "dash": (0, (5, 2)), "dot": (0, (1, 1.5)), "dashdot": (0, (5, 1.5, 1, 1.5))}
@@ -33,13 +37,17 @@ def svg(figure: Figure) -> str:
         # As many columns as the longest label leaves room for.
         longest = max((len(e.label) for e in entries), default=0)
         keys = max(1, min(len(entries), int(WIDTH_IN / (KEY_IN + CHARACTER_IN * longest))))
-        legend = LEGEND_IN * -(-len(entries) // keys) if len(entries) > 1 else 0
+        heat = figure.heat()
+        legend = LEGEND_IN * -(-len(entries) // keys) if len(entries) > 1 else BAR_IN if heat else 0
         places, height = _places(figure, legend)
         canvas = Canvas(figsize=(WIDTH_IN, height))
         # Fixed places: a layout engine would take most of the time of the whole report.
         for panel, place in zip(figure.panels, places, strict=True):
             _draw(canvas.add_axes(place), panel, figure, place[2] * WIDTH_IN)
-        if legend:
+        if heat:
+            bar = canvas.add_axes((0.25, (BAR_IN - BAR_HEIGHT_IN) / height, 0.5, BAR_HEIGHT_IN / height))
+            _colour_bar(canvas, bar, heat)
+        elif legend:
             canvas.legend([_key(e) for e in entries], [e.label for e in entries], loc="lower center", borderaxespad=0.1,
                           ncols=keys, frameon=False, handlelength=2.6)
         buffer = io.StringIO()
@@ -54,6 +62,8 @@ def _places(figure: Figure, legend: float) -> tuple[list[tuple[float, float, flo
     words = max((len(word) for panel in figure.panels for _, word in panel.y.ticks), default=0)
     left = max(LEFT_IN, 0.12 + CHARACTER_IN * words + (0.16 if any(p.y.label for p in figure.panels) else 0.0))
     title, foot = (0.18, 0.04) if figure.shared else (TITLE_IN, FOOT_IN)
+    # Names of places may stand in several rows, with the axis' label under them.
+    foot += LEGEND_IN * max((word.count("\n") for panel in figure.panels for _, word in panel.x.ticks), default=0)
     # Panels that share their scales need room for numbers at the edges only.
     beside = 0.05 if figure.shared else left + RIGHT_IN
     width = (WIDTH_IN - left - RIGHT_IN - beside * (columns - 1)) / columns
@@ -65,6 +75,19 @@ def _places(figure: Figure, legend: float) -> tuple[list[tuple[float, float, flo
         bottom = height - (title + plot) * (row + 1) - foot * row
         places.append(((left + column * (width + beside)) / WIDTH_IN, bottom / height, width / WIDTH_IN, plot / height))
     return places, height
+
+
+def _colours(heat: Heat) -> dict[str, Any]:
+    low, high = np.log10(heat.range)
+    colours = LinearSegmentedColormap.from_list("warm", heat.colours).with_extremes(bad=NO_DATA)
+    return {"cmap": colours, "norm": Normalize(low, high)}
+
+
+def _colour_bar(canvas: Any, place: Any, heat: Heat) -> None:
+    places, text = heat.decades
+    bar = canvas.colorbar(ScalarMappable(**_colours(heat)), cax=place, orientation="horizontal", label=heat.label)
+    bar.set_ticks(places, labels=text)
+    bar.outline.set_linewidth(0.5)
 
 
 def _line(style: Style) -> dict[str, Any]:
@@ -83,6 +106,10 @@ def _key(entry: Curve | Band) -> Any:
 
 def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> None:
     small = figure.shared
+    if panel.heat is not None:
+        rows = np.arange(len(panel.heat.z) + 1) - 0.5
+        ax.pcolormesh(panel.heat.x_edges, rows, np.ma.masked_invalid(panel.heat.logarithm), edgecolors="white",
+                      linewidth=0.3, **_colours(panel.heat))
     for band in panel.bands:
         ax.fill_between(band.x, band.low, band.high, color=band.style.colour, alpha=0.25, linewidth=0)
     for curve in panel.curves:
@@ -100,7 +127,8 @@ def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> None:
                 markersize=3, **look)
     _scale(ax, "x", panel.x, panel.x.range)
     _scale(ax, "y", panel.y, log_range(panel) if panel.y.scale == "log" else panel.y.range)
-    ax.grid(True, linewidth=0.4, color="#dddddd")
+    if panel.heat is None:
+        ax.grid(True, linewidth=0.4, color="#dddddd")
     if panel.title:
         ax.set_title(panel.title, fontsize=_fitting(panel.title, width, 6.5 if small else 8.5), loc="left",
                      pad=2.5 if small else None)

@@ -55,8 +55,8 @@ def _piece(piece: Piece) -> dict[str, Any]:
     match piece:
         case Heading(text):
             return {"kind": "heading", "text": text}
-        case Paragraph(text, kind, good):
-            return {"kind": kind, "text": text, "good": good}
+        case Paragraph(text, kind, good, half):
+            return {"kind": kind, "text": text, "good": good, "half": half}
         case Bullets(items):
             return {"kind": "bullets", "items": list(items)}
         case Formula(source, _):

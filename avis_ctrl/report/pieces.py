@@ -32,11 +32,12 @@ class Heading:
 
 @dataclass(frozen=True)
 class Paragraph:
-    """Text. "verdict" stands out, coloured by `good`; "note" stands back."""
+    """Text. "verdict" stands out, coloured by `good`, or as a warning by `half`; "note" stands back."""
 
     text: str
     kind: Literal["text", "verdict", "note"] = "text"
     good: bool | None = None
+    half: bool = False
 
 
 @dataclass(frozen=True)

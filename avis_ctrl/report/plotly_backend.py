@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, log_range, ticks_log
+from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Heat, Panel, log_range, ticks_log
 
 PANEL_PX, LEGEND_ROW_PX = 300, 22
 
@@ -21,6 +21,8 @@ def graph(figure: Figure) -> dict[str, Any]:
     shown: set[str] = set()
     for k, panel in enumerate(figure.panels):
         suffix = "" if k == 0 else str(k + 1)
+        if panel.heat is not None:
+            traces.append({**_heat(panel), "xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "showlegend": False})
         things: list[Band | Curve] = [*panel.bands, *panel.curves]
         for thing in things:
             drawn = _band(thing) if isinstance(thing, Band) else [_curve(thing)]
@@ -37,6 +39,8 @@ def _layout(figure: Figure, columns: int) -> dict[str, Any]:
     layout: dict[str, Any] = {
         "height": round(PANEL_PX * figure.height * rows) + 90 + LEGEND_ROW_PX * (len(figure.legend()) // 3),
         "annotations": [], "showlegend": len(figure.legend()) > 1}
+    if (heat := figure.heat()) is not None:
+        layout["coloraxis"] = _colour_bar(heat)
     # As many pixels as title and numbers need, however low the panels are.
     gap = (0.14 if figure.shared else 0.26 / figure.height) / rows if rows > 1 else 0.0
     between = 0.0 if columns == 1 else 0.012 if figure.shared else 0.11
@@ -97,6 +101,26 @@ def _band(band: Band) -> list[dict[str, Any]]:
     return [{**edge, "y": _numbers(band.low), "key": False},
             {**edge, "y": _numbers(band.high), "fill": "tonexty", "key": True,
              "fillcolor": f"rgba({red},{green},{blue},0.25)"}]
+
+
+def _heat(panel: Panel) -> dict[str, Any]:
+    heat = panel.heat
+    assert heat is not None
+    names = dict(panel.y.ticks)
+    cells = [[f"{_text(names.get(float(row), str(row)))}, {low:.3g} to {high:.3g} Hz: {value:.3g}"
+              for low, high, value in zip(heat.x_edges[:-1], heat.x_edges[1:], values, strict=True)]
+             for row, values in enumerate(heat.z)]
+    return {"type": "heatmap", "x": _numbers(heat.x_edges), "y": [k - 0.5 for k in range(len(heat.z) + 1)],
+            "z": [_numbers(row) for row in heat.logarithm], "coloraxis": "coloraxis", "text": cells,
+            "hovertemplate": "%{text}<extra></extra>", "xgap": 1, "ygap": 1, "hoverongaps": False}
+
+
+def _colour_bar(heat: Heat) -> dict[str, Any]:
+    places, text = heat.decades
+    low, high = (float(np.log10(v)) for v in heat.range)
+    bar = {"title": {"text": _text(heat.label), "side": "right"}, "thickness": 14, "tickvals": places, "ticktext": text,
+           "outlinewidth": 0.5}
+    return {"cmin": low, "cmax": high, "colorscale": [list(stop) for stop in heat.colours], "colorbar": bar}
 
 
 def _axis(axis: Axis, limits: tuple[float, float] | None) -> dict[str, Any]:

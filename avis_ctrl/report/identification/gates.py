@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from avis_ctrl.measurement.gates.finding import SEVERITIES, Finding, Picture
 from avis_ctrl.report.identification.pictures import figure_of
 from avis_ctrl.report.pieces import Cell, Fold, Mark, Paragraph, Piece, Section, table
@@ -14,9 +16,14 @@ TOGETHER = 6
 
 def gates(found: Identification) -> Section:
     """Table of all findings, and their pictures."""
-    if not found.findings:
+    return gates_of(found.findings)
+
+
+def gates_of(findings: Sequence[Finding]) -> Section:
+    """The same of findings by themselves."""
+    if not findings:
         return Section("Gates", "gates", (Paragraph("The gates look at records in time; there were none."),))
-    ordered = sorted(found.findings, key=lambda f: -SEVERITIES.index(f.severity))
+    ordered = sorted(findings, key=lambda f: -SEVERITIES.index(f.severity))
     rows = [(f.gate, MARKS[f.severity], f.sentence) for f in ordered]
     counts = ", ".join(f"{sum(f.severity == s for f in ordered)} {s}" for s in reversed(SEVERITIES)
                        if any(f.severity == s for f in ordered))

@@ -19,16 +19,17 @@ def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int
     """Pictures as panels of one figure: a name has the same look in all of them."""
     names = list(dict.fromkeys(s.name for p in pictures for s in p.series))
     limits = list(dict.fromkeys(one.name for p in pictures for one in p.limits))
-    return Figure(name, caption, tuple(panel_of(p, names, limits) for p in pictures), min(columns, len(pictures)),
+    columns = min(columns, len(pictures))
+    return Figure(name, caption, tuple(panel_of(p, names, limits, LETTERS * 2 // columns) for p in pictures), columns,
                   height)
 
 
-def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str]) -> Panel:
-    """A picture; names, limits : in the order of their styles."""
+def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str], letters: int = LETTERS) -> Panel:
+    """A picture; names, limits : in the order of their styles; letters : that fit beside each other under it."""
     curves = tuple(_curve(one, Style(numbered(names.index(one.name)).colour)) for one in picture.series if len(one.x))
     if len(picture.series) == 1:  # title and axis say what it is
         curves = tuple(replace(curve, label="") for curve in curves)
-    x = Axis(picture.x_label, _scale(picture.x_scale), ticks=_named(picture.x_names))
+    x = Axis(picture.x_label, _scale(picture.x_scale), ticks=_named(picture.x_names, letters))
     panel = Panel(x, Axis(picture.y_label, _scale(picture.y_scale)),
                   curves, (), picture.title)
     lines = tuple(_line(one, panel, Style(LIMITS[limits.index(one.name) % len(LIMITS)], "dash", 1.3))
@@ -36,9 +37,9 @@ def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str]) -> P
     return _framed(replace(panel, curves=(*curves, *lines)))
 
 
-def _named(names: Sequence[str]) -> tuple[tuple[float, str], ...]:
+def _named(names: Sequence[str], letters: int) -> tuple[tuple[float, str], ...]:
     """Names as ticks, in as many rows as keep them from each other."""
-    rows = 1 + sum(len(name) + 1 for name in names) // LETTERS
+    rows = 1 + sum(len(name) + 1 for name in names) // letters
     return tuple((float(k), "\n" * (k % rows) + name) for k, name in enumerate(names))
 
 

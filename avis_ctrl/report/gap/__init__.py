@@ -1,0 +1,1 @@
+"""The report of `avis gap`: its content, one file a section."""

@@ -1,0 +1,167 @@
+"""The gap before and after: residual over noise, frequency responses, and the ladder of stages."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.gap.result import Gap, HeatMap
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, Style, hertz, level
+from avis_ctrl.report.gap import wording
+from avis_ctrl.report.gap.finding import Found
+from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.gap_overlay import GapOverlay, gap_overlay
+
+BEFORE, AFTER, NOISE = Style("#d55e00", "dash", 1.8), Style("#0072b2", "solid", 2.0), Style("#7a7a7a", "dot", 1.6)
+PAIRS, MOST_POINTS = 3, 70
+
+
+def before_after(found: Found) -> Section:
+    """Number and picture, on held-out data, and measured responses with both models over them."""
+    gap = found.gap
+    pieces: list[Piece] = []
+    if gap.heat is not None and gap.heat.before.size:
+        pieces.append(spectrum(gap.heat, bool(gap.effects)))
+    if gap.stages:
+        pieces += [ladder(gap), _stages(gap)]
+    seen = gap_overlay(found.measured, gap.baseline, gap.updated)
+    pieces += [Paragraph(seen, "note")] if isinstance(seen, str) else responses(seen, bool(gap.effects))
+    return Section("The gap before and after", "before_after", tuple(pieces))
+
+
+def spectrum(heat: HeatMap, named: bool) -> Figure:
+    """Residual power over noise power by frequency: mean of all channels, and the worst one."""
+    edges = edges_of(heat)
+    sides = [("re-identified", heat.before, BEFORE)] + ([("updated", heat.after, AFTER)] if named else [])
+    panels = []
+    for title, reduce in (("Mean of all channels", _mean), ("Worst channel of each band", _worst)):
+        curves = [Curve(*_steps(edges, reduce(values)), label, style) for label, values, style in sides]
+        curves.append(level(edges[0], edges[-1], 1.0, "noise alone", NOISE))
+        panels.append(Panel(hertz(float(edges[0]), float(edges[-1])), Axis("residual / noise power [-]", "log"),
+                            tuple(curves), (), title))
+    return Figure("gap_spectrum", "The gap on held-out data: power of what the model leaves over power of the "
+                  "measured noise, by frequency band. Of a model that lacks nothing the mean lies at 1, and the worst "
+                  f"of {heat.before.shape[1]} channels a little above.", tuple(panels), 2, 0.95)
+
+
+def edges_of(heat: HeatMap) -> np.ndarray:
+    """(n_bands + 1,) Hz; a first band from zero begins at half of its end, for the axis is logarithmic."""
+    edges = np.asarray(heat.bands_Hz, float)
+    return np.append(edges[1] / 2, edges[1:]) if edges[0] <= 0 else edges
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    known = np.isfinite(values)
+    count = np.maximum(known.sum(axis=1), 1)
+    return np.where(known.any(axis=1), np.where(known, values, 0.0).sum(axis=1) / count, np.nan)
+
+
+def _worst(values: np.ndarray) -> np.ndarray:
+    known = np.isfinite(values)
+    return np.where(known.any(axis=1), np.where(known, values, -np.inf).max(axis=1), np.nan)
+
+
+def _steps(edges: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A value for each band as a staircase."""
+    return np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(values, float), 2)
+
+
+def ladder(gap: Gap) -> Figure:
+    """Error of each stage as a bar, with the line of what noise alone would leave."""
+    values = np.array([100 * one.nrmse for one in gap.stages])
+    place = np.arange(len(values), dtype=float)
+    noise = 100 * gap.noise_nrmse
+    shown = np.append(values, noise)
+    shown = shown[np.isfinite(shown) & (shown > 0)]
+    limits = (10 ** np.floor(np.log10(shown.min() / 1.5)), 1.6 * shown.max()) if shown.size else (0.1, 100.0)
+    bars = Curve(place, np.where(np.isfinite(values) & (values > 0), values, np.nan), "error of the model",
+                 Style("#8fbbdc"), line=False, bars=0.6)
+    lines = [level(-0.5, len(values) - 0.5, noise, "noise alone", STYLES["limit"])] if noise > 0 else []
+    ticks = tuple((float(k), rung(one.name, k)) for k, one in enumerate(gap.stages))
+    return Figure("ladder", "The ladder of stages: normalised r.m.s. error on held-out data, and what noise alone "
+                  "would leave. Logarithmic.",
+                  (Panel(Axis("stage", "linear", (-0.6, len(values) - 0.4), ticks),
+                         Axis("n.r.m.s. error [%]", "log", (float(limits[0]), float(limits[1]))), (bars, *lines)),),
+                  height=0.85)
+
+
+def rung(name: str, k: int) -> str:
+    """A stage's name under its bar."""
+    return name if name in ("nominal", "re-identified") or k == 0 else f"+ {wording.titled(name)}"
+
+
+def _stages(gap: Gap) -> Table:
+    rows = []
+    for k, one in enumerate(gap.stages):
+        over = one.nrmse / gap.noise_nrmse if gap.noise_nrmse > 0 else np.nan
+        rows.append((rung(one.name, k), wording.percent(one.nrmse), words.number(over), words.number(
+            one.chi2_per_dof, 4)))
+    if np.isfinite(gap.noise_nrmse):
+        rows.append(("noise alone", wording.percent(gap.noise_nrmse), "1", "1"))
+    return table("The stages. Each model is fitted to the same records; the figures are of records or periods that no "
+                 f"fit has seen{f' ({gap.held_out})' if gap.held_out else ''}. Error: r.m.s. of what the model leaves "
+                 "over that of the measured outputs.",
+                 ("stage", "n.r.m.s. error", "over noise", "chi-square / dof"), rows)
+
+
+def responses(seen: GapOverlay, named: bool) -> list[Piece]:
+    """The pairs of input and output that disagree most, and in words what is drawn."""
+    pairs = worst_pairs(seen)
+    text = (f"Frequency responses, measured from records {', '.join(seen.records)}, those that were fitted among them: "
+            f"{seen.method}. Shown are the {len(pairs)} paths on which the re-identified model is furthest off, in "
+            "standard deviations of the measured response; no two have the same output.")
+    if seen.left_out:
+        names = words.joined(list(map(wording.titled, seen.left_out)))
+        text += (f" The drawn response of the updated model is without {names}: what depends on amplitude or time has "
+                 "no frequency response.")
+    panels = [panel for i, j in pairs for panel in (_magnitude(seen, i, j, named), _residual(seen, i, j, named))]
+    figure = Figure("gap_responses", "Left: magnitude, measured (points) with a band of two standard deviations to "
+                    "each side. Right: magnitude of the complex difference between measured and model; with noise "
+                    "alone 86 % of the points lie below the dotted line.", tuple(panels), 2, 0.85)
+    return [Paragraph(text), figure]
+
+
+def worst_pairs(seen: GapOverlay) -> list[tuple[int, int]]:
+    """(output, input) by mean squared distance of the re-identified model in standard deviations, the worst first."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = np.abs(seen.measured - seen.baseline) ** 2 / seen.measured_std ** 2
+    size = np.mean(np.where(np.isfinite(far), far, 0.0), axis=0)
+    drives = [j for j, name in enumerate(seen.inputs) if name not in ("vx", "vy", "vz")] or list(
+        range(len(seen.inputs)))
+    best = [(i, max(drives, key=lambda j: size[i, j])) for i in range(len(seen.outputs))]
+    return sorted(best, key=lambda pair: -size[pair])[:PAIRS]
+
+
+def _unit(seen: GapOverlay, j: int) -> str:
+    output, _, inputs = seen.unit.partition(" per ")
+    return words.unit(f"{output}/({'m/s' if seen.inputs[j] in ('vx', 'vy', 'vz') else inputs.partition(';')[0]})"
+                      ).replace("/(V)", "/V")
+
+
+def _models(seen: GapOverlay, named: bool) -> list[tuple[str, np.ndarray, Style]]:
+    return [("re-identified", seen.baseline, BEFORE)] + ([("updated", seen.updated, AFTER)] if named else [])
+
+
+def _magnitude(seen: GapOverlay, i: int, j: int, named: bool) -> Panel:
+    f, size, two = seen.frequency_Hz, np.abs(seen.measured[:, i, j]), 2 * seen.measured_std[:, i, j]
+    keep = np.unique(np.linspace(0, len(f) - 1, min(len(f), MOST_POINTS)).round().astype(int))
+    models = [(label, np.abs(G[:, i, j]), style) for label, G, style in _models(seen, named)]
+    low = 0.5 * float(min(np.quantile(size, 0.02), *(m.min() for _, m, _ in models)))
+    high = 2.0 * float(max(size.max(), *(m.max() for _, m, _ in models)))
+    curves = [Curve(f[keep], size[keep], "measured", Style("#222222"), points=True, line=False),
+              *(Curve(f, m, label, style) for label, m, style in models)]
+    band = Band(f, np.maximum(size - two, low), np.maximum(size + two, low), "measured, ± 2 σ", Style("#7a7a7a"))
+    return Panel(hertz(float(f[0]), float(f[-1])), Axis(f"magnitude [{_unit(seen, j)}]", "log", (low, high)),
+                 tuple(curves), (band,), f"{seen.outputs[i]} from {seen.inputs[j]}")
+
+
+def _residual(seen: GapOverlay, i: int, j: int, named: bool) -> Panel:
+    f, two = seen.frequency_Hz, 2 * seen.measured_std[:, i, j]
+    left = [(label, np.abs(seen.measured[:, i, j] - G[:, i, j]), style) for label, G, style in _models(seen, named)]
+    values = np.concatenate([two, *(v for _, v, _ in left)])
+    values = values[values > 0]
+    limits = (0.5 * float(np.quantile(values, 0.01)), 2 * float(values.max())) if values.size else (1e-3, 1.0)
+    curves = [*(Curve(f, v, label, style) for label, v, style in left),
+              Curve(f, two, "two standard deviations of the measured", Style("#222222", "dot", 1.4))]
+    return Panel(hertz(float(f[0]), float(f[-1])), Axis(f"difference [{_unit(seen, j)}]", "log", limits),
+                 tuple(curves), (), f"{seen.outputs[i]} from {seen.inputs[j]}")

@@ -1,0 +1,32 @@
+"""The runners-up and why they lost."""
+
+from __future__ import annotations
+
+from avis_ctrl.report import words
+from avis_ctrl.report.gap import wording
+from avis_ctrl.report.gap.finding import Found
+from avis_ctrl.report.pieces import Fold, Paragraph, Piece, Section, table
+
+FIRST = 12
+
+
+def candidates(found: Found) -> Section:
+    """Every candidate that was refitted, the most probable first."""
+    ranked = sorted(found.gap.considered, key=lambda one: (-one.probability, one.chi2_per_dof))
+    if not ranked:
+        return Section("Runners-up", "considered", (Paragraph(_none(found)),))
+    header = ("candidate", "chi-square / dof", "probability", "best size", "why it was not named")
+    rows = [(wording.candidate(one), words.number(one.chi2_per_dof, 4), wording.probability(one.probability),
+             wording.quantities(one.parameters) or "not stated", one.reason) for one in ranked]
+    pieces: list[Piece] = [table("Candidates that were refitted together with all parameters of the rig, with "
+                                 "chi-square on held-out data, and why each lost.", header, rows[:FIRST], "lrrll")]
+    if rows[FIRST:]:
+        pieces.append(Fold(f"{len(rows) - FIRST} more candidates",
+                           (table("The others.", header, rows[FIRST:], "lrrll"),)))
+    return Section("Runners-up", "considered", tuple(pieces))
+
+
+def _none(found: Found) -> str:
+    if found.gap.verdict == "none":
+        return "No candidate was refitted: no score of any effect at any place was significant."
+    return "No other candidate was refitted."

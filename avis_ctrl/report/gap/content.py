@@ -1,0 +1,33 @@
+"""What the report of a gap says, once for all renderers."""
+
+from __future__ import annotations
+
+from avis_ctrl.report.gap.before_after import before_after
+from avis_ctrl.report.gap.candidates import candidates
+from avis_ctrl.report.gap.controller import controller
+from avis_ctrl.report.gap.dependence import dependence
+from avis_ctrl.report.gap.effects import parameters
+from avis_ctrl.report.gap.finding import Found
+from avis_ctrl.report.gap.measurement import measurement
+from avis_ctrl.report.gap.method import method
+from avis_ctrl.report.gap.opening import opening
+from avis_ctrl.report.gap.places import places
+from avis_ctrl.report.gap.remaining import remaining
+from avis_ctrl.report.identification.gates import gates_of
+from avis_ctrl.report.pieces import Document
+from avis_ctrl.report.sections.provenance import provenance_table, stamp_of
+
+
+def document(found: Found) -> Document:
+    """The report of a gap."""
+    made = str(found.provenance.get("date", ""))[:10]
+    sections = [make(found) for make in (opening, before_after, places, dependence, parameters, candidates, remaining)]
+    sections += [part for part in (controller(found),) if part is not None]
+    sections += [measurement(found), gates_of(found.findings), method(found.gap)]
+    told = {"seed": found.gap.seed, "seconds": found.gap.seconds, **found.provenance}
+    sections.append(provenance_table(told, "With the same measurement, rig, options, seed, library versions and "
+                                     "processor the same figures come out."))
+    name = found.gap.baseline.rig.name
+    return Document(f"Gap between simulation and measurement of the rig {name}",
+                    "Where they disagree, which effect is missing, and what remains" + (f", {made}" if made else ""),
+                    stamp_of(found.provenance), tuple(sections))

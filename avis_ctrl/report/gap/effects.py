@@ -1,0 +1,84 @@
+"""The named effects with their parameters, and what became of the rig's own."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.gap.result import Gap, NamedEffect
+from avis_ctrl.report import words
+from avis_ctrl.report.gap import wording
+from avis_ctrl.report.gap.finding import Found
+from avis_ctrl.report.pieces import Bullets, Fold, Paragraph, Piece, Section, Table, table
+
+
+def parameters(found: Found) -> Section:
+    """Sizes with standard deviations, how each effect was confirmed, and the rig's parameters with and without."""
+    gap = found.gap
+    pieces: list[Piece] = []
+    if gap.effects:
+        pieces += [_sizes(gap), Bullets(tuple(_told(one) for one in gap.effects))]
+    else:
+        pieces.append(Paragraph("No effect is named, so the updated model is the re-identified one."))
+    if len(gap.baseline.values):
+        both = " and updated" if gap.effects else ""
+        pieces.append(Fold(f"The rig's own parameters, re-identified{both}", (_rig(gap),)))
+    return Section("Parameters", "parameters", tuple(pieces))
+
+
+def _sizes(gap: Gap) -> Table:
+    rows = []
+    for one in gap.effects:
+        for name, p in one.parameters.items():
+            value, sigma = words.with_deviation(p.value, p.std)
+            known = np.isfinite(p.std) and p.std > 0
+            rows.append((one.name, one.location, name, value, f"± {sigma}" if known else "none",
+                         "" if p.unit == "1" else words.unit(p.unit)))
+    return table("Parameters of the named effects, fitted together with all parameters of the rig; one standard "
+                 "deviation, from the covariance of that fit.",
+                 ("effect", "place", "parameter", "value", "± 1 σ", "unit"), rows, "lllrrl")
+
+
+def _told(one: NamedEffect) -> str:
+    """What the effect is, what it looks like, and what confirmed it."""
+    effect = wording.known(one.name)
+    text = f"{wording.titled(one.name).capitalize()} ({one.location}): {wording.what_it_is(one)}."
+    if effect is not None:
+        text += f" What it does to responses: {effect.looks_like}."
+    if one.confirmed:
+        text += f" With it the held-out log-likelihood {'rises' if one.confirmed > 0 else 'falls'} by "
+        text += f"{words.number(abs(one.confirmed))}."
+    if one.confirmation:
+        text += f" {one.confirmation[:1].upper()}{one.confirmation[1:].rstrip('.')}."
+    if one.indistinguishable_from:
+        names = words.joined(list(map(wording.titled, one.indistinguishable_from)))
+        text += f" This data cannot tell it from {names}."
+    return text
+
+
+def _rig(gap: Gap) -> Table:
+    before = dict(zip(gap.baseline.names, gap.baseline.values, strict=True))
+    after = dict(zip(gap.updated.names, gap.updated.values, strict=True))
+    units, sigma = dict(zip(gap.baseline.names, gap.baseline.units, strict=True)), _deviations(gap)
+    rows = []
+    for name, value in before.items():
+        new = after.get(name, np.nan)
+        shown, spread = words.with_deviation(new, sigma[name]) if name in sigma else (words.number(new, 5),
+                                                                                     "not stated")
+        change = f"{100 * (new / value - 1):+.2f} %".replace("-", "−") if value and np.isfinite(new) else "none"
+        middle = (words.number(value, 5), shown, spread, change) if gap.effects else (shown, spread)
+        rows.append((name, *middle, words.unit(units[name])))
+    if not gap.effects:
+        return table("The rig's own parameters as re-identified.", ("parameter", "value", "± 1 σ", "unit"), rows,
+                     "lrrl")
+    return table("A model that lacks an effect bends its own parameters to make up for it; the change is what they "
+                 "give back. A large one is no error: it may lie along a direction that the data hardly know.",
+                 ("parameter", "re-identified", "updated", "± 1 σ", "change", "unit"), rows, "lrrrrl")
+
+
+def _deviations(gap: Gap) -> dict[str, float]:
+    """Standard deviations of the updated model's parameters, those that are known."""
+    names = gap.updated.names
+    if gap.covariance is None or gap.covariance.shape != (len(names), len(names)):
+        return {}
+    variance = np.diag(gap.covariance)
+    return {name: float(np.sqrt(v)) for name, v in zip(names, variance, strict=True) if np.isfinite(v) and v > 0}

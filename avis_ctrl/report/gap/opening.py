@@ -1,0 +1,86 @@
+"""The answer: one sentence, what it rests on, and the named effects in one table."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.gap.result import Gap, NamedEffect
+from avis_ctrl.report import words
+from avis_ctrl.report.gap import wording
+from avis_ctrl.report.gap.finding import Found
+from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, table
+
+
+def opening(found: Found) -> Section:
+    """Verdict, the gap in numbers, named effects."""
+    gap = found.gap
+    good = {"none": True, "explained": True, "unexplained": False}.get(gap.verdict)
+    pieces: list[Piece] = [Paragraph(sentence(gap), "verdict", good, gap.verdict == "partly explained")]
+    pieces.append(Paragraph(wording.CLAIMS[gap.verdict]))
+    if numbers := in_numbers(gap):
+        pieces.append(Paragraph(numbers))
+    if gap.effects:
+        pieces.append(_effects(gap))
+    pieces += [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from]
+    if gap.sentences[1:]:
+        pieces.append(Bullets(gap.sentences[1:]))
+    warned = list(dict.fromkeys(f.gate for f in found.findings if f.severity in ("warning", "stop")))
+    if warned:
+        pieces.append(Paragraph(f"Gates that warned of the records: {words.joined(warned)}; see the section on gates.",
+                                "note"))
+    return Section("Result", "result", tuple(pieces))
+
+
+def sentence(gap: Gap) -> str:
+    """The finder's own first sentence; of the effects where it has none."""
+    if gap.sentences:
+        return gap.sentences[0]
+    if not gap.effects:
+        return ("No disagreement beyond the measured noise." if gap.verdict == "none" else
+                "A significant disagreement that no effect of the library accounts for.")
+    return " ".join(f"{wording.titled(one.name).capitalize()} at {one.location}: {wording.quantities(one.parameters)}; "
+                    f"probability {wording.probability(one.probability)}." for one in gap.effects)
+
+
+def in_numbers(gap: Gap) -> str:
+    """The gap before and after on held-out data, beside what noise leaves."""
+    if not gap.stages:
+        return ""
+    told = [f"{wording.percent(one.nrmse)} {_stage(one.name)}" for one in gap.stages]
+    text = f"Normalised r.m.s. error on held-out data: {words.joined(told)}"
+    if np.isfinite(gap.noise_nrmse):
+        text += f"; noise alone would leave {wording.percent(gap.noise_nrmse)}"
+    first, last = _reference(gap), gap.stages[-1].nrmse
+    if gap.effects and first > 0 and last > 0:
+        text += f". Naming the effect{'s' * (len(gap.effects) > 1)} divides the re-identified error by "
+        text += words.number(first / last)
+        if gap.noise_nrmse > 0:
+            text += f" and leaves {words.number(last / gap.noise_nrmse)} times the noise"
+    return text + "."
+
+
+def _reference(gap: Gap) -> float:
+    """Error of the re-identified model."""
+    named = {one.name: one.nrmse for one in gap.stages}
+    return named.get("re-identified", gap.stages[0].nrmse)
+
+
+def _group(one: NamedEffect) -> str:
+    names = [wording.titled(one.name), *map(wording.titled, one.indistinguishable_from)]
+    return (f"This data cannot tell these apart: {words.joined(names)}. The missing effect is one of them; the section "
+            "on what to measure next says what would tell.")
+
+
+def _stage(name: str) -> str:
+    return {"nominal": "with the model as its file has it", "re-identified": "after re-identification"}.get(
+        name, f"with {wording.titled(name)}")
+
+
+def _effects(gap: Gap) -> Table:
+    rows = [(wording.titled(one.name), one.location, wording.quantities(one.parameters),
+             wording.probability(one.probability),
+             ", ".join(map(wording.titled, one.indistinguishable_from)) or "none")
+            for one in gap.effects]
+    return table("What is named. The probability is that of this effect among the effects of the library, given the "
+                 "data; it does not count effects that nobody put into the library. Sizes with one standard "
+                 "deviation.", ("effect", "place", "size", "probability", "cannot be told from"), rows, "lllrl")

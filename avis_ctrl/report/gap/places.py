@@ -1,0 +1,80 @@
+"""Where model and measurement disagree: a map of channel and frequency, and the places that stand out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from avis_ctrl.gap.result import Gap, HeatMap, Where
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import Axis, Figure, Heat, Panel, hertz
+from avis_ctrl.report.gap import wording
+from avis_ctrl.report.gap.before_after import edges_of
+from avis_ctrl.report.gap.finding import Found
+from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+
+# Colours begin at half of the noise's power and end at ten times it or more.
+LOWEST, LEAST_TOP = 0.5, 10.0
+LETTERS = 20
+
+
+def places(found: Found) -> Section:
+    """Heat map before and after, and the table of places before naming."""
+    gap = found.gap
+    pieces: list[Piece] = []
+    if gap.heat is not None and gap.heat.before.size:
+        pieces.append(heat_map(gap.heat, bool(gap.effects)))
+    else:
+        pieces.append(Paragraph("No map of channels and frequencies was computed.", "note"))
+    if gap.where:
+        pieces.append(table_of(gap.where, "Places of the gap after re-identification, before any effect is added. "))
+    else:
+        pieces.append(Paragraph(_nowhere(gap)))
+    return Section("Where they disagree", "where", tuple(pieces))
+
+
+def _nowhere(gap: Gap) -> str:
+    if gap.verdict == "none":
+        return "No band of any channel stands out of the noise."
+    return "The places of the gap were not stated."
+
+
+def heat_map(heat: HeatMap, named: bool) -> Figure:
+    """Channels over frequency, re-identified and updated, on one colour scale."""
+    known = np.concatenate([heat.before.ravel(), heat.after.ravel()])
+    known = known[np.isfinite(known) & (known > 0)]
+    top = float(10 ** np.ceil(np.log10(max(LEAST_TOP, known.max(initial=LEAST_TOP))) - 1e-9))
+    edges, n = edges_of(heat), len(heat.columns)
+    rows = Axis("", "linear", (n - 0.5, -0.5), tuple((float(k), _short(name)) for k, name in enumerate(heat.columns)))
+    sides = [("After re-identification", heat.before)] + ([("With the named effects", heat.after)] if named else [])
+    panels = tuple(Panel(hertz(float(edges[0]), float(edges[-1])), rows, (), (), title,
+                         Heat(edges, np.asarray(values, float).T, "residual / noise power [-]", (LOWEST, top)))
+                   for title, values in sides)
+    return Figure("heat_map", "Power of what the model leaves on held-out data over power of the measured noise, by "
+                  "channel and frequency band. White: noise alone. Grey: no data. Logarithmic colours.", panels,
+                  len(panels), max(0.75, min(2.4, 0.085 * n + 0.25)))
+
+
+def _short(name: str) -> str:
+    """As many letters as fit beside a map."""
+    return name if len(name) <= LETTERS else f"{name[:LETTERS - 1]}…"
+
+
+def table_of(listed: Sequence[Where], caption: str) -> Table:
+    """Bands and paths with their share of the excess over noise."""
+    rows = [(wording.place(one), wording.percent(one.share), _stated(one.excess), _chance(one.p_value))
+            for one in listed]
+    return table(f"{caption}Share: of the power in excess of the noise. Over noise: power of the residual over that "
+                 "of the noise. Chance: of as much by noise alone anywhere (family-wise).",
+                 ("place", "share", "over noise", "chance"), rows)
+
+
+def _stated(value: float) -> str:
+    return words.number(value) if np.isfinite(value) else "not stated"
+
+
+def _chance(value: float) -> str:
+    if not np.isfinite(value):
+        return "not stated"
+    return "< 1e−6" if value < 1e-6 else words.number(value, 2)

@@ -1,0 +1,36 @@
+"""What remains, and what to measure next."""
+
+from __future__ import annotations
+
+from avis_ctrl.gap.result import Gap
+from avis_ctrl.report.gap.finding import Found
+from avis_ctrl.report.gap.places import table_of
+from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Section
+
+
+def remaining(found: Found) -> Section:
+    """Places of what the updated model leaves, and the next experiment."""
+    gap = found.gap
+    pieces: list[Piece] = [Paragraph(_left(gap))]
+    if gap.remaining:
+        pieces.append(table_of(gap.remaining, "Places of what the updated model leaves on held-out data. "))
+    pieces += [Heading("What to measure next"), Paragraph(gap.next_experiment or _nothing(gap))]
+    return Section("What remains, and what to measure next", "remaining", tuple(pieces))
+
+
+def _left(gap: Gap) -> str:
+    if gap.verdict in ("none", "explained"):
+        after = " with the named effects" if gap.effects else ""
+        return (f"Nothing beyond the measured noise was found{after}." if not gap.remaining else
+                f"The held-out residual{after} counts as noise as a whole; the places below stand out by themselves.")
+    what = "What the named effects leave" if gap.effects else "The whole gap"
+    return (f"{what} is significant, and nothing in the library accounts for it."
+            + (" The places below hold it." if gap.remaining else " Its places were not stated."))
+
+
+def _nothing(gap: Gap) -> str:
+    if gap.effects and any(one.indistinguishable_from for one in gap.effects):
+        return "No experiment was found that would tell the inseparable effects apart."
+    if gap.verdict in ("partly explained", "unexplained"):
+        return "No experiment was found that would tell more."
+    return "Nothing is needed to decide what is asked here."

@@ -1,0 +1,90 @@
+"""Words for verdicts, effects, parameters and ratios, the same in every section."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from avis_ctrl.gap.effects.base import Effect, Reported, library
+from avis_ctrl.gap.result import Considered, NamedEffect, Where
+from avis_ctrl.report import words
+
+# What each verdict claims, and what it does not.
+CLAIMS = {
+    "none": "Verdict: none. After re-identification of its own parameters the rig's model agrees with the held-out "
+            "data to within the measured noise. Nothing was added. An effect that is too weak for this campaign, or "
+            "that these records do not excite, would not show.",
+    "explained": "Verdict: explained. With what is named above the model agrees with the held-out data to within "
+                 "the measured noise. What hides below that noise this campaign cannot show.",
+    "partly explained": "Verdict: partly explained. What is named above is confirmed by the held-out data, but a "
+                        "significant part of the gap remains and nothing in the library accounts for it. The updated "
+                        "model is better, not complete.",
+    "unexplained": "Verdict: unexplained. Model and held-out data disagree significantly and no effect of the library "
+                   "accounts for it, so none is named: the nearest one would be wrong. The updated model is the "
+                   "re-identified one.",
+}
+PERCENT = 100.0
+
+
+def titled(name: str) -> str:
+    """An effect's name as read."""
+    return name.replace("_", " ")
+
+
+def known(name: str) -> Effect | None:
+    """The effect of the library, None for one that acts on the signals alone."""
+    return library().get(name)
+
+
+def what_it_is(effect: NamedEffect) -> str:
+    """The effect's title in words."""
+    listed = known(effect.name)
+    return effect.title or (listed.title if listed else titled(effect.name))
+
+
+def probability(value: float) -> str:
+    """A probability in per cent; certainty is never stated."""
+    if not np.isfinite(value):
+        return "not computed"
+    if value > 0.999:
+        return "> 99.9 %"
+    return "< 0.1 %" if value < 0.001 else f"{words.number(PERCENT * value, 3)} %"
+
+
+def percent(share: float, digits: int = 3) -> str:
+    """A share in per cent."""
+    return f"{words.number(PERCENT * share, digits)} %" if np.isfinite(share) else "not computed"
+
+
+def quantity(one: Reported) -> str:
+    """value ± standard deviation unit."""
+    value, sigma = words.with_deviation(one.value, one.std)
+    unit = "" if one.unit in ("", "1") else f" {words.unit(one.unit)}"
+    if not (np.isfinite(one.std) and one.std > 0):
+        return f"{value}{unit} (no standard deviation)"
+    return f"({value} ± {sigma}){unit}" if unit else f"{value} ± {sigma}"
+
+
+def quantities(parameters: Mapping[str, Reported]) -> str:
+    """Name = value ± std unit, of each."""
+    return "; ".join(f"{parameter(name)} {quantity(one)}" for name, one in parameters.items())
+
+
+def parameter(name: str) -> str:
+    """A parameter's name without its unit, which stands behind the number."""
+    for tail in ("_Hz", "_s", "_m", "_kg", "_V", "_N", "_N_per_m", "_Ns_per_m", "_kgm2", "_deg", "_rad"):
+        if name.endswith(tail):
+            return name.removesuffix(tail).replace("_", " ")
+    return name.replace("_", " ")
+
+
+def place(one: Where) -> str:
+    """A band and path in words."""
+    path = f"{one.output} from {one.input}" if one.input else one.output
+    return f"{path}, {words.number(one.from_Hz)} to {words.number(one.to_Hz)} Hz"
+
+
+def candidate(one: Considered) -> str:
+    """Name and place; a pair's names are written with a plus."""
+    return f"{titled(one.name)} ({one.location})" if one.location else titled(one.name)

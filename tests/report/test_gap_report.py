@@ -1,0 +1,298 @@
+"""The report of a gap: what it says agrees with what was found, in HTML and in PDF."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import gap_stand_in as stand_in
+import numpy as np
+import pytest
+from gap_stand_in import Finds
+from test_report import HOSTILE, Reader, pdf_text
+
+from avis_ctrl.gap.effects.base import Reported, library
+from avis_ctrl.gap.result import VERDICTS, HeatMap, Stage, Where
+from avis_ctrl.gap.table_model import active
+from avis_ctrl.measurement.gates.finding import Finding, Picture, Series
+from avis_ctrl.report import gap_html, gap_pdf
+from avis_ctrl.report.figures import Figure, Heat, Panel
+from avis_ctrl.report.gap import wording
+from avis_ctrl.report.gap.before_after import edges_of, spectrum, worst_pairs
+from avis_ctrl.report.gap.content import document
+from avis_ctrl.report.gap.dependence import kind
+from avis_ctrl.report.gap.places import heat_map
+from avis_ctrl.report.matplotlib_backend import svg
+from avis_ctrl.report.pieces import Mark, Paragraph, Section, Table
+from avis_ctrl.report.plotly_backend import graph
+from avis_ctrl.study.gap_overlay import GapOverlay, gap_overlay, selections
+
+NAMED = {"gap_spectrum", "ladder", "gap_responses", "heat_map", "gap_coherence_0", "gap_level_0", "gap_time_0",
+         "gap_other_0", "gap_mu"}
+
+
+@pytest.fixture(scope="module")
+def found() -> Finds:
+    return stand_in.finding(stand_in.records())
+
+
+@pytest.fixture(scope="module")
+def html(found: Finds) -> str:
+    return gap_html(found)
+
+
+def section(found: Finds, anchor: str) -> Section:
+    return next(s for s in document(found).sections if s.anchor == anchor)
+
+
+def tables(part: Section) -> list[Table]:
+    return [p for p in part.flat() if isinstance(p, Table)]
+
+
+def figures(part: Section) -> dict[str, Figure]:
+    return {p.name: p for p in part.flat() if isinstance(p, Figure)}
+
+
+def prose(part: Section) -> str:
+    return " ".join(p.text for p in part.flat() if isinstance(p, Paragraph))
+
+
+def test_same_sections_figures_and_tables_in_both(found, html, tmp_path):
+    content, page, text = document(found), Reader(html.encode()), pdf_text(gap_pdf(found), tmp_path)
+    drawn = [a["data-name"] for tag, a in page.elements if "data-name" in a]
+    assert drawn == [p.name for p in content.figures()] == list(page.graphs())
+    assert set(drawn) == NAMED
+    count = sum(len(tables(s)) for s in content.sections)
+    for word, things in (("Figure", len(drawn)), ("Table", count)):
+        for source in (page.text, text):
+            assert {int(n) for n in re.findall(rf"\b{word} (\d+)[.:]", source)} == set(range(1, things + 1))
+    for number, one in enumerate(content.sections, 1):
+        assert f"{number}. {one.title}" in page.text
+        assert re.search(rf"^ *{number} +{re.escape(one.title)}", text, re.M), one.title
+
+
+def test_opens_with_the_sentence_of_the_finder_and_the_numbers(found):
+    first = section(found, "result").pieces[0]
+    assert isinstance(first, Paragraph) and first.text == found.gap.sentences[0] and first.good is True
+    text = prose(section(found, "result"))
+    assert "31.0 %" in text and "12.0 %" in text and "1.04 %" in text and "noise alone would leave 1.01 %" in text
+    assert "by 11.5" in text and "1.03 times the noise" in text  # 0.12/0.0104 and 0.0104/0.0101
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_each_verdict_has_its_words_and_colour(found, verdict):
+    one = replace(found, gap=stand_in.with_verdict(found.gap, verdict))
+    part = section(one, "result")
+    first = part.pieces[0]
+    look = (first.good, first.half)
+    assert look == {"none": (True, False), "explained": (True, False), "partly explained": (None, True),
+                    "unexplained": (False, False)}[verdict]
+    claims = {name: sum(text in prose(part) for text in (claim,)) for name, claim in wording.CLAIMS.items()}
+    assert claims == {name: int(name == verdict) for name in VERDICTS}
+    assert f"Verdict: {verdict}." in prose(part)
+    css = {(True, False): "verdict good", (None, True): "verdict half", (False, False): "verdict bad"}[look]
+    classes = [a.get("class") for tag, a in Reader(gap_html(one).encode()).elements if tag == "p"]
+    assert css in classes
+    # Without a named effect nothing of an updated model is drawn or tabled.
+    labels = {entry.label for name in ("before_after", "where") for f in figures(section(one, name)).values()
+              for entry in f.legend()}
+    assert ("updated" in labels) == bool(one.gap.effects)
+    assert len(figures(section(one, "where"))["heat_map"].panels) == 1 + bool(one.gap.effects)
+
+
+def test_none_says_what_would_not_have_been_seen(found):
+    one = replace(found, gap=stand_in.with_verdict(found.gap, "none"))
+    assert "An actuator lag below 3.1e-05 s would not have been seen." in Reader(gap_html(one).encode()).text
+
+
+def test_a_group_is_said_to_be_one(found):
+    effect = replace(found.gap.effects[0], indistinguishable_from=("product_of_inertia",))
+    one = replace(found, gap=replace(found.gap, effects=(effect,), next_experiment="Shake the floor."))
+    assert "cannot tell these apart: com offset and product of inertia" in prose(section(one, "result"))
+    assert tables(section(one, "result"))[0].rows[0][-1] == "product of inertia"
+    assert "Shake the floor." in prose(section(one, "remaining"))
+
+
+def test_ladder_and_noise_line(found):
+    drawn = figures(section(found, "before_after"))["ladder"].panels[0]
+    bars = next(c for c in drawn.curves if c.bars)
+    np.testing.assert_allclose(bars.y, [31.0, 12.0, 1.04])
+    line = next(c for c in drawn.curves if c.label == "noise alone")
+    np.testing.assert_allclose(line.y, 1.01)
+    assert drawn.y.scale == "log" and [word for _, word in drawn.x.ticks] == ["nominal", "re-identified",
+                                                                             "+ com offset"]
+    rows = tables(section(found, "before_after"))[0].rows
+    assert [row[0] for row in rows] == ["nominal", "re-identified", "+ com offset", "noise alone"]
+    assert [row[3] for row in rows] == ["900.0", "140.0", "1.030", "1"]
+
+
+def test_sizes_are_rounded_to_their_deviation(found):
+    rows = {row[2]: row for row in tables(section(found, "parameters"))[0].rows}
+    for name, p in found.gap.effects[0].parameters.items():
+        assert abs(float(rows[name][3].replace("−", "-")) - p.value) <= 0.06 * p.std
+        assert float(rows[name][4].removeprefix("± ")) == pytest.approx(p.std, rel=0.06)
+
+
+@pytest.mark.parametrize(("one", "text"), [
+    (Reported(92.0, 1.0, "Hz"), "(92.0 ± 1.0) Hz"), (Reported(0.93, 0.004, "1"), "0.9300 ± 0.0040"),
+    (Reported(5.0, float("nan"), "Hz"), "5.0000 Hz (no standard deviation)")])
+def test_a_quantity_in_words(one, text):
+    assert wording.quantity(one) == text
+
+
+def test_probabilities_are_never_certain():
+    assert wording.probability(1.0) == "> 99.9 %" and wording.probability(0.0) == "< 0.1 %"
+    assert wording.probability(0.874) == "87.4 %"
+
+
+def test_runners_up_with_their_reasons(found):
+    rows = tables(section(found, "considered"))[0].rows
+    assert {row[-1] for row in rows} == {one.reason for one in found.gap.considered}
+    assert rows[0][0] == "cable stiffness (payload)"  # the most probable first
+
+
+def test_heat_map_cells_reach_both_backends(found):
+    drawn = figures(section(found, "where"))["heat_map"]
+    made = graph(drawn)
+    for trace, values in zip(made["data"], (found.gap.heat.before, found.gap.heat.after), strict=True):
+        assert trace["type"] == "heatmap" and len(trace["x"]) == len(values) + 1
+        with np.errstate(invalid="ignore"):
+            expected = np.log10(values).T
+        shown = np.array([[np.nan if v is None else v for v in row] for row in trace["z"]])
+        np.testing.assert_allclose(shown, expected, atol=1e-5)
+    bar = made["layout"]["coloraxis"]
+    assert bar["colorbar"]["title"]["text"] == "residual / noise power [-]" and bar["cmin"] < 0 < bar["cmax"]
+    assert bar["cmax"] == 3.0  # the decade above the largest ratio
+    assert "residual / noise power [-]" in svg(drawn)
+
+
+def test_colours_are_ordered_and_white_is_noise():
+    heat = Heat(np.array([1.0, 2.0]), np.ones((1, 1)), "", (0.5, 1000.0))
+    places = [place for place, _ in heat.colours]
+    assert places == sorted(places) and places[0] == 0 and places[-1] == pytest.approx(1)
+    white = next(place for place, colour in heat.colours if colour == "#ffffff")
+    low, high = np.log10(heat.range)
+    assert low + white * (high - low) == pytest.approx(0, abs=1e-12)
+
+
+def test_spectrum_is_the_mean_and_the_worst_of_the_map():
+    heat = HeatMap(np.array([1.0, 2.0, 4.0]), ("a", "b"), np.array([[1.0, 3.0], [np.nan, 8.0]]), np.ones((2, 2)))
+    mean, worst = spectrum(heat, True).panels
+    np.testing.assert_allclose(mean.curves[0].y, [2, 2, 8, 8])
+    np.testing.assert_allclose(worst.curves[0].y, [3, 3, 8, 8])
+    np.testing.assert_allclose(mean.curves[0].x, [1, 2, 2, 4])
+
+
+def test_a_map_of_nothing_or_from_zero_is_drawn():
+    empty = HeatMap(np.array([0.0, 2.0, 4.0]), ("a",), np.full((2, 1), np.nan), np.full((2, 1), np.inf))
+    assert edges_of(empty).tolist() == [1.0, 2.0, 4.0]
+    for drawn in (heat_map(empty, True), spectrum(empty, True)):
+        assert svg(drawn).startswith("<?xml") and graph(drawn)["data"]
+
+
+def test_responses_show_the_gap_and_that_it_closes(found):
+    """The records are of a table whose centre of mass is off: the updated model has it, the other has not."""
+    seen = gap_overlay(found.measured, found.gap.baseline, found.gap.updated)
+    assert isinstance(seen, GapOverlay)
+    pairs = worst_pairs(seen)
+    assert len({i for i, _ in pairs}) == len(pairs) == 3
+    far = [np.mean(np.abs(seen.measured - G) ** 2 / (2 * seen.measured_std ** 2), axis=0)
+           for G in (seen.baseline, seen.updated)]
+    for i, j in pairs:
+        assert far[0][i, j] > 50 * far[1][i, j]
+        assert far[1][i, j] < 3  # of complex noise alone 1
+    assert far[0][pairs[0]] == pytest.approx(far[0].max())
+
+
+def test_an_effect_without_a_response_is_said_to_be_left_out(found):
+    base = found.gap.baseline
+    updated = base.with_effect(active(library()["cubic_stiffness"], base, library()["cubic_stiffness"].places(base)[0]))
+    seen = gap_overlay(found.measured, base, updated)
+    assert isinstance(seen, GapOverlay) and seen.left_out == ("cubic_stiffness",)
+    np.testing.assert_allclose(seen.updated, seen.baseline, rtol=1e-9)
+    text = prose(section(replace(found, gap=replace(found.gap, updated=updated, covariance=None)), "before_after"))
+    assert "without cubic stiffness" in text
+
+
+def test_records_of_one_level_come_first(found):
+    def at(record, level):
+        return replace(record, header=replace(record.header, level_V=level))
+    a, b, c, rest = found.measured.records
+    campaign = replace(found.measured, records=(at(a, 0.1), at(b, 0.3), at(c, 0.31), rest))
+    assert [[r.header.name for r in one.records] for one in selections(campaign)] == [["01", "02"], ["00", "01", "02"]]
+    quiet = replace(found.measured, records=(rest,))
+    assert selections(quiet) == []
+    assert "no record drives" in gap_overlay(quiet, found.gap.baseline, found.gap.updated)
+
+
+@pytest.mark.parametrize(("title", "x", "y", "expected"), [
+    ("Sz1", "frequency [Hz]", "coherence [-]", "coherence"),
+    ("Gain at three levels", "frequency [Hz]", "gain [-]", "level"),
+    ("Error", "level [V]", "error [%]", "level"), ("Error", "time [s]", "error [%]", "time"),
+    ("Scores", "effect", "score [-]", "other")])
+def test_pictures_find_their_place(title, x, y, expected):
+    assert kind(Picture(title, x, y, (Series("a", np.arange(2.0), np.arange(2.0)),))) == expected
+
+
+def test_controller_only_where_there_is_one(found):
+    assert "controller" not in {s.anchor for s in document(replace(found, design=None)).sections}
+    rows = tables(section(found, "controller"))[0].rows
+    assert [row[4] for row in rows] == [Mark("0.950", True), Mark("1.32", False), Mark("0.970", True)]
+    lost = replace(found.design.loops[0], stable=False, mu_upper=float("inf"), stability_upper=float("nan"),
+                   mu_curve=None)
+    part = section(replace(found, design=replace(found.design, loops=(lost,))), "controller")
+    assert tables(part)[0].rows[0][2:] == (Mark("NO", False), "not computed", Mark("unstable", False), "none", "none")
+    assert not figures(part)
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_next_to_nothing_found(found, verdict, tmp_path):
+    """None, nan and empty everywhere: sentences in their place, in both formats."""
+    poor = Finds(stand_in.minimal(found.gap, verdict), found.measured)
+    page = Reader(gap_html(poor).encode()).text
+    assert "No map of channels and frequencies was computed." in page
+    assert "No pictures were made of: level, time, coherence." in page
+    assert "No other candidate was refitted." in page or "No candidate was refitted" in page
+    if verdict == "none":
+        text = pdf_text(gap_pdf(poor), tmp_path)
+        assert "No disagreement beyond the measured noise." in text
+
+
+def test_numbers_that_are_not_finite(found):
+    """A stage without noise, a place without statistics, an effect without deviation: said in words."""
+    nan, inf = float("nan"), float("inf")
+    effect = replace(found.gap.effects[0], parameters={"offset_x_m": Reported(0.02, nan, "m")}, probability=nan)
+    gap = replace(found.gap, effects=(effect,), stages=(Stage("nominal", inf, nan), Stage("re-identified", 0.0, nan)),
+                  where=(Where(1.0, 2.0, "", "Sz1", nan),), noise_nrmse=nan, sentences=())
+    one = replace(found, gap=gap)
+    gap_html(one)
+    gap_pdf(one)
+    cells = [c.text if isinstance(c, Mark) else c for s in document(one).sections for t in tables(s)
+             for row in t.rows for c in row]
+    assert len(cells) > 100
+    assert not [c for c in cells if re.search(r"\b(inf|nan|None|np\.|array)\b", c)]
+
+
+def test_every_axis_has_a_unit_or_names(found):
+    for figure in document(found).figures():
+        assert isinstance(figure, Figure) and figure.caption
+        for panel in figure.panels:
+            assert isinstance(panel, Panel)
+            for axis in (panel.x, panel.y):
+                assert re.search(r"\[[^\]]+\]$", axis.label) or axis.ticks, (figure.name, axis.label)
+
+
+def test_text_from_files_is_never_markup(found, html, tmp_path):
+    effect = replace(found.gap.effects[0], confirmation=HOSTILE)
+    gap = replace(found.gap, sentences=(HOSTILE, HOSTILE), effects=(effect,), next_experiment=HOSTILE, heat=replace(
+        found.gap.heat, columns=(HOSTILE, *found.gap.heat.columns[1:])))
+    bad = replace(found, gap=gap, findings=(Finding(HOSTILE, "warning", HOSTILE),),
+                  measured=replace(found.measured, notes=(HOSTILE,), source=HOSTILE))
+    page, plain = Reader(gap_html(bad).encode()), Reader(html.encode())
+    assert [tag for tag, _ in page.elements].count("script") == [tag for tag, _ in plain.elements].count("script")
+    assert page.text.count(HOSTILE) >= 5
+    assert "<b>x</b>" in " ".join(pdf_text(gap_pdf(bad), tmp_path).split())
+
+
+def test_same_input_same_page(found, html):
+    assert gap_html(found) == html
