@@ -93,6 +93,14 @@ def relaxing(ratio, corner_Hz):
     return table
 
 
+def leveled(integral):
+    """The integral of the deflection pushes back at the first three mounts."""
+    table = Table(RIG)
+    for G in table.maps[:3]:
+        table.attach(G[2], [[0.0]], [[1.0, 0]], [0, 0, -integral])
+    return table
+
+
 def lagging(tau):
     table = Table(RIG)
     table.lag_s = tau
@@ -103,6 +111,7 @@ LINEAR = [
     ("attached_oscillator", "payload/z", [20.0, 12.0, 0.03, 0.3, -0.2],
      attached(20.0, 12.0, 0.03, [0.3, -0.2, 0.0], 2), {}),
     ("mount_relaxation", "isolators z", [0.8, 2.5], relaxing(0.8, 2.5), {}),
+    ("leveling_loop", "isolators 1-3 z/plain", [2e4], leveled(2e4), {}),
     ("actuator_lag", "actuators", [4e-3], lagging(4e-3), {}),
     ("loop_delay", "loop", [2.5e-3], Table(RIG), {"delay_substeps": round(3.5 * SUBSTEPS)}),
 ]
@@ -156,6 +165,22 @@ def test_two_effects_at_once():
     model = with_effect("actuator_saturation", "actuators", [0.5], model)
     y, _ = Table(RIG).run(np.clip(U, -0.5, 0.5), FS, cubic=1e13, friction=(3e3, 1e-5))
     assert error(simulate(model, U, None, FS).y, y) < 2e-4
+
+
+@pytest.mark.parametrize(("name", "place", "values"), [
+    ("base_compliance", "chassis/rocking", [5e3, 40.0, 30.0, 0.05, 35.0, 0.8]),
+    ("payload_flexible_mode", "payload", [60.0, 0.02, *np.linspace(-0.02, 0.02, 12)])])
+def test_cubic_mounts_on_a_table_with_more_coordinates(name, place, values):
+    """A chassis that recoils a little, a payload that bends a little: the march has their coordinates."""
+    cubic = with_effect("cubic_stiffness", "isolators z", [1e13])
+    more = simulate(with_effect(name, place, values, cubic), U, None, FS)
+    beside = error(simulate(with_effect(name, place, values), U, None, FS).y, simulate(BARE, U, None, FS).y)
+    assert 1e-3 < beside < 0.2
+    assert error(more.y, simulate(cubic, U, None, FS).y) < 3 * beside
+    # With next to no force the march leaves the linear table as it is.
+    soft = with_effect(name, place, values, with_effect("cubic_stiffness", "isolators z", [1.0]))
+    assert error(simulate(soft, U, None, FS).y, simulate(with_effect(name, place, values), U, None, FS).y) < 1e-9
+    assert more.defect < 1e-5
 
 
 def test_large_rotations_as_the_nonlinear_table():
