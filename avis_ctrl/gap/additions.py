@@ -127,7 +127,7 @@ def has_addition(one: ActiveEffect) -> bool:
 
 
 def impedance(table: Table, K: np.ndarray, h: StateSpace, of: str = "r") -> StateSpace:
-    """Force -K h(s) by displacement ("r") or by absolute velocity ("v"), K (n, n) symmetric; states as few as its rank."""
+    """Force -K h(s) by displacement ("r") or absolute velocity ("v"), K (n, n) symmetric; states as few as its rank."""
     sizes, V = np.linalg.eigh(K)
     felt = np.abs(sizes) > 1e-12 * max(np.abs(sizes).max(), 1e-300)
     V, sizes = V[:, felt], sizes[felt]
@@ -168,7 +168,7 @@ def _structural(table: Table, place: str, values: Mapping[str, float]) -> StateS
     ratios = np.array([ratio for _, ratio in branches])
     # rest - 1 + sum of ratio s/(s + w) = rest - 1 + sum(ratio) - sum of ratio w/(s + w)
     h = StateSpace(-np.diag(corners), np.sqrt(corners)[:, None], -(ratios * np.sqrt(corners))[None],
-                   [[rest - 1 + ratios.sum()]])
+                   np.array([[rest - 1 + ratios.sum()]]))
     return impedance(table, G.T @ (k[:, None] * G), h)
 
 

@@ -206,12 +206,13 @@ def _sensor_filters(model: TableModel, factors: np.ndarray) -> list[StateSpace]:
     return found
 
 
-def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: int = 6, when: float = 0.0,
+def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: int | None = None, when: float = 0.0,
             check_Hz: np.ndarray = CHECK_Hz) -> Realised:
     """One state space of a model, drives and sensors included; coordinates not kept are locked at rest.
 
-    pade_order : of the delay and of the hold (1-10). The error is measured where all six coordinates are kept, nan
-    otherwise: `TableModel.response` knows no locked ones.
+    pade_order : of delay and hold (1-10); by default what keeps the delay's error below 1e-3 up to the highest of
+    check_Hz, or 10. The error is measured where all six coordinates are kept, nan otherwise: `TableModel.response`
+    knows no locked ones.
 
     Raises
     ------
@@ -219,12 +220,14 @@ def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: in
     """
     if model.sensors.motion != "velocity":
         raise InputError("expected sensors of velocity", field="sensors", value=model.sensors.motion)
+    omega = 2 * np.pi * np.asarray(check_Hz, float)
+    order = pade_order or sufficient_order(loop_lag(model)[0], float(omega.max()), 1e-3, 10)[0]
     effective = model.effective
     rig = uncertain_rig(effective.rig, [], keep).system
     names = [edge_name(name) for name in keep]
     table = Table(model, tuple(keep), when)
     inner = with_effects(rig, model, keep, when)
-    parts = {"table": inner, "chains": _chains(table, names), "loop": _loop(model, pade_order)}
+    parts = {"table": inner, "chains": _chains(table, names), "loop": _loop(model, order)}
     floor = [f"floor_{a}_dot" for a in names]
     place = np.zeros((len(names), 3))
     for k, name in enumerate(keep):
@@ -238,7 +241,6 @@ def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: in
     system = connect(parts, [*(f"{name}_command" for name in model.actuators), *FLOOR],
                      [*(f"{a}_dot" for a in names), *model.sensors.names]
                      ).renamed({f"{name}_command": name for name in model.actuators})
-    omega = 2 * np.pi * np.asarray(check_Hz, float)
     linear = replace(model, effects=tuple(one for one in model.effects if not one.effect.nonlinear))
     if set(keep) != set(COORDINATES):
         error, folded = float("nan"), float("nan")
@@ -251,6 +253,21 @@ def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: in
         same = realise(linear, keep, pade_order, when, check_Hz)
         error, folded = same.error, same.aliases
     return Realised(system, omega, error, folded, notes_on(model))
+
+
+def sufficient_order(delay_s: float, omega: float, tolerance: float, largest: int, least: int = 2) -> tuple[int, float]:
+    """Lowest order of a delay's Pade approximant with an error below the tolerance up to omega [rad/s], and its error.
+
+    The largest order where none is; all-pass, so that the error is of phase alone and grows with frequency.
+    """
+    error = 0.0
+    for order in range(least, largest + 1):
+        made = pade_delay(delay_s, order).frequency_response(np.array([omega]))[0, 0, 0]
+        # The phase of the approximant falls short of the delay's by less than a turn where it is of any use.
+        error = float(abs(made - np.exp(-1j * omega * delay_s)))
+        if error < tolerance and omega * delay_s < np.pi * order:
+            return order, error
+    return largest, error if omega * delay_s < np.pi * largest else 2.0
 
 
 def loop_lag(model: TableModel) -> tuple[float, float | None]:

@@ -27,7 +27,7 @@ from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
-from avis_ctrl.study.gap_plant import CARRIED, carried, plant_of
+from avis_ctrl.study.gap_plant import CARRIED, carried, delay_order, plant_of, six_dof_is_stable
 from avis_ctrl.study.identification_design import default_design, design_toml
 from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.plant import DesignPlant
@@ -43,12 +43,14 @@ class LoopFigures:
     """A controller on a plant.
 
     stable : nominally, all poles of the closed loop in the left half plane; where not, the figures are infinite.
+    stable_in_six : the same on all six coordinates, the others without control (`gap_plant.six_dof_is_stable`).
     mu_upper, mu_lower : robust performance of the design's weights. peak_dB, band_dB : largest nominal transmissibility
     over all frequencies and over the design's band. worst_peak_dB, worst_band_dB : upper bounds of the same over the
     design's uncertainty.
     """
 
     stable: bool
+    stable_in_six: bool
     mu_upper: float
     mu_lower: float
     peak_dB: float
@@ -124,9 +126,10 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
     began = time.monotonic()
     progress("controller for the baseline: mu synthesis")
     plant, asked, rig = plant_of(design, baseline)
+    new_rig = rig
     K = mu_optimal(asked, plant, rig)[0].K
     assert K is not None
-    before = figures(asked, plant, K)
+    before = figures(asked, baseline, plant, K)
     progress(f"  mu {before.mu_upper:.3f} on the baseline")
     after, new, K_new, when, notes = None, None, None, 0.0, []
     if updated.effects:
@@ -137,13 +140,14 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
         try:
             K_new = mu_optimal(new_design, new_plant, new_rig)[0].K
             assert K_new is not None
-            new = figures(new_design, new_plant, K_new)
+            new = figures(new_design, updated, new_plant, K_new, when)
             progress(f"  mu {new.mu_upper:.3f} for the new controller")
         except ComputationError as error:
             notes.append(f"No controller was found for the updated model: {error}")
     realised = realise(updated)
     files, in_files, not_in_files = _files(design, updated, when)
-    words = (*_outcome(before, after, new), *notes, *_told(realised, updated, when, in_files, not_in_files))
+    words = (*_outcome(before, after, new), *notes,
+             *_told(realised, design, new_rig, updated, when, in_files, not_in_files))
     return DesignEffect(before, after, new, K, K_new, realised, in_files, not_in_files, files, words,
                         time.monotonic() - began)
 
@@ -168,15 +172,16 @@ def _worst_moment(design: Design, model: TableModel, allocation: np.ndarray, K: 
     found = []
     for when in (-0.5, 0.5) if drifts else (0.0,):
         plant, asked, _ = plant_of(design, model, allocation, when)
-        found.append((figures(asked, plant, K), when))
+        found.append((figures(asked, model, plant, K, when), when))
     return max(found, key=lambda one: one[0].mu_upper)
 
 
-def figures(design: Design, plant: DesignPlant, K: StateSpace) -> LoopFigures:
-    """Measure a controller on a plant."""
+def figures(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace, when: float = 0.0) -> LoopFigures:
+    """Measure a controller on a plant of a model."""
+    in_six = six_dof_is_stable(design, model, plant, K, when)
     fastest = float(np.max(np.abs(K.poles()), initial=0.0)) / (2 * np.pi)
     if not plant.full.closed(K).is_stable():
-        return LoopFigures(False, *(float("inf"),) * 6, fastest)
+        return LoopFigures(False, in_six, *(float("inf"),) * 6, fastest)
     performance = plant.synthesis.closed(K)
     motion = plant.full.restricted(plant.floor_velocities, plant.velocities).closed(K)
     blocks = plant.synthesis.blocks
@@ -186,7 +191,7 @@ def figures(design: Design, plant: DesignPlant, K: StateSpace) -> LoopFigures:
     in_band = nominal.frequency_response(2 * np.pi * np.geomspace(low, high, 400))
     worst = worst_case_gain(motion, blocks, slack=SLACK)
     worst_band = worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high), slack=SLACK)
-    return LoopFigures(True, mu.upper, mu.lower, _dB(hinf_norm(nominal).gain),
+    return LoopFigures(True, in_six, mu.upper, mu.lower, _dB(hinf_norm(nominal).gain),
                        _dB(float(np.max(np.linalg.norm(in_band, ord=2, axis=(1, 2))))), _dB(worst.upper),
                        _dB(worst_band.upper), fastest)
 
@@ -218,13 +223,19 @@ def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | 
     else:
         first = (f"{said} has {start} and {after.mu_upper:.3g} on the updated model: "
                  f"{_verdict(before.mu_upper, after.mu_upper)}; {_worst_case(before, after)}.")
+    if after.stable and before.stable_in_six and not after.stable_in_six:
+        first += " On all six coordinates it makes the updated model unstable, which the locked ones hide."
     if new is None:
         return [first]
     if not new.stable:
         return [first, "The controller designed on the updated model does not stabilise it."]
     reach = "meets the specification" if new.mu_upper < 1 else "misses the specification too"
+    hidden = "" if new.stable_in_six else " On all six coordinates it is unstable."
+    bounds = f"worst case {new.worst_peak_dB:.1f} dB at the peak, {new.worst_band_dB:.1f} dB in the band"
+    if not np.isfinite(new.worst_peak_dB):
+        bounds = "stability is not proved for every table within the design's uncertainty"
     return [first, f"A controller designed on the updated model has mu {new.mu_upper:.3g} there and {reach} "
-                   f"(worst case {new.worst_peak_dB:.1f} dB at the peak, {new.worst_band_dB:.1f} dB in the band)."]
+                   f"({bounds}).{hidden}"]
 
 
 def _worst_case(before: LoopFigures, after: LoopFigures) -> str:
@@ -247,14 +258,21 @@ def _verdict(before: float, after: float) -> str:
     return f"it is {'worse' if after > before else 'better'}, {kept}"
 
 
-def _told(realised: Realised, model: TableModel, when: float, inside: Sequence[str], outside: Sequence[str]
-          ) -> list[str]:
+def _told(realised: Realised, design: Design, plant_rig: Rig, model: TableModel, when: float, inside: Sequence[str],
+          outside: Sequence[str]) -> list[str]:
     """How far to trust the figures and where the effects are."""
     if not model.effects:
         return []
-    said = [f"In state space the updated model differs from its own response by at most {100 * realised.error:.2g} % "
+    error = f"at most {100 * realised.error:.2g} %" if realised.error > 1e-6 else "rounding only"
+    said = [f"In state space the updated model differs from its own response by {error} "
             f"from {realised.omega[0] / 2 / np.pi:.3g} to {realised.omega[-1] / 2 / np.pi:.3g} Hz; aliases of "
-            f"sampling, up to {100 * realised.aliases:.2g} %, are left out.", *realised.notes]
+            f"sampling, up to {100 * realised.aliases:.2g} %, are left out.", *realised.notes,
+            "mu and transmissibility are of the design's coordinates, the others locked; stability was looked at on "
+            "all six too."]
+    left = delay_order(design, plant_rig)[1]
+    if left > 0.1:
+        said.append(f"The delay of {1e3 * plant_rig.loop_delay_s:.3g} ms is beyond the order that a design's delay may "
+                    f"have: error {left:.2g} at the bandwidth of the drives, so do not rely on the new controller.")
     if any(one.effect.name == "stiffness_drift" for one in model.effects):
         said.append(f"Stiffness is taken at the {'begin' if when < 0 else 'end'} of the campaign, where mu is larger.")
     by_label = {one.label: one.effect.name for one in model.effects}

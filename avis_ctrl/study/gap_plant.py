@@ -1,6 +1,6 @@
 """The generalized plant of a design on a model with effects, and what of it the files of `avis design` can carry.
 
-    floor -> (chassis) -> rig, its uncertain parameters -> + effects -> what the sensors really see -> decoding as before
+    floor -> (chassis) -> rig, its uncertain parameters -> + effects -> what the sensors see -> decoding as before
 
 Uncertainty stays where the design has it. What the effects multiply (the branch of a mount, the recoil of the chassis)
 is taken with nominal values. Allocation and decoding are those of the first plant: the controller does not know.
@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl.gap.realise import loop_lag, with_effects
+from avis_ctrl.gap.realise import loop_lag, realise, sufficient_order, with_effects
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.lti.connect import connect
-from avis_ctrl.lti.statespace import StateSpace, gain
+from avis_ctrl.lti.connect import connect, lft_lower
+from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.plant import DesignPlant, build_plant
@@ -29,7 +30,12 @@ CARRIED: Mapping[str, str] = {
     "actuator_gain": "the motor's force constant in the rig file",
     "sensor_gain": "the sensor's sensitivity in the rig file", "loop_delay": "the rig's loop delay",
     "actuator_lag": "loop.amplifier_corner_Hz of the design", "actuator_saturation": "the rig's drive limit",
-    "stiffness_drift": "the rig's stiffness at that moment", "contact_friction": "the rig's stiffness far below the slip"}
+    "stiffness_drift": "the rig's stiffness at that moment",
+    "contact_friction": "the rig's stiffness far below the slip"}
+
+
+# Error of a plant's delay at the bandwidth of the drives that asks for a higher order than the design's (at most 6).
+DELAY_ERROR = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +77,22 @@ def plant_of(design: Design, model: TableModel, allocation: np.ndarray | None = 
 
 
 def _loop(rig: Rig, design: Design, model: TableModel) -> tuple[Rig, Design]:
-    """Delay, amplifiers and drive limit of the model; amplifiers that it does not know stay as the design assumes."""
+    """Delay, amplifiers and drive limit of the model; amplifiers that it does not know stay as the design assumes.
+
+    The delay's order rises where the design's would be wrong within its bandwidth.
+    """
     delay, corner = loop_lag(model)
     limits = [one.by_name["limit_V"] for one in model.effects if one.effect.name == "actuator_saturation"]
     rig = _with_equipment(rig, delay, min([rig.drive_limit_V, *limits]))
-    if corner is not None:
-        design = design.model_copy(update={"loop": design.loop.model_copy(update={"amplifier_corner_Hz": corner})})
-    return rig, design
+    order, _ = delay_order(design, rig)
+    changes = {"pade_order": order} | ({} if corner is None else {"amplifier_corner_Hz": corner})
+    return rig, design.model_copy(update={"loop": design.loop.model_copy(update=changes)})
+
+
+def delay_order(design: Design, rig: Rig) -> tuple[int, float]:
+    """Order of the design's delay, at least its own, and the error that is left at the bandwidth of its drives."""
+    omega = 2 * np.pi * design.control_effort.bandwidth_Hz
+    return sufficient_order(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, omega, DELAY_ERROR, 6, design.loop.pade_order)
 
 
 def _with_equipment(rig: Any, delay_s: float, limit_V: float) -> Any:
@@ -133,6 +148,29 @@ def _sensor_chain(plant: DesignPlant, axis: str) -> StateSpace:
                       (f"sensed_{axis}_dot", f"tilt_{axis}"), (f"clean_{axis}_dot",))
 
 
+def six_dof_is_stable(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace, when: float = 0.0) -> bool:
+    """Whether the loop is stable on all six coordinates, the others without control: eigenvalues of a realisation.
+
+    The path is not that of the plant: volts to volts with hold, delay and every sensor's own chain. What the locked
+    coordinates of a design hide (an offset centre of mass, gravity, a tilted sensor) is in it.
+    """
+    table = realise(model, when=when).system
+    volts = table.inputs[:len(model.actuators)]
+    A = np.zeros((len(volts), len(plant.axes)))
+    for row, name in zip(plant.allocation, plant.actuators, strict=True):
+        A[volts.index(name)] = row
+    sensors = list(model.sensors.names)
+    seen = plant.decoding[:, [plant.sensors.index(name) for name in sensors]] / model.sensors.sensitivity
+    corner = 2 * np.pi * design.loop.amplifier_corner_Hz
+    lag = cascade([], [-corner], corner) if loop_lag(model)[1] is None else gain([[1.0]])
+    lags = append(*(lag.renamed([f"c{k}"], [f"d{k}"]) for k in range(len(plant.axes))))
+    G = table.select(sensors, list(volts)).scaled(seen, A) @ lags
+    n = len(plant.axes)
+    open_loop = StateSpace(G.A, np.hstack([np.zeros((G.nstates, n)), G.B]), np.vstack([G.C, G.C]),
+                           np.block([[np.zeros((n, n)), G.D], [np.zeros((n, n)), G.D]]))
+    return lft_lower(open_loop, K).is_stable()
+
+
 def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
     """Rig and design from which `avis design` starts on a model, as far as the files have a place for its effects.
 
@@ -144,7 +182,8 @@ def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
 
     def add(name: str, value: float) -> None:
         changes[name] = changes.get(name, known[name].value) + value
-    inside, outside = [], []
+    inside: list[str] = []
+    outside: list[str] = []
     lag_known = model.amplifier_corner_Hz is not None
     factors = dict.fromkeys(model.sensors.names, 1.0)
     for one in model.effects:
