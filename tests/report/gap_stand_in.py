@@ -18,28 +18,10 @@ from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.study.campaign_plan import plan_from_table
+from avis_ctrl.study.gap_design import DesignEffect, LoopFigures
 
 OFFSET = (0.02, -0.012, 0.0)
 OUTPUTS = ("Sy1", "Sz1", "Sx2", "Sz2", "Sy3", "Sz3")
-
-
-@dataclass(frozen=True, eq=False)
-class Loop:
-    controller: str
-    model: str
-    stable: bool
-    mu_upper: float
-    stability_upper: float
-    modulus_margin: float
-    peak_dB: float
-    mu_curve: tuple[np.ndarray, np.ndarray] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class OnController:
-    design: str
-    loops: tuple[Loop, ...]
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +30,7 @@ class Finds:
     measured: Campaign
     findings: tuple[Finding, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    design: OnController | None = None
+    design: DesignEffect | None = None
 
 
 def records(duration_s: float = 8.0, count: int = 3) -> Campaign:
@@ -156,15 +138,15 @@ def with_verdict(gap: Gap, verdict: str) -> Gap:
     return gap
 
 
-def design() -> OnController:
-    """Yesterday's controller, which the effect spoils, and a new one."""
-    f = np.geomspace(0.1, 200, 80)
-    hump = np.exp(-np.log(f / 6) ** 2)
-    return OnController("avis_z_phix.toml", (
-        Loop("mu controller of the old model", "old model", True, 0.95, 0.61, 0.55, 3.1, (f, 0.2 + 0.75 * hump)),
-        Loop("mu controller of the old model", "updated model", True, 1.32, 0.8, 0.41, 5.9, (f, 0.2 + 1.12 * hump)),
-        Loop("new mu controller", "updated model", True, 0.97, 0.64, 0.54, 3.2, (f, 0.2 + 0.77 * hump))),
-        ("Both designs have the same weights.",))
+def design() -> DesignEffect:
+    """Yesterday's controller, which the effect spoils, and a new one; without the controllers themselves."""
+    nothing: Any = None
+    return DesignEffect(LoopFigures(True, True, 0.95, 0.94, 3.1, -12.0, 5.2, -9.1, 60.0),
+                        LoopFigures(True, True, 1.32, 1.3, 5.9, -9.5, float("inf"), -4.0, 60.0),
+                        LoopFigures(True, True, 0.97, 0.96, 3.2, -11.8, 5.4, -8.9, 60.0), nothing, nothing, nothing,
+                        (), ("com_offset@payload",), {},
+                        ("Yesterday's controller has mu 0.95 on the baseline and 1.32 on the updated model.",
+                         "A controller designed on the updated model has mu 0.97 there."), 30.0)
 
 
 def finding(campaign: Campaign) -> Finds:

@@ -236,13 +236,18 @@ def test_pictures_find_their_place(title, x, y, expected):
 
 def test_controller_only_where_there_is_one(found):
     assert "controller" not in {s.anchor for s in document(replace(found, design=None)).sections}
-    rows = tables(section(found, "controller"))[0].rows
+    part = section(found, "controller")
+    assert part.pieces[0] == Paragraph(found.design.sentences[0])
+    rows = tables(part)[0].rows
     assert [row[4] for row in rows] == [Mark("0.950", True), Mark("1.32", False), Mark("0.970", True)]
-    lost = replace(found.design.loops[0], stable=False, mu_upper=float("inf"), stability_upper=float("nan"),
-                   mu_curve=None)
-    part = section(replace(found, design=replace(found.design, loops=(lost,))), "controller")
-    assert tables(part)[0].rows[0][2:] == (Mark("NO", False), "not computed", Mark("unstable", False), "none", "none")
-    assert not figures(part)
+    assert [row[7] for row in rows] == ["+5.2 dB", "unstable", "+5.4 dB"]
+    lost = replace(found.design.before, stable=False, **dict.fromkeys(
+        ("mu_upper", "mu_lower", "peak_dB", "band_dB", "worst_peak_dB", "worst_band_dB"), float("inf")))
+    part = section(replace(found, design=replace(found.design, before=lost, after=None, new=None)), "controller")
+    assert tables(part)[0].rows == (("yesterday's", "re-identified", Mark("NO", False), Mark("yes", True),
+                                     Mark("unstable", False), *["unstable"] * 4),)
+    drawn = figures(part)["gap_mu"]
+    assert "not stable" in drawn.caption and svg(drawn).startswith("<?xml")
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)

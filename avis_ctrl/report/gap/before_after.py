@@ -26,7 +26,7 @@ def before_after(found: Found) -> Section:
         pieces += [ladder(gap), _stages(gap)]
     seen = gap_overlay(found.measured, gap.baseline, gap.updated)
     pieces += [Paragraph(seen, "note")] if isinstance(seen, str) else responses(seen, bool(gap.effects))
-    return Section("The gap before and after", "before_after", tuple(pieces))
+    return Section("The gap before and after" if gap.effects else "The gap", "before_after", tuple(pieces))
 
 
 def spectrum(heat: HeatMap, named: bool) -> Figure:

@@ -2,60 +2,67 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, hertz, level, numbered
-from avis_ctrl.report.gap.finding import EffectOnController, Found, LoopOnModel
-from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, table
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, level
+from avis_ctrl.report.gap.finding import Found
+from avis_ctrl.report.pieces import Bullets, Cell, Mark, Paragraph, Piece, Section, table
+
+if TYPE_CHECKING:
+    from avis_ctrl.study.gap_design import DesignEffect, LoopFigures
 
 
 def controller(found: Found) -> Section | None:
-    """Yesterday's controller on the updated model beside a new one; None where no design was asked for."""
+    """Yesterday's controller on both models beside a new one; None where no design was asked for."""
     effect = found.design
     if effect is None:
         return None
-    rows = [(one.controller, one.model, _yes(one.stable), _mu(one.stability_upper), _mu(one.mu_upper),
-             _stated(one.modulus_margin, one.stable), _decibel(one.peak_dB, one.stable)) for one in effect.loops]
-    pieces: list[Piece] = [table(
-        f"Controllers of the design {effect.design}. Upper bounds of mu: below 1 the whole uncertainty set is stable "
-        "(robust stability), or also performs as asked (robust performance). Margin: smallest distance of the loop "
-        "from instability, 1 / max sigma(S) at the actuators. Peak: of the nominal transmissibility.",
-        ("controller", "on model", "stable", "mu, stability", "mu, performance", "margin [-]", "peak [dB]"), rows,
-        "llcrrrr")]
-    pieces += [curves] if (curves := _curves(effect)) is not None else []
-    pieces += [Paragraph(note, "note") for note in effect.notes]
+    rows = [(who, model, *_figures(one)) for who, model, one in loops(effect)]
+    pieces: list[Piece] = [Paragraph(effect.sentences[0])] if effect.sentences else []
+    pieces += [table(
+        "The controllers. Upper bound of mu below 1: every table of the design's uncertainty set performs as asked. "
+        "Decibels count the largest singular value from floor to payload. Worst cases are upper bounds over the whole "
+        "set; \"unstable\" means that the set holds a table that the controller does not stabilise, or is not shown "
+        "to. Six: the nominal loop on all six coordinates, those beside the design's without control.",
+        ("controller", "on model", "stable", "stable in six", "mu, upper bound", "mu, lower bound", "peak",
+         "worst peak", "worst in band"), rows, "llccrrrrr"), _bounds(effect)]
+    if effect.sentences[1:]:
+        pieces.append(Bullets(tuple(effect.sentences[1:])))
     return Section("Effect on the controller", "controller", tuple(pieces))
 
 
-def _curves(effect: EffectOnController) -> Figure | None:
-    drawn: list[tuple[LoopOnModel, tuple[np.ndarray, np.ndarray]]] = [
-        (one, one.mu_curve) for one in effect.loops if one.mu_curve is not None]
-    if not drawn:
-        return None
-    curves = [Curve(f, mu, f"{one.controller} on the {one.model}", numbered(k))
-              for k, (one, (f, mu)) in enumerate(drawn)]
-    low, high = (float(pick(np.concatenate([f for _, (f, _) in drawn]))) for pick in (np.min, np.max))
-    return Figure("gap_mu", "Upper bound of mu, robust performance; below 1 every plant of the set performs as asked.",
-                  (Panel(hertz(low, high), Axis("mu, upper bound [-]", "log"),
-                         (*curves, level(low, high, 1.0, "limit", STYLES["limit"]))),))
+def loops(effect: DesignEffect) -> list[tuple[str, str, LoopFigures]]:
+    """Controller, model and figures of the loops that were computed."""
+    every = (("yesterday's", "re-identified", effect.before), ("yesterday's", "updated", effect.after),
+             ("new", "updated", effect.new))
+    return [(who, model, one) for who, model, one in every if one is not None]
+
+
+def _figures(one: LoopFigures) -> tuple[Cell, ...]:
+    decibels = [words.quantity(v, "dB") for v in (one.peak_dB, one.worst_peak_dB, one.worst_band_dB)]
+    return (_yes(one.stable), _yes(one.stable_in_six),
+            Mark(words.bound(one.mu_upper), bool(one.mu_upper < 1)), words.bound(one.mu_lower), *decibels)
 
 
 def _yes(stable: bool) -> Mark:
     return Mark("yes", True) if stable else Mark("NO", False)
 
 
-def _mu(value: float) -> Cell:
-    if np.isnan(value):
-        return "not computed"
-    return Mark(words.bound(value), bool(value < 1))
-
-
-def _stated(value: float, stable: bool) -> str:
-    return words.number(value) if stable else "none"
-
-
-def _decibel(value: float, stable: bool) -> str:
-    if not stable:
-        return "none"
-    return "not computed" if np.isnan(value) else f"{value:+.1f}".replace("-", "−")
+def _bounds(effect: DesignEffect) -> Figure:
+    """mu of each loop as a bar; none where the loop is not stable."""
+    drawn = loops(effect)
+    mu = np.array([one.mu_upper for _, _, one in drawn])
+    place = np.arange(len(mu), dtype=float)
+    ticks = tuple((float(k), f"{who}, {model} model") for k, (who, model, _) in enumerate(drawn))
+    lost = " A loop without a bar is not stable." if not np.isfinite(mu).all() else ""
+    top = 1.15 * max(1.0, float(np.max(mu[np.isfinite(mu)], initial=0.0)))
+    bars = Curve(place, np.where(np.isfinite(mu), mu, np.nan), "upper bound of mu", Style("#8fbbdc"), line=False,
+                 bars=0.5)
+    return Figure("gap_mu", "Upper bound of mu, robust performance, of each controller on each model; below 1 every "
+                  f"table of the set performs as asked.{lost}",
+                  (Panel(Axis("controller, model", "linear", (-0.6, len(mu) - 0.4), ticks),
+                         Axis("mu, upper bound [-]", "linear", (0.0, top)),
+                         (bars, level(-0.5, len(mu) - 0.5, 1.0, "limit", STYLES["limit"]))),), height=0.7)
