@@ -9,12 +9,16 @@ squares is biased by the noise of the position; `identify_single_axis` has instr
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy import signal
+from scipy.interpolate import BSpline
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.gap.single_axis.machine import octaves
 from avis_ctrl.gap.single_axis.terms import AxisParameter, Term, register
+from avis_ctrl.measurement.gates.finding import Picture, Series, thinned
 
 BLOCKS = 16
 # Repeated: the motion returns to itself within this part of its r.m.s.
@@ -135,8 +139,6 @@ class DriveData:
         index = np.clip(self.keep[:, None] + np.round(shift * FIR_STEP_S * self.rate).astype(int), 0, len(self.q) - 1)
         fir = np.column_stack([self.v[index], self.a[index]])
         q, v, a = (x[self.keep] / np.sqrt(np.mean(x ** 2)) for x in (self.q - self.q.mean(), self.v, self.a))
-        from scipy.interpolate import BSpline
-
         def bumps(x: np.ndarray, count: int) -> np.ndarray:
             """Quadratic splines over quantiles, so that each has its share of the data."""
             inner = np.unique(np.quantile(x, np.linspace(0, 1, count - 1)))
@@ -146,6 +148,17 @@ class DriveData:
         free = np.hstack([(Q[:, :, None] * V[:, None, :]).reshape(len(q), -1),
                           (A[:, :, None] * V[:, None, ::2]).reshape(len(q), -1)])
         return {f"linear of order {2 * FIR_TAPS}": fir, "free map of position, velocity and acceleration": free}
+
+
+    def where(self, e: np.ndarray) -> tuple[dict[str, Any], ...]:
+        f = np.fft.rfftfreq(len(e), 1 / self.row_rate)
+        keep = f > 0
+        return octaves(f[keep], np.abs(np.fft.rfft(e)[keep]) ** 2, {"input": "force", "output": "position"})
+
+    def picture(self, errors: Sequence[np.ndarray], names: Sequence[str]) -> Picture:
+        t = self.t[self.keep]
+        series = tuple(Series(name, *thinned(t, e)) for name, e in zip(names, errors, strict=True))
+        return Picture("What each stage leaves on unseen data", "time [s]", "force [N]", series)
 
 
 def _checked(time: np.ndarray, position: np.ndarray, force: np.ndarray, reference: np.ndarray | None

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -21,6 +21,7 @@ from scipy.optimize import least_squares
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.gap.single_axis.terms import AxisParameter, Term
 from avis_ctrl.identification.single_axis.fit import andrews_lags, not_below
+from avis_ctrl.measurement.gates.finding import Picture
 
 # Singular values below this part of the largest one are combinations that the data do not determine.
 RANK = 1e-8
@@ -51,6 +52,12 @@ class AxisProblem(Protocol):
 
     def references(self, terms: Sequence[Term], theta: np.ndarray) -> Mapping[str, np.ndarray]:
         """Name to columns (n, p): additional regressors of models without physics."""
+
+    def where(self, e: np.ndarray) -> tuple[dict[str, Any], ...]:
+        """Bands that hold most of the squared residual, as in the contract."""
+
+    def picture(self, errors: Sequence[np.ndarray], names: Sequence[str]) -> Picture:
+        """Residuals of the stages on unseen data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,3 +205,17 @@ def correlation_time(problem: AxisProblem, judged: HeldOut) -> float:
         rho = sum(float(z[run][lag:] @ z[run][:-lag]) for run in problem.runs if len(run) > lag) / power
         tau += 2 * (1 - lag / (lags + 1)) * rho
     return max(tau, 1.0)
+
+
+def octaves(frequency_Hz: np.ndarray, power: np.ndarray, channel: dict[str, str]) -> tuple[dict[str, Any], ...]:
+    """The octaves that together hold at least half of the power, largest first."""
+    top = float(frequency_Hz.max())
+    index = np.floor(np.log2(top / np.maximum(frequency_Hz, top * 2.0 ** -12)) + 1e-12).astype(int)
+    share = np.bincount(index, power) / max(float(power.sum()), np.finfo(float).tiny)
+    found: list[dict[str, Any]] = []
+    for k in np.argsort(-share):
+        if sum(place["share"] for place in found) >= 0.5 or share[k] <= 0:
+            break
+        found.append({"from_Hz": top * 2.0 ** -(k + 1.0), "to_Hz": top * 2.0 ** -float(k), **channel,
+                      "share": float(share[k])})
+    return tuple(found)

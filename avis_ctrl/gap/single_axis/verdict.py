@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from avis_ctrl.gap.single_axis.machine import AxisProblem, HeldOut, correlation_
 from avis_ctrl.gap.single_axis.result import AxisEffect, AxisGap, AxisStage, Estimate
 from avis_ctrl.gap.single_axis.stepwise import FALSE_ALARM, Candidate, Progress, Step, reference, search
 from avis_ctrl.gap.single_axis.terms import AxisParameter, Term
-from avis_ctrl.measurement.gates.finding import Picture, Series, thinned
+from avis_ctrl.measurement.gates.finding import Picture, Series
 
 # The contract: the gap is closed within 1.2 of the noise floor.
 AT_THE_NOISE = 1.2
@@ -44,15 +43,17 @@ def gap_of(problem: AxisProblem, library: Sequence[Term], seed: int, progress: P
     references = tuple(AxisStage(f"{where}, {one.name}", *_figures(problem, one.judged))
                        for where, several in (("base", on_base), ("all named", left if len(steps) > 1 else ()))
                        for one in several)
-    effects = tuple(_effect(step) for step in steps[1:])
+    effects = _effects(problem, steps)
     first = steps[1].candidates if len(steps) > 1 else last
     experiments = [text for step in steps[1:] if step.rivals
                    for text in (step.named.term.separated_by if step.named else "",) if text]
-    return AxisGap(problem.kind, verdict, effects, stages, references, _where(problem, steps[-1].judged),
-                   tuple(_sentences(problem, verdict, steps, stages, references, left, last, refused)),
+    return AxisGap(problem.kind, verdict, effects, stages, references, problem.where(steps[-1].judged.e),
+                   tuple(_sentences(problem, verdict, stages, effects, steps, left, last, refused)),
                    "; ".join(dict.fromkeys(experiments)) or None,
                    _estimates(steps[-1].fitted.parameters, steps[-1], 0, len(problem.base)),
-                   tuple((c.term.key, c.probability) for c in first), _pictures(problem, steps, stages))
+                   tuple((c.term.key, c.probability) for c in first),
+                   (_picture(stages), problem.picture([step.judged.e for step in steps],
+                                                      [stage.stage for stage in stages])))
 
 
 def _references(problem: AxisProblem, step: Step, rng: np.random.Generator) -> list[_Reference]:
@@ -109,9 +110,64 @@ def _estimates(parameters: Sequence[AxisParameter], step: Step, start: int, stop
                  for j in range(start, stop))
 
 
-def _effect(step: Step) -> AxisEffect:
-    assert step.named is not None
-    count = len(step.fitted.parameters) - len(step.named.term.parameters_count)
-    return AxisEffect(step.named.term.name, step.named.term.location,
-                      _estimates(step.fitted.parameters, step, count, len(step.fitted.parameters)),
-                      step.named.probability, tuple(c.term.key for c in step.rivals))
+def _effects(problem: AxisProblem, steps: Sequence[Step]) -> tuple[AxisEffect, ...]:
+    """Each with its parameters in the last model, where all are fitted together."""
+    found, at = [], len(problem.base)
+    for step in steps[1:]:
+        assert step.named is not None
+        stop = at + len(step.named.term.parameters(problem))
+        found.append(AxisEffect(step.named.term.name, step.named.term.location,
+                                _estimates(steps[-1].fitted.parameters, steps[-1], at, stop), step.named.probability,
+                                tuple(c.term.key for c in step.rivals)))
+        at = stop
+    return tuple(found)
+
+
+def _sentences(problem: AxisProblem, verdict: str, stages: Sequence[AxisStage], effects: Sequence[AxisEffect],
+               steps: Sequence[Step], left: Sequence[_Reference], last: Sequence[Candidate], refused: str
+               ) -> list[str]:
+    said = [_answer(verdict, stages, effects, steps)]
+    for step in steps[1:]:
+        if step.rivals and step.named:
+            rivals = " or ".join(f"{c.term.words} ({100 * c.probability:.0f} %)" for c in step.rivals)
+            said.append(f"{step.named.term.name}: these data cannot tell it from {rivals}; what would: "
+                        f"{step.named.term.separated_by}.")
+    if stages[-1].chi2_per_dof is not None:
+        said.append(f"What is left on unseen data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured noise.")
+    else:
+        said.append("Nothing in these data repeats, so that the noise is not measured: what is left is compared with "
+                    "models without physics alone.")
+    for one in left:
+        told = f"leaves {one.ratio:.2f} times less" if one.ratio > 1 else "predicts no better"
+        said.append(f"A model without physics ({one.name}) on top {told} on unseen data"
+                    + (", certainly." if one.certain else ", which may be chance."))
+    if refused:
+        said.append(refused + ".")
+    lost = [f"{c.term.key} {c.refused}" for c in last if c.gain > 0 and c.refused][:3]
+    if lost:
+        said.append("Not named: " + "; ".join(lost) + ".")
+    return said
+
+
+def _answer(verdict: str, stages: Sequence[AxisStage], effects: Sequence[AxisEffect], steps: Sequence[Step]) -> str:
+    first, last = 100 * stages[0].nrmse, 100 * stages[-1].nrmse
+    if verdict == "none":
+        return f"Nothing is missing that these data can show: the base model leaves {first:.3g} % on unseen data."
+    if not effects:
+        return (f"The base model leaves {first:.3g} % on unseen data, significantly more than a model without physics "
+                "or the noise, and no effect of the library accounts for it: unexplained.")
+    names = []
+    for effect, step in zip(effects, steps[1:], strict=True):
+        sizes = ", ".join(f"{p.name} {p.value:.4g} +- {p.std:.2g} {p.unit}".rstrip() for p in effect.parameters)
+        words = step.named.term.words if step.named else ""
+        names.append(f"{words} ({effect.name} at {effect.location}: {sizes}; probability {effect.probability:.2f})")
+    tail = "" if verdict == "explained" else ", and something more is missing that the library does not hold"
+    return (f"The model lacks {'; then '.join(names)}; with that the gap on unseen data falls from {first:.3g} % to "
+            f"{last:.3g} %{tail}.")
+
+
+def _picture(stages: Sequence[AxisStage]) -> Picture:
+    at = np.arange(len(stages), dtype=float)
+    return Picture("Gap on unseen data", "stage", "error over measured [%]",
+                   (Series("left", at, np.array([100 * stage.nrmse for stage in stages]), "bars"),), (), "linear", "log",
+                   tuple(stage.stage for stage in stages))
