@@ -103,7 +103,7 @@ _kept: list[tuple[TableModel, int, float, LineResponse]] = []
 
 
 def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> LineResponse:
-    """The linear part of a model for records of one length; the last two are kept.
+    """The linear part of a model for records of one length; the last one is kept.
 
     Raises
     ------
@@ -119,9 +119,9 @@ def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> Lin
         raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", field="sample_rate_Hz",
                          value=sample_rate_Hz)
     padded = scipy.fft.next_fast_len(max(2 * samples, samples + int(np.ceil(QUIET_s * sample_rate_Hz))), True)
+    _kept.clear()  # first, so that two never lie in memory
     found = _formed(model, samples, padded, sample_rate_Hz)
     _kept.append((model, samples, sample_rate_Hz, found))
-    del _kept[:-2]
     return found
 
 

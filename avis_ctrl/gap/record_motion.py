@@ -94,11 +94,12 @@ def _volts_and_deflection(record: Record, linear: TableModel) -> tuple[np.ndarra
     x = lines.motion(lines.drive(u, floor))
     deflection = lines.in_time(lines.deflection(x, floor))
     rows = [h.y_names.index(name) for name in linear.sensors.names if name in h.y_names]
-    if not rows or not deflection.size:
+    if not rows or not deflection.size:  # nothing measured, or a rig without mounts of their own
         return u, deflection
     seen = np.array([name in h.y_names for name in linear.sensors.names])
     left = record.y[:, rows] - lines.in_time(lines.sensed(x, u))[:, seen]
-    return u, deflection + _unmodelled(left - left.mean(0), lines, seen)
+    left = left - left.mean(0)
+    return u, deflection + _unmodelled(left, lines, seen) if np.any(left) else deflection
 
 
 def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.ndarray:

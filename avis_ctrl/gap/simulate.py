@@ -123,7 +123,8 @@ def _answer(lines: LineResponse, mass: np.ndarray) -> Answer:
     for known, found in _answers:
         if known is lines:
             return found
-    _answers[:] = [(lines, Answer(lines, mass))]
+    _answers.clear()
+    _answers.append((lines, Answer(lines, mass)))
     return _answers[0][1]
 
 

@@ -327,3 +327,30 @@ def test_where_the_motors_and_mounts_are():
     np.testing.assert_array_equal(one.driven_rows, Table(RIG).motor_rows)
     np.testing.assert_array_equal(one.vertical, np.arange(12) % 3 == 2)
     np.testing.assert_allclose(one.rows, np.vstack(Table(RIG).maps), atol=1e-12)
+
+
+@pytest.mark.parametrize("samples", [2, 50, 3000])
+@pytest.mark.parametrize("rms", [0.0, 1e-3])
+def test_records_at_rest_and_short_ones(samples, rms):
+    """Noise of the sensors alone moves no mount by more than they could have felt of it."""
+    y = rms * np.random.default_rng(1).standard_normal((samples, 6))
+    model = with_effect("contact_friction", "actuators", [3e4, 1e-6])
+    model = with_effect("cubic_stiffness", "isolators z", [1e13], model)
+    model = model.with_effect(active(LargeMotion(), model, "payload", [1.0, 0.0, 0.0]))
+    found = motion_of(Campaign("avis", (record_of(np.zeros((samples, 8)), y),)), model)["00"]
+    assert np.max(np.abs(found.deflection)) <= rms * 1e-4
+    still = simulate(model, np.zeros((samples, 8)), None, FS)
+    assert not np.any(still.y)
+    assert not np.any(still.deflection)
+
+
+def test_a_rig_without_mounts_by_name():
+    rig = load_rig("halcyonics")
+    model = TableModel(ResponseModel.of(rig, ()))
+    rate = rig.sample_rate_Hz
+    u = 0.1 * np.random.default_rng(3).standard_normal((2000, len(model.actuators)))
+    found = simulate(model, u, None, rate)
+    assert found.deflection.shape == (2000, 0)
+    header = RecordHeader("00", rate, 2000, model.actuators, model.sensors.names, "noise")
+    motion = motion_of(Campaign(rig.name, (Record(header, u, found.y),)), model)["00"]
+    assert motion.deflection.shape == (2000, 0)
