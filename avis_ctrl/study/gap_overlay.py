@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from avis_ctrl.errors import AvisError, InputError
+from avis_ctrl.errors import AvisError, ComputationError, InputError
+from avis_ctrl.gap.simulate import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.campaign_fit import driven_inputs, excited_band
-from avis_ctrl.identification.overlays import measured_response
-from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.identification.model_error import HALF_WIDTHS
+from avis_ctrl.identification.overlays import POINTS
+from avis_ctrl.measurement.campaign import Campaign, Record
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
+from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 
+# What a method begins with that measures beside a model.
+BESIDE = "response of the model with what it leaves: "
 # Levels within this factor are one; what depends on amplitude is not averaged over them.
 SAME_LEVEL = 1.25
 
@@ -72,16 +79,65 @@ def selections(campaign: Campaign) -> list[Campaign]:
 
 
 def _overlay(records: Campaign, baseline: TableModel, updated: TableModel) -> GapOverlay:
-    measured = measured_response(records, excited_band(records), baseline.base)
+    linear = replace(updated, effects=tuple(one for one in updated.effects if not one.effect.nonlinear))
+    measured = _measured(records, excited_band(records), linear)
     if missing := [name for name in measured.inputs if name not in baseline.inputs]:
         raise InputError(f"the model's inputs are {', '.join(baseline.inputs)}", field="inputs", value=missing)
-    columns = [baseline.inputs.index(name) for name in measured.inputs]
     rows = [measured.outputs.index(name) for name in baseline.sensors.names]
-    U = np.broadcast_to(np.eye(len(baseline.inputs), dtype=complex)[:, columns],
-                        (len(measured.omega), len(baseline.inputs), len(columns)))
-    before, after = (model.driven(measured.omega, U, False).Y for model in (baseline, updated))
+    before, after = (_response(model, measured) for model in (baseline, linear))
+    value = measured.value[:, rows] + (after if measured.method.startswith(BESIDE) else 0.0)
     return GapOverlay(measured.frequency_Hz, tuple(measured.inputs), baseline.sensors.names,
-                      f"{measured.output_unit} per {measured.input_unit}", measured.value[:, rows],
+                      f"{measured.output_unit} per {measured.input_unit}", value,
                       measured.standard_deviation[:, rows] / np.sqrt(2), before, after,
                       tuple(r.header.name for r in records.records), measured.method,
                       tuple(one.effect.name for one in updated.effects if one.effect.nonlinear))
+
+
+def _response(model: TableModel, like: FrequencyResponse) -> np.ndarray:
+    """(n, n_y, n_u) from the inputs of a measured response."""
+    columns = [model.inputs.index(name) for name in like.inputs]
+    U = np.broadcast_to(np.eye(len(model.inputs), dtype=complex)[:, columns],
+                        (len(like.omega), len(model.inputs), len(columns)))
+    return model.driven(like.omega, U, False).Y
+
+
+def _measured(records: Campaign, band_Hz: tuple[float, float], model: TableModel) -> FrequencyResponse:
+    """The best linear approximation where the records allow one; otherwise what the model leaves of the records,
+    regressed on the inputs: of the records themselves the windows would round off the resonances."""
+    try:
+        found = best_linear_approximation(records, band_Hz=band_Hz)
+        keep = np.searchsorted(found.frequency_Hz, np.geomspace(found.frequency_Hz[0], found.frequency_Hz[-1], POINTS))
+        return found.at(np.unique(np.clip(keep, 0, len(found.frequency_Hz) - 1)))
+    except AvisError:
+        left = replace(records, records=tuple(_left(one.load(), model) for one in records.records))
+        step = 1 / min(one.header.duration_s for one in records.records)
+        low, high = np.ceil(band_Hz[0] / step - 1e-9) * step, np.floor(band_Hz[1] / step + 1e-9) * step
+        if not 0 < low < high:
+            raise InputError("expected a band with lines of every record", field="band_Hz", value=band_Hz) from None
+        grid = np.clip(np.geomspace(low, high, min(POINTS, round((high - low) / step) + 1)), low, high)
+        found = _regressed(left, band_Hz, grid)
+        return replace(found, method=f"{BESIDE}{found.method}")
+
+
+def _left(record: Record, model: TableModel) -> Record:
+    """A record less what the model reads in it, from rest at its start."""
+    h = record.header
+    for field, wanted, there in (("y", model.sensors.names, h.y_names), ("u", model.actuators, h.u_names)):
+        if missing := [name for name in wanted if name not in there]:
+            raise InputError(f"the record has {', '.join(there)}", field=f"record {h.name}: {field} names",
+                             value=missing)
+    y = record.y.copy()
+    u = record.u[:, [h.u_names.index(name) for name in model.actuators]]
+    y[:, [h.y_names.index(name) for name in model.sensors.names]] -= simulate(
+        model, u, record.floor, h.sample_rate_Hz, start_s=h.start_s).y
+    return replace(record, y=y)
+
+
+def _regressed(left: Campaign, band_Hz: tuple[float, float], grid: np.ndarray) -> FrequencyResponse:
+    """Windows grow until the inputs can be told apart in each."""
+    for half_width in HALF_WIDTHS[:-1]:
+        try:
+            return local_polynomial(left, band_Hz=band_Hz, frequency_Hz=grid, half_width=half_width)
+        except ComputationError:
+            continue
+    return local_polynomial(left, band_Hz=band_Hz, frequency_Hz=grid, half_width=HALF_WIDTHS[-1])

@@ -10,7 +10,7 @@ from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, S
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
-from avis_ctrl.study.gap_overlay import GapOverlay, gap_overlay
+from avis_ctrl.study.gap_overlay import BESIDE, GapOverlay, gap_overlay
 
 BEFORE, AFTER, NOISE = Style("#d55e00", "dash", 1.8), Style("#0072b2", "solid", 2.0), Style("#7a7a7a", "dot", 1.6)
 PAIRS, MOST_POINTS = 3, 70
@@ -110,6 +110,11 @@ def responses(seen: GapOverlay, named: bool) -> list[Piece]:
     text = (f"Frequency responses, measured from records {', '.join(seen.records)}, those that were fitted among them: "
             f"{seen.method}. Shown are the {len(pairs)} paths on which the re-identified model is furthest off, in "
             "standard deviations of the measured response; no two have the same output.")
+    if seen.method.startswith(BESIDE):
+        text += (f" The records allow no response that is measured without a model: the points are the "
+                 f"{'updated' if named else 're-identified'} model's response plus what it leaves in the records, "
+                 "regressed on the inputs. An error narrower than a window of lines does not show here, but in the "
+                 "residual above.")
     if seen.left_out:
         names = words.joined(list(map(wording.titled, seen.left_out)))
         text += (f" The drawn response of the updated model is without {names}: what depends on amplitude or time has "
