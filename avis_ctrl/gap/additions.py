@@ -175,16 +175,16 @@ def _structural(table: Table, place: str, values: Mapping[str, float]) -> StateS
 def ladder(power: float) -> tuple[float, list[tuple[float, float]]]:
     """(s/w_ref)^power as rest + sum of ratio s/(s + w), all ratios positive: (rest, [(w, ratio)]).
 
-    As few branches, evenly spaced in log w, as keep the error below LADDER_ERROR in LADDER_Hz. Positive ratios make
-    it passive.
+    As few branches, evenly spaced in log w within and beyond the band, as keep the error below LADDER_ERROR in
+    LADDER_Hz. Positive ratios make it passive.
     """
     f = np.geomspace(*LADDER_Hz, 200)
     s = 2j * np.pi * f
     wanted = (s / (2 * np.pi * REFERENCE_Hz)) ** power
     if power == 0:
         return 1.0, []
-    for count in range(2, 24):
-        w = 2 * np.pi * np.geomspace(LADDER_Hz[0] / 3, LADDER_Hz[1] * 3, count)
+    for count, reach in ((count, reach) for count in range(2, 24) for reach in (3.0, 10.0, 30.0)):
+        w = 2 * np.pi * np.geomspace(LADDER_Hz[0] / reach, LADDER_Hz[1] * reach, count)
         basis = np.column_stack([np.ones(len(s)), s[:, None] / (s[:, None] + w)]) / wanted[:, None]
         found, _ = nnls(np.vstack([basis.real, basis.imag]), np.concatenate([np.ones(len(s)), np.zeros(len(s))]))
         if np.max(np.abs(basis @ found - 1)) < LADDER_ERROR:

@@ -145,7 +145,7 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
         except ComputationError as error:
             notes.append(f"No controller was found for the updated model: {error}")
     realised = realise(updated)
-    files, in_files, not_in_files = _files(design, updated, when)
+    files, in_files, not_in_files = start_files(design, updated, when)
     words = (*_outcome(before, after, new), *notes,
              *_told(realised, design, new_rig, updated, when, in_files, not_in_files))
     return DesignEffect(before, after, new, K, K_new, realised, in_files, not_in_files, files, words,
@@ -200,7 +200,9 @@ def _dB(value: float) -> float:
     return float(20 * np.log10(value)) if value > 0 else -float("inf")
 
 
-def _files(design: Design, model: TableModel, when: float) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
+def start_files(design: Design, model: TableModel, when: float = 0.0
+                ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
+    """rig.toml and design.toml of a model by name, labels of the effects that they hold, and of those they do not."""
     found = carried(design, model, when)
     held = ", ".join(found.inside) or "none"
     header = f"{found.rig.name}, updated by avis gap\neffects in this folder's rig.toml and design.toml: {held}"

@@ -1,0 +1,225 @@
+"""What effects do to a design: the plant around them, the files that carry them, mu before and after."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.lti.connect import lft_lower, lft_upper
+from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.study.controllers import classical_skyhook
+from avis_ctrl.study.design_file import read_study
+from avis_ctrl.study.gap_design import PARAMETERS_PERCENT, compare_designs, design_effect, figures, start_files
+from avis_ctrl.study.gap_plant import carried, plant_of, six_dof_is_stable
+from avis_ctrl.study.identification_design import default_design
+from avis_ctrl.study.plant import build_plant
+from avis_ctrl.uncertainty.blocks import RealScalar
+
+ROOT = Path(__file__).resolve().parents[2]
+OMEGA = 2 * np.pi * np.geomspace(0.2, 150.0, 60)
+LAG_40_HZ = ("actuator_lag", "actuators", (1 / (2 * np.pi * 40),))
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return load_rig("avis")
+
+
+@pytest.fixture(scope="module")
+def baseline(rig):
+    return TableModel(ResponseModel.of(rig, ("mass",)))
+
+
+@pytest.fixture(scope="module")
+def design(rig):
+    return default_design(rig, "z and phi_x", PARAMETERS_PERCENT)
+
+
+def with_one(model: TableModel, name: str, place: str, values) -> TableModel:
+    return replace(model, effects=(*model.effects, active(library()[name], model, place, values)))
+
+
+def response(plant) -> np.ndarray:
+    return plant.full.P.frequency_response(OMEGA)
+
+
+def same(a: np.ndarray, b: np.ndarray, share: float = 1e-8) -> bool:
+    """Entry by entry, against the largest of each entry over frequency."""
+    return bool(np.all(np.abs(a - b).max(axis=0) <= share * np.abs(b).max(axis=0) + 1e-10 * np.abs(b).max()))
+
+
+def test_default_is_the_design_of_the_repository(rig, design):
+    written, _ = read_study(ROOT / "designs" / "avis_z_phix.toml")
+    assert written.uncertainty == design.uncertainty and written.transmissibility == design.transmissibility
+    assert written.control_effort == design.control_effort and written.loop == design.loop
+
+
+def test_without_effects_it_is_the_plant_of_the_design(rig, baseline, design):
+    plant, asked, table = plant_of(design, baseline)
+    assert asked == design and table == rig
+    assert same(response(plant), response(build_plant(design, rig)), 0.0)
+
+
+@pytest.mark.parametrize("name, place, values", [
+    ("com_offset", "payload", (0.0, 0.0, 0.0)), ("sensor_gain", "Sz1", (1.0,)),
+    ("mount_relaxation", "isolators z", (0.0, 3.0)), ("attached_oscillator", "payload/z", (0.0, 12.0, 0.05, 0.1, 0.1)),
+    ("tilt_coupling", "horizontal geophones", (0.0,)),
+    ("structural_damping", "isolators/causal", (0.0,)), ("mount_surge", "isolators z", (0.0, 0.5, 0.0)),
+    ("base_compliance", "chassis/rocking", (1e12, 90.0, 90.0, 0.05, 90.0, 1e3))])
+def test_effects_without_strength_leave_the_plant(baseline, design, name, place, values):
+    plant, _, _ = plant_of(design, with_one(baseline, name, place, values))
+    # A chassis that is heavy enough still filters the floor, by design.
+    rows = slice(None)
+    before = response(plant_of(design, baseline)[0])
+    if name == "base_compliance":
+        rows = [k for k, n in enumerate(plant.full.P.inputs) if not n.startswith("floor")]
+    assert same(response(plant)[:, :, rows], before[:, :, rows], 1e-6)
+
+
+def test_a_sensor_gain_is_seen_through_the_decoding(baseline, design):
+    """Closed form: seen = (I + decoding (g - 1) e_k row_k) seen before, noise apart."""
+    plain, _, _ = plant_of(design, baseline)
+    plant, _, _ = plant_of(design, with_one(baseline, "sensor_gain", "Sz2", (1.25,)))
+    k = plain.sensors.index("Sz2")
+    _, rows = baseline.rig.sensor_rows()
+    row = rows[k][[2, 3]] / np.array([1.0, baseline.rig.edge_m])
+    mixing = np.eye(2) + 0.25 * np.outer(plain.decoding[:, k], row)
+    seen, volts = list(plain.full.y), list(plain.full.u)
+    before = plain.full.P.select(seen, volts).frequency_response(OMEGA)
+    assert np.allclose(plant.full.P.select(seen, volts).frequency_response(OMEGA), mixing @ before, rtol=1e-9)
+
+
+def test_the_controller_keeps_its_allocation(rig, baseline, design):
+    """A motor that pushes harder than the controller knows pushes harder."""
+    plain, _, _ = plant_of(design, baseline)
+    constant = rig.parameters()["actuator.Az1"].value
+    stronger = replace(baseline, base=replace(baseline.base, rig=rig.with_parameters({"actuator.Az1": 2 * constant})))
+    plant, _, _ = plant_of(design, stronger, plain.allocation)
+    gained, _, _ = plant_of(design, with_one(baseline, "actuator_gain", "Az1", (2.0,)))
+    assert same(response(plant), response(gained))
+    assert not same(response(plant), response(plain), 1e-2)
+
+
+def moved(plant, size: float) -> np.ndarray:
+    """Response of one table of the design's set: every real delta at `size`."""
+    P, blocks = plant.full.P, plant.full.blocks
+    real = np.concatenate([np.full(b.rows, size if isinstance(b, RealScalar) else 0.0) for b in blocks.blocks])
+    return lft_upper(P, np.diag(real)).frequency_response(OMEGA)
+
+
+@pytest.mark.parametrize("name, place, values, seen", [
+    (*LAG_40_HZ, True), ("loop_delay", "loop", (3e-3,), True), ("com_offset", "payload", (0.01, 0.03, -0.02), True),
+    ("product_of_inertia", "Jxy", (4.0,), False), ("contact_friction", "actuators", (6e3, 1e-5), True),
+    ("actuator_saturation", "actuators", (2.0,), True)])
+def test_the_files_hold_what_they_say(baseline, design, tmp_path, name, place, values, seen):
+    """The plant that `avis design` makes of rig.toml and design.toml is the updated one."""
+    model = with_one(baseline, name, place, values)
+    files, inside, outside = start_files(design, model, 0.0)
+    assert inside == (f"{name}@{place}",) and outside == ()
+    for file, text in files.items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    plant, updated = build_plant(*read_study(tmp_path / "design.toml")), plant_of(design, model)[0]
+    assert same(moved(plant, 0.0), moved(updated, 0.0))
+    # In the file the friction is stiffness like any other, so that its range in per cent covers it too.
+    assert same(moved(plant, 0.7), moved(updated, 0.7)) or name == "contact_friction"
+    # z and phi_x alone do not feel a product of inertia.
+    assert same(moved(plant, 0.0), moved(plant_of(design, baseline)[0], 0.0), 1e-3) == (not seen)
+
+
+def test_gains_in_the_files_are_known_to_the_controller(baseline, design):
+    model = with_one(with_one(baseline, "sensor_gain", "Sz1", (1.2,)), "actuator_gain", "Az1", (0.8,))
+    found = carried(design, model)
+    old = baseline.rig
+    assert found.rig.geophones.sensitivity_Vs_per_m[found.rig.geophones.names.index("Sz1")] == pytest.approx(
+        1.2 * old.geophones.sensitivity_Vs_per_m[old.geophones.names.index("Sz1")])
+    assert found.rig.parameters()["actuator.Az1"].value == pytest.approx(0.8 * old.parameters()["actuator.Az1"].value)
+
+
+def test_drift_is_carried_at_the_moment_asked(baseline, design):
+    found = carried(design, with_one(baseline, "stiffness_drift", "isolators", (0.2,)), -0.5)
+    old = baseline.rig.parameters()["isolator2.k_z"].value
+    assert found.rig.parameters()["isolator2.k_z"].value == pytest.approx(0.9 * old)
+
+
+def test_files_say_what_they_do_not_hold(baseline, design):
+    found = carried(design, with_one(baseline, "mount_relaxation", "isolators z", (0.4, 3.0)))
+    assert found.inside == () and found.outside == ("mount_relaxation@isolators z",)
+
+
+def test_two_ways_to_the_same_limit_of_stability(rig, baseline, design):
+    """Delay that a skyhook survives: on the design's plant, and on six coordinates through every channel's chain."""
+    plain, asked, _ = plant_of(design, baseline)
+    K = classical_skyhook(plain, rig, design).K
+    assert six_dof_is_stable(asked, baseline, plain, K) and plain.full.closed(K).is_stable()
+
+    def stable(ms: float) -> tuple[bool, bool]:
+        model = with_one(baseline, "loop_delay", "loop", (1e-3 * ms,))
+        plant, own, _ = plant_of(design, model, plain.allocation)
+        return plant.full.closed(K).is_stable(), six_dof_is_stable(own, model, plant, K)
+
+    def limit(way: int) -> float:
+        low, high = 0.0, 60.0
+        while high - low > 0.2:
+            middle = (low + high) / 2
+            low, high = (middle, high) if stable(middle)[way] else (low, middle)
+        return low
+    first, second = limit(0), limit(1)
+    assert 0.5 < first < 59 and second == pytest.approx(first, rel=0.15)
+
+
+def test_an_unstable_loop_has_no_figures(rig, baseline, design):
+    plain, asked, _ = plant_of(design, baseline)
+    K = -classical_skyhook(plain, rig, design).K.scaled(3.0)
+    assert not lft_lower(plain.full.P, K).is_stable()
+    found = figures(asked, baseline, plain, K)
+    assert not found.stable and not found.stable_in_six and found.mu_upper == np.inf
+
+
+def test_refusals(baseline, design, tmp_path):
+    path = tmp_path / "design.toml"
+    path.write_text("title = 1\n", encoding="utf-8")
+    with pytest.raises(InputError):
+        design_effect(SimpleNamespace(baseline=baseline, updated=baseline), path)
+    by_name = design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
+        update={"identified": "uncertainty.json"})})
+    with pytest.raises(InputError, match="set by hand"):
+        design_effect(SimpleNamespace(baseline=baseline, updated=baseline), by_name)
+    halcyonics = TableModel(ResponseModel.of(load_rig("halcyonics"), ("mass",), unit="m/s"))
+    with pytest.raises(InputError, match="give a design file"):
+        design_effect(SimpleNamespace(baseline=halcyonics, updated=halcyonics))
+
+
+@pytest.mark.slow
+def test_an_amplifier_lag_costs_the_controller_and_a_new_one_wins_it_back(baseline):
+    found = design_effect(SimpleNamespace(baseline=baseline, updated=with_one(baseline, *LAG_40_HZ)))
+    assert found.before.stable and found.mu_before < 1
+    assert found.mu_after > 1.1 * found.mu_before
+    assert found.mu_new < 0.95 * found.mu_after
+    for one in (found.before, found.after, found.new):
+        assert one.mu_lower <= one.mu_upper <= 1.05 * one.mu_lower
+        assert one.peak_dB <= one.worst_peak_dB and one.band_dB <= one.worst_band_dB and one.stable_in_six
+    assert "robust performance is lost" in found.sentences[0]
+    assert "amplifier_corner_Hz = 40" in found.files["design.toml"]
+
+
+@pytest.mark.slow
+def test_an_effect_that_does_nothing_leaves_mu(baseline, design):
+    lines = []
+    found = compare_designs(baseline, with_one(baseline, "mount_relaxation", "isolators z", (0.0, 3.0)), design,
+                            lines.append)
+    assert found.mu_after == pytest.approx(found.mu_before, rel=1e-2)
+    assert "does not matter" in found.sentences[0] and len(lines) == 5
+
+
+@pytest.mark.slow
+def test_nothing_named_nothing_compared(baseline, design):
+    found = compare_designs(baseline, baseline, design)
+    assert found.after is None and found.mu_new is None and "nothing else was computed" in found.sentences[0]
