@@ -80,6 +80,9 @@ class DriveData:
                                    level / np.sqrt(np.mean(self.a ** 2))),
                      AxisParameter("Fv", "N s/m", level / self.speed / 2, -np.inf, np.inf, level / self.speed))
         self.splits = self._halves()
+        self.notes = () if self.repeats_s is None else (
+            f"The motion repeats every {self.repeats_s:.4g} s; the force scatters by {np.sqrt(self.noise or 0):.3g} N from "
+            "one repetition to the next, which is the measured noise.",)
 
     def filtered(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(signal.sosfiltfilt(self.sections, x))

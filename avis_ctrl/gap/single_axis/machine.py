@@ -33,7 +33,7 @@ class AxisProblem(Protocol):
     base : parameters of the base model. block : (n,) block of each row. runs : rows in natural order (time, frequency),
     each an index array, for the correlation of residuals. size : (n,) r.m.s. of what was measured, row by row.
     noise : mean square of the measured noise in the rows, None where nothing tells it. splits : halves of the data
-    whose parameters must agree: name, blocks of one, blocks of the other.
+    whose parameters must agree: name, blocks of one, blocks of the other. notes : sentences on the data.
     """
 
     kind: str
@@ -43,6 +43,7 @@ class AxisProblem(Protocol):
     size: np.ndarray
     noise: float | None
     splits: Sequence[tuple[str, np.ndarray, np.ndarray]]
+    notes: Sequence[str]
 
     def residual(self, terms: Sequence[Term], theta: np.ndarray) -> np.ndarray:
         """(n,) measured less predicted, theta of the base first, then of each term."""

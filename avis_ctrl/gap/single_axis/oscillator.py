@@ -39,7 +39,8 @@ class OscillatorData:
     """
 
     kind = "oscillator"
-    noise = None
+    noise: float | None = None
+    notes: tuple[str, ...] = ("The state at both ends of every block is free, on unseen blocks too.",)
 
     def __init__(self, u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz: tuple[float, float] | None = None):
         u, y = np.asarray(u, float).ravel(), np.asarray(y, float).ravel()

@@ -8,7 +8,7 @@ of the summed log scores, averaged over draws. A candidate that wins by one luck
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -114,7 +114,7 @@ def _candidates(problem: AxisProblem, steps: Sequence[Step], library: Sequence[T
                         _too_small(float(g.sum()), float(s), least))
               for c, g, w, s in zip(found, gain, weight, sure, strict=True)]
     judged.sort(key=lambda c: (-c.probability, -c.gain))
-    return tuple(_checked(problem, judged, len(now.theta)))
+    return tuple(_checked(problem, _without_limits(judged, len(now.theta)), len(now.theta)))
 
 
 def _added(problem: AxisProblem, now: Fitted, term: Term) -> Candidate:
@@ -138,20 +138,32 @@ def _too_small(gain: float, sure: float, least: float) -> str:
     return ""
 
 
+def _without_limits(candidates: list[Candidate], first: int) -> list[Candidate]:
+    """A rival whose best parameters lie at the limit of what is physical is no rival; where the leader's do, nobody
+    takes its place: the second best of a wrong explanation is no explanation."""
+    limit = "a parameter ends at the limit of its physical range"
+    ended = [c.fitted.at_bound(first) for c in candidates]
+    if ended[0] and not candidates[0].refused:
+        return [replace(c, refused=c.refused or (limit if end else "less probable than what leads"))
+                for c, end in zip(candidates, ended, strict=True)]
+    left = sum(c.probability for c, end in zip(candidates, ended, strict=True) if not end)
+    whole = sum(c.probability for c in candidates)
+    kept = [replace(c, probability=0.0 if end else c.probability * whole / max(left, 1e-300),
+                    refused=c.refused or (limit if end else "")) for c, end in zip(candidates, ended, strict=True)]
+    return sorted(kept, key=lambda c: (-c.probability, -c.gain))
+
+
 def _checked(problem: AxisProblem, candidates: list[Candidate], first: int) -> list[Candidate]:
-    """The leader must be physical and agree with itself; where it does not, no other takes its place unless it is in
-    the same credible set: the second best of a wrong explanation is no explanation."""
+    """The leader must agree with itself; where it does not, only a member of the same credible set takes its place."""
     found, held = [], 0.0
     for c in candidates:
         reason = c.refused
         if not reason and held >= CREDIBLE:
             reason = "less probable than what leads"
-        if not reason and c.fitted.at_bound(first):
-            reason = "a parameter ends at the limit of its physical range"
         if not reason:
             reason = disagreement(problem, c.fitted, first)
         held += c.probability
-        found.append(Candidate(c.term, c.fitted, c.judged, c.gain, c.probability, reason))
+        found.append(replace(c, refused=reason))
     return found
 
 

@@ -141,6 +141,12 @@ def _sentences(problem: AxisProblem, verdict: str, stages: Sequence[AxisStage], 
         told = f"leaves {one.ratio:.2f} times less" if one.ratio > 1 else "predicts no better"
         said.append(f"A model without physics ({one.name}) on top {told} on unseen data"
                     + (", certainly." if one.certain else ", which may be chance."))
+    if len(effects) > 1:
+        power = [stage.nrmse ** 2 for stage in stages]
+        said.append("Of the squared error of the base model, " + ", ".join(
+            f"{effect.name} takes {100 * (power[k] - power[k + 1]) / power[0]:.3g} %" for k, effect in enumerate(effects))
+            + ".")
+    said += problem.notes
     if refused:
         said.append(refused + ".")
     lost = [f"{c.term.key} {c.refused}" for c in last if c.gain > 0 and c.refused][:3]
