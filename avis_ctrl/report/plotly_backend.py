@@ -133,7 +133,8 @@ def _axis(axis: Axis, limits: tuple[float, float] | None) -> dict[str, Any]:
         found |= {"tickvals": values, "ticktext": text, "tickmode": "array"}
     if axis.ticks:
         found |= {"tickvals": [place for place, _ in axis.ticks], "tickmode": "array",
-                  "ticktext": [_text(word) for _, word in axis.ticks]}
+                  # Names in several rows keep theirs; a name put into a lower row does not need it here.
+                  "ticktext": [_text(word.strip("\n")).replace("\n", "<br>") for _, word in axis.ticks]}
     if axis.silent:
         found |= {"showticklabels": False, "title": {"text": ""}}
     return found

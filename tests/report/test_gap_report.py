@@ -301,3 +301,10 @@ def test_text_from_files_is_never_markup(found, html, tmp_path):
 
 def test_same_input_same_page(found, html):
     assert gap_html(found) == html
+
+
+def test_long_names_of_stages_stand_in_rows(found):
+    stages = (*found.gap.stages, Stage("mount_relaxation", 0.0102, 1.01))
+    drawn = figures(section(replace(found, gap=replace(found.gap, stages=stages)), "before_after"))["ladder"]
+    assert drawn.panels[0].x.ticks[-1][1] == "+ mount\nrelaxation"
+    assert graph(drawn)["layout"]["xaxis"]["ticktext"][-1] == "+ mount<br>relaxation"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import numpy as np
 
 from avis_ctrl.gap.result import Gap, HeatMap
@@ -14,6 +16,8 @@ from avis_ctrl.study.gap_overlay import BESIDE, GapOverlay, gap_overlay
 
 BEFORE, AFTER, NOISE = Style("#d55e00", "dash", 1.8), Style("#0072b2", "solid", 2.0), Style("#7a7a7a", "dot", 1.6)
 PAIRS, MOST_POINTS = 3, 70
+# Of a row of a stage's name under its bar, so that four stand beside each other on a phone.
+LETTERS = 13
 
 
 def before_after(found: Found) -> Section:
@@ -77,12 +81,12 @@ def ladder(gap: Gap) -> Figure:
     bars = Curve(place, np.where(np.isfinite(values) & (values > 0), values, np.nan), "error of the model",
                  Style("#8fbbdc"), line=False, bars=0.6)
     lines = [level(-0.5, len(values) - 0.5, noise, "noise alone", STYLES["limit"])] if noise > 0 else []
-    ticks = tuple((float(k), rung(one.name, k)) for k, one in enumerate(gap.stages))
+    ticks = tuple((float(k), textwrap.fill(rung(one.name, k), LETTERS)) for k, one in enumerate(gap.stages))
     return Figure("ladder", "The ladder of stages: normalised r.m.s. error on held-out data, and what noise alone "
                   "would leave. Logarithmic.",
-                  (Panel(Axis("stage", "linear", (-0.6, len(values) - 0.4), ticks),
+                  (Panel(Axis("", "linear", (-0.6, len(values) - 0.4), ticks),
                          Axis("n.r.m.s. error [%]", "log", (float(limits[0]), float(limits[1]))), (bars, *lines)),),
-                  height=0.85)
+                  height=0.7)
 
 
 def rung(name: str, k: int) -> str:

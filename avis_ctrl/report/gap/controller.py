@@ -56,13 +56,13 @@ def _bounds(effect: DesignEffect) -> Figure:
     drawn = loops(effect)
     mu = np.array([one.mu_upper for _, _, one in drawn])
     place = np.arange(len(mu), dtype=float)
-    ticks = tuple((float(k), f"{who}, {model} model") for k, (who, model, _) in enumerate(drawn))
+    ticks = tuple((float(k), f"{who} on\n{model}") for k, (who, model, _) in enumerate(drawn))
     lost = " A loop without a bar is not stable." if not np.isfinite(mu).all() else ""
     top = 1.15 * max(1.0, float(np.max(mu[np.isfinite(mu)], initial=0.0)))
     bars = Curve(place, np.where(np.isfinite(mu), mu, np.nan), "upper bound of mu", Style("#8fbbdc"), line=False,
                  bars=0.5)
     return Figure("gap_mu", "Upper bound of mu, robust performance, of each controller on each model; below 1 every "
                   f"table of the set performs as asked.{lost}",
-                  (Panel(Axis("controller, model", "linear", (-0.6, len(mu) - 0.4), ticks),
+                  (Panel(Axis("", "linear", (-0.6, len(mu) - 0.4), ticks),
                          Axis("mu, upper bound [-]", "linear", (0.0, top)),
                          (bars, level(-0.5, len(mu) - 0.5, 1.0, "limit", STYLES["limit"]))),), height=0.7)
