@@ -41,9 +41,10 @@ def method(gap: Gap) -> Section:
         Paragraph("Selection. Significant candidates are refitted together with all parameters of the rig, and "
                   "compared by the Bayesian information criterion of the fit, with p combinations of parameters that n "
                   "data determine, and by the likelihood of data that no fit has seen. Probabilities follow from the "
-                  "sum, over the candidates that were refitted:"),
-        Formula("kappa = chi_\"fit\"^2 + p ln n + chi_\"held out\"^2, quad P_i = e^(-kappa_i slash 2) "
-                "slash sum_j e^(-kappa_j slash 2)",
+                  "sum, over the candidates that were refitted, all equal beforehand; where even the best one leaves "
+                  "more than noise, its chi-square per degree of freedom m (at least 1) divides the criteria:"),
+        Formula("kappa = chi_\"fit\"^2 + p ln n + chi_\"held out\"^2, quad P_i = e^(-kappa_i slash 2 m) "
+                "slash sum_j e^(-kappa_j slash 2 m)",
                 "the probability of candidate i is its share of the exponentials of minus half the criterion"),
         Paragraph("An effect is named only if the held-out data confirm it. Effects are added one by one until the "
                   "held-out residual is noise or nothing in the library helps. Error and noise in per cent:"),
