@@ -83,7 +83,8 @@ def find_axis_gap_in(kind: str, path: str | Path, columns: Mapping[str, str] | N
         if columns or scale:
             raise InputError("expected no columns and no scale: the names of the files say what they are",
                              field="columns", value=dict(columns or scale or {}))
-        return find_axis_gap(kind, campaign=read_levels(path, sample_rate_Hz), seed=seed, progress=progress)
+        return find_axis_gap(kind, campaign=read_levels(path, sample_rate_Hz), transient="none", seed=seed,
+                             progress=progress, **options)
     if kind not in PROBLEMS:
         raise InputError(f"expected one of {', '.join((*PROBLEMS, 'levels'))}", field="kind", value=kind)
     factors = dict(scale or {})
