@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -80,7 +80,9 @@ def _parted(record: RecordSource) -> tuple[RecordSource, RecordSource]:
     at = 2 * h.samples // 3
     if h.period_samples and h.periods >= 2:
         at = max(round(2 * h.periods / 3), 1) * h.period_samples
-    return Portion(record, 0, at), Portion(record, at, h.samples)
+    last = Portion(record, at, h.samples)
+    last.header = replace(last.header, name=f"{h.name} (end)")
+    return Portion(record, 0, at), last
 
 
 def blocks_of(campaign: Campaign, model: TableModel, band_Hz: tuple[float, float]) -> list[SpectralBlock]:
@@ -89,13 +91,14 @@ def blocks_of(campaign: Campaign, model: TableModel, band_Hz: tuple[float, float
     return [block for block in found if np.any(block.U)]
 
 
-def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, model: TableModel, band_Hz: tuple[float, float]
-               ) -> tuple[list[SpectralBlock], str]:
+def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campaign, model: TableModel,
+               band_Hz: tuple[float, float]) -> tuple[list[SpectralBlock], str]:
     """The blocks with noise that no error of the model's drives can enter, and a sentence.
 
     Of records at rest, and of the lines between the harmonics of periodic ones, first period left out: there u is
-    silent. Without either, of what a local polynomial model of the records leaves (Schoukens, Vandersteen, Barbe,
-    Pintelon 2009).
+    silent. Without either, of what a local polynomial model leaves (Schoukens, Vandersteen, Barbe, Pintelon 2009) of
+    `left`, the campaign less what the model predicts: whatever the model misses of the drives' response goes into the
+    local model, and that is smooth where the response itself is sharp.
 
     Raises
     ------
@@ -109,7 +112,7 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, model: Table
         key = (block.kind, len(block.omega))
         if key not in known:
             known[key] = (noise_from_residuals(quiet, [block], model=model)[0] if block.kind in kinds
-                          else _local(campaign, block, band_Hz))
+                          else _local(left, block, band_Hz))
         like = known[key]
         assert like.noise is not None
         found.append(block.with_noise(like.noise, like.dof))

@@ -13,6 +13,7 @@ follows the floor displacement w through H_w and recoils with B: zero and one on
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -127,9 +128,8 @@ class Operators:
         self.stiffness_factor, self.damping_factor = np.ones((1, n_g), complex), np.ones((1, n_g), complex)
         self.internal_mass, self.outer_damping, self.payload_share = np.zeros(n_g), np.zeros(n_g), np.full(n_g, 0.5)
         self.rows = base.matrices.R[None]
-        chain = base.sensors.chain
-        sense = np.ones(n, complex) if chain is None else chain.frequency_response(self.omega)[:, 0, 0]
-        self.sense = np.repeat((sense * self.s ** POWER[base.sensors.motion])[:, None], len(base.sensors.names), axis=1)
+        sense = chain_response(base, self.omega) * self.s ** POWER[base.sensors.motion]
+        self.sense = np.repeat(sense[:, None], len(base.sensors.names), axis=1)
         self.sensor_gain = np.ones(len(base.sensors.names))
         self.drive = np.ones((1, len(base.actuators)), complex)
         self.delay_s, self.amplifier_corner_Hz = base.delay_s, base.amplifier_corner_Hz
@@ -152,14 +152,45 @@ class Operators:
     def volts(self) -> tuple[np.ndarray, np.ndarray]:
         """(n, n_u) commanded volts to acting ones, and (n,) their aliases."""
         base, corner = self.base, self.amplifier_corner_Hz
-        if base.period_s:
-            a = hold(self.omega, base.period_s, self.delay_s)
-            folded = aliases(self.omega, base.period_s, self.delay_s, base.sensors.motion, corner)
-        else:
-            a, folded = np.exp(-1j * self.omega * self.delay_s), np.zeros(len(self.omega), complex)
-        if corner:
-            a = a / (1 + self.s / (2 * np.pi * corner))
-        return a[:, None] * self.drive, folded * base._passband()
+        key = ("volts", base.period_s, self.delay_s, base.sensors.motion, corner, base._passband(), *_of(self.omega))
+        known = _kept.get(key)
+        if known is None:
+            if base.period_s:
+                a = hold(self.omega, base.period_s, self.delay_s)
+                folded = aliases(self.omega, base.period_s, self.delay_s, base.sensors.motion, corner)
+            else:
+                a, folded = np.exp(-1j * self.omega * self.delay_s), np.zeros(len(self.omega), complex)
+            if corner:
+                a = a / (1 + self.s / (2 * np.pi * corner))
+            known = _keep(key, (a, folded * base._passband()))
+        a, folded = known
+        return a[:, None] * self.drive, folded
+
+
+# What a fit asks for again and again on the same lines; the oldest go first.
+_kept: dict[tuple, Any] = {}
+_MOST_KEPT = 64
+
+
+def _of(omega: np.ndarray) -> tuple[int, float, float, float]:
+    return len(omega), float(omega[0]), float(omega[-1]), float(omega.sum())
+
+
+def _keep(key: tuple, value: Any) -> Any:
+    while len(_kept) >= _MOST_KEPT:
+        _kept.pop(next(iter(_kept)), None)
+    _kept[key] = value
+    return value
+
+
+def chain_response(base: ResponseModel, omega: np.ndarray) -> np.ndarray:
+    """(n,) of the sensors' chain of unit sensitivity."""
+    chain = base.sensors.chain
+    if chain is None:
+        return np.ones(len(omega), complex)
+    key = ("chain", chain.A.tobytes(), chain.B.tobytes(), chain.C.tobytes(), chain.D.tobytes(), *_of(omega))
+    known = _kept.get(key)
+    return _keep(key, chain.frequency_response(omega)[:, 0, 0]) if known is None else known
 
 
 _geometry: list[tuple[Rig, MountGeometry]] = []

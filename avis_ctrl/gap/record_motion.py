@@ -53,7 +53,7 @@ def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = No
     known: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     found = {}
     for record in campaign.records:
-        source, begin, stop = _origin(record)
+        source, begin, stop = origin(record)
         if id(source) not in known:
             known[id(source)] = _volts_and_deflection(source.load(), linear)
         volts, deflection = known[id(source)]
@@ -63,7 +63,7 @@ def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = No
     return found
 
 
-def _origin(record: RecordSource) -> tuple[RecordSource, int, int]:
+def origin(record: RecordSource) -> tuple[RecordSource, int, int]:
     """The whole record, and which samples of it a record is."""
     begin, stop = 0, record.header.samples
     while isinstance(record, Portion):

@@ -15,7 +15,7 @@ from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, fit
 from avis_ctrl.identification.prediction_error import prediction_error
 from avis_ctrl.identification.spectra import SpectralBlock
 
-MOST_ITERATIONS = 25
+MOST_ITERATIONS = 20
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,9 +29,9 @@ FALSE_ALARM = 1e-3
 # Fall of the criterion that a further effect must bring: odds of e^10 against it, before the number of candidates.
 LEAST_FALL = 20.0
 # Refits of the first stage, and of each parent later; parents kept; effects in a chain.
-REFITS, REFITS_LATER, PARENTS, LONGEST = 12, 7, 3, 3
+REFITS, REFITS_LATER, PARENTS, LONGEST = 10, 5, 2, 3
 # First on few lines and iterations; so many of a stage go on to all lines.
-COARSE_LINES, COARSE_ITERATIONS, PROMOTED = 140, 10, 4
+COARSE_LINES, COARSE_ITERATIONS, PROMOTED = 140, 8, 3
 # A name is refitted, at its best place, where its score is at least this share of the best one's.
 SHARE_OF_BEST = 0.02
 

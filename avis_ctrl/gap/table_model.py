@@ -109,7 +109,7 @@ class TableModel:
     def amplifier_corner_Hz(self) -> float | None:
         return self.base.amplifier_corner_Hz
 
-    @property
+    @cached_property
     def _free(self) -> list[tuple[int, int]]:
         """(effect, parameter) of each free parameter of the effects."""
         return [(k, j) for k, one in enumerate(self.effects) for j, name in enumerate(one.names)
@@ -154,6 +154,13 @@ class TableModel:
         moved = tuple(one.at(v) for one, v in zip(self.effects, values, strict=True))
         return replace(self, base=self.base.at(theta[:n]), effects=moved)
 
+    def _with_effect_parameter(self, index: int, value: float) -> TableModel:
+        """One free parameter of an effect elsewhere; the rig as it is."""
+        k, j = self._free[index]
+        values = list(self.effects[k].values)
+        values[j] = value
+        return replace(self, effects=(*self.effects[:k], self.effects[k].at(values), *self.effects[k + 1:]))
+
     def with_effect(self, effect: ActiveEffect) -> TableModel:
         return replace(self, effects=(*self.effects, effect))
 
@@ -172,9 +179,11 @@ class TableModel:
     def matrices(self) -> Matrices:
         return self.effective.matrices
 
-    @property
+    @cached_property
     def derivative_matrices(self) -> Matrices:
-        return self.effective.derivative_matrices
+        """Of the free parameters that are not a mount's stiffness or damping, in their order."""
+        others = tuple(name for name in self.base.names if not _MOUNT.fullmatch(name))
+        return replace(self.effective, names=others).derivative_matrices
 
     @property
     def nonlinear(self) -> bool:
@@ -208,7 +217,7 @@ class TableModel:
         if not derivative:
             return Driven(answer.Y, np.empty(0))
         dY = np.zeros((len(self.names), *answer.Y.shape), complex)
-        answer.by_rig(self.effective, dY)
+        answer.by_rig(self.effective, self.derivative_matrices, dY)
         self._by_effects(omega, U, block, made, answer, dY)
         return Driven(answer.Y, dY)
 
@@ -245,9 +254,7 @@ class TableModel:
             ends = [min(max(theta[row] + sign * step, low[row]), high[row]) for sign in (1, -1)]
             sides = []
             for end in ends:
-                moved = theta.copy()
-                moved[row] = end
-                other = replace(self, effects=self.at(moved).effects)
+                other = self._with_effect_parameter(row - n, end)
                 acting = other._acting(U, block)
                 own = made if self.effects[self._free[row - n][0]].effect.nonlinear else assemble(
                     other.operators(omega), invert=False)
@@ -319,11 +326,11 @@ class _Answer:
         """(n, n_y, n_q) y by a force on the coordinates."""
         return self.gain * self.sense * (self.made.rows @ self.made.inverse)
 
-    def by_rig(self, model: ResponseModel, dY: np.ndarray) -> None:
-        """Derivatives by the rig's free parameters into the first rows of dY."""
+    def by_rig(self, model: ResponseModel, d: Matrices, dY: np.ndarray) -> None:
+        """Derivatives by the rig's free parameters into the first rows of dY; d of those that are no mount's."""
         made, ops, s = self.made, self.made.ops, self.s
         left = self.left
-        d, mat = model.derivative_matrices, model.matrices
+        mat, others = model.matrices, 0
         rows = {name: k for k, name in enumerate(ops.mounts.names)}
         own = made.G @ self.x
         chassis = ops.mounts.chassis @ made.chassis(self.x, self.w)
@@ -331,6 +338,7 @@ class _Answer:
         folded_q = self.Minv @ mat.T @ self.folded
         for j, name in enumerate(model.names):
             if name.startswith("sensor."):
+                others += 1
                 k = model.sensors.names.index(name.removeprefix("sensor."))
                 dY[j, :, k] = self.Y[:, k] / model.sensors.sensitivity[k]
             elif match := _MOUNT.fullmatch(name):
@@ -348,7 +356,8 @@ class _Answer:
                 raise InputError("expected the effect loop_delay in the place of this parameter", field="parameters",
                                  value=name)
             else:
-                dY[j] = self._by_matrices(d, j, left, folded_q, mat)
+                dY[j] = self._by_matrices(d, others, left, folded_q, mat)
+                others += 1
 
     def _by_matrices(self, d: Matrices, j: int, left, folded_q, mat: Matrices) -> np.ndarray:
         """By a parameter of M, T, R, or of stiffness and damping beside the mounts."""

@@ -32,6 +32,8 @@ from avis_ctrl.identification.response import N_Q, ResponseModel, positive
 from avis_ctrl.identification.spectra import SpectralBlock, transient_columns
 
 Prior = tuple[float, float]
+# Lines of all blocks together below which threads cost more than they bring.
+FEW_LINES = 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +170,11 @@ class _Descent:
         _ = model.matrices, derivative and model.derivative_matrices  # formed once, before the threads ask for them
         work = partial(_block_residual, model, derivative=derivative)
         # Large arrays in few calls, which leave the interpreter free: threads serve, and keep the order of the sums.
-        with ThreadPoolExecutor(min(len(self.blocks), os.cpu_count() or 1)) as threads:
-            parts = list(threads.map(work, self.blocks, self.whiteners))
+        if sum(len(block.omega) for block in self.blocks) < FEW_LINES:
+            parts = list(map(work, self.blocks, self.whiteners))
+        else:
+            with ThreadPoolExecutor(min(len(self.blocks), os.cpu_count() or 1)) as threads:
+                parts = list(threads.map(work, self.blocks, self.whiteners))
         for e, J, residual in parts:
             chi2 += float(e @ e)
             if derivative:

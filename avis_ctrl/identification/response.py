@@ -133,7 +133,7 @@ class ResponseModel:
     amplifier_corner_Hz: float | None = None
 
     def __post_init__(self) -> None:
-        known = self.all_parameters()
+        known = self._known
         if unknown := [name for name in self.names if name not in known]:
             raise InputError(f"the rig {self.rig.name} has no such parameter; it has {', '.join(known)}",
                              field="parameters", value=unknown)
@@ -152,6 +152,11 @@ class ResponseModel:
                              1 / rig.sample_rate_Hz if sampled else 0.0, rig.loop_delay_s if sampled else 0.0,
                              amplifier_corner_Hz)
 
+    @property
+    def _known(self) -> frozenset[str]:
+        """Names of every parameter that could be free."""
+        return frozenset(self.rig.parameters()) | {f"sensor.{name}" for name in self.sensors.names} | {"loop_delay_s"}
+
     def all_parameters(self) -> dict[str, Parameter]:
         """Every parameter that could be free."""
         found = dict(self.rig.parameters())
@@ -160,11 +165,13 @@ class ResponseModel:
         found["loop_delay_s"] = Parameter(self.delay_s, "s", "delay from the sample to the actuator voltage")
         return found
 
-    @property
+    @cached_property
     def values(self) -> np.ndarray:
-        """(n_p,) present values of the free parameters."""
+        """(n_p,) present values of the free parameters; not to be written to."""
         known = self.all_parameters()
-        return np.array([known[name].value for name in self.names])
+        found = np.array([known[name].value for name in self.names])
+        found.setflags(write=False)
+        return found
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -194,7 +201,8 @@ class ResponseModel:
         delay = values.get("loop_delay_s", self.delay_s)
         if not 0 <= delay < 1:
             raise InputError("expected a delay from 0 to 1 s", field="loop_delay_s", value=delay)
-        of_rig = {name: value for name, value in values.items() if name in self.rig.parameters()}
+        of_rig = {name: value for name, value in values.items()
+                  if not name.startswith("sensor.") and name != "loop_delay_s"}
         return replace(self, rig=self.rig.with_parameters(of_rig), delay_s=delay,
                        sensors=replace(self.sensors, sensitivity=sensitivity))
 

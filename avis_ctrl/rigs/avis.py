@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -94,6 +95,10 @@ class AvisTable(Rig):
 
     def parameters(self) -> dict[str, Parameter]:
         """mass, J1.., com_x.., isolator1.k_x.., isolator1.c_x.., isolator1.p_x.., actuator.Ay1.. (1-based)."""
+        return dict(self._parameters)
+
+    @cached_property
+    def _parameters(self) -> dict[str, Parameter]:
         found = {"mass": Parameter(self.mass, "kg", "mass of the payload")}
         for name, value in zip(INERTIA, self.inertia, strict=True):
             found[name] = Parameter(value, "kg m^2", "inertia about the centre of mass")
@@ -126,6 +131,11 @@ class AvisTable(Rig):
                        isolators=isolators, motors=motors)
 
     def mounted_body(self) -> MountedBody:
+        return self._body
+
+    # A fit asks for the same table again and again.
+    @cached_property
+    def _body(self) -> MountedBody:
         mounts = tuple(
             Mount(f"isolator{number}", np.array(one.position), np.add(one.position, one.chassis_offset),
                   np.diag(one.stiffness), np.diag(one.damping))
@@ -136,7 +146,11 @@ class AvisTable(Rig):
 
     def equations_of_motion(self) -> EquationsOfMotion:
         """Eq. 2.36 with the chassis motion kept; about the geometric centre."""
-        return self.mounted_body().equations_of_motion()
+        return self._equations
+
+    @cached_property
+    def _equations(self) -> EquationsOfMotion:
+        return self._body.equations_of_motion()
 
     def points(self) -> dict[str, Place]:
         found = {f"isolator{k}": Place(np.array(one.position), "isolator") for k, one in enumerate(self.isolators, 1)}

@@ -59,7 +59,7 @@ class PointActuator:
     def __post_init__(self) -> None:
         _freeze(self, position=(3,), direction=(3,))
         length = float(np.linalg.norm(self.direction))
-        if not np.isclose(length, 1.0, rtol=1e-9):
+        if not abs(length - 1.0) <= 1e-9:
             raise InputError("expected a unit vector", field=f"direction of {self.name}", value=length)
 
 

@@ -27,7 +27,8 @@ def cross_matrix(r: ArrayLike) -> np.ndarray:
 
 def point_map(p: ArrayLike) -> np.ndarray:
     """G(p) = [I, -S(p)], (3, 6): displacement of the body-fixed point p [m] for a small motion q."""
-    return np.hstack([np.eye(3), -cross_matrix(p)])
+    x, y, z = np.asarray(p)
+    return np.array([[1.0, 0.0, 0.0, 0.0, z, -y], [0.0, 1.0, 0.0, -z, 0.0, x], [0.0, 0.0, 1.0, y, -x, 0.0]])
 
 
 def rotation_matrix(angles: ArrayLike) -> np.ndarray:

@@ -146,7 +146,7 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
             notes.append(f"No controller was found for the updated model: {error}")
     realised = realise(updated)
     files, in_files, not_in_files = start_files(design, updated, when)
-    words = (*_outcome(before, after, new), *notes,
+    words = (*_outcome(before, after, new, design.synthesis.target_mu), *notes,
              *_told(realised, design, new_rig, updated, when, in_files, not_in_files))
     return DesignEffect(before, after, new, K, K_new, realised, in_files, not_in_files, files, words,
                         time.monotonic() - began)
@@ -213,7 +213,8 @@ def start_files(design: Design, model: TableModel, when: float = 0.0
             found.outside)
 
 
-def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | None) -> list[str]:
+def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | None, target: float | None
+             ) -> list[str]:
     """mu of the three, in words."""
     if after is None:
         return [f"The controller designed on the baseline has mu {before.mu_upper:.3g} there; no named effect "
@@ -236,8 +237,10 @@ def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | 
     bounds = f"worst case {new.worst_peak_dB:.1f} dB at the peak, {new.worst_band_dB:.1f} dB in the band"
     if not np.isfinite(new.worst_peak_dB):
         bounds = "stability is not proved for every table within the design's uncertainty"
+    stop = f" Synthesis stops near its target of {target:g}: it does not look for the lowest mu." \
+        if target and after.mu_upper < new.mu_upper < 1 else ""
     return [first, f"A controller designed on the updated model has mu {new.mu_upper:.3g} there and {reach} "
-                   f"({bounds}).{hidden}"]
+                   f"({bounds}).{stop}{hidden}"]
 
 
 def _worst_case(before: LoopFigures, after: LoopFigures) -> str:

@@ -125,7 +125,8 @@ def _read(kind: str, path: str | Path, columns: dict[str, str], factors: dict[st
     measured = [role for role in (*needed, *optional) if role in columns]
     mapping = {"u": [columns[driven]], "y": [columns[role] for role in measured]}
     mapping |= {"t": [columns["t"]]} if "t" in columns else {}
-    campaign = read_measurements(path, mapping, **({} if rate is None else {"sample_rate_Hz": rate}))
+    hints: dict[str, Any] = {} if rate is None else {"sample_rate_Hz": rate}
+    campaign = read_measurements(path, mapping, **hints)
     if not isinstance(campaign, Campaign):
         raise InputError("expected records over time, found a frequency response", file=path)
     return campaign, driven, measured

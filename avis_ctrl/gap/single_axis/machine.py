@@ -150,7 +150,8 @@ def _covariance(J: np.ndarray, e: np.ndarray, block: np.ndarray, used: np.ndarra
     """Sandwich with the scores summed over each block (Liang and Zeger, Biometrika 73 (1986) 13): whatever correlation
     there is inside a block counts. Not below that of a white residual."""
     A, w, b = J[used], e[used], block[used]
-    size = np.maximum(np.linalg.norm(A, axis=0), np.finfo(float).tiny)
+    size = np.linalg.norm(A, axis=0)
+    size = np.where(size > 0, size, 1.0)  # of no influence: the pseudo-inverse gives it no variance
     bread = np.linalg.pinv((A / size).T @ (A / size), rcond=RANK, hermitian=True) / np.outer(size, size)
     scores = np.stack([np.bincount(b, A[:, j] * w, minlength=block.max() + 1) for j in range(A.shape[1])], axis=1)
     scores = scores[np.unique(b)]
@@ -168,9 +169,9 @@ def held_out(problem: AxisProblem, found: Fitted, extra: np.ndarray | None = Non
     J = J[:, free]
     blocks = [np.flatnonzero(problem.block == b) for b in range(problem.block.max() + 1)]
     grams, sides = [J[r].T @ J[r] for r in blocks], [J[r].T @ w[r] for r in blocks]
-    gram, side = sum(grams), sum(sides)
-    penalty = np.diag(np.r_[np.zeros(free[:len(found.theta)].sum()), np.full(J.shape[1] - free[:len(found.theta)].sum(),
-                                                                            ridge)])
+    gram, side = np.sum(grams, axis=0), np.sum(sides, axis=0)
+    own = int(np.count_nonzero(free[:len(found.theta)]))
+    penalty = np.diag(np.r_[np.zeros(own), np.full(J.shape[1] - own, ridge)])
     e, sigma, score = np.empty_like(w), np.empty_like(w), np.empty_like(w)
     for b, rows in enumerate(blocks):
         step = -np.linalg.pinv(gram - grams[b] + penalty, rcond=RANK, hermitian=True) @ (side - sides[b])
@@ -215,8 +216,8 @@ def octaves(frequency_Hz: np.ndarray, power: np.ndarray, channel: dict[str, str]
     share = np.bincount(index, power) / max(float(power.sum()), np.finfo(float).tiny)
     found: list[dict[str, Any]] = []
     for k in np.argsort(-share):
-        if sum(place["share"] for place in found) >= 0.5 or share[k] <= 0:
+        if sum(float(place["share"]) for place in found) >= 0.5 or share[k] <= 0:
             break
-        found.append({"from_Hz": top * 2.0 ** -(k + 1.0), "to_Hz": top * 2.0 ** -float(k), **channel,
+        found.append({"from_Hz": top * 2.0 ** -(int(k) + 1.0), "to_Hz": top * 2.0 ** -float(int(k)), **channel,
                       "share": float(share[k])})
     return tuple(found)

@@ -80,7 +80,7 @@ class AxisGap:
                          "indistinguishable_from": list(effect.indistinguishable_from)} for effect in self.effects],
             "gap": [_stage(stage) for stage in self.stages],
             "references": [_stage(stage) for stage in self.references],
-            "where": [{key: _number(value) if isinstance(value, (float, np.floating)) else value
+            "where": [{key: _number(float(value)) if isinstance(value, (float, np.floating)) else value
                        for key, value in place.items()} for place in self.where],
             "base_parameters": _parameters(self.base_parameters),
             "runners_up": [{"name": name, "probability": _number(p)} for name, p in self.runners_up],

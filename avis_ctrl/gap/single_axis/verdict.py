@@ -45,8 +45,8 @@ def gap_of(problem: AxisProblem, library: Sequence[Term], seed: int, progress: P
                        for one in several)
     effects = _effects(problem, steps)
     first = steps[1].candidates if len(steps) > 1 else last
-    experiments = [text for step in steps[1:] if step.rivals
-                   for text in (step.named.term.separated_by if step.named else "",) if text]
+    experiments = [step.named.term.separated_by for step, effect in zip(steps[1:], effects, strict=True)
+                   if effect.indistinguishable_from and step.named]
     return AxisGap(problem.kind, verdict, effects, stages, references, problem.where(steps[-1].judged.e),
                    tuple(_sentences(problem, verdict, stages, effects, steps, left, last, refused)),
                    "; ".join(dict.fromkeys(experiments)) or None,
@@ -113,12 +113,13 @@ def _estimates(parameters: Sequence[AxisParameter], step: Step, start: int, stop
 def _effects(problem: AxisProblem, steps: Sequence[Step]) -> tuple[AxisEffect, ...]:
     """Each with its parameters in the last model, where all are fitted together."""
     found, at = [], len(problem.base)
+    named = {step.named.term.key for step in steps[1:] if step.named}
     for step in steps[1:]:
         assert step.named is not None
         stop = at + len(step.named.term.parameters(problem))
         found.append(AxisEffect(step.named.term.name, step.named.term.location,
                                 _estimates(steps[-1].fitted.parameters, steps[-1], at, stop), step.named.probability,
-                                tuple(c.term.key for c in step.rivals)))
+                                tuple(c.term.key for c in step.rivals if c.term.key not in named)))
         at = stop
     return tuple(found)
 
@@ -127,9 +128,10 @@ def _sentences(problem: AxisProblem, verdict: str, stages: Sequence[AxisStage], 
                steps: Sequence[Step], left: Sequence[_Reference], last: Sequence[Candidate], refused: str
                ) -> list[str]:
     said = [_answer(verdict, stages, effects, steps)]
-    for step in steps[1:]:
-        if step.rivals and step.named:
-            rivals = " or ".join(f"{c.term.words} ({100 * c.probability:.0f} %)" for c in step.rivals)
+    for step, effect in zip(steps[1:], effects, strict=True):
+        if effect.indistinguishable_from and step.named:
+            rivals = " or ".join(f"{c.term.words} ({100 * c.probability:.0f} %)" for c in step.rivals
+                                 if c.term.key in effect.indistinguishable_from)
             said.append(f"{step.named.term.name}: these data cannot tell it from {rivals}; what would: "
                         f"{step.named.term.separated_by}.")
     if stages[-1].chi2_per_dof is not None:
@@ -143,9 +145,9 @@ def _sentences(problem: AxisProblem, verdict: str, stages: Sequence[AxisStage], 
                     + (", certainly." if one.certain else ", which may be chance."))
     if len(effects) > 1:
         power = [stage.nrmse ** 2 for stage in stages]
-        said.append("Of the squared error of the base model, " + ", ".join(
-            f"{effect.name} takes {100 * (power[k] - power[k + 1]) / power[0]:.3g} %" for k, effect in enumerate(effects))
-            + ".")
+        shares = [f"{effect.name} takes {100 * (power[k] - power[k + 1]) / power[0]:.3g} %"
+                  for k, effect in enumerate(effects)]
+        said.append(f"Of the squared error of the base model, {', '.join(shares)}.")
     said += problem.notes
     if refused:
         said.append(refused + ".")
@@ -175,5 +177,5 @@ def _answer(verdict: str, stages: Sequence[AxisStage], effects: Sequence[AxisEff
 def _picture(stages: Sequence[AxisStage]) -> Picture:
     at = np.arange(len(stages), dtype=float)
     return Picture("Gap on unseen data", "stage", "error over measured [%]",
-                   (Series("left", at, np.array([100 * stage.nrmse for stage in stages]), "bars"),), (), "linear", "log",
-                   tuple(stage.stage for stage in stages))
+                   (Series("left", at, np.array([100 * stage.nrmse for stage in stages]), "bars"),), (), "linear",
+                   "log", tuple(stage.stage for stage in stages))

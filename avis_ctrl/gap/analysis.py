@@ -1,0 +1,210 @@
+"""The gap between a rig and a campaign, from signals to verdict."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.data import Halves, blocks_of, divide, thinned, with_noise
+from avis_ctrl.gap.effects.base import Effect
+from avis_ctrl.gap.effects.large_motion import LargeMotion
+from avis_ctrl.gap.judgement import judge
+from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
+from avis_ctrl.gap.refit import Refit, judged, refit
+from avis_ctrl.gap.result import Gap
+from avis_ctrl.gap.search import NOISE, Found, search
+from avis_ctrl.gap.show import shown
+from avis_ctrl.gap.signal_effects import (
+    SignalFaults,
+    converter_faults,
+    find_hum,
+    left_by,
+    levels,
+    predicted,
+    without_hum,
+)
+from avis_ctrl.gap.signals.hum import HumFinding, polluted
+from avis_ctrl.gap.signals.leftover import Leftover
+from avis_ctrl.gap.signals.repair import repair
+from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.identification.campaign_fit import excited_band
+from avis_ctrl.identification.maximum_likelihood import fit
+from avis_ctrl.identification.noise import relative_noise
+from avis_ctrl.identification.parameter_sets import default_parameters
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.measurement.campaign import Campaign, Record
+from avis_ctrl.rigs.rig import Rig
+
+Progress = Callable[[str], None]
+# Share of a channel's samples beyond its limits from which repaired samples are predicted anew.
+REPAIRED = 1e-5
+# Second-order terms as Newton and Euler have them, with sensors fixed to the payload and forces along earth axes.
+BY_PHYSICS = (1.0, 0.0, 1.0)
+
+
+# Rounds of noise measurement and search: the noise is known best once the model is.
+ROUNDS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A campaign made ready: halves, blocks with noise on all lines, and the re-identified model.
+
+    unmasked : held-out blocks as they came, hum and all. nominal : the rig as its file has it. faults : of the signals.
+    """
+
+    campaign: Campaign
+    halves: Halves
+    band_Hz: tuple[float, float]
+    fitted: list[SpectralBlock]
+    held_out: list[SpectralBlock]
+    unmasked: list[SpectralBlock]
+    noise: str
+    nominal: TableModel
+    base: Refit
+    faults: SignalFaults
+
+    @cached_property
+    def thin(self) -> list[SpectralBlock]:
+        return [thinned(block) for block in self.fitted]
+
+    @cached_property
+    def thin_held(self) -> list[SpectralBlock]:
+        return [thinned(block) for block in self.held_out]
+
+    def measured_with(self, model: TableModel, left: tuple[Leftover, ...]) -> Prepared:
+        """The same with the noise that a model's residual in time gives, and the re-identified model refitted."""
+        fitted, how = _noise(self.fitted, self.halves, left, model, self.band_Hz)
+        held_out, _ = _noise(self.held_out, self.halves, left, model, self.band_Hz)
+        unmasked = _noise(self.unmasked, self.halves, left, model, self.band_Hz)[0] if self.faults.hum else held_out
+        made = replace(self, fitted=fitted, held_out=held_out, unmasked=unmasked, noise=how)
+        return replace(made, base=refit(self.base.model, made.thin, made.thin_held))
+
+
+def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, float] | None = None,
+            amplifier_corner_Hz: float | None = None, effects: Sequence[Effect] | None = None,
+            progress: Progress = lambda text: None) -> Gap:
+    """Find, name and close the gap.
+
+    Parameters
+    ----------
+    campaign : records in the rig's own words, driven ones among them. rig : as its file has it.
+    band_Hz : of the comparison; the excited one where None. effects : candidates; the library where None.
+
+    Raises
+    ------
+    InputError : a campaign that drives nothing, or tells no noise.
+    ComputationError : a fit that does not come to an end.
+    """
+    began = time.monotonic()
+    prepared = prepare(campaign, rig, band_Hz, amplifier_corner_Hz, progress)
+    for k in range(ROUNDS):
+        found = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects)
+        progress("noise of floor and sensors, with what was found")
+        left = left_by(prepared.campaign, found.best.model)
+        prepared = prepared.measured_with(found.best.model, left)
+        best = refit(found.best.model, prepared.thin, prepared.thin_held)
+        if best.held_per_dof <= NOISE or k == ROUNDS - 1:
+            break
+    found = replace(found, chain=(prepared.base, *found.chain[1:-1], best) if len(found.chain) > 1 else (prepared.base,),
+                    reached_noise=best.held_per_dof <= NOISE)
+    progress("fits to all lines, and what they leave of the held-out records")
+    base, updated = _final(prepared, found)
+    faults = replace(prepared.faults, noise=levels(left, updated.model, prepared.faults.hum, prepared.faults.converter))
+    judgement = judge(prepared.thin, found, base, updated, faults)
+    return shown(prepared, found, base, updated, judgement, seed, time.monotonic() - began)
+
+
+def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = None,
+            amplifier_corner_Hz: float | None = None, progress: Progress = lambda text: None) -> Prepared:
+    """From records to blocks with noise and the re-identified model."""
+    progress("converters, and what is held out")
+    converter = converter_faults(campaign, rig)
+    mended = repair(campaign, rig, None, converter) if campaign.y_unit == "V" and rig.acquisition else None
+    campaign = mended.campaign if mended else campaign
+    halves = divide(campaign)
+    band = band_Hz or excited_band(halves.fitted)
+    if not 0 <= band[0] < band[1]:
+        raise InputError("expected the lower end first, the upper one after it", field="band_Hz", value=band)
+    nominal = TableModel(ResponseModel.of(rig, default_parameters(rig), campaign.y_unit, campaign.y_names,
+                                          campaign.u_names, True, amplifier_corner_Hz))
+    progress(f"re-identification of {len(nominal.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz; {halves.how}")
+    rough = _rough(nominal, halves, band)
+    if mended and max(mended.clipped.values()) > REPAIRED:
+        progress("clipped samples: what the model expects behind the limits")
+        campaign = repair(campaign, rig, predicted(campaign, rough), converter).campaign
+        halves = divide(campaign)
+        rough = _rough(rough, halves, band)
+    left = left_by(campaign, rough)
+    raw_held = blocks_of(halves.held_out, rough, band)
+    hum = find_hum(left)
+    if hum is not None:
+        progress(f"hum of {hum.frequency_Hz.value:.5g} Hz taken out")
+        campaign = without_hum(campaign, hum, left)
+        halves = divide(campaign)
+        rough = _rough(rough, halves, band)
+        left = left_by(campaign, rough)
+    fitted = _masked(blocks_of(halves.fitted, rough, band), halves.fitted, hum)
+    held_out = _masked(blocks_of(halves.held_out, rough, band), halves.held_out, hum)
+    progress("noise, and second-order terms of large rotations")
+    fitted, how = _noise(fitted, halves, left, rough, band)
+    held_out, _ = _noise(held_out, halves, left, rough, band)
+    unmasked = _noise(raw_held, halves, left, rough, band)[0] if hum else held_out
+    motion = with_large_motion(motion_of(_parts(halves), rough, campaign), rough)
+    model = replace(rough, motion=motion)
+    # The large motion's own coefficients are physics; they are free because the source leaves open what turns.
+    base = refit(model.with_effect(active(LargeMotion(), model, "payload", BY_PHYSICS)),
+                 [thinned(block) for block in fitted], [thinned(block) for block in held_out])
+    return Prepared(campaign, halves, band, fitted, held_out, unmasked, how, replace(nominal, motion=motion), base,
+                    SignalFaults(converter, hum))
+
+
+def _noise(blocks: Sequence[SpectralBlock], halves: Halves, left: tuple[Leftover, ...], model: TableModel,
+           band: tuple[float, float]) -> tuple[list[SpectralBlock], str]:
+    """Blocks with the noise of the fitted records, from what a model leaves of them in time."""
+    of = {one.header.name: one for one in left}
+    records = []
+    for source in halves.fitted.records:
+        whole, start, stop = origin(source)
+        e = of[whole.header.name].e[start:stop]
+        record = source.load()
+        records.append(Record(record.header, record.u, e, record.floor))
+    return with_noise(blocks, halves.fitted, replace(halves.fitted, records=tuple(records)), model, band)
+
+
+def _parts(halves: Halves) -> Campaign:
+    """Fitted and held-out records, or parts of records, together, each under the name of its block."""
+    return replace(halves.fitted, records=(*halves.fitted.records, *halves.held_out.records))
+
+
+def _rough(model: TableModel, halves: Halves, band: tuple[float, float]) -> TableModel:
+    """A first fit, each line weighted alike."""
+    blocks = [thinned(block) for block in relative_noise(blocks_of(halves.fitted, model, band))]
+    return replace(model, base=fit(model.base, blocks).model)
+
+
+def _masked(blocks: Sequence[SpectralBlock], campaign: Campaign, hum: HumFinding | None) -> list[SpectralBlock]:
+    """Blocks without the lines that hum has spoiled."""
+    if hum is None:
+        return list(blocks)
+    found = []
+    for block in blocks:
+        h = campaign.named(block.name).header
+        spoiled = polluted(hum, h.samples, h.sample_rate_Hz)
+        lines = np.rint(block.omega * h.samples / (2 * np.pi * h.sample_rate_Hz)).astype(int)
+        found.append(block.lines(np.flatnonzero(~spoiled[lines])))
+    return found
+
+
+def _final(prepared: Prepared, found: Found) -> tuple[Refit, Refit]:
+    """Re-identified and updated model, fitted to all lines."""
+    base = judged(fit(found.chain[0].model, prepared.fitted), prepared.held_out)
+    if len(found.chain) == 1:
+        return base, base
+    return base, judged(fit(found.best.model, prepared.fitted), prepared.held_out)

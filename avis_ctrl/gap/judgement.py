@@ -1,0 +1,188 @@
+"""From a search to a verdict: what is named, how sure, what cannot be told apart, and when to refuse.
+
+An effect is named for certain when the model with it leaves noise only. When something remains, the gap may be one the
+library has no name for, of which the best candidate is only the nearest neighbour. Then it is named only if it takes
+most of the gap and comes out the same from data that share nothing: half of the records, half of the band.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.gap.refit import Refit, probabilities, try_refit
+from avis_ctrl.gap.result import Considered, NamedEffect, Verdict
+from avis_ctrl.gap.search import NOISE, Found, location
+from avis_ctrl.gap.signal_effects import SignalFaults, named
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.identification.spectra import SpectralBlock
+
+# No probability is reported above this: what the library does not hold, and the noise's own uncertainty, leave so much.
+MOST_SURE = 0.99
+# A rival as probable as this cannot be told apart.
+RIVAL = 0.05
+# Without a named effect: chi-square per degree of freedom from which a residual counts as a gap although no score is
+# significant: a tenth in r.m.s. above the noise, twice what its own uncertainty leaves open.
+UNEXPLAINED = 1.21
+# With something left: share of the excess that the named effects must take.
+MOST_OF_IT = 0.97
+# Halves agree within so many standard deviations (of parameters, widened by the misfit), or within this share.
+AGREE_STD, AGREE_SHARE = 4.0, 0.05
+LARGE_MOTION = "large_motion"
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Verdict, effects and model; rivals that were refitted, and sentences on how it was decided."""
+
+    verdict: Verdict
+    effects: tuple[NamedEffect, ...]
+    updated: Refit
+    considered: tuple[Considered, ...]
+    reasons: tuple[str, ...]
+    next_experiment: str | None
+
+
+def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Refit, faults: SignalFaults) -> Judgement:
+    """Weigh what a search and the signals brought."""
+    signal = named(faults)
+    own = effects_of(updated.model)
+    raised = faults.raised
+    reasons = [f"the noise of {', '.join(raised)} is above the rig file's ambient level; the library has no name for "
+               "that"] if raised else []
+    if own and not found.reached_noise:
+        refusal = refused(thin, base, updated)
+        if refusal:
+            reasons.append(f"{' and '.join(one.effect.name for one in own)} comes nearest, but {refusal}: not named")
+            own, updated = [], base
+    residual_left = updated.held_per_dof > (NOISE if own else UNEXPLAINED) or bool(raised)
+    effects = [*_table_effects(found, updated, own), *signal]
+    if effects:
+        verdict: Verdict = "partly explained" if residual_left else "explained"
+    else:
+        verdict = "unexplained" if residual_left else "none"
+    ties = [(one.name, other) for one in effects for other in one.indistinguishable_from]
+    return Judgement(verdict, tuple(effects), updated, _considered(found, updated), tuple(reasons),
+                     _next(ties, found, verdict))
+
+
+def effects_of(model: TableModel) -> list[ActiveEffect]:
+    """Effects beside the second-order terms that every model holds."""
+    return [one for one in model.effects if one.effect.name != LARGE_MOTION]
+
+
+def refused(thin: Sequence[SpectralBlock], base: Refit, updated: Refit) -> str:
+    """Why effects that leave more than noise are not to be named; empty where they are."""
+    excess, left = base.held_per_dof - 1.0, updated.held_per_dof - 1.0
+    share = 1 - left / excess if excess > 0 else 0.0
+    if share < MOST_OF_IT:
+        return f"it takes only {100 * max(share, 0):.0f} % of the gap away"
+    records = ([block for k, block in enumerate(thin) if k % 2 == 0], [block for k, block in enumerate(thin) if k % 2])
+    middle = float(np.median(np.concatenate([block.omega for block in thin])))
+    bands = ([block.lines(np.flatnonzero(block.omega <= middle)) for block in thin],
+             [block.lines(np.flatnonzero(block.omega > middle)) for block in thin])
+    for halves, what in ((records, "halves of the records"), (bands, "halves of the band")):
+        if all(halves) and (why := _disagree(updated, halves, what)):
+            return why
+    return ""
+
+
+def _disagree(updated: Refit, halves: tuple[list[SpectralBlock], list[SpectralBlock]], what: str) -> str:
+    fits = [try_refit(updated.model, half, half, 8) for half in halves]
+    a, b = fits
+    if a is None or b is None:
+        return f"no fit to {what} came to an end"
+    for first, second in zip(effects_of(a.model), effects_of(b.model), strict=True):
+        std = [np.sqrt(np.maximum(np.diag(one.covariance_of(e)), 0) * max(one.fit.chi2_per_dof, 1.0))
+               for one, e in ((a, first), (b, second))]
+        for k, parameter in enumerate(first.parameters):
+            x, y = first.values[k], second.values[k]
+            spread = float(np.hypot(std[0][k], std[1][k]))
+            size = max(abs(x - parameter.none), abs(y - parameter.none)) if parameter.linear else max(abs(x), abs(y))
+            # A parameter that a half does not determine says nothing.
+            if spread > 0.5 * size or parameter.optional:
+                continue
+            if abs(x - y) > max(AGREE_STD * spread, AGREE_SHARE * size):
+                return (f"its {parameter.name} is {x:.4g} or {y:.4g} {parameter.unit} from {what}")
+    return ""
+
+
+def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect]) -> list[NamedEffect]:
+    """Effects that act on the table, with probabilities among what was refitted in their place."""
+    made = []
+    misfit = max(updated.fit.chi2_per_dof, updated.held_per_dof, 1.0)
+    for one in own:
+        others = {label for label in updated.labels if label != one.label}
+        rivals = [r for stage in found.pool for r in stage
+                  if others <= set(r.labels) and len(r.labels) == len(updated.labels) and not r.implausible()]
+        p = probabilities(rivals) if rivals else np.ones(0)
+        by_name: dict[tuple[str, str], float] = {}
+        for rival, share in zip(rivals, p, strict=True):
+            last = next(e for e in rival.model.effects if e.label not in others)
+            key = (last.effect.name, location(last.place))
+            by_name[key] = by_name.get(key, 0.0) + float(share)
+        key = (one.effect.name, location(one.place))
+        ties = tuple(sorted({name for (name, _), share in by_name.items() if share >= RIVAL and name != key[0]}))
+        made.append(NamedEffect(*key, one.effect.title, updated.reported(one, misfit),
+                                min(by_name.get(key, 1.0), MOST_SURE), ties,
+                                _gain(found, updated), one.label))
+    return made
+
+
+def _gain(found: Found, updated: Refit) -> float:
+    """Rise of the held-out log-likelihood by the last step of the chain, on the compared lines."""
+    if len(found.chain) < 2:
+        return 0.0
+    return float(found.chain[-2].chi2_held - found.chain[-1].chi2_held) / 2
+
+
+def _considered(found: Found, updated: Refit) -> tuple[Considered, ...]:
+    """What was refitted and not taken, best first, and why."""
+    rows = []
+    chosen = set(updated.labels)
+    for stage in found.pool:
+        if not stage:
+            continue
+        p = probabilities(stage)
+        for rival, share in sorted(zip(stage, p, strict=True), key=lambda pair: pair[0].criterion):
+            own = effects_of(rival.model)
+            if set(rival.labels) == chosen or not own:
+                continue
+            reason = rival.implausible() or (f"leaves {rival.held_per_dof:.3g} times the noise's power of the held-out "
+                                             f"records, the chosen model {found.best.held_per_dof:.3g}")
+            rows.append(Considered(" and ".join(one.effect.name for one in own),
+                                   " and ".join(location(one.place) for one in own), rival.held_per_dof, float(share),
+                                   reason, rival.reported(own[-1])))
+    return tuple(rows[:12])
+
+
+def _next(ties: Sequence[tuple[str, str]], found: Found, verdict: Verdict) -> str | None:
+    """Which measurement would tell rivals apart, from where their predictions differ most."""
+    if ties:
+        name, other = ties[0]
+        return _between(name, other, found)
+    if verdict in ("unexplained", "partly explained"):
+        return ("Repeat the records at half and at twice the level, and one record at rest with the floor measured: a "
+                "residual that keeps its size relative to the drive is linear and missing from the library, one that "
+                "grows faster is not linear, one that stays is noise.")
+    return None
+
+
+def _between(name: str, other: str, found: Found) -> str:
+    models = {one.model.effects[-1].effect.name: one.model for stage in found.pool for one in stage}
+    a, b = models.get(name), models.get(other)
+    if a is None or b is None or a.effects[-1].effect.nonlinear != b.effects[-1].effect.nonlinear:
+        return (f"To tell {name} from {other}, record the same signals at half and at twice the level: only one of them "
+                "depends on amplitude.")
+    frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), 300)
+    omega = 2 * np.pi * frequency
+    n_u = len(a.actuators)
+    Ga, Gb = a.response(omega)[:, :, :n_u], b.response(omega)[:, :, :n_u]
+    difference = np.abs(Ga - Gb)
+    k, i, j = np.unravel_index(int(np.argmax(difference)), difference.shape)
+    near = frequency[difference[:, i, j] > 0.5 * difference[k, i, j]]
+    return (f"To tell {name} from {other}, drive {a.actuators[j]} from {near.min():.3g} to {near.max():.3g} Hz and look "
+            f"at {a.sensors.names[i]}: there their predictions differ most, by {difference[k, i, j]:.2g} "
+            f"{a.sensors.unit}/V.")

@@ -1,0 +1,227 @@
+"""Figures, maps and sentences of a judged gap, all on held-out data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import stats
+
+from avis_ctrl.gap.judgement import Judgement, effects_of
+from avis_ctrl.gap.refit import Refit
+from avis_ctrl.gap.result import Gap, HeatMap, NamedEffect, Stage, Where
+from avis_ctrl.gap.search import Found
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.prediction_error import PredictionError, prediction_error
+from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.measurement.gates.finding import Limit, Picture, Series
+
+if TYPE_CHECKING:
+    from avis_ctrl.gap.analysis import Prepared
+
+# Residual over noise that is shown as a place of the gap: significant at this level over all places together.
+PLACE_ALARM = 0.01
+MOST_PLACES = 10
+BANDS_PER_OCTAVE = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Left:
+    """What a model leaves of held-out blocks; names of its outputs and inputs."""
+
+    errors: tuple[PredictionError, ...]
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+
+    @staticmethod
+    def of(model: TableModel, blocks: Sequence[SpectralBlock]) -> Left:
+        return Left(tuple(prediction_error(model, block, derivative=False) for block in blocks), model.sensors.names,
+                    model.inputs)
+
+    @property
+    def chi2_per_dof(self) -> float:
+        return sum(e.chi2 for e in self.errors) / sum(e.dof for e in self.errors)
+
+    @property
+    def nrmse(self) -> float:
+        """R.m.s. over channels of error over y, in the band."""
+        return _relative(sum(np.sum(np.abs(e.error) ** 2, axis=(0, 2)) for e in self.errors), self.errors)
+
+    @property
+    def noise_nrmse(self) -> float:
+        """What noise alone would leave."""
+        return _relative(sum(e.noise_share() for e in self.errors), self.errors)
+
+
+def _relative(power: np.ndarray, errors: Sequence[PredictionError]) -> float:
+    whole = sum(np.sum(np.abs(e.block.Y) ** 2, axis=(0, 2)) for e in errors)
+    return float(np.sqrt(np.mean(power / whole)))
+
+
+def shown(prepared: Prepared, found: Found, base: Refit, updated: Refit, judgement: Judgement, seed: int,
+          seconds: float) -> Gap:
+    """The gap as it is reported."""
+    blocks, unmasked = prepared.held_out, prepared.unmasked
+    before, after = Left.of(base.model, blocks), Left.of(judgement.updated.model, blocks)
+    ladder = [Stage("nominal", *_figures(Left.of(prepared.nominal, unmasked))),
+              Stage("re-identified", *_figures(Left.of(base.model, unmasked)))]
+    ladder += _steps(found, base, judgement, before, after)
+    where = places(before)
+    remaining = places(after) if judgement.verdict in ("partly explained", "unexplained") else ()
+    sentences = (opening(judgement, ladder, after), *judgement.reasons, prepared.noise)
+    return Gap(judgement.verdict, judgement.effects, tuple(ladder), where if judgement.verdict != "none" else (),
+               remaining, after.noise_nrmse, judgement.next_experiment, base.model, judgement.updated.model,
+               judgement.considered, heat_map(before, after), sentences,
+               pictures(prepared, before, after), prepared.halves.how, seed, seconds, judgement.updated.covariance)
+
+
+def _figures(left: Left) -> tuple[float, float]:
+    return left.nrmse, left.chi2_per_dof
+
+
+def _steps(found: Found, base: Refit, judgement: Judgement, before: Left, after: Left) -> list[Stage]:
+    """A stage for each named effect: those of the table in the order in which they were found, signals first."""
+    signal = [one for one in judgement.effects if not one.label]
+    steps = [Stage(one.name, *_figures(before)) for one in signal]
+    table = effects_of(judgement.updated.model)
+    blocks = [e.block for e in before.errors]
+    for depth in range(1, len(table) + 1):
+        label = table[depth - 1].effect.name
+        if depth == len(table):
+            steps.append(Stage(label, *_figures(after)))
+        else:
+            steps.append(Stage(label, *_figures(Left.of(found.chain[depth].model, blocks))))
+    return steps
+
+
+def opening(judgement: Judgement, ladder: Sequence[Stage], after: Left) -> str:
+    """The one sentence."""
+    first, last = ladder[1], ladder[-1]
+    if judgement.verdict == "none":
+        return (f"No effect is missing: after re-identification the model leaves {_percent(first.nrmse)} of the held-out "
+                f"records, noise alone {_percent(after.noise_nrmse)}.")
+    if judgement.verdict == "unexplained":
+        return (f"Something is missing that the library has no name for: after re-identification the model leaves "
+                f"{_percent(first.nrmse)} of the held-out records, noise alone {_percent(after.noise_nrmse)}.")
+    named = " and ".join(in_words(one) for one in judgement.effects)
+    end = "the noise" if judgement.verdict == "explained" else f"{_percent(last.nrmse)}, and something else remains"
+    return (f"Missing from the model: {named}; with that in it the gap falls from {_percent(first.nrmse)} to "
+            f"{end if judgement.verdict != 'explained' else f'{_percent(last.nrmse)}, which is {end}'}.")
+
+
+def in_words(one: NamedEffect) -> str:
+    """An effect with its place, first parameters and probability."""
+    sizes = ", ".join(f"{name} = {p.value:.5g} +- {p.std:.2g} {'' if p.unit == '1' else p.unit}".rstrip()
+                      for name, p in list(one.parameters.items())[:3])
+    ties = f", or {' or '.join(one.indistinguishable_from)}, which this data cannot tell from it" \
+        if one.indistinguishable_from else ""
+    return f"{one.title} ({one.name}, {one.location}: {sizes}; probability {one.probability:.2f}{ties})"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
+
+
+def edges_of(errors: Sequence[PredictionError]) -> np.ndarray:
+    """Bands in Hz, BANDS_PER_OCTAVE to the octave."""
+    low = min(float(e.block.omega[0]) for e in errors) / (2 * np.pi)
+    high = max(float(e.block.omega[-1]) for e in errors) / (2 * np.pi)
+    count = max(int(np.ceil(BANDS_PER_OCTAVE * np.log2(high / low))), 1)
+    return np.geomspace(low, high * (1 + 1e-9), count + 1)
+
+
+def places(left: Left) -> tuple[Where, ...]:
+    """Bands, outputs and the input that goes with each, where the residual exceeds the noise significantly."""
+    edges = edges_of(left.errors)
+    model_inputs = left.errors[0].block.U.shape[1]
+    rows = []
+    for low, high in pairwise(edges):
+        for k, output in enumerate(left.outputs):
+            power, lines, found = 0.0, 0, np.zeros(model_inputs)
+            noise_dof = np.inf
+            for e in left.errors:
+                f = e.block.omega / (2 * np.pi)
+                band = (f >= low) & (f < high)
+                sigma2 = _own_noise(e, k)[band]
+                error = e.error[band, k, 0] / np.sqrt(sigma2)
+                U = e.block.U[band, :, 0]
+                power += float(np.sum(np.abs(error) ** 2))
+                lines += len(error)
+                noise_dof = min(noise_dof, e.block.dof)
+                strength = np.sum(np.abs(U) ** 2, axis=0)
+                along = np.abs(np.sum(error[:, None] * np.conj(U), axis=0)) ** 2
+                found += np.divide(along, strength, out=np.zeros(model_inputs), where=strength > 0)
+            if lines:
+                rows.append((low, high, output, power, lines, found, noise_dof))
+    count = max(len(rows), 1)
+    excess_all = sum(max(power - lines, 0.0) for *_, power, lines, _, _ in rows) or 1.0
+    made = []
+    for low, high, output, power, lines, found, dof in rows:
+        ratio = power / lines
+        p = float(stats.f.sf(ratio, 2 * lines, 2 * dof * max(lines / 60, 1)) if np.isfinite(dof)
+                  else stats.chi2.sf(2 * power, 2 * lines))
+        if min(p * count, 1.0) < PLACE_ALARM:
+            best = int(np.argmax(found))
+            made.append(Where(float(low), float(high), left.inputs[best] if found[best] > 0.1 * power else "", output,
+                              max(power - lines, 0.0) / excess_all, ratio, min(p * count, 1.0)))
+    return tuple(sorted(made, key=lambda w: -w.share)[:MOST_PLACES])
+
+
+def _own_noise(e: PredictionError, k: int) -> np.ndarray:
+    assert e.block.noise is not None
+    return np.real(np.broadcast_to(e.block.noise, (len(e.block.omega), *e.block.noise.shape[1:]))[:, 0, k, k])
+
+
+def heat_map(before: Left, after: Left) -> HeatMap:
+    """Residual power over noise power by band, held-out record and output."""
+    edges = edges_of(before.errors)
+    columns = tuple(f"{e.block.name}: {output}" for e in before.errors for output in before.outputs)
+    return HeatMap(edges, columns, _ratios(before, edges), _ratios(after, edges))
+
+
+def _ratios(left: Left, edges: np.ndarray) -> np.ndarray:
+    found = np.full((len(edges) - 1, sum(e.block.Y.shape[1] for e in left.errors)), np.nan)
+    column = 0
+    for e in left.errors:
+        f = e.block.omega / (2 * np.pi)
+        band = np.digitize(f, edges) - 1
+        for k in range(e.block.Y.shape[1]):
+            ratio = np.abs(e.error[:, k, 0]) ** 2 / _own_noise(e, k)
+            for b in range(len(edges) - 1):
+                if np.any(band == b):
+                    found[b, column] = float(np.mean(ratio[band == b]))
+            column += 1
+    return found
+
+
+def pictures(prepared: Prepared, before: Left, after: Left) -> tuple[Picture, ...]:
+    """Residual spectra over the noise, and what each record leaves by level and by time."""
+    edges = edges_of(before.errors)
+    centre = np.sqrt(edges[1:] * edges[:-1])
+    spectra = Picture(
+        "What the models leave of the held-out records, over the noise", "frequency [Hz]", "residual / noise, r.m.s.",
+        tuple(Series(name, centre, np.sqrt(np.nanmean(_ratios(left, edges), axis=1)))
+              for name, left in (("re-identified", before), ("with the named effects", after))),
+        (Limit("noise", 1.0),), "log", "log")
+    return (spectra, *_by_record(prepared, before, after))
+
+
+def _by_record(prepared: Prepared, before: Left, after: Left) -> tuple[Picture, ...]:
+    headers = {r.header.name: r.header for r in (*prepared.halves.fitted.records, *prepared.halves.held_out.records)}
+    own = [headers[e.block.name] for e in before.errors]
+
+    def ratio(left: Left) -> np.ndarray:
+        return np.array([np.sqrt(e.chi2 / e.dof) for e in left.errors])
+
+    made = []
+    for title, label, x in (("Dependence on level", "level [V r.m.s.]", [h.level_V for h in own]),
+                            ("Dependence on time", "start of the record [s]", [h.start_s for h in own])):
+        order = np.argsort(x)
+        made.append(Picture(f"{title}: what each held-out record leaves", label, "residual / noise, r.m.s.",
+                            tuple(Series(name, np.array(x)[order], ratio(left)[order], "points")
+                                  for name, left in (("re-identified", before), ("with the named effects", after))),
+                            (Limit("noise", 1.0),)))
+    return tuple(made)

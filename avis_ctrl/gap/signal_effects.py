@@ -1,0 +1,117 @@
+"""Effects that act on the signals alone: recognised in the records themselves, not by refits of the table.
+
+They stand in the library beside the others, so that a list of it is whole; they have no part in a score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.errors import AvisError
+from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.result import NamedEffect
+from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
+from avis_ctrl.gap.signals.hum import HumFinding, find_hum, subtract
+from avis_ctrl.gap.signals.leftover import Estimate, Leftover, leftovers
+from avis_ctrl.gap.signals.noise_level import NoiseLevels, noise_levels
+from avis_ctrl.gap.simulate import simulate
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.prediction import model_inputs
+from avis_ctrl.measurement.campaign import Campaign, Record
+from avis_ctrl.rigs.rig import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class SignalFaults:
+    """What the signals themselves show."""
+
+    converter: tuple[ConverterFinding, ...] = ()
+    hum: HumFinding | None = None
+    noise: NoiseLevels | None = None
+
+    @property
+    def resolution_V(self) -> dict[str, float]:
+        return {one.channel: one.parameters["resolution_V"].value for one in self.converter
+                if one.kind == "resolution"}
+
+    @property
+    def raised(self) -> tuple[str, ...]:
+        """Sensors whose own noise is above ambient, for which the library has no name."""
+        if self.noise is None:
+            return ()
+        known = {one.channel for one in self.converter}
+        return tuple(one.channel for one in self.noise.raised if one.channel not in known)
+
+
+def converter_faults(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, ...]:
+    """Converters coarser, or clipping lower, than the rig file says; none where y is not in V."""
+    return inspect_converter(campaign, rig) if campaign.y_unit == "V" and rig.acquisition is not None else ()
+
+
+def predicted(campaign: Campaign, model: TableModel) -> dict[str, np.ndarray]:
+    """(samples, n_y) that the model reads in every record, from rest."""
+    found = {}
+    starts = [r.header.start_s for r in campaign.records]
+    clock = (min(starts), max(r.header.start_s + r.header.duration_s for r in campaign.records))
+    for record in campaign.records:
+        loaded = record.load()
+        u, floor = model_inputs(model.base, loaded)
+        found[record.header.name] = simulate(model, u, floor, record.header.sample_rate_Hz,
+                                             start_s=record.header.start_s, campaign_s=clock).y
+    return found
+
+
+def left_by(campaign: Campaign, model: TableModel) -> tuple[Leftover, ...]:
+    """What the model leaves of every record in time."""
+    return leftovers(campaign, predicted(campaign, model))
+
+
+def levels(left: tuple[Leftover, ...], model: TableModel, hum: HumFinding | None,
+           converter: tuple[ConverterFinding, ...]) -> NoiseLevels | None:
+    """Noise of floor and sensors; None where the records or the rig file do not allow it."""
+    n_u, steps = len(model.actuators), SignalFaults(converter).resolution_V
+    try:
+        return noise_levels(left, lambda omega: model.response(omega)[:, :, n_u:], model.rig, hum, steps)
+    except AvisError:
+        return None
+
+
+def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[Leftover, ...]) -> Campaign:
+    """The campaign with the hum's sines taken out of every record."""
+    of, records = {one.header.name: one for one in left}, []
+    for source in campaign.records:
+        record = source.load()
+        h = record.header
+        y = subtract(hum, of[h.name].e, record.y, h.sample_rate_Hz, h.y_names)
+        records.append(Record(h, record.u, y, record.floor))
+    return replace(campaign, records=tuple(records))
+
+
+def named(faults: SignalFaults) -> list[NamedEffect]:
+    """Effects of the library that the signals show."""
+    found = []
+    for one in faults.converter:
+        found.append(NamedEffect("sensor_quantisation", one.channel,
+                                 f"the converter of {one.channel} is coarser than the rig file says"
+                                 if one.kind == "resolution" else
+                                 f"the converter of {one.channel} clips below its nominal range",
+                                 _reported(one.parameters), one.confidence, confirmation=one.sentence))
+    if faults.hum is not None:
+        found.append(NamedEffect("mains_hum", "geophones", f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics "
+                                 f"in {', '.join(faults.hum.channels)}", _reported(faults.hum.parameters),
+                                 faults.hum.confidence, confirmation=faults.hum.sentence))
+    motion = faults.noise.ground_motion if faults.noise is not None else None
+    if motion is not None:
+        found.append(NamedEffect("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured",
+                                 _reported(motion.parameters), 0.99, confirmation=motion.sentence))
+    return found
+
+
+def _reported(parameters: Mapping[str, Estimate]) -> dict[str, Reported]:
+    return {name: Reported(float(p.value), float(p.std), p.unit) for name, p in parameters.items()}
+
+
+__all__ = ["SignalFaults", "converter_faults", "find_hum", "left_by", "levels", "named", "predicted", "without_hum"]
