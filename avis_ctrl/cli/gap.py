@@ -1,0 +1,96 @@
+"""`avis gap`: which physical effect a model still misses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from avis_ctrl.cli.console import Progress
+from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints
+from avis_ctrl.errors import InputError
+
+
+def gap(
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="records of the rig: HDF5, .mat, UFF 58 or CSV")],
+    rig: Annotated[str, typer.Option("--rig", metavar="RIG", help="avis, halcyonics, halcyonics_loaded or a rig.toml")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for gap.json, report and models")],
+    columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="which variable of the file "
+                                                "is what, as in avis identify")] = None,
+    period_s: PERIOD = None,
+    excitation: EXCITATION = None,
+    sample_rate_Hz: SAMPLE_RATE = None,
+    unit_y: UNIT_Y = None,
+    band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default "
+                                                                "what is excited")] = None,
+    amplifier_Hz: Annotated[float | None, typer.Option("--amplifier-corner", help="first-order lag that the amplifiers "
+                                                       "are known to have [Hz]")] = None,
+    design: Annotated[bool, typer.Option("--design", help="also design controllers on both models: what the effect does "
+                                         "to mu (about a minute more)")] = False,
+    design_file: Annotated[Path | None, typer.Option("--design-file", metavar="DESIGN.toml", help="with --design: whose "
+                                                     "axes, uncertainty and weights; by default z and phi_x")] = None,
+    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="go on where a gate says stop")] = False,
+    seed: Annotated[int, typer.Option("--seed")] = 1,
+) -> None:
+    """Find where model and measurement disagree, name the missing effect, show the gap close.
+
+    Writes gap.json, gap.html, gap.pdf and the models baseline and updated (.json, .toml) into DIR; then `avis predict
+    DIR OTHER --out PRED.h5` simulates another campaign with both.
+    """
+    from rich.console import Console
+
+    from avis_ctrl.measurement.campaign import Campaign, in_short
+    from avis_ctrl.measurement.formats import parse_columns, read_measurements
+    from avis_ctrl.rigs import load_rig
+    from avis_ctrl.study.files import open_folder
+    from avis_ctrl.study.gap_names import GAP_FILES
+    from avis_ctrl.study.rig_channels import in_words_of
+
+    console = Console(highlight=False)
+    start = load_rig(rig)
+    mapping = parse_columns(columns) if columns else None
+    measured = read_measurements(campaign, mapping, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
+    if not isinstance(measured, Campaign):
+        raise InputError("expected records, found frequency responses", file=campaign)
+    try:
+        named = in_words_of(start, measured, mapping)
+    except InputError as error:
+        raise error.in_file(campaign) from None
+    for note in in_short(measured.notes):
+        console.print(f"[dim]{note}[/]")
+    folder = open_folder(out, GAP_FILES)
+    with Progress(console) as progress:
+        from avis_ctrl.report import gap_html, gap_pdf
+        from avis_ctrl.study.gap import GapOptions, find_gap
+        from avis_ctrl.study.gap_files import write_gap
+
+        options = GapOptions(seed, band_Hz, True, despite_gates, amplifier_Hz, design or design_file is not None,
+                             design_file)
+        found = find_gap(named, start, options, progress)
+        progress("report")
+        files = write_gap(folder, found.gap, gap_html(found), gap_pdf(found))
+    _summary(console, found)
+    console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
+
+
+def _summary(console, found) -> None:
+    from rich.table import Table
+
+    gap = found.gap
+    console.print(f"[bold]{gap.verdict}[/]: {gap.sentences[0]}")
+    table = Table("stage", "error of held-out y, r.m.s.", "chi-square per degree of freedom",
+                  title="gap on records that no fit has seen")
+    for stage in gap.stages:
+        table.add_row(stage.name, f"{100 * stage.nrmse:.3g} %", f"{stage.chi2_per_dof:.4g}")
+    table.add_row("[dim]noise alone[/]", f"[dim]{100 * gap.noise_nrmse:.3g} %[/]", "[dim]1[/]")
+    console.print(table)
+    for sentence in gap.sentences[1:]:
+        console.print(f"- {sentence}")
+    if gap.next_experiment:
+        console.print(f"- next: {gap.next_experiment}")
+    if found.design is not None:
+        for sentence in found.design.sentences:
+            console.print(f"- {sentence}")
+    if found.design_note:
+        console.print(f"- {found.design_note}")

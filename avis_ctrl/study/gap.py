@@ -1,0 +1,145 @@
+"""From a campaign and a rig to the effect that the model misses: gates, analysis, design, provenance."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+import avis_ctrl
+from avis_ctrl.errors import AvisError, InputError
+from avis_ctrl.gap.analysis import analyse
+from avis_ctrl.gap.result import Gap
+from avis_ctrl.gap.simulate import simulate
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.prediction import model_inputs
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.measurement.campaign import Campaign, digest
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.gates import Finding, examine
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.study.gap_design import DesignEffect, design_effect
+from avis_ctrl.study.identification import expectation
+from avis_ctrl.study.rig_channels import in_words_of
+
+Progress = Callable[[str], None]
+# Gates that say stop on what `gap` itself recognises and names, or mends.
+NAMED_HERE = ("clipping", "hum", "signal to noise", "coherence", "repeatability", "level dependence", "periodicity",
+              "spikes")
+
+
+@dataclass(frozen=True)
+class GapOptions:
+    """What a user may choose.
+
+    band_Hz : of the comparison; the excited one where None. design : synthesise controllers on both models, by
+    design_file or by default z and phi_x. gates : look at the signals before anything else. despite_gates : go on where
+    a gate says stop. amplifier_corner_Hz : lag that the amplifiers are known to have.
+    """
+
+    seed: int = 1
+    band_Hz: tuple[float, float] | None = None
+    gates: bool = True
+    despite_gates: bool = False
+    amplifier_corner_Hz: float | None = None
+    design: bool = False
+    design_file: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class GapFinding:
+    """Everything that `avis gap` found; design is None where no controller was asked for, design_note says why."""
+
+    gap: Gap
+    measured: Campaign
+    findings: tuple[Finding, ...]
+    provenance: Mapping[str, Any]
+    design: DesignEffect | None = None
+    design_note: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """gap.json of the contract, with provenance."""
+        return {**self.gap.to_json(), "provenance": dict(self.provenance)}
+
+
+def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptions | None = None,
+             progress: Progress = lambda text: None) -> GapFinding:
+    """Find where a rig and a campaign disagree, and name what is missing.
+
+    Raises
+    ------
+    InputError : frequency responses instead of records, channels that are not the rig's, a gate that says stop,
+        records that drive nothing or tell no noise.
+    ComputationError : a fit that does not come to an end.
+    """
+    options, began = options or GapOptions(), time.monotonic()
+    if not isinstance(measured, Campaign):
+        raise InputError("expected records in time; from frequency responses alone no fault of a signal can be told from "
+                         "one of the table", field="measurement")
+    named = in_words_of(rig, measured)
+    assert isinstance(named, Campaign)  # as it was
+    measured = named
+    if measured.records[0].header.u_unit != "V":
+        raise InputError("expected commanded voltages in V", field="unit of u", value=measured.records[0].header.u_unit)
+    with threadpool_limits(1):
+        findings = _gates(measured, rig, options, progress) if options.gates else ()
+        gap = analyse(measured, rig, options.seed, options.band_Hz, options.amplifier_corner_Hz, None, progress)
+        seconds = time.monotonic() - began
+        gap = replace(gap, seconds=seconds)
+        design, note = _design(gap, options, progress)
+    return GapFinding(gap, measured, findings, provenance(measured, rig, options, seconds), design, note)
+
+
+def _gates(measured: Campaign, rig: Rig, options: GapOptions, progress: Progress) -> tuple[Finding, ...]:
+    """What the gates say; raises InputError where one stops that `gap` has no name for."""
+    progress("gates")
+    model = ResponseModel.of(rig, (), measured.y_unit, measured.y_names, measured.u_names)
+    findings = examine(measured, expectation(model))
+    stops = [one for one in findings if one.severity == "stop" and one.gate not in NAMED_HERE]
+    for one in stops:
+        progress(f"  stop: {one.sentence}")
+    if stops and not options.despite_gates:
+        raise InputError(f"{stops[0].sentence.rstrip('.')}; --despite-gates goes on all the same", field="measurement",
+                         value=stops[0].gate)
+    return findings
+
+
+def _design(gap: Gap, options: GapOptions, progress: Progress) -> tuple[DesignEffect | None, str]:
+    if not options.design:
+        return None, ""
+    try:
+        return design_effect(gap, options.design_file, progress), ""
+    except AvisError as error:
+        return None, f"no comparison of controllers: {error}"
+
+
+def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(y_baseline, y_updated), each (samples, n_y), of every record of another campaign of the rig, from u and floor."""
+    clock = (min(r.header.start_s for r in campaign.records),
+             max(r.header.start_s + r.header.duration_s for r in campaign.records))
+
+    def read(model: TableModel, record) -> np.ndarray:
+        u, floor = model_inputs(model.base, record)
+        return simulate(model, u, floor, record.header.sample_rate_Hz, start_s=record.header.start_s,
+                        campaign_s=clock).y
+    loaded = [record.load() for record in campaign.records]
+    return [(read(found.gap.baseline, record), read(found.gap.updated, record)) for record in loaded]
+
+
+def provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float) -> dict[str, Any]:
+    """What made this result: versions, hash of the inputs, seed, time."""
+    text = repr(sorted((k, v.value) for k, v in rig.parameters().items())) + repr(options)
+    return {"avis_ctrl": avis_ctrl.__version__, "measurement": measured.source,
+            "measurement_sha256": digest(measured), "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
+            "seed": options.seed, "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
+            "python": platform.python_version(),
+            **{name: metadata.version(name) for name in ("numpy", "scipy", "numba", "h5py")}}
