@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 from scipy import signal
-from scipy.interpolate import BSpline
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.single_axis.machine import octaves
+from avis_ctrl.gap.single_axis.machine import bumps, octaves
 from avis_ctrl.gap.single_axis.terms import AxisParameter, Term, register
 from avis_ctrl.measurement.gates.finding import Picture, Series, thinned
 
@@ -81,8 +80,8 @@ class DriveData:
                      AxisParameter("Fv", "N s/m", level / self.speed / 2, -np.inf, np.inf, level / self.speed))
         self.splits = self._halves()
         self.notes = () if self.repeats_s is None else (
-            f"The motion repeats every {self.repeats_s:.4g} s; the force scatters by {np.sqrt(self.noise or 0):.3g} N from "
-            "one repetition to the next, which is the measured noise.",)
+            f"The motion repeats every {self.repeats_s:.4g} s; the force scatters by {np.sqrt(self.noise or 0):.3g} N "
+            "from one repetition to the next, which is the measured noise.",)
 
     def filtered(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(signal.sosfiltfilt(self.sections, x))
@@ -142,16 +141,18 @@ class DriveData:
         index = np.clip(self.keep[:, None] + np.round(shift * FIR_STEP_S * self.rate).astype(int), 0, len(self.q) - 1)
         fir = np.column_stack([self.v[index], self.a[index]])
         q, v, a = (x[self.keep] / np.sqrt(np.mean(x ** 2)) for x in (self.q - self.q.mean(), self.v, self.a))
-        def bumps(x: np.ndarray, count: int) -> np.ndarray:
-            """Quadratic splines over quantiles, so that each has its share of the data."""
-            inner = np.unique(np.quantile(x, np.linspace(0, 1, count - 1)))
-            knots = np.r_[[inner[0] - 1e-9] * 2, inner, [inner[-1] + 1e-9] * 2]
-            return BSpline.design_matrix(np.clip(x, inner[0], inner[-1] - 1e-12), knots, 2).toarray()
-        Q, V, A = bumps(q, 8), bumps(v, 16), bumps(a, 8)
+        Q, V, A = (np.stack(bumps(x, count), axis=1) for x, count in ((q, 8), (v, 16), (a, 8)))
         free = np.hstack([(Q[:, :, None] * V[:, None, :]).reshape(len(q), -1),
                           (A[:, :, None] * V[:, None, ::2]).reshape(len(q), -1)])
         return {f"linear of order {2 * FIR_TAPS}": fir, "free map of position, velocity and acceleration": free}
 
+
+    def free(self, variable: str, terms: Sequence[Term], theta: np.ndarray) -> np.ndarray:
+        if variable == "position":
+            shapes = bumps(self.q, 16)
+        else:  # friction jumps where the motion turns
+            shapes = [one * side for one in bumps(np.abs(self.v), 10) for side in (self.v > 0, self.v < 0)]
+        return np.column_stack([self.filtered(1.0 * one)[self.keep] for one in shapes])
 
     def where(self, e: np.ndarray) -> tuple[dict[str, Any], ...]:
         f = np.fft.rfftfreq(len(e), 1 / self.row_rate)
@@ -203,6 +204,7 @@ def _one(name: str, unit: str, scale: float, low: float = -np.inf) -> tuple[Axis
 
 
 class CoulombFriction(DriveTerm):
+    variable = "velocity"
     name, words = "coulomb_friction", "Coulomb friction, a force of constant size against the motion"
     separated_by = "slow motion at several constant speeds"
 
@@ -225,6 +227,7 @@ class ForceOffset(DriveTerm):
 
 
 class CoulombAsymmetry(DriveTerm):
+    variable = "velocity"
     name, words = "coulomb_asymmetry", "Coulomb friction that differs between the two directions"
     needs = ("coulomb_friction",)
     separated_by = ForceOffset.separated_by
@@ -237,6 +240,7 @@ class CoulombAsymmetry(DriveTerm):
 
 
 class ViscousAsymmetry(DriveTerm):
+    variable = "velocity"
     name, words = "viscous_asymmetry", "viscous friction that differs between the two directions"
     separated_by = "several constant speeds in each direction"
 
@@ -248,6 +252,7 @@ class ViscousAsymmetry(DriveTerm):
 
 
 class QuadraticDrag(DriveTerm):
+    variable = "velocity"
     name, words = "quadratic_drag", "a drag that grows with the square of the speed"
     separated_by = "several constant speeds"
 
@@ -259,6 +264,7 @@ class QuadraticDrag(DriveTerm):
 
 
 class Stribeck(DriveTerm):
+    variable = "velocity"
     name, words = "stribeck_friction", "Stribeck friction, which falls as the drive starts to move"
     needs = ("coulomb_friction",)
     separated_by = "slow motion at several constant speeds"
@@ -277,6 +283,7 @@ class Stribeck(DriveTerm):
 
 
 class Stiffness(DriveTerm):
+    variable = "position"
     name, words = "stiffness", "a spring to the ground (a cable, a hose)"
     separated_by = "the force at rest in several positions"
 
@@ -290,6 +297,7 @@ class Stiffness(DriveTerm):
 
 
 class CubicStiffness(DriveTerm):
+    variable = "position"
     name, words = "cubic_stiffness", "a spring that stiffens with the cube of the displacement from mid travel"
     separated_by = "the force at rest in several positions"
 
@@ -301,6 +309,7 @@ class CubicStiffness(DriveTerm):
 
 
 class Cogging(DriveTerm):
+    variable = "position"
     name, words = "cogging", "a force that is periodic in the position (cogging, pitch of a screw)"
     separated_by = "slow motion over the whole travel"
 

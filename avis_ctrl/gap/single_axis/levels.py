@@ -149,7 +149,10 @@ def _bands(f: np.ndarray) -> np.ndarray:
 
 
 def mode_shifts(low: FrequencyResponse, high: FrequencyResponse) -> list[ModeShift]:
-    """Peaks of the responses at the higher level, and where each is at both, by frequency; modes whose shapes differ are left out."""
+    """Peaks of the responses at the higher level, and where each is at both, by frequency.
+
+    Modes whose shapes differ are left out.
+    """
     size = np.sqrt(np.sum(np.abs(high.value) ** 2, axis=(1, 2)))
     smooth = signal.savgol_filter(20 * np.log10(np.maximum(size, 1e-300)), 5, 2) if len(size) > 5 else size
     peaks, told = signal.find_peaks(smooth, prominence=MODE_PROMINENCE_DB)
@@ -169,8 +172,10 @@ def mode_shifts(low: FrequencyResponse, high: FrequencyResponse) -> list[ModeShi
 
 def linear_models(low: FrequencyResponse, high: FrequencyResponse, level_V: float
                   ) -> list[tuple[int, float, float, float]]:
-    """(order, error on the lines fitted, on unseen lines of the same level, on the same unseen lines of the other
-    level), each relative to the response, every entry in its own size; fitted to every other line of the lower level."""
+    """(order, error on the lines fitted, on unseen lines of the same level, on the same unseen lines of the other).
+
+    Each is relative to the response, every entry in its own size. Fitted to every other line of the lower level.
+    """
     step = max(1, len(low.frequency_Hz) // FITTED_LINES)
     fitted = np.arange(len(low.frequency_Hz)) // step % 2 == 0
     use = np.flatnonzero(fitted)[::max(1, step // 2)]
@@ -254,11 +259,12 @@ def _where(compared: _Comparison, response: FrequencyResponse) -> tuple[dict[str
 
 def _pictures(low: FrequencyResponse, high: FrequencyResponse, names: list[str], compared: _Comparison
               ) -> tuple[Picture, ...]:
-    b, i, j = np.unravel_index(int(np.argmax(compared.share)), compared.share.shape)
+    _, i, j = np.unravel_index(int(np.argmax(compared.share)), compared.share.shape)
     f = low.frequency_Hz
+    spread = np.sqrt(np.maximum((low.variance() + high.variance())[:, i, j], 0))
     lines = [(names[0], np.abs(low.value[:, i, j])), (names[1], np.abs(high.value[:, i, j])),
              ("difference", np.abs(high.value - low.value)[:, i, j]),
-             ("noise and distortion of the difference", np.sqrt(np.maximum((low.variance() + high.variance())[:, i, j], 0)))]
+             ("noise and distortion of the difference", spread)]
     unit = f"{low.output_unit}/{low.input_unit}"
     one = Picture(f"{low.inputs[j]} to {low.outputs[i]} at two levels", "frequency [Hz]", f"magnitude [{unit}]",
                   tuple(Series(name, *thinned(f, x)) for name, x in lines), (), "log", "log")

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError
@@ -53,6 +54,9 @@ class AxisProblem(Protocol):
 
     def references(self, terms: Sequence[Term], theta: np.ndarray) -> Mapping[str, np.ndarray]:
         """Name to columns (n, p): additional regressors of models without physics."""
+
+    def free(self, variable: str, terms: Sequence[Term], theta: np.ndarray) -> np.ndarray:
+        """(n, p) regressors of a free function of a variable of `Term.variable`."""
 
     def where(self, e: np.ndarray) -> tuple[dict[str, Any], ...]:
         """Bands that hold most of the squared residual, as in the contract."""
@@ -192,7 +196,7 @@ def held_out_refitted(problem: AxisProblem, found: Fitted) -> HeldOut:
 
 def _scored(problem: AxisProblem, e: np.ndarray, train: np.ndarray, rows: np.ndarray, spent: int
             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    n = np.count_nonzero(train)
+    n = int(np.count_nonzero(train))
     sigma = problem.sigma(e, train)[rows] * np.sqrt(n / max(n - spent, 1))
     return e[rows], sigma, -np.log(sigma) - 0.5 * (e[rows] / sigma) ** 2
 
@@ -207,6 +211,14 @@ def correlation_time(problem: AxisProblem, judged: HeldOut) -> float:
         rho = sum(float(z[run][lag:] @ z[run][:-lag]) for run in problem.runs if len(run) > lag) / power
         tau += 2 * (1 - lag / (lags + 1)) * rho
     return max(tau, 1.0)
+
+
+def bumps(x: np.ndarray, count: int) -> list[np.ndarray]:
+    """Quadratic splines over quantiles of x, so that each has its share of the data; any shape of x."""
+    inner = np.unique(np.quantile(x, np.linspace(0, 1, count - 1)))
+    knots = np.r_[[inner[0]] * 2, inner, [inner[-1]] * 2]
+    flat = BSpline.design_matrix(np.clip(x.ravel(), inner[0], inner[-1]), knots, 2).toarray()
+    return [column.reshape(x.shape) for column in flat.T]
 
 
 def octaves(frequency_Hz: np.ndarray, power: np.ndarray, channel: dict[str, str]) -> tuple[dict[str, Any], ...]:

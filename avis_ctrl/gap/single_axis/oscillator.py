@@ -1,6 +1,6 @@
 """An oscillator m y'' + d y' + k y = u with what may be missing from it, in the frequency domain.
 
-As in `identification.single_axis.oscillator`, the transforms of a block obey Y = (U + T - N)/D with D = m s^2 + d s + k,
+As in `identification.single_axis.oscillator`, the transforms of a block obey Y = (U + T - N)/D, D = m s^2 + d s + k,
 T a polynomial in s for the state at both ends, fitted block by block and projected out (the state is no part of a
 model, so that it is free on unseen blocks too), and N the transform of a nonlinear restoring force, evaluated on the
 measured y: exact but for the noise of y, and linear in its coefficients.
@@ -12,17 +12,19 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy import signal
 from scipy.interpolate import make_interp_spline
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.single_axis.machine import octaves
+from avis_ctrl.gap.single_axis.machine import bumps, octaves
 from avis_ctrl.gap.single_axis.terms import AxisParameter, Term, register
 from avis_ctrl.identification.single_axis.oscillator import TRANSIENT, fit_oscillator
 from avis_ctrl.measurement.gates.finding import Picture, Series, thinned
 
 BLOCKS = 16
 LEAST_LINES = 40
-LINEAR_ORDER = 8  # of the linear model without physics: four modes where the base has one
+OVERSAMPLED = 4
+LINEAR_ORDER = 40  # of the linear model without physics, where the base has two
 DEGREE = 5  # of the free polynomial force in y and y'
 
 
@@ -55,8 +57,11 @@ class OscillatorData:
         self.f = np.fft.rfftfreq(n, 1 / sample_rate_Hz)[self.line]
         self.s = 2j * np.pi * self.f
         self.u, self.y = (x[:n * BLOCKS].reshape(BLOCKS, n) for x in (u, y))
-        v = make_interp_spline(np.arange(len(y)) / sample_rate_Hz, y, k=5).derivative()(np.arange(len(y)) / sample_rate_Hz)
-        self.v = v[:n * BLOCKS].reshape(BLOCKS, n)
+        # Kinks in a force have harmonics beyond half the sample rate, which would fold back into the band.
+        fine = signal.resample_poly(y - y.mean(), OVERSAMPLED, 1, window=("kaiser", 8.0)) + y.mean()
+        spline = make_interp_spline(np.arange(len(fine)) / (OVERSAMPLED * sample_rate_Hz), fine, k=5)
+        v = spline.derivative()(np.arange(len(fine)) / (OVERSAMPLED * sample_rate_Hz))
+        self.fine, self.v = (x[:OVERSAMPLED * n * BLOCKS].reshape(BLOCKS, -1) for x in (fine, v))
         self.U, self.Y = self.transform(self.u), self.transform(self.y)
         self.s0 = 2 * np.pi * float(np.sqrt(band[0] * band[1])) if band[0] > 0 else np.pi * band[1]
         self.level = float(np.sqrt(np.mean(y ** 2)))
@@ -78,8 +83,8 @@ class OscillatorData:
                        ("even and odd blocks", order[::2], order[1::2])]
 
     def transform(self, x: np.ndarray) -> np.ndarray:
-        """(blocks, lines) of (blocks, samples)."""
-        return np.fft.rfft(x, axis=1)[:, self.line]
+        """(blocks, lines) of (blocks, samples), at the sample rate or OVERSAMPLED times it."""
+        return np.fft.rfft(x, axis=1)[:, :len(self.line)][:, self.line] * (self.u.shape[1] / x.shape[1])
 
     def _free_state(self, e: np.ndarray, D: np.ndarray) -> np.ndarray:
         """(2 lines, columns) without the part that T/D can be; e (lines, columns) complex."""
@@ -108,15 +113,26 @@ class OscillatorData:
         return np.full(len(e), max(float(np.sqrt(np.mean(e[used] ** 2))), 1e-12 * self.size[0]))
 
     def references(self, terms: Sequence[Term], theta: np.ndarray) -> Mapping[str, np.ndarray]:
-        """A rational transfer function of high order; and any polynomial force in y and y'."""
-        D, z = self._dynamics(theta), self.s / self.s0
-        linear = [self.U * z ** k / D for k in range(1, LINEAR_ORDER - 1)]
-        linear += [self.Y * self.s0 ** 2 * theta[0] * z ** k / D for k in range(3, LINEAR_ORDER + 1)]
-        y, v = self.y / self.level, self.v / self.speed
+        """A bank of modes all over the band, driven by the input; and any polynomial force in y and y'."""
+        D = self._dynamics(theta)
+        modes = 2 * np.pi * np.geomspace(self.f[0], self.f[-1], LINEAR_ORDER // 2)
+        # As broad as they are apart, so that together they follow any smooth response. The input alone drives them:
+        # with the output among the regressors they would predict its noise.
+        broad = float(np.log(modes[1] / modes[0])) / 2
+        linear = [self.U * self.s ** k * w ** (2 - k) / (self.s ** 2 + 2 * broad * w * self.s + w ** 2) / theta[2]
+                  for w in modes for k in (0, 1)]
+        # Between them, the resonance and its surroundings: D once more, and its square.
+        linear += [self.U * (self.s / self.s0) ** k * theta[2] / D ** 2 for k in range(4)]
+        y, v = self.fine / self.level, self.v / self.speed
         free = [self.transform(y ** i * v ** j) / D for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)
                 if i + j >= 2]
         return {f"linear of order {LINEAR_ORDER}": self._columns(linear, D),
                 f"any force of degree {DEGREE} in y and y'": self._columns(free, D)}
+
+    def free(self, variable: str, terms: Sequence[Term], theta: np.ndarray) -> np.ndarray:
+        x = self.fine if variable == "position" else self.v
+        D = self._dynamics(theta)
+        return self._columns([self.transform(one) / D for one in bumps(x, 16)], D)
 
     def _columns(self, several: Sequence[np.ndarray], D: np.ndarray) -> np.ndarray:
         return np.column_stack([self._free_state(one.T, D).T.ravel() for one in several])
@@ -172,19 +188,21 @@ class Force(OscillatorTerm):
     def _of(self, data: OscillatorData) -> tuple[np.ndarray, float]:
         kept = data.__dict__.setdefault("kept", {})
         if self.key not in kept:
-            N = self.shape(data.y, data.v)
+            N = self.shape(data.fine, data.v)
             kept[self.key] = data.transform(N), float(np.sqrt(np.mean(N ** 2)))
         return kept[self.key]
 
     def parameters(self, data: OscillatorData) -> tuple[AxisParameter, ...]:
         scale = 0.01 * data.force / self._of(data)[1]
-        return (AxisParameter(self.symbol, self.unit(), 0.0 if self.low < 0 else 1e-3 * scale, self.low, np.inf, scale),)
+        start = 0.0 if self.low < 0 else 1e-3 * scale
+        return (AxisParameter(self.symbol, self.unit(), start, self.low, np.inf, scale),)
 
     def transformed(self, data: OscillatorData, p: np.ndarray) -> np.ndarray:
         return p[0] * self._of(data)[0]
 
 
 class CubicStiffness(Force):
+    variable = "position"
     name, words, symbol = "cubic_stiffness", "cubic stiffness, a restoring force k3 y^3", "k3"
     separated_by = "a sine swept slowly up and down at several levels"
 
@@ -196,6 +214,7 @@ class CubicStiffness(Force):
 
 
 class QuadraticStiffness(Force):
+    variable = "position"
     name, words, symbol = "quadratic_stiffness", "quadratic stiffness, a restoring force k2 y^2", "k2"
     separated_by = "the mean displacement under a sine at several levels"
 
@@ -207,6 +226,7 @@ class QuadraticStiffness(Force):
 
 
 class QuadraticDamping(Force):
+    variable = "velocity"
     name, words, symbol = "quadratic_damping", "quadratic damping, a force d2 |y'| y'", "d2"
     separated_by = "free decays from several amplitudes"
 
@@ -218,6 +238,7 @@ class QuadraticDamping(Force):
 
 
 class CubicDamping(Force):
+    variable = "velocity"
     name, words, symbol = "cubic_damping", "cubic damping, a force d3 y'^3", "d3"
     separated_by = "free decays from several amplitudes"
 
@@ -229,7 +250,9 @@ class CubicDamping(Force):
 
 
 class CoulombFriction(Force):
-    name, words, symbol, low = "coulomb_friction", "Coulomb friction, a force of constant size against the motion", "Fc", 0
+    variable = "velocity"
+    name, words = "coulomb_friction", "Coulomb friction, a force of constant size against the motion"
+    symbol, low = "Fc", 0
     separated_by = "free decays from several amplitudes"
 
     def shape(self, y: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -240,7 +263,7 @@ class CoulombFriction(Force):
 
 
 class PositionDamping(Force):
-    name, words, symbol = "position_damping", "damping that changes with the square of the position, a force c y^2 y'", "c"
+    name, words = "position_damping", "damping that changes with the square of the position, a force c y^2 y'"
     separated_by = "free decays from several amplitudes"
 
     def shape(self, y: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -303,17 +326,17 @@ class AttachedOscillator(OscillatorTerm):
     separated_by = "a finer resolution about the second resonance"
 
     def parameters(self, data: OscillatorData) -> tuple[AxisParameter, ...]:
-        low, high = data.f[0], data.f[-1]
+        low, high = float(data.f[0]), float(data.f[-1])
         mass = data.base[0].start
         return (AxisParameter("mass", "u s^2 a unit of y", 0.01 * mass, 0.0, np.inf, 0.1 * mass),
-                AxisParameter("frequency_Hz", "Hz", float(np.sqrt(low * high)), float(low), float(high), 0.1 * float(high)),
+                AxisParameter("frequency_Hz", "Hz", float(np.sqrt(low * high)), low, high, 0.1 * high),
                 AxisParameter("damping", "", 0.02, 1e-4, 1.0, 0.02))
 
     def starts(self, data: OscillatorData, residual: np.ndarray) -> list[np.ndarray]:
         power = np.sum(residual.reshape(BLOCKS, 2, -1) ** 2, axis=(0, 1))
         smooth = np.convolve(power, np.ones(9), mode="same")
-        return [np.array([0.01 * data.base[0].start, f, 0.02]) for f in (data.f[int(np.argmax(smooth))],
-                                                                        float(np.sqrt(data.f[0] * data.f[-1])))]
+        tried = (float(data.f[int(np.argmax(smooth))]), float(np.sqrt(data.f[0] * data.f[-1])))
+        return [np.array([0.01 * data.base[0].start, f, 0.02]) for f in tried]
 
     def impedance(self, data: OscillatorData, p: np.ndarray) -> np.ndarray:
         w = 2 * np.pi * p[1]

@@ -64,7 +64,8 @@ class SeismometerData:
                                         else -np.inf, np.inf, abs(float(x)))
                           for name, unit, x in zip(start.names, start.information.units, start.values, strict=True))
         relative = {kind: np.asarray(V) / np.abs(responses.value[kind]) ** 2 for kind, V in responses.variance.items()}
-        both = sum(relative[kind] for kind in self.channels) if ratio_variance is None else np.asarray(ratio_variance)
+        summed = np.sum([relative[kind] for kind in self.channels], axis=0)
+        both = summed if ratio_variance is None else np.asarray(ratio_variance)
         variance = [relative[self.channels[0]], *([both] if len(self.channels) > 1 else [])]
         H = [responses.value[kind] for kind in self.channels]
         self.measured = [H[0], *([H[1] / H[0]] if len(H) > 1 else [])]
@@ -72,8 +73,8 @@ class SeismometerData:
         self.runs = [np.arange(n * k, n * (k + 1)) for k in range(kinds)]
         self.v = np.concatenate([x / 2 for x in variance for _ in (0, 1)])
         self.notes = () if not np.any(h) else (
-            f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {self.f[int(np.argmax(h))]:.3g} Hz: the mass "
-            "itself is nonlinear, which no term of a channel holds.",)
+            f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {self.f[int(np.argmax(h))]:.3g} Hz: the "
+            "mass itself is nonlinear, which no term of a channel holds.",)
         self.h = np.tile(h / max(float(np.median(h)), 1e-12), kinds)
         count = n // TOGETHER
         self.block = np.tile(np.minimum(np.arange(n) // TOGETHER, count - 1), kinds)
@@ -156,6 +157,9 @@ class SeismometerData:
             modes[:n, k - 1], modes[n:2 * n, k - 1] = (z ** k * D).real, (z ** k * D).imag
         return {"more modes of the mass, order 4": modes, "free bends of magnitude and phase": free}
 
+    def free(self, variable: str, terms: Sequence[Term], theta: np.ndarray) -> np.ndarray:
+        return np.zeros((len(self.block), 0))  # no term of a channel is a static function
+
     def where(self, e: np.ndarray) -> tuple[dict[str, Any], ...]:
         power = [e[self.runs[2 * k]] ** 2 + e[self.runs[2 * k + 1]] ** 2 for k in range(len(self.measured))]
         worst = int(np.argmax([one.sum() for one in power]))
@@ -164,7 +168,8 @@ class SeismometerData:
 
     def picture(self, errors: Sequence[np.ndarray], names: Sequence[str]) -> Picture:
         run, what = self.runs[-1], f"phase of {' over '.join(self.channels[::-1])}"
-        series = tuple(Series(name, self.f, np.degrees(e[run]), "points") for name, e in zip(names, errors, strict=True))
+        series = tuple(Series(name, self.f, np.degrees(e[run]), "points")
+                       for name, e in zip(names, errors, strict=True))
         return Picture(f"What each stage leaves on unseen frequencies, {what}", "frequency [Hz]", "phase [deg]", series,
                        (), "log", "linear")
 

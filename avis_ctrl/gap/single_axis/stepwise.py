@@ -31,6 +31,9 @@ CREDIBLE = 0.95
 # Halves may differ by this part of a value even where their deviations are smaller: re-identified parameters of one rig
 # scatter as much (the contract's damping: +-20 %), and no physical law holds to a per cent on a real machine.
 AGREEMENT = 0.2
+# The contract: the gap is closed within 1.2 of the noise floor. Beyond the first effect, what moves the r.m.s. by less
+# is as well an inexact shape of the effects that are named.
+AT_THE_NOISE = 1.2
 MOST_EFFECTS = 5
 DRAWS = 2000
 RIDGES = (1e-6, 1e-4, 1e-2, 1.0, 100.0)
@@ -113,6 +116,8 @@ def _candidates(problem: AxisProblem, steps: Sequence[Step], library: Sequence[T
     judged = [Candidate(c.term, c.fitted, c.judged, float(g.sum()), float(w) * (1 - nothing),
                         _too_small(float(g.sum()), float(s), least))
               for c, g, w, s in zip(found, gain, weight, sure, strict=True)]
+    if now.terms:
+        judged = [replace(c, refused=c.refused or _immaterial(current, c.judged)) for c in judged]
     judged.sort(key=lambda c: (-c.probability, -c.gain))
     return tuple(_checked(problem, _without_limits(judged, len(now.theta)), len(now.theta)))
 
@@ -138,6 +143,11 @@ def _too_small(gain: float, sure: float, least: float) -> str:
     return ""
 
 
+def _immaterial(current: HeldOut, judged: HeldOut) -> str:
+    ratio = float(np.linalg.norm(current.e / current.sigma) / np.linalg.norm(judged.e / current.sigma))
+    return "" if ratio >= AT_THE_NOISE else f"changes what is left by a factor of {ratio:.3g} only"
+
+
 def _without_limits(candidates: list[Candidate], first: int) -> list[Candidate]:
     """A rival whose best parameters lie at the limit of what is physical is no rival; where the leader's do, nobody
     takes its place: the second best of a wrong explanation is no explanation."""
@@ -154,17 +164,11 @@ def _without_limits(candidates: list[Candidate], first: int) -> list[Candidate]:
 
 
 def _checked(problem: AxisProblem, candidates: list[Candidate], first: int) -> list[Candidate]:
-    """The leader must agree with itself; where it does not, only a member of the same credible set takes its place."""
-    found, held = [], 0.0
-    for c in candidates:
-        reason = c.refused
-        if not reason and held >= CREDIBLE:
-            reason = "less probable than what leads"
-        if not reason:
-            reason = disagreement(problem, c.fitted, first)
-        held += c.probability
-        found.append(replace(c, refused=reason))
-    return found
+    """The leader must agree with itself; where it does not, no other takes its place."""
+    leader = candidates[0]
+    reason = leader.refused or disagreement(problem, leader.fitted, first)
+    return [replace(leader, refused=reason),
+            *(replace(c, refused=c.refused or "less probable than what leads") for c in candidates[1:])]
 
 
 def disagreement(problem: AxisProblem, found: Fitted, first: int) -> str:

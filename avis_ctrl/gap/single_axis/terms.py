@@ -39,6 +39,8 @@ class Term:
     words : what is missing, as the end of "the model lacks ...".
     separated_by : the measurement that tells it from terms that predict the same here.
     needs : names of terms without which it has no meaning.
+    variable : "position" or "velocity" where the term is a static function of it: a free function of the same variable
+        then judges its shape. Empty otherwise.
     """
 
     name: ClassVar[str] = ""
@@ -46,6 +48,7 @@ class Term:
     words: ClassVar[str] = ""
     separated_by: ClassVar[str] = ""
     needs: ClassVar[tuple[str, ...]] = ()
+    variable: ClassVar[str] = ""
 
     def parameters(self, data: Any) -> tuple[AxisParameter, ...]:
         """Of this term for these data, whose sizes give scales and starts."""

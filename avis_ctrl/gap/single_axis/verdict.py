@@ -9,14 +9,22 @@ import numpy as np
 
 from avis_ctrl.gap.single_axis.machine import AxisProblem, HeldOut, correlation_time, held_out
 from avis_ctrl.gap.single_axis.result import AxisEffect, AxisGap, AxisStage, Estimate
-from avis_ctrl.gap.single_axis.stepwise import FALSE_ALARM, Candidate, Progress, Step, reference, search
+from avis_ctrl.gap.single_axis.stepwise import (
+    AT_THE_NOISE,
+    DRAWS,
+    FALSE_ALARM,
+    Candidate,
+    Progress,
+    Step,
+    reference,
+    search,
+)
 from avis_ctrl.gap.single_axis.terms import AxisParameter, Term
 from avis_ctrl.measurement.gates.finding import Picture, Series
 
-# The contract: the gap is closed within 1.2 of the noise floor.
-AT_THE_NOISE = 1.2
-# Effects that take up less than this of what a model without physics can take up are neighbours of the truth, not it.
-LEAST_SHARE = 0.5
+# Of the squared error that a model without physics shows to be removable, effects that take less than this leave more
+# than half of the r.m.s.: neighbours of the truth, not the truth.
+LEAST_SHARE = 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,17 +65,19 @@ def gap_of(problem: AxisProblem, library: Sequence[Term], seed: int, progress: P
 
 
 def _references(problem: AxisProblem, step: Step, rng: np.random.Generator) -> list[_Reference]:
-    found = []
-    plain = held_out(problem, step.fitted)
-    for name, columns in problem.references(step.fitted.terms, step.fitted.theta).items():
-        judged = reference(problem, step.fitted, columns)
-        tau = correlation_time(problem, plain)
-        gain = judged.blocks(problem.block, tau) - plain.blocks(problem.block, tau)
-        draws = rng.dirichlet(np.ones(len(gain)), 2000) * len(gain)
-        certain = bool(gain.sum() > np.log(1 / FALSE_ALARM) and np.mean(draws @ gain > 0) >= 1 - FALSE_ALARM)
-        found.append(_Reference(name, judged, float(np.linalg.norm(plain.e / plain.sigma)
-                                                    / np.linalg.norm(judged.e / plain.sigma)), certain))
-    return found
+    return [_reference(problem, step, name, columns, rng)
+            for name, columns in problem.references(step.fitted.terms, step.fitted.theta).items()]
+
+
+def _reference(problem: AxisProblem, step: Step, name: str, columns: np.ndarray, rng: np.random.Generator
+               ) -> _Reference:
+    plain, judged = held_out(problem, step.fitted), reference(problem, step.fitted, columns)
+    tau = correlation_time(problem, plain)
+    gain = judged.blocks(problem.block, tau) - plain.blocks(problem.block, tau)
+    draws = rng.dirichlet(np.ones(len(gain)), DRAWS) * len(gain)
+    certain = bool(gain.sum() > np.log(1 / FALSE_ALARM) and np.mean(draws @ gain > 0) >= 1 - FALSE_ALARM)
+    ratio = float(np.linalg.norm(plain.e / plain.sigma) / np.linalg.norm(judged.e / plain.sigma))
+    return _Reference(name, judged, ratio, certain)
 
 
 def _enough(problem: AxisProblem, steps: list[Step], on_base: Sequence[_Reference], left: Sequence[_Reference]
@@ -81,10 +91,24 @@ def _enough(problem: AxisProblem, steps: list[Step], on_base: Sequence[_Referenc
     floor = min([*floors, after])
     share = (before - after) / max(before - floor, np.finfo(float).tiny)
     if share >= LEAST_SHARE:
-        return steps, ""
+        return _of_right_shape(problem, steps)
     names = ", ".join(step.named.term.name for step in steps[1:] if step.named)
     return steps[:1], (f"{names} would take up {100 * share:.0f} % of the squared error that can be taken up: a "
                        "neighbour of what is missing, and not named")
+
+
+def _of_right_shape(problem: AxisProblem, steps: list[Step]) -> tuple[list[Step], str]:
+    """No effects where a free function of the variable that one of them acts on removes as much of what is left."""
+    last = steps[-1]
+    rng = np.random.default_rng(0)
+    for variable in sorted({term.variable for term in last.fitted.terms if term.variable}):
+        one = _reference(problem, last, f"free function of the {variable}",
+                         problem.free(variable, last.fitted.terms, last.fitted.theta), rng)
+        if one.certain and one.ratio ** 2 * (1 - LEAST_SHARE) > 1:
+            names = ", ".join(term.name for term in last.fitted.terms if term.variable == variable)
+            return steps[:1], (f"What is missing is a function of the {variable}, but not of the shape of {names}: "
+                               f"a free function leaves {one.ratio:.3g} times less, and {names} is not named")
+    return steps, ""
 
 
 def _verdict(problem: AxisProblem, steps: Sequence[Step], left: Sequence[_Reference]) -> str:
