@@ -58,7 +58,7 @@ def find_axis_gap(kind: str, *, seed: int = 1, progress: Progress | None = None,
     except TypeError as error:
         if "argument" not in str(error):
             raise
-        raise InputError(f"expected the data of a {kind}, see find_axis_gap", field="data",
+        raise InputError(f"expected the data for kind {kind}, see find_axis_gap", field="data",
                          value=sorted(data)) from None
     found = problem if isinstance(problem, AxisGap) else gap_of(problem, list(library(kind).values()), seed, told)
     return replace(found, seconds=time.perf_counter() - begun)

@@ -124,15 +124,32 @@ class OscillatorData:
         # Between them, the resonance and its surroundings: D once more, and its square.
         linear += [self.U * (self.s / self.s0) ** k * theta[2] / D ** 2 for k in range(4)]
         y, v = self.fine / self.level, self.v / self.speed
-        free = [self.transform(y ** i * v ** j) / D for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)
+        free = [self.transform(self._without_linear(y ** i * v ** j)) / D
+                for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)
                 if i + j >= 2]
-        return {f"linear of order {LINEAR_ORDER}": self._columns(linear, D),
-                f"any force of degree {DEGREE} in y and y'": self._columns(free, D)}
+        found = {f"linear of order {LINEAR_ORDER}": self._columns(linear, D),
+                 f"any force of degree {DEGREE} in y and y'": self._columns(free, D)}
+        if not terms:
+            # A named force passes the noise of y on, which a free function of the same y would then predict.
+            found |= {f"free function of the {name}": self.free(name, terms, theta)
+                      for name in ("position", "velocity")}
+        return found
 
     def free(self, variable: str, terms: Sequence[Term], theta: np.ndarray) -> np.ndarray:
         x = self.fine if variable == "position" else self.v
         D = self._dynamics(theta)
-        return self._columns([self.transform(one) / D for one in bumps(x, 16)], D)
+        return self._columns([self.transform(self._without_linear(one)) / D for one in bumps(x, 16)], D)
+
+    def _without_linear(self, N: np.ndarray) -> np.ndarray:
+        """N(y, y') less what is linear in y and y'.
+
+        A regressor that holds y itself holds the noise of the y that it is to predict, and would predict it. For a
+        Gaussian y the rest does not correlate with small noise on y (Stein: E[N' - E[y N]/E[y^2]] = 0).
+        """
+        linear = np.column_stack([self.fine.ravel(), self.v.ravel(), np.ones(N.size)])
+        scale = np.linalg.norm(linear, axis=0)
+        Q = linear / scale
+        return N - (Q @ np.linalg.solve(Q.T @ Q, Q.T @ N.ravel())).reshape(N.shape)
 
     def _columns(self, several: Sequence[np.ndarray], D: np.ndarray) -> np.ndarray:
         return np.column_stack([self._free_state(one.T, D).T.ravel() for one in several])
@@ -177,7 +194,8 @@ class OscillatorTerm(Term):
 class Force(OscillatorTerm):
     """A force c N(y, y'), linear in c; the transform of N is kept, one for each data set."""
 
-    symbol, low = "c", -np.inf
+    symbol = "c"
+    low = -np.inf
 
     def shape(self, y: np.ndarray, v: np.ndarray) -> np.ndarray:
         raise NotImplementedError
@@ -228,6 +246,7 @@ class QuadraticStiffness(Force):
 class QuadraticDamping(Force):
     variable = "velocity"
     name, words, symbol = "quadratic_damping", "quadratic damping, a force d2 |y'| y'", "d2"
+    low = 0.0  # a passive force takes energy out
     separated_by = "free decays from several amplitudes"
 
     def shape(self, y: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -240,6 +259,7 @@ class QuadraticDamping(Force):
 class CubicDamping(Force):
     variable = "velocity"
     name, words, symbol = "cubic_damping", "cubic damping, a force d3 y'^3", "d3"
+    low = 0.0
     separated_by = "free decays from several amplitudes"
 
     def shape(self, y: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -252,7 +272,7 @@ class CubicDamping(Force):
 class CoulombFriction(Force):
     variable = "velocity"
     name, words = "coulomb_friction", "Coulomb friction, a force of constant size against the motion"
-    symbol, low = "Fc", 0
+    symbol, low = "Fc", 0.0
     separated_by = "free decays from several amplitudes"
 
     def shape(self, y: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -263,7 +283,8 @@ class CoulombFriction(Force):
 
 
 class PositionDamping(Force):
-    name, words = "position_damping", "damping that changes with the square of the position, a force c y^2 y'"
+    name, words = "position_damping", "damping that grows with the square of the position, a force c y^2 y'"
+    low = 0.0
     separated_by = "free decays from several amplitudes"
 
     def shape(self, y: np.ndarray, v: np.ndarray) -> np.ndarray:
