@@ -1,0 +1,272 @@
+"""Every effect of the mechanics against the same physics with explicit coordinates, and its limits in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from assembled_table import Assembly, mount_map
+
+from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.operators import assemble
+from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.rigs import load_rig
+
+RIG = load_rig("avis")
+# Displacements against the voltage itself: no chain, no hold, no aliases.
+BARE = TableModel(ResponseModel.of(RIG, (), unit="m", sampled=False))
+F = np.geomspace(0.3, 150.0, 50)
+OMEGA = 2 * np.pi * F
+VERTICAL = [one.stiffness[2] for one in RIG.isolators]
+
+
+def with_effect(name, place, values, model=BARE):
+    return model.with_effect(active(library()[name], model, place, values))
+
+
+def agree(model, assembly, rtol=1e-9):
+    found, true = model.response(OMEGA), assembly.response(F)
+    for part in (slice(0, 8), slice(8, 11)):  # by volts, by the floor's velocity
+        off = np.abs(found - true)[:, :, part].max(axis=(1, 2)) / np.abs(true)[:, :, part].max(axis=(1, 2))
+        assert np.max(off) < rtol
+    # and the effect is not one that could be left out
+    plain = Assembly(RIG).mounts().response(F)
+    assert np.max(np.abs(true - plain).max(axis=(1, 2)) / np.abs(plain).max(axis=(1, 2))) > 1e-3
+
+
+def dynamic_stiffness(model, f):
+    """(n, 6, 6) at rest floor."""
+    return assemble(model.operators(2 * np.pi * np.atleast_1d(np.asarray(f, float)))).D
+
+
+def added_stiffness(name, place, values, f, model=BARE):
+    return dynamic_stiffness(with_effect(name, place, values, model), f) - dynamic_stiffness(model, f)
+
+
+def test_bare_table():
+    np.testing.assert_allclose(BARE.response(OMEGA), Assembly(RIG).mounts().response(F), rtol=1e-9, atol=1e-20)
+
+
+# --- mounts
+
+@pytest.mark.parametrize(("ratio", "corner"), [(0.1, 0.5), (1.0, 3.0), (5.0, 40.0)])
+def test_relaxation_is_a_spring_with_a_damper_in_series(ratio, corner):
+    table = Assembly(RIG, 4).mounts()
+    for i, (G, k) in enumerate(zip(table.maps, VERTICAL, strict=True)):
+        between = {f"e{i}": -1.0}
+        table.spring(table.row(G[2], **between), ratio * k)
+        table.spring(table.row(**{f"e{i}": 1.0}), 0.0, ratio * k / (2 * np.pi * corner), [0, 0, 1])
+    agree(with_effect("mount_relaxation", "isolators z", [ratio, corner]), table)
+
+
+def test_relaxation_stiffness_at_rest_and_at_high_frequency():
+    low, high = added_stiffness("mount_relaxation", "isolators z", [0.7, 2.0], [1e-5, 1e5])[:, 2, 2]
+    assert abs(low) < 1e-4 * sum(VERTICAL)
+    assert high == pytest.approx(0.7 * sum(VERTICAL), rel=1e-4)
+
+
+@pytest.mark.parametrize("eta", [0.02, 0.2])
+def test_structural_loss(eta):
+    """Both laws lose the same share at every frequency; the causal one stiffens as Kramers and Kronig ask."""
+    f = np.array([0.5, 3.0, 20.0])
+    K = Assembly(RIG).mounts().K
+    for place in ("isolators/causal", "isolators/complex"):
+        Z = added_stiffness("structural_damping", place, [eta], f) + K
+        np.testing.assert_allclose(Z.imag, eta * Z.real, atol=1e-9 * np.max(K))
+    causal = added_stiffness("structural_damping", "isolators/causal", [eta], f)[:, 2, 2] + K[2, 2]
+    assert abs(causal[1]) == pytest.approx(K[2, 2])
+    # Bode's relation: phase = pi/2 times the slope of the modulus on logarithmic axes
+    slope = np.log(abs(causal[2] / causal[0])) / np.log(f[2] / f[0])
+    assert np.angle(causal[1]) == pytest.approx(np.pi / 2 * slope, rel=1e-9)
+
+
+@pytest.mark.parametrize(("mass", "share", "bypass"), [(20.0, 0.5, 0.0), (5.0, 0.3, 0.0), (60.0, 0.7, 0.8)])
+def test_surge_is_a_mass_between_two_springs(mass, share, bypass):
+    table = Assembly(RIG, 4).mounts(without="z")
+    for i, (G, one) in enumerate(zip(table.maps, RIG.isolators, strict=True)):
+        k, c, z = one.stiffness[2], one.damping[2], np.array([0, 0, 1])
+        inner = (1 - bypass) * c
+        table.spring(table.row(G[2], **{f"e{i}": -1.0}), k / share, inner / share)
+        table.spring(table.row(**{f"e{i}": 1.0}), k / (1 - share), inner / (1 - share), z)
+        table.spring(table.row(G[2]), 0.0, bypass * c, z)
+        table.mass(table.row(**{f"e{i}": 1.0}), mass)
+    agree(with_effect("mount_surge", "isolators z", [mass, share, bypass]), table)
+
+
+def test_surge_keeps_the_static_stiffness_and_resonates_at_sqrt_4k_over_m():
+    quiet = replace(BARE, base=replace(BARE.base, rig=RIG.with_parameters(
+        {f"isolator{i}.c_z": 1e-3 for i in range(1, 5)} | {f"isolator{i}.k_z": 4e4 for i in range(1, 5)})))
+    values = [12.0, 0.5, 0.0]
+    assert added_stiffness("mount_surge", "isolators z", values, 1e-4, quiet)[0, 2, 2] == pytest.approx(0, abs=1e-2)
+    f0 = np.sqrt(4 * 4e4 / 12.0) / (2 * np.pi)
+    f = np.linspace(0.9 * f0, 1.1 * f0, 2001)
+    peak = np.abs(added_stiffness("mount_surge", "isolators z", values, f, quiet)[:, 2, 2])
+    assert f[np.argmax(peak)] == pytest.approx(f0, rel=1e-4)
+    model = with_effect("mount_surge", "isolators z", values, quiet)
+    told = library()["mount_surge"].reported(model, "isolators z", dict(zip(
+        ("mass_kg", "payload_share", "bypass"), values, strict=True)), np.diag([0.12 ** 2, 0.0, 0.0]))["frequency_Hz"]
+    assert told.value == pytest.approx(f0)
+    assert told.std == pytest.approx(f0 * 0.12 / 12 / 2)  # f goes as m^-1/2
+
+
+@pytest.mark.parametrize("valve", [None, 0.4])
+def test_leveling_integrates_the_deflection_of_three_mounts(valve):
+    gain = 3e4
+    values = [gain] if valve is None else [gain, valve]
+    model = with_effect("leveling_loop", f"isolators 1-3 z/{'plain' if valve is None else 'lag'}", values)
+    true = []
+    for f in F:
+        s, table = 2j * np.pi * f, Assembly(RIG).mounts()
+        law = gain / s / (1 + s / (2 * np.pi * valve) if valve else 1)
+        for G in table.maps[:3]:
+            table.spring(table.row(G[2]), law, floor=[0, 0, 1])
+        true.append(table.response([f])[0])
+    np.testing.assert_allclose(model.response(OMEGA), true, rtol=1e-9, atol=1e-20)
+    # An integral undoes a static force on three mounts; the fourth alone cannot hold the vertical axis there.
+    assert np.max(np.abs(np.array(true) / Assembly(RIG).mounts().response(F) - 1)) > 0.05
+
+
+def test_an_integrator_feeds_energy_in():
+    """The one law of the library that is active: its loss is negative at every frequency."""
+    Z = added_stiffness("leveling_loop", "isolators 1-3 z/plain", [1e4], F)
+    assert np.all(np.linalg.eigvalsh((Z - np.conj(np.swapaxes(Z, 1, 2))) / 2j)[:, 0] < 0)
+
+
+# --- chassis
+
+@pytest.mark.parametrize("rocking", [False, True])
+def test_base_compliance_is_a_second_body(rocking):
+    m_c, f_z, f_xy, zeta, f_r, radius = 900.0, 14.0, 9.0, 0.05, 11.0, 0.4
+    table = Assembly(RIG, 6)
+    for G, one in zip(table.maps, RIG.isolators, strict=True):
+        for a in range(3):
+            row = np.concatenate([G[a], -G[a] if rocking else [*-G[a][:3], 0, 0, 0]])
+            table.spring(row, one.stiffness[a], one.damping[a])
+    table.T[6:] = -table.T[:6] if rocking else np.vstack([-table.T[:3], np.zeros((3, 8))])
+    for a, (m, f) in enumerate(zip([m_c] * 3 + [m_c * radius ** 2] * 3, [f_xy, f_xy, f_z] + [f_r] * 3, strict=True)):
+        w, floor = 2 * np.pi * f, np.eye(3)[a] if a < 3 else np.zeros(3)
+        table.mass(table.row(**{f"e{a}": 1.0}), m)
+        table.spring(table.row(**{f"e{a}": 1.0}), m * w ** 2, 2 * zeta * w * m, floor)
+    values = [m_c, f_z, f_xy, zeta, *([f_r, radius] if rocking else [])]
+    agree(with_effect("base_compliance", f"chassis/{'rocking' if rocking else 'translation'}", values), table)
+
+
+def test_momentum_is_conserved_far_above_the_resonance_of_the_base():
+    """Without outer force the payload and the chassis move against each other, in inverse proportion to their masses."""
+    model = with_effect("base_compliance", "chassis/translation", [800.0, 2.0, 2.0, 1e-3])
+    made = assemble(model.operators(2 * np.pi * np.array([2000.0])))
+    x = made.inverse @ np.asarray(made.T[:, :1])[None]
+    moved = made.chassis(x, np.zeros((1, 3, 1)))
+    np.testing.assert_allclose(RIG.mass * x[0, :3] + 800.0 * moved[0, :3], 0, atol=1e-5 * RIG.mass * np.abs(x).max())
+
+
+def test_a_heavy_chassis_is_a_stiff_floor():
+    for mass, close in ((1e5, 0.05), (1e12, 1e-8)):
+        model = with_effect("base_compliance", "chassis/rocking", [mass, 300.0, 300.0, 0.05, 300.0, 1.0])
+        by_u = model.response(OMEGA)[:, :, :8]
+        bare = BARE.response(OMEGA)[:, :, :8]
+        assert np.max(np.abs(by_u - bare)) < close * np.max(np.abs(bare))
+    stiff = with_effect("base_compliance", "chassis/translation", [1e12, 1e5, 1e5, 0.05]).response(OMEGA)
+    np.testing.assert_allclose(stiff, BARE.response(OMEGA), rtol=1e-3)  # (150 Hz / 100 kHz)^2 and the damper
+
+
+# --- payload
+
+def test_centre_of_mass_by_the_parallel_axis_theorem():
+    c = np.array([0.03, -0.02, 0.05])
+    table = Assembly(RIG).mounts()
+    J = RIG.inertia_matrix() + RIG.mass * (c @ c * np.eye(3) - np.outer(c, c))
+    S = np.array([[0, -c[2], c[1]], [c[2], 0, -c[0]], [-c[1], c[0], 0]])
+    table.M = np.block([[RIG.mass * np.eye(3), -RIG.mass * S], [RIG.mass * S, J]])
+    agree(with_effect("com_offset", "payload", c), table)
+
+
+@pytest.mark.parametrize(("place", "a", "b"), [("Jxy", 0, 1), ("Jxz", 0, 2), ("Jyz", 1, 2)])
+def test_product_of_inertia_is_that_entry_of_the_tensor(place, a, b):
+    table = Assembly(RIG).mounts()
+    table.M[3 + a, 3 + b] = table.M[3 + b, 3 + a] = 4.0
+    agree(with_effect("product_of_inertia", place, [4.0]), table)
+
+
+@pytest.mark.parametrize("axes", ["z", "x", "y", "xyz"])
+def test_oscillator_is_a_mass_on_a_spring(axes):
+    m, f, zeta = 15.0, 12.0, 0.04
+    place = np.array([0.35, -0.2, 0.3])
+    if axes != "xyz":
+        place["xyz".index(axes)] = 0.0  # along its own axis a place makes no difference
+    table, w = Assembly(RIG, len(axes)).mounts(), 2 * np.pi * f
+    for k, axis in enumerate(axes):
+        table.mass(table.row(**{f"e{k}": 1.0}), m)
+        table.spring(table.row(mount_map(place)["xyz".index(axis)], **{f"e{k}": -1.0}), m * w ** 2, 2 * zeta * w * m)
+    values = [m, f, zeta, *(x for x, name in zip(place, "xyz", strict=True) if axes == "xyz" or name != axes)]
+    agree(with_effect("attached_oscillator", f"payload/{axes}", values), table)
+
+
+def test_oscillator_is_added_mass_far_below_and_nothing_far_above():
+    values = [10.0, 20.0, 0.05, 0.0, 0.0]
+    low, high = added_stiffness("attached_oscillator", "payload/z", values, [0.1, 4000.0])[:, 2, 2]
+    assert low == pytest.approx(-10.0 * (2 * np.pi * 0.1) ** 2, rel=1e-3)
+    assert abs(high) < 3e-3 * 10.0 * (2 * np.pi * 4000.0) ** 2  # its damper: 2 zeta f0/f
+
+
+def test_flexible_mode_is_a_coordinate_of_unit_mass():
+    rng = np.random.default_rng(3)
+    shape, f, zeta = 0.02 * rng.standard_normal(12), 25.0, 0.01
+    table, w = Assembly(RIG, 1), 2 * np.pi * 25.0
+    for i, (G, one) in enumerate(zip(table.maps, RIG.isolators, strict=True)):
+        for a in range(3):
+            table.spring(table.row(G[a], e0=shape[3 * i + a]), one.stiffness[a], one.damping[a], np.eye(3)[a])
+    table.mass(table.row(e0=1.0), 1.0)
+    table.spring(table.row(e0=1.0), w ** 2, 2 * zeta * w)
+    for k, motor in enumerate(RIG.motors):
+        table.T[6, k] = motor.constant_N_per_V * shape[3 * (motor.isolator - 1) + "xyz".index(motor.axis)]
+    g = RIG.geophones
+    table.R[:, 6] = [shape[3 * (i - 1) + "xyz".index(axis)] for i, axis in zip(g.isolator, g.axis, strict=True)]
+    agree(with_effect("payload_flexible_mode", "payload", [f, zeta, *shape]), table)
+
+
+def test_cable_along_the_axes_and_oblique():
+    place = np.array([0.3, 0.2, -0.1])
+    for along, K, values in (
+            ("axes", np.diag([800.0, 300.0, 1500.0]), [800.0, 300.0, 1500.0]),
+            ("oblique", 2000.0 * np.outer([0.6, 0.0, 0.8], [0.6, 0.0, 0.8]), [720.0, 0.0, 1280.0, 0.0, 960.0, 0.0])):
+        table, k = Assembly(RIG).mounts(), np.zeros((6, 6))
+        G = mount_map(place)
+        k[:6, :6] = G.T @ K @ G
+        table.K, table.C = table.K + k, table.C + 2e-3 * k
+        table.K_w, table.C_w = table.K_w + G.T @ K, table.C_w + 2e-3 * G.T @ K
+        agree(with_effect("cable_stiffness", f"payload/{along}", [*values, 2e-3, *place]), table)
+
+
+@pytest.mark.parametrize(("name", "place", "values"), [
+    ("mount_relaxation", "isolators z", [0.5, 2.0]),
+    ("structural_damping", "isolators/causal", [0.1]),
+    ("structural_damping", "isolators/complex", [0.1]),
+    ("attached_oscillator", "payload/xyz", [10.0, 8.0, 0.05, 0.3, 0.2, 0.1]),
+    ("cable_stiffness", "payload/axes", [500.0, 500.0, 500.0, 1e-3, 0.3, 0.2, 0.1]),
+    ("mount_surge", "isolators z", [20.0, 0.4, 0.3])])
+def test_passive_at_every_frequency(name, place, values):
+    """Power taken by a motion, w/2 q^H Im(Z) q, is never negative: of the effect itself, or of the mounts with it."""
+    Z = added_stiffness(name, place, values, F) if name != "mount_surge" else dynamic_stiffness(
+        with_effect(name, place, values), F)
+    loss = np.linalg.eigvalsh((Z - np.conj(np.swapaxes(Z, 1, 2))) / 2j)
+    assert np.all(loss[:, 0] > -1e-9 * np.abs(Z).max(axis=(1, 2)))
+    assert np.all(loss[:, -1] > 0)
+
+
+@pytest.mark.parametrize(("name", "place", "values"), [
+    ("mount_relaxation", "isolators z", [0.5, 2.0]),
+    ("attached_oscillator", "payload/xyz", [10.0, 8.0, 0.05, 0.3, 0.2, 0.1]),
+    ("com_offset", "payload", [0.02, 0.01, -0.03]),
+    ("mount_surge", "isolators z", [20.0, 0.3, 0.5]),
+    ("base_compliance", "chassis/rocking", [900.0, 14.0, 9.0, 0.05, 11.0, 0.4]),
+    ("payload_flexible_mode", "payload", [25.0, 0.01, *np.linspace(-0.02, 0.03, 12)])])
+def test_reciprocity(name, place, values):
+    """Whatever has no rotor and no feedback answers alike when force and displacement change places."""
+    made = assemble(with_effect(name, place, values).operators(OMEGA))
+    inverse = made.inverse
+    if name == "base_compliance":  # forces between chassis and payload move these against each other
+        inverse = inverse - made.chassis(inverse, np.zeros((len(OMEGA), 3, 6)))
+    np.testing.assert_allclose(inverse, np.swapaxes(inverse, 1, 2), rtol=0, atol=1e-9 * np.abs(inverse).max())
