@@ -136,40 +136,55 @@ def test_an_integrator_feeds_energy_in():
 
 # --- chassis
 
-@pytest.mark.parametrize("rocking", [False, True])
-def test_base_compliance_is_a_second_body(rocking):
-    m_c, f_z, f_xy, zeta, f_r, radius = 900.0, 14.0, 9.0, 0.05, 11.0, 0.4
-    table = Assembly(RIG, 6)
+CHASSIS = {"mass_kg": 900.0, "damping": 0.05, "x_Hz": 9.0, "y_Hz": 11.0, "z_Hz": 14.0, "rx_Hz": 10.0, "ry_Hz": 12.0,
+           "rz_Hz": 13.0, "gyration_x_m": 0.4, "gyration_y_m": 0.5, "gyration_z_m": 0.6, "centre_z_m": -0.45,
+           "base_z_m": -0.2}
+
+
+def on_chassis(place, **changes):
+    values = {one.name: CHASSIS[one.name] for one in library()["base_compliance"].parameters(BARE, place)}
+    return with_effect("base_compliance", place, list((values | changes).values()))
+
+
+@pytest.mark.parametrize("place", ["chassis/translation", "chassis/rocking"])
+def test_base_compliance_is_a_second_body(place):
+    """Its coordinates are the displacement of its point at the table's centre, and its rotation."""
+    rocking, table, v = place.endswith("rocking"), Assembly(RIG, 6), CHASSIS
     for G, one in zip(table.maps, RIG.isolators, strict=True):
         for a in range(3):
             row = np.concatenate([G[a], -G[a] if rocking else [*-G[a][:3], 0, 0, 0]])
             table.spring(row, one.stiffness[a], one.damping[a])
     table.T[6:] = -table.T[:6] if rocking else np.vstack([-table.T[:3], np.zeros((3, 8))])
-    for a, (m, f) in enumerate(zip([m_c] * 3 + [m_c * radius ** 2] * 3, [f_xy, f_xy, f_z] + [f_r] * 3, strict=True)):
-        w, floor = 2 * np.pi * f, np.eye(3)[a] if a < 3 else np.zeros(3)
-        table.mass(table.row(**{f"e{a}": 1.0}), m)
-        table.spring(table.row(**{f"e{a}": 1.0}), m * w ** 2, 2 * zeta * w * m, floor)
-    values = [m_c, f_z, f_xy, zeta, *([f_r, radius] if rocking else [])]
-    agree(with_effect("base_compliance", f"chassis/{'rocking' if rocking else 'translation'}", values), table)
+    height = v["centre_z_m"] if rocking else 0.0
+    centre, below = (0, 0, height), (0, 0, height + (v["base_z_m"] if rocking else 0.0))
+    for a, axis in enumerate("xyz"):
+        m, w = v["mass_kg"], 2 * np.pi * v[f"{axis}_Hz"]
+        at_centre, at_base = (np.concatenate([np.zeros(6), mount_map(p)[a]]) for p in (centre, below))
+        table.mass(at_centre, m)
+        table.spring(at_base, m * w ** 2, 2 * v["damping"] * w * m, np.eye(3)[a])
+        J, w = m * v[f"gyration_{axis}_m"] ** 2, 2 * np.pi * v[f"r{axis}_Hz"]
+        turned = table.row(**{f"e{3 + a}": 1.0})
+        table.mass(turned, J)
+        table.spring(turned, J * w ** 2, 2 * v["damping"] * w * J)
+    agree(on_chassis(place), table)
 
 
 def test_momentum_is_conserved_far_above_the_resonance_of_the_base():
-    """Without outer force the payload and the chassis move against each other, in inverse proportion to their masses."""
-    model = with_effect("base_compliance", "chassis/translation", [800.0, 2.0, 2.0, 1e-3])
+    """Without outer force payload and chassis move against each other, in inverse proportion to their masses."""
+    model = on_chassis("chassis/translation", x_Hz=2.0, y_Hz=2.0, z_Hz=2.0, damping=1e-3)
     made = assemble(model.operators(2 * np.pi * np.array([2000.0])))
     x = made.inverse @ np.asarray(made.T[:, :1])[None]
     moved = made.chassis(x, np.zeros((1, 3, 1)))
-    np.testing.assert_allclose(RIG.mass * x[0, :3] + 800.0 * moved[0, :3], 0, atol=1e-5 * RIG.mass * np.abs(x).max())
+    np.testing.assert_allclose(RIG.mass * x[0, :3] + 900.0 * moved[0, :3], 0, atol=1e-5 * RIG.mass * np.abs(x).max())
 
 
 def test_a_heavy_chassis_is_a_stiff_floor():
-    for mass, close in ((1e5, 0.05), (1e12, 1e-8)):
-        model = with_effect("base_compliance", "chassis/rocking", [mass, 300.0, 300.0, 0.05, 300.0, 1.0])
-        by_u = model.response(OMEGA)[:, :, :8]
-        bare = BARE.response(OMEGA)[:, :, :8]
-        assert np.max(np.abs(by_u - bare)) < close * np.max(np.abs(bare))
-    stiff = with_effect("base_compliance", "chassis/translation", [1e12, 1e5, 1e5, 0.05]).response(OMEGA)
-    np.testing.assert_allclose(stiff, BARE.response(OMEGA), rtol=1e-3)  # (150 Hz / 100 kHz)^2 and the damper
+    bare = BARE.response(OMEGA)
+    for mass, close in ((1e5, 0.05), (1e12, 1e-8)):  # its own resonances stay, but nothing of the table moves it
+        by_u = on_chassis("chassis/rocking", mass_kg=mass).response(OMEGA)[:, :, :8]
+        assert np.max(np.abs(by_u - bare[:, :, :8])) < close * np.max(np.abs(bare[:, :, :8]))
+    hard = on_chassis("chassis/translation", mass_kg=1e12, x_Hz=1e5, y_Hz=1e5, z_Hz=1e5).response(OMEGA)
+    np.testing.assert_allclose(hard, bare, rtol=1e-3)  # (150 Hz / 100 kHz)^2 and the damper
 
 
 # --- payload
@@ -261,7 +276,7 @@ def test_passive_at_every_frequency(name, place, values):
     ("attached_oscillator", "payload/xyz", [10.0, 8.0, 0.05, 0.3, 0.2, 0.1]),
     ("com_offset", "payload", [0.02, 0.01, -0.03]),
     ("mount_surge", "isolators z", [20.0, 0.3, 0.5]),
-    ("base_compliance", "chassis/rocking", [900.0, 14.0, 9.0, 0.05, 11.0, 0.4]),
+    ("base_compliance", "chassis/rocking", list(CHASSIS.values())),
     ("payload_flexible_mode", "payload", [25.0, 0.01, *np.linspace(-0.02, 0.03, 12)])])
 def test_reciprocity(name, place, values):
     """Whatever has no rotor and no feedback answers alike when force and displacement change places."""

@@ -1,0 +1,353 @@
+"""The library as a whole: names, places and ranges of the contract; sensors, drives and amplitude; derivatives."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from assembled_table import Assembly, chain, mount_map
+
+from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.motion import RecordMotion
+from avis_ctrl.gap.record_motion import mount_rows
+from avis_ctrl.gap.search import location
+from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.identification.parameter_sets import default_parameters
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock, record_block
+from avis_ctrl.measurement.campaign import Record, RecordHeader
+from avis_ctrl.rigs import load_rig
+
+RIG = load_rig("avis")
+BARE = TableModel(ResponseModel.of(RIG, default_parameters(RIG)))
+ANALOGUE = TableModel(ResponseModel.of(RIG, (), sampled=False))
+F = np.geomspace(0.3, 150.0, 40)
+OMEGA = 2 * np.pi * F
+SIGNALS = {"mains_hum", "sensor_quantisation", "ground_motion"}  # recognised in the records, not by refits
+OWN = {name: one for name, one in library().items() if type(one).__module__.startswith("avis_ctrl.")}
+EVERYWHERE = [(name, place) for name, one in OWN.items() for place in one.places(BARE)]
+
+
+def with_effect(name, place, values, model=BARE):
+    return model.with_effect(active(library()[name], model, place, values))
+
+
+# --- the contract
+
+@pytest.fixture
+def contract(shared):
+    """Location by name, from the table of the contract."""
+    text = (shared / "contracts" / "gap.md").read_text(encoding="utf-8")
+    return {match[1]: match[2] for match in re.finditer(r"^\| `(\w+)` \|.*\| (.+) \|$", text, re.MULTILINE)}
+
+
+def test_names_and_locations_are_those_of_the_contract(contract):
+    assert len(contract) == 24
+    assert set(OWN) == set(contract) - SIGNALS
+    own = {"sensor": set(BARE.sensors.names), "actuator": set(BARE.actuators)}
+    for name, effect in OWN.items():
+        words = contract[name]
+        expected = own.get(words) or set(re.findall(r"`([^`]+)`", words))
+        assert {location(place) for place in effect.places(BARE)} == expected, name
+
+
+@pytest.mark.parametrize(("name", "place"), EVERYWHERE)
+def test_parameters_have_units_ranges_and_a_start_within(name, place):
+    effect = OWN[name]
+    assert effect.title
+    assert effect.looks_like
+    assert set(effect.confusable) <= set(OWN)
+    parameters = effect.parameters(BARE, place)
+    assert len({one.name for one in parameters}) == len(parameters)
+    for one in parameters:
+        assert one.unit
+        assert one.description
+        assert one.low < one.high
+        assert 0 < one.size <= max(abs(one.low), abs(one.high))
+        if one.linear:
+            assert one.low <= one.none <= one.high
+        else:
+            assert one.grid
+            assert all(one.low <= value <= one.high for value in one.grid)
+    for start in effect.starts(BARE, place):
+        assert len(start) == len(parameters)
+
+
+def test_effects_that_a_rig_has_no_place_for_have_none():
+    """The Halcyonics has no mounts by name and no geophones."""
+    for name in ("halcyonics", "halcyonics_loaded"):
+        rig = load_rig(name)
+        model = TableModel(ResponseModel.of(rig, ()))
+        for effect in OWN.values():
+            for place in effect.places(model):
+                for one in effect.parameters(model, place):
+                    assert np.all(np.isfinite([one.low, one.high, one.size, *one.grid])), effect.name
+                assert np.all(np.isfinite(with_effect(effect.name, place, None, model).response(OMEGA[:3])))
+        assert not OWN["geophone_corner"].places(model)
+        assert not OWN["mount_surge"].places(model)
+
+
+# --- the model itself
+
+@pytest.mark.parametrize("name", ["avis", "halcyonics", "halcyonics_loaded"])
+def test_without_effects_the_table_is_the_response_model(name):
+    rig = load_rig(name)
+    base = ResponseModel.of(rig, default_parameters(rig))
+    rng = np.random.default_rng(1)
+    U = rng.standard_normal((len(F), len(base.inputs) + 12, 2)) + 1j * rng.standard_normal((len(F), 1, 2))
+    found, true = TableModel(base).driven(OMEGA, U), base.driven(OMEGA, U)
+    np.testing.assert_allclose(found.Y, true.Y, rtol=1e-9, atol=1e-12 * np.abs(true.Y).max())
+    size = np.abs(true.dY).max(axis=(1, 2, 3), keepdims=True)
+    assert np.all(np.abs(found.dY - true.dY) <= 1e-8 * size)
+
+
+NONE_ELSEWHERE = {"base_compliance", "mount_surge", "actuator_saturation"}  # none at a limit: tested by themselves
+
+
+@pytest.mark.parametrize(("name", "place"), [pair for pair in EVERYWHERE if pair[0] not in NONE_ELSEWHERE])
+def test_without_strength_nothing_changes(name, place):
+    model = with_effect(name, place, None, MOVING)
+    np.testing.assert_allclose(model.answer(BLOCK, derivative=False).Y, MOVING.answer(BLOCK, derivative=False).Y,
+                               rtol=1e-10, atol=0)
+
+
+def test_a_surge_without_mass_is_none():
+    model = with_effect("mount_surge", "isolators z", [0.0, 0.5, 0.0])
+    np.testing.assert_array_equal(model.response(OMEGA), BARE.response(OMEGA))
+
+
+# --- sensors
+
+def by_ratio(model, sensor):
+    """(n,) what an effect makes of one sensor, the same from every input; the other sensors are as they were."""
+    ratio = model.response(OMEGA) / ANALOGUE.response(OMEGA)
+    k = ANALOGUE.sensors.names.index(sensor)
+    np.testing.assert_allclose(np.delete(ratio, k, axis=1), 1, rtol=1e-12)
+    np.testing.assert_allclose(ratio[:, k], ratio[:, k, :1] * np.ones(ratio.shape[2]), rtol=1e-9)
+    return ratio[:, k, 0]
+
+
+def test_bare_sensors_are_the_chain_times_velocity():
+    y = Assembly(RIG).mounts().response(F) * (2j * np.pi * F * chain(RIG, F))[:, None, None]
+    np.testing.assert_allclose(ANALOGUE.response(OMEGA), y, rtol=1e-9, atol=1e-12 * np.abs(y).max())
+
+
+def test_geophone_corner():
+    s, g = 2j * np.pi * F, RIG.geophones
+    def suspension(f, z):
+        return s ** 2 / (s ** 2 + 2 * z * 2 * np.pi * f * s + (2 * np.pi * f) ** 2)
+    ratio = by_ratio(with_effect("geophone_corner", "Sz2", [5.1, 0.62], ANALOGUE), "Sz2")
+    np.testing.assert_allclose(ratio, suspension(5.1, 0.62) / suspension(g.suspension_Hz, g.suspension_damping),
+                               rtol=1e-9)
+
+
+def test_gains_are_one_real_factor():
+    np.testing.assert_allclose(by_ratio(with_effect("sensor_gain", "Sx2", [1.07], ANALOGUE), "Sx2"), 1.07, rtol=1e-12)
+    ratio = with_effect("actuator_gain", "Az3", [0.9], ANALOGUE).response(OMEGA) / ANALOGUE.response(OMEGA)
+    k = RIG.equations_of_motion().actuators.index("Az3")
+    np.testing.assert_allclose(ratio[:, :, k], 0.9, rtol=1e-12)
+    np.testing.assert_allclose(np.delete(ratio, k, axis=2), 1, rtol=1e-12)
+
+
+def test_misaligned_sensor_reads_along_its_tilted_axis():
+    table = Assembly(RIG).mounts()
+    towards_x, towards_z = np.radians([4.0, -7.0])
+    e = np.array([np.tan(towards_x), 1.0, np.tan(towards_z)])
+    table.R[0] = e / np.linalg.norm(e) @ mount_map(RIG.isolators[0].position)  # Sy1
+    y = table.response(F) * (2j * np.pi * F * chain(RIG, F))[:, None, None]
+    found = with_effect("sensor_misalignment", "Sy1", [4.0, -7.0], ANALOGUE)
+    assert [one.name for one in found.effects[0].parameters] == ["towards_x_deg", "towards_z_deg"]
+    np.testing.assert_allclose(found.response(OMEGA), y, rtol=1e-8, atol=1e-12 * np.abs(y).max())
+
+
+def test_tilt_reads_g_times_the_tilt_as_acceleration():
+    """A body at rest, turned by phi: its x axis points down by sin phi_y, its y axis up by sin phi_x."""
+    table, g = Assembly(RIG).mounts(), 9.80665
+    q = np.linalg.solve(table.K, table.T)  # static: what remains at low frequency
+    f = np.array([1e-3])
+    found = (with_effect("tilt_coupling", "horizontal geophones", [g], ANALOGUE).response(2 * np.pi * f)
+             - ANALOGUE.response(2 * np.pi * f))[0, :, :8]
+    s = 2j * np.pi * f[0]
+    acceleration = {"x": -g * q[4], "y": g * q[3], "z": 0 * q[3]}
+    true = np.array([acceleration[axis] for axis in RIG.geophones.axis]) * chain(RIG, f)[0] / s
+    np.testing.assert_allclose(found, true, rtol=1e-4, atol=1e-6 * np.abs(true).max())
+    # Az1 tilts the table; what Sy1 makes of that, beside the motion that Sz1 reads, goes as g/w^2.
+    tilted = with_effect("tilt_coupling", "horizontal geophones", [g], ANALOGUE)
+    omega = 2 * np.pi * np.array([0.02, 0.01])
+    plain = ANALOGUE.response(omega)
+    share = np.abs((tilted.response(omega) - plain)[:, 0, 1] / plain[:, 1, 1])
+    assert share[1] / share[0] == pytest.approx(4, rel=1e-3)
+
+
+# --- drives
+
+def sampled(rig, f, delay_s, tau=0.0, aliases=2000):
+    """(n, 6, 8) by samples of held and delayed volts: the sum over what sampling folds."""
+    n = np.arange(-aliases, aliases + 1)
+    table, found = Assembly(rig).mounts(), []
+    for one in f:
+        g = one + 1000.0 * n
+        s = 2j * np.pi * g
+        y = table.response(g)[:, :, :8] * (s * chain(rig, g))[:, None, None]
+        hold = (1 - np.exp(-s / 1000)) / (s / 1000) * np.exp(-s * delay_s) / (1 + s * tau)
+        found.append(np.sum(y * hold[:, None, None], axis=0))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("name", "place", "value", "delay_s", "tau"), [
+    ("actuator_lag", "actuators", 1.7e-3, 1e-3, 1.7e-3), ("loop_delay", "loop", 0.4e-3, 1.4e-3, 0.0),
+    ("loop_delay", "loop", 3e-3, 4e-3, 0.0)])
+def test_lag_and_delay_of_held_volts(name, place, value, delay_s, tau):
+    f = np.array([1.0, 12.0, 60.0, 150.0])
+    found = with_effect(name, place, [value]).response(2 * np.pi * f)[:, :, :8]
+    true = sampled(RIG, f, delay_s, tau)
+    assert np.max(np.abs(found - true) / np.abs(true).max(axis=(1, 2), keepdims=True)) < 2e-4
+    ratio = found[:2] / BARE.response(2 * np.pi * f[:2])[:, :, :8]
+    phase = -np.arctan(2 * np.pi * f[:2] * value) if tau else -2 * np.pi * f[:2] * value
+    loudest = np.abs(found[:2]).reshape(2, -1).argmax(1)
+    np.testing.assert_allclose(np.angle(ratio.reshape(2, -1)[[0, 1], loudest]), phase, atol=1e-3)
+
+
+def test_two_lags_in_series():
+    known = replace(BARE, base=replace(BARE.base, amplifier_corner_Hz=200.0))
+    f = np.array([3.0, 30.0])
+    ratio = with_effect("actuator_lag", "actuators", [2e-3], known).response(2 * np.pi * f) / known.response(
+        2 * np.pi * f)
+    np.testing.assert_allclose(ratio[:, 1, 1], 1 / (1 + 2j * np.pi * f * 2e-3), rtol=2e-3)
+
+
+# --- amplitude and time
+
+def motion(deflection, volts=None, start_s=0.0, campaign_s=(0.0, 10.0)):
+    volts = np.zeros((len(deflection), 8)) if volts is None else volts
+    return RecordMotion("00", 1000.0, start_s, campaign_s, volts, deflection, *mount_rows(BARE))
+
+
+def only(column, values):
+    found = np.zeros((len(values), 12))
+    found[:, column] = values
+    return found
+
+
+def test_cubic_stiffness_by_harmonic_balance():
+    """k3 (A sin)^3 = 3/4 k3 A^3 sin - 1/4 k3 A^3 sin of thrice the frequency, at its own mount."""
+    A, k3, t = 2e-5, 1e12, np.arange(5000) / 1000
+    record = motion(only(5, A * np.sin(2 * np.pi * 2.0 * t)))
+    force = OWN["cubic_stiffness"].force(record, "isolators z", {"k3_N_per_m3": k3})
+    true = -k3 * A ** 3 * (0.75 * np.sin(2 * np.pi * 2.0 * t) - 0.25 * np.sin(2 * np.pi * 6.0 * t))
+    x, y, _ = RIG.isolators[1].position
+    np.testing.assert_allclose(force, true[:, None] * [0, 0, 1, y, -x, 0], atol=1e-12)
+    assert not np.any(OWN["cubic_stiffness"].force(motion(only(4, t)), "isolators z", {"k3_N_per_m3": k3}))
+
+
+def friction_on_Ay1(amplitude, slip, stiffness=1e4, f=1.0):
+    """Displacement of Ay1's contact over three cycles, and the force along it."""
+    d = amplitude * np.sin(2 * np.pi * f * np.arange(3000) / 1000)
+    force = OWN["contact_friction"].force(motion(only(1, d)), "actuators",
+                                          {"stiffness_N_per_m": stiffness, "slip_m": slip})
+    return d, force[:, 1]
+
+
+def test_friction_is_a_spring_below_the_slip():
+    d, force = friction_on_Ay1(1e-9, 1e-5)
+    np.testing.assert_allclose(force, -1e4 * d, atol=3e-4 * 1e4 * 1e-9)
+
+
+def test_friction_is_coulombs_far_above_the_slip():
+    d, force = friction_on_Ay1(1e-3, 1e-6)
+    moving = np.abs(d) < 0.9e-3
+    moving[:250] = False
+    np.testing.assert_allclose(force[moving], -1e-2 * np.sign(np.gradient(d))[moving], rtol=1e-6)
+    last = slice(2000, 3000)
+    lost = -np.sum(force[last] * np.gradient(d)[last])
+    assert lost == pytest.approx(4 * 1e-2 * 1e-3, rel=5e-3)  # 4 F_c A a cycle
+
+
+def test_friction_never_gives_energy():
+    rng = np.random.default_rng(5)
+    d = np.cumsum(rng.standard_normal(4000)) * 1e-7
+    force = OWN["contact_friction"].force(motion(only(1, d)), "actuators",
+                                          {"stiffness_N_per_m": 1e4, "slip_m": 3e-7})[:, 1]
+    step = np.diff(d, prepend=0.0)
+    mean = (force + np.concatenate([[0.0], force[:-1]])) / 2
+    taken = np.cumsum(-mean * step)
+    assert np.min(taken) > -1e-18
+    assert taken[-1] > 10 * 1e4 * 3e-7 ** 2
+
+
+def test_drift_is_a_spring_that_grows_with_time():
+    d = np.random.default_rng(2).standard_normal((100, 12)) * 1e-5
+    k = np.array([value for one in RIG.isolators for value in one.stiffness])
+    G = np.vstack([mount_map(one.position) for one in RIG.isolators])
+    force = OWN["stiffness_drift"].force(motion(d, start_s=8.0), "isolators", {"relative_change": 0.2})
+    when = (8.0 + np.arange(100) / 1000 - 5.0) / 10.0
+    np.testing.assert_allclose(force, -0.2 * when[:, None] * ((d * k) @ G), rtol=1e-12)
+
+
+def test_saturation_clips_the_commanded_volts():
+    u = np.random.default_rng(3).standard_normal((50, 8))
+    volts = OWN["actuator_saturation"].volts(motion(np.zeros((50, 12)), u), "actuators", {"limit_V": 0.7})
+    np.testing.assert_array_equal(volts, np.where(np.abs(u) > 0.7, 0.7 * np.sign(u), u))
+
+
+# --- derivatives
+
+def _moving():
+    """A model with one record of motion in time, and its block."""
+    rng = np.random.default_rng(4)
+    u = rng.standard_normal((2000, 8))
+    d = 1e-5 * np.cumsum(rng.standard_normal((2000, 12)), axis=0) / 40
+    header = RecordHeader("00", 1000.0, 2000, BARE.actuators, BARE.sensors.names, "noise", 1.0,
+                          floor_names=("vx", "vy", "vz"))
+    record = Record(header, u, rng.standard_normal((2000, 6)), 1e-5 * rng.standard_normal((2000, 3)))
+    block = record_block(record, BARE.base, (0.5, 80.0)).lines(np.arange(0, 159, 7))
+    return replace(BARE, motion={"00": motion(d, u)}), block
+
+
+MOVING, BLOCK = _moving()
+VALUES = {"geophone_corner": [4.8, 0.5], "sensor_gain": [1.05], "sensor_misalignment": [2.0, -3.0],
+          "tilt_coupling": [9.8], "actuator_gain": [0.95], "actuator_lag": [2e-3], "loop_delay": [0.7e-3],
+          "actuator_saturation": [1.0], "mount_relaxation": [0.3, 3.0], "structural_damping": [0.06],
+          "mount_surge": [30.0, 0.45, 0.2], "leveling_loop": [1e4, 0.5], "cubic_stiffness": [1e13],
+          "contact_friction": [3e3, 1e-5], "stiffness_drift": [0.03],
+          "base_compliance": [1000.0, 0.05, 9.0, 10.0, 14.0, 20.0, 25.0, 30.0, 0.4, 0.5, 0.6, -0.4, -0.1],
+          "com_offset": [0.01, -0.02, 0.03],
+          "product_of_inertia": [2.0], "payload_flexible_mode": [30.0, 0.02, *np.linspace(-0.02, 0.03, 12)],
+          "attached_oscillator": [10.0, 12.0, 0.05, 0.3, 0.2, 0.1],
+          "cable_stiffness": [500.0, 400.0, 300.0, 50.0, 40.0, 30.0, 1e-3, 0.3, 0.2, 0.1]}
+
+
+def values_at(name, place):
+    values, parameters = VALUES[name], OWN[name].parameters(MOVING, place)
+    if name == "cable_stiffness" and place.endswith("axes"):
+        values = [*values[:3], *values[6:]]
+    return values[:len(parameters)]
+
+
+@pytest.mark.parametrize(("name", "place"), [
+    pair for k, pair in enumerate(EVERYWHERE) if k == 0 or EVERYWHERE[k - 1][0] != pair[0] or "/" in pair[1]])
+def test_derivatives_by_central_differences(name, place):
+    """By all parameters of rig and effect: differences of the answer as a whole, of two steps (Richardson)."""
+    model = with_effect(name, place, values_at(name, place), MOVING)
+    theta, found = model.values, model.answer(BLOCK)
+    free = [*range(0, len(BARE.names), 3), *range(len(BARE.names), len(theta))]
+    for row in free:
+        size = model.scales()[row] if row < len(BARE.names) else max(abs(theta[row]), 1e-3 * model.scales()[row])
+        step, slopes = 1e-3 * size, []
+        for h in (step, step / 2):
+            sides = [model.at(theta + sign * h * np.eye(len(theta))[row]).answer(BLOCK, derivative=False).Y
+                     for sign in (1, -1)]
+            slopes.append((sides[0] - sides[1]) / (2 * h))
+        true = (4 * slopes[1] - slopes[0]) / 3
+        # By the rig analytic; by effects a difference of step 1e-4 of a parameter's size. Clipped volts have kinks.
+        most = 1e-6 if row < len(BARE.names) else 2e-3 if name == "actuator_saturation" else 1e-5
+        assert np.linalg.norm(found.dY[row] - true) <= most * np.linalg.norm(true), model.names[row]
+
+
+def test_a_block_without_its_record_is_refused():
+    model = with_effect("cubic_stiffness", "isolators z", [1e12], MOVING)
+    other = SpectralBlock("07", BLOCK.omega, BLOCK.U, BLOCK.Y)
+    with pytest.raises(ValueError, match="block 07: expected the record's motion"):
+        model.answer(other)
