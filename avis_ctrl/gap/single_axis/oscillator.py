@@ -121,7 +121,7 @@ class OscillatorData:
         broad = float(np.log(modes[1] / modes[0])) / 2
         linear = [self.U * self.s ** k * w ** (2 - k) / (self.s ** 2 + 2 * broad * w * self.s + w ** 2) / theta[2]
                   for w in modes for k in (0, 1)]
-        # Between them, the resonance and its surroundings: D once more, and its square.
+        # And the resonance itself, free to move and to broaden.
         linear += [self.U * (self.s / self.s0) ** k * theta[2] / D ** 2 for k in range(4)]
         y, v = self.fine / self.level, self.v / self.speed
         free = [self.transform(self._without_linear(y ** i * v ** j)) / D

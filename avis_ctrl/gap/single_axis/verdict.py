@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from avis_ctrl.gap.single_axis.machine import AxisProblem, HeldOut, correlation_time, held_out
 from avis_ctrl.gap.single_axis.result import AxisEffect, AxisGap, AxisStage, Estimate
@@ -117,7 +118,10 @@ def _verdict(problem: AxisProblem, steps: Sequence[Step], left: Sequence[_Refere
     judged = steps[-1].judged
     chi = _figures(problem, judged)[1]
     free = any(one.certain and one.ratio > AT_THE_NOISE for one in left)
-    missing = free or (chi is not None and chi > AT_THE_NOISE ** 2)
+    # Few rows scatter by more than that, and unseen rows carry the scatter of the parameters too.
+    rows = len(judged.e) / correlation_time(problem, judged)
+    chance = float(stats.chi2(rows).isf(FALSE_ALARM)) / rows * (1 + len(steps[-1].fitted.theta) / rows)
+    missing = free or (chi is not None and chi > max(AT_THE_NOISE ** 2, chance))
     if len(steps) == 1:
         # Where nothing tells the noise, a model without physics that certainly predicts better is all that does.
         return "unexplained" if missing or (chi is None and any(one.certain for one in left)) else "none"
