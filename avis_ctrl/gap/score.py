@@ -19,28 +19,43 @@ import numpy as np
 
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.score_algebra import SYMMETRIC, Reduction, reduction
-from avis_ctrl.gap.table_model import ActiveEffect, TableModel, _Answer, _Side
+from avis_ctrl.gap.table_model import ActiveEffect, Acting, TableModel, _Answer, _Side
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
 from avis_ctrl.identification.response import N_Q
 from avis_ctrl.identification.spectra import SpectralBlock, transient_columns
 
 # Step of a linear parameter, in units of its size, at which its direction is taken.
 STEP = 1e-3
+# Share of a direction that must be left when what re-identification absorbs is taken out: below, it is round-off.
+LEFT = 1e-5
 
 
 class Part:
-    """One block at the model: response pieces, and the projection of its transient."""
+    """One block at the model: response pieces, and the projection of its transient.
+
+    body : (n, 12, 1) impulses and steps of the transient as the data have it; an effect changes what they do, too.
+    """
 
     def __init__(self, model: TableModel, block: SpectralBlock):
         self.model, self.block = model, block
         self.L = whitener(block)
         self.made = assemble(model.operators(block.omega))
-        self.answer = _Answer(self.made, model._acting(block.U, block if model.nonlinear else None))
         self.transient = np.zeros((0, 0))
+        self.body: np.ndarray | None = None
+        self.answer = _Answer(self.made, self._acting(model))
         if block.transient:
-            columns, _ = transient_columns(block, model)
+            columns, norms = transient_columns(block, model)
             T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
-            self.transient = np.linalg.qr(T.T)[0]
+            self.transient, R = np.linalg.qr(T.T)
+            left = as_real(whitened(self.L, block.Y - self.answer.Y)[None])[0]
+            x = np.linalg.lstsq(R, self.transient.T @ left, rcond=1e-12)[0][:2 * N_Q] / norms[:2 * N_Q]
+            self.body = np.broadcast_to(x[:, None], (len(block.omega), 2 * N_Q, 1))
+            self.answer = _Answer(self.made, self._acting(model))
+
+    def _acting(self, model: TableModel) -> Acting:
+        block = self.block
+        U = block.U if self.body is None else np.concatenate([block.U, self.body], axis=1)
+        return model._acting(U, block if model.nonlinear else None)
 
     @property
     def s(self) -> np.ndarray:
@@ -56,9 +71,7 @@ class Part:
 
     def side(self, model: TableModel) -> _Side:
         """What a model near by misses of the motion of this one."""
-        block = self.block
-        return _Side(assemble(model.operators(block.omega), invert=False),
-                     model._acting(block.U, block if model.nonlinear else None), self.answer.x)
+        return _Side(assemble(model.operators(self.block.omega), invert=False), self._acting(model), self.answer.x)
 
     def by_impedance(self, dynamic: np.ndarray) -> np.ndarray:
         """(21, n, n_y, m): y by each symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""
@@ -83,10 +96,10 @@ class Score:
         self.kept: dict = {}
         self.parts = [Part(model, block) for block in blocks]
         self.e = np.concatenate([part.real((part.block.Y - part.answer.Y)[None])[0] for part in self.parts])
-        J = np.concatenate([part.real(model.answer(part.block).dY) for part in self.parts], axis=1)
+        J = np.concatenate([part.real(model.answer(part.block, part.body).dY) for part in self.parts], axis=1)
         J = J * model.scales()[:, None]
         size = np.linalg.norm(J, axis=1)
-        U, s, Vt = np.linalg.svd(J / np.where(size > 0, size, 1.0)[:, None], full_matrices=False)
+        _, s, Vt = np.linalg.svd(J / np.where(size > 0, size, 1.0)[:, None], full_matrices=False)
         self.basis = Vt[s > 1e-6 * s[0]]
         self.e = self.e - self.basis.T @ (self.basis @ self.e)
 
@@ -105,14 +118,16 @@ class Score:
     def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
         """(k, N) of one (k, n, n_y, m) a block, projected."""
         A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
-        return A - (A @ self.basis.T) @ self.basis
+        left = A - (A @ self.basis.T) @ self.basis
+        left[np.linalg.norm(left, axis=1) < LEFT * np.linalg.norm(A, axis=1)] = 0
+        return left
 
     def of_effect(self, effect: ActiveEffect) -> np.ndarray:
         """(k, N): by each linear parameter of an effect without strength, or its whole change where it has none."""
         linear = [j for j, one in enumerate(effect.parameters) if one.linear]
         if not linear:
             added = self.model.with_effect(effect)
-            return self.directions([(added.answer(part.block, None, False).Y - part.answer.Y)[None]
+            return self.directions([(added.answer(part.block, part.body, False).Y - part.answer.Y)[None]
                                     for part in self.parts])
         models = []
         for j in linear:

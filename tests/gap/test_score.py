@@ -1,0 +1,153 @@
+"""The score test: what it is on noise alone, what it cannot see, and that a refit gains what it says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.score import Score
+from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.gap.search import FALSE_ALARM, candidates
+from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.identification.maximum_likelihood import fit
+from avis_ctrl.identification.parameter_sets import default_parameters
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.rigs import load_rig
+
+RIG = load_rig("avis")
+MODEL = TableModel(ResponseModel.of(RIG, default_parameters(RIG)))
+OMEGA = 2 * np.pi * np.geomspace(0.5, 60.0, 60)
+SIGMA = 2e-2
+
+
+def gaussian(rng, *shape):
+    """Circular, E|z|^2 = 1."""
+    return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) / np.sqrt(2)
+
+
+def covariance():
+    """Correlated noise, one for all lines."""
+    A = np.eye(6) + 0.3 * np.random.default_rng(9).standard_normal((6, 6))
+    return SIGMA ** 2 * A @ A.T
+
+
+C = covariance()
+ROOT = np.linalg.cholesky(C)
+
+
+def block(truth, rng, transient=False, noise=1.0, name="00"):
+    """What a model reads of a random drive, with noise of covariance C, and the ends of a record."""
+    U = np.zeros((len(OMEGA), 11, 1), complex)
+    U[:, :8] = 0.3 * gaussian(np.random.default_rng([7, int(name)]), len(OMEGA), 8, 1)
+    made = SpectralBlock(name, OMEGA, U, np.zeros((len(OMEGA), 6, 1), complex), transient=transient)
+    body = None
+    if transient:
+        body = np.broadcast_to(rng.standard_normal((12, 1)), (len(OMEGA), 12, 1)) * 0.5
+    Y = truth.answer(made, body, False).Y + noise * ROOT @ gaussian(rng, len(OMEGA), 6, 1)
+    return replace(made, Y=Y).with_noise(np.broadcast_to(C, (len(OMEGA), 6, 6)).copy())
+
+
+def effect(name, place, values=None, model=MODEL):
+    return active(library()[name], model, place, values)
+
+
+ABSENT = [("com_offset", "payload", None), ("sensor_gain", "Sz2", None), ("mount_relaxation", "isolators z", (0.0, 3.0)),
+          ("loop_delay", "loop", None)]
+
+
+@pytest.mark.parametrize("transient", [False, True], ids=["periodic", "with ends"])
+def test_of_noise_alone_a_reduction_is_chi_square(transient):
+    """As many degrees of freedom as directions: at the truth, which no fit has to find first."""
+    rng, draws = np.random.default_rng(1), 120
+    found = {name: [] for name, _, _ in ABSENT}
+    ranks = {}
+    for _ in range(draws):
+        score = Score(MODEL, [block(MODEL, rng, transient)])
+        for name, place, values in ABSENT:
+            took = score.reduction(score.of_effect(effect(name, place, values)))
+            found[name].append(took.chi2)
+            ranks[name] = took.rank
+    assert ranks == {"com_offset": 3, "sensor_gain": 1, "mount_relaxation": 1, "loop_delay": 1}
+    for name, values in found.items():
+        rank = ranks[name]
+        assert abs(np.mean(values) - rank) < 4 * np.sqrt(2 * rank / draws), name
+        assert stats.kstest(values, stats.chi2(rank).cdf).pvalue > 1e-3, name
+
+
+def test_the_residual_itself_is_chi_square():
+    rng = np.random.default_rng(2)
+    scores = [Score(MODEL, [block(MODEL, rng, True, name=name) for name in ("00", "01")]) for _ in range(30)]
+    dof = scores[0].dof
+    assert dof <= 2 * 2 * 60 * 6 - 24 - 20  # the ends of two records, and combinations of parameters
+    assert abs(np.mean([one.chi2 for one in scores]) - dof) < 4 * np.sqrt(2 * dof / 30)
+
+
+def test_what_re_identification_absorbs_is_never_significant():
+    """A sensitivity that is free itself, while another effect leaves a residual a hundred times the noise."""
+    free = TableModel(ResponseModel.of(RIG, (*default_parameters(RIG), "sensor.Sz2", "actuator.Az1")))
+    truth = free.with_effect(effect("actuator_lag", "actuators", [20e-3], free))
+    score = Score(free, [block(truth, np.random.default_rng(3))])
+    assert score.chi2 / score.dof > 100
+    for name, place in (("sensor_gain", "Sz2"), ("actuator_gain", "Az1")):
+        took = score.reduction(score.of_effect(effect(name, place, None, free)))
+        assert took.chi2 < 1e-6 * score.chi2
+        assert took.rank == 0
+    found = candidates(score, [library()["sensor_gain"]])
+    assert "sensor_gain@Sz2" not in [one.effect.label for one in found if one.p_value < FALSE_ALARM]
+
+
+def test_parameter_errors_alone_are_found_by_no_effect():
+    """Parameters off by a per cent or two: after the fit no score is significant."""
+    rng = np.random.default_rng(4)
+    truth = MODEL.at(MODEL.values * (1 + 0.02 * rng.standard_normal(len(MODEL.values))))
+    blocks = [block(truth, rng, True, name=name) for name in ("00", "01")]
+    fitted = fit(MODEL, blocks).model
+    found = candidates(Score(fitted, blocks), list(library().values()))
+    assert len(found) > 10
+    assert min(one.p_value for one in found) > FALSE_ALARM
+
+
+SMALL = [("actuator_gain", "Az3", [1.02], ()), ("com_offset", "payload", [4e-4, -2e-4, 4e-4], ()),
+         ("sensor_misalignment", "Sy1", [0.1, -0.05], ()), ("actuator_lag", "actuators", [3e-4], ()),
+         ("mount_relaxation", "isolators z", [3e-3, 4.0], ("corner_Hz",)),
+         ("attached_oscillator", "payload/z", [0.1, 12.0, 0.05, 0.3, 0.2], ("frequency_Hz", "damping", "x_m", "y_m")),
+         ("tilt_coupling", "horizontal geophones", [0.3], ()), ("structural_damping", "isolators/causal", [5e-4], ())]
+
+
+@pytest.mark.parametrize(("name", "place", "values", "held"), SMALL, ids=[one[0] for one in SMALL])
+def test_a_refit_gains_what_the_score_predicts(name, place, values, held):
+    rng = np.random.default_rng(5)
+    true = effect(name, place, values)
+    blocks = [block(MODEL.with_effect(true), rng, True, name=one) for one in ("00", "01")]
+    before = fit(MODEL, blocks, max_iterations=40)
+    score = Score(before.model, blocks)
+    assert score.chi2 == pytest.approx(before.chi2, rel=1e-6)
+    none = true.at([v if one.name in held else one.none for one, v in zip(true.parameters, values, strict=True)])
+    took = score.reduction(score.of_effect(none))
+    assert took.chi2 > 30  # well beyond chance
+    model = replace(before.model.with_effect(none), fixed=frozenset(f"{true.label}.{one}" for one in held))
+    after = fit(model, blocks, max_iterations=40)
+    assert took.chi2 == pytest.approx(before.chi2 - after.chi2, rel=0.02)
+    linear = [k for k, one in enumerate(true.parameters) if one.linear]
+    found = np.array(after.model.effects[0].values)[linear]
+    wanted = np.array([true.parameters[k].none for k in linear]) + took.coefficients
+    sizes = np.abs(np.array(values)[linear] - [true.parameters[k].none for k in linear])
+    np.testing.assert_allclose(found, wanted, atol=0.05 * np.max(sizes))
+
+
+def test_reduction_is_least_squares():
+    rng = np.random.default_rng(6)
+    A, e = rng.standard_normal((3, 50)) * [[1.0], [1e-6], [1e4]], rng.standard_normal(50)
+    took = reduction(A @ A.T, A @ e)
+    x, rest, *_ = np.linalg.lstsq(A.T, e, rcond=None)
+    assert took.rank == 3
+    assert took.chi2 == pytest.approx(e @ e - rest[0])
+    np.testing.assert_allclose(took.coefficients, x, rtol=1e-5)
+    twice = np.vstack([A, A[:1] + 1e4 * A[1:2]])  # one that the others make up changes nothing
+    again = reduction(twice @ twice.T, twice @ e)
+    assert (again.rank, again.chi2) == (3, pytest.approx(took.chi2, rel=1e-6))
