@@ -15,9 +15,9 @@ from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.judgement import judge
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
-from avis_ctrl.gap.refit import Refit, judged, refit
+from avis_ctrl.gap.refit import Refit, judged, likelihood, refit
 from avis_ctrl.gap.result import Gap
-from avis_ctrl.gap.search import NOISE, Found, search
+from avis_ctrl.gap.search import LONGEST, NOISE, Found, search
 from avis_ctrl.gap.show import shown
 from avis_ctrl.gap.signal_effects import (
     SignalFaults,
@@ -48,8 +48,8 @@ REPAIRED = 1e-5
 BY_PHYSICS = (1.0, 0.0, 1.0)
 
 
-# Rounds of noise measurement and search: the noise is known best once the model is.
-ROUNDS = 2
+# Lines of each record that the reported model is fitted to, and iterations from where the search left it.
+FINAL_LINES, FINAL_ITERATIONS = 1500, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,21 +104,32 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     """
     began = time.monotonic()
     prepared = prepare(campaign, rig, band_Hz, amplifier_corner_Hz, progress)
-    for k in range(ROUNDS):
-        found = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects)
-        progress("noise of floor and sensors, with what was found")
-        left = left_by(prepared.campaign, found.best.model)
-        prepared = prepared.measured_with(found.best.model, left)
-        best = refit(found.best.model, prepared.thin, prepared.thin_held)
-        if best.held_per_dof <= NOISE or k == ROUNDS - 1:
-            break
-    found = replace(found, chain=(prepared.base, *found.chain[1:-1], best) if len(found.chain) > 1 else (prepared.base,),
-                    reached_noise=best.held_per_dof <= NOISE)
+    found = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects)
+    progress("noise of floor and sensors, with what was found")
+    left = left_by(prepared.campaign, found.best.model)
+    prepared = prepared.measured_with(found.best.model, left)
+    found = _again(prepared, found, effects, progress)
     progress("fits to all lines, and what they leave of the held-out records")
     base, updated = _final(prepared, found)
     faults = replace(prepared.faults, noise=levels(left, updated.model, prepared.faults.hum, prepared.faults.converter))
     judgement = judge(prepared.thin, found, base, updated, faults)
     return shown(prepared, found, base, updated, judgement, seed, time.monotonic() - began)
+
+
+def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, progress: Progress) -> Found:
+    """What was found, against the noise that is known now; searched on where that leaves more than noise."""
+    if len(found.chain) == 1:
+        if prepared.base.held_per_dof <= NOISE:
+            return replace(found, chain=(prepared.base,))
+        return search(prepared.base, prepared.thin, prepared.thin_held, progress, effects)
+    best = refit(found.best.model, prepared.thin, prepared.thin_held)
+    chain = (prepared.base, *found.chain[1:-1], best)
+    longer = replace(found, chain=chain, reached_noise=best.held_per_dof <= NOISE)
+    if longer.reached_noise or len(chain) > LONGEST:
+        return longer
+    on = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, chain)
+    return replace(on, pool=(*found.pool, *on.pool), passed_over=(*found.passed_over, *on.passed_over),
+                   scores=found.scores)
 
 
 def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = None,
@@ -203,8 +214,7 @@ def _masked(blocks: Sequence[SpectralBlock], campaign: Campaign, hum: HumFinding
 
 
 def _final(prepared: Prepared, found: Found) -> tuple[Refit, Refit]:
-    """Re-identified and updated model, fitted to all lines."""
-    base = judged(fit(found.chain[0].model, prepared.fitted), prepared.held_out)
-    if len(found.chain) == 1:
-        return base, base
-    return base, judged(fit(found.best.model, prepared.fitted), prepared.held_out)
+    """Re-identified and updated model with what they leave of all held-out lines; the last one fitted to many lines."""
+    many = [thinned(block, FINAL_LINES) for block in prepared.fitted]
+    best = judged(likelihood(found.best.model, many, FINAL_ITERATIONS), prepared.held_out)
+    return (judged(found.chain[0].fit, prepared.held_out), best) if len(found.chain) > 1 else (best, best)

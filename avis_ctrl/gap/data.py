@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
+from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.campaign_fit import Portion, driven_inputs, measured_noise
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.prediction_error import prediction_error
+from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block
-from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
 
 # Records at levels within this factor are of one level.
@@ -107,19 +109,19 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campai
     quiet = [found for record in campaign.records if (found := _silent(record, model, band_Hz)) is not None]
     kinds = {one.block.kind for one in quiet}
     known: dict[tuple[str, int], SpectralBlock] = {}
-    found = []
+    made = []
     for block in blocks:
         key = (block.kind, len(block.omega))
         if key not in known:
-            known[key] = (noise_from_residuals(quiet, [block], model=model)[0] if block.kind in kinds
+            known[key] = (noise_from_residuals(quiet, [block], model=cast(ResponseModel, model))[0] if block.kind in kinds
                           else _local(left, block, band_Hz))
         like = known[key]
         assert like.noise is not None
-        found.append(block.with_noise(like.noise, like.dof))
-    dof = f"{found[0].dof:.0f} degrees of freedom a line"
+        made.append(block.with_noise(like.noise, like.dof))
+    dof = f"{made[0].dof:.0f} degrees of freedom a line"
     if kinds:
-        return found, f"noise measured where the drives are silent, at rest or between the harmonics: {dof}"
-    return found, f"noise measured by a local polynomial model of the records: {dof}"
+        return made, f"noise measured where the drives are silent, at rest or between the harmonics: {dof}"
+    return made, f"noise measured by a local polynomial model of the records: {dof}"
 
 
 def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:
@@ -145,7 +147,7 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
     else:
         return None
     flat = np.mean(np.abs(block.Y) ** 2, axis=(0, 2))
-    left = prediction_error(model, block.with_noise(np.broadcast_to(np.diag(flat), (len(block.omega), *2 * flat.shape))
+    left = prediction_error(cast(ResponseModel, model), block.with_noise(np.broadcast_to(np.diag(flat), (len(block.omega), *2 * flat.shape))
                                                     .copy()), derivative=False)
     return Residual(block, left.error, left.white, np.zeros_like(left.error))
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from avis_ctrl.gap.refit import Refit, probabilities, try_refit
 from avis_ctrl.gap.result import Considered, NamedEffect, Verdict
-from avis_ctrl.gap.search import NOISE, Found, location
+from avis_ctrl.gap.search import Found, location
 from avis_ctrl.gap.signal_effects import SignalFaults, named
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.spectra import SpectralBlock
@@ -23,13 +23,16 @@ from avis_ctrl.identification.spectra import SpectralBlock
 MOST_SURE = 0.99
 # A rival as probable as this cannot be told apart.
 RIVAL = 0.05
+# Held-out chi-square per degree of freedom up to which a named effect has brought the residual to the noise: an r.m.s.
+# within 1.2 of it.
+AT_THE_NOISE = 1.44
 # Without a named effect: chi-square per degree of freedom from which a residual counts as a gap although no score is
 # significant: a tenth in r.m.s. above the noise, twice what its own uncertainty leaves open.
 UNEXPLAINED = 1.21
 # With something left: share of the excess that the named effects must take.
 MOST_OF_IT = 0.97
 # Halves agree within so many standard deviations (of parameters, widened by the misfit), or within this share.
-AGREE_STD, AGREE_SHARE = 4.0, 0.05
+AGREE_STD, AGREE_SHARE = 4.0, 0.15
 LARGE_MOTION = "large_motion"
 
 
@@ -57,7 +60,7 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
         if refusal:
             reasons.append(f"{' and '.join(one.effect.name for one in own)} comes nearest, but {refusal}: not named")
             own, updated = [], base
-    residual_left = updated.held_per_dof > (NOISE if own else UNEXPLAINED) or bool(raised)
+    residual_left = updated.held_per_dof > (AT_THE_NOISE if own else UNEXPLAINED) or bool(raised)
     effects = [*_table_effects(found, updated, own), *signal]
     if effects:
         verdict: Verdict = "partly explained" if residual_left else "explained"
@@ -100,13 +103,21 @@ def _disagree(updated: Refit, halves: tuple[list[SpectralBlock], list[SpectralBl
         for k, parameter in enumerate(first.parameters):
             x, y = first.values[k], second.values[k]
             spread = float(np.hypot(std[0][k], std[1][k]))
-            size = max(abs(x - parameter.none), abs(y - parameter.none)) if parameter.linear else max(abs(x), abs(y))
+            size = _size(first, second, k)
             # A parameter that a half does not determine says nothing.
             if spread > 0.5 * size or parameter.optional:
                 continue
             if abs(x - y) > max(AGREE_STD * spread, AGREE_SHARE * size):
                 return (f"its {parameter.name} is {x:.4g} or {y:.4g} {parameter.unit} from {what}")
     return ""
+
+
+def _size(first: ActiveEffect, second: ActiveEffect, k: int) -> float:
+    """Size of a parameter, or of the largest of its group: from its value without the effect where that means none."""
+    group = first.parameters[k].group
+    rows = [j for j, one in enumerate(first.parameters) if j == k or (group and one.group == group)]
+    return max(abs(e.values[j] - (e.parameters[j].none if e.parameters[j].linear else 0.0))
+               for e in (first, second) for j in rows)
 
 
 def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect]) -> list[NamedEffect]:
@@ -155,6 +166,11 @@ def _considered(found: Found, updated: Refit) -> tuple[Considered, ...]:
             rows.append(Considered(" and ".join(one.effect.name for one in own),
                                    " and ".join(location(one.place) for one in own), rival.held_per_dof, float(share),
                                    reason, rival.reported(own[-1])))
+    for rival in sorted(found.passed_over, key=lambda one: one.held_per_dof):
+        own = effects_of(rival.model)
+        rows.append(Considered(" and ".join(one.effect.name for one in own),
+                               " and ".join(location(one.place) for one in own), rival.held_per_dof, 0.0, rival.implausible() or "left far behind after a refit to few "
+                               f"lines: {rival.held_per_dof:.3g} times the noise's power", rival.reported(own[-1])))
     return tuple(rows[:12])
 
 
@@ -174,8 +190,8 @@ def _between(name: str, other: str, found: Found) -> str:
     models = {one.model.effects[-1].effect.name: one.model for stage in found.pool for one in stage}
     a, b = models.get(name), models.get(other)
     if a is None or b is None or a.effects[-1].effect.nonlinear != b.effects[-1].effect.nonlinear:
-        return (f"To tell {name} from {other}, record the same signals at half and at twice the level: only one of them "
-                "depends on amplitude.")
+        return (f"To tell {name} from {other}, record the same signals at half and at twice the level: only one of "
+                "them depends on amplitude.")
     frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), 300)
     omega = 2 * np.pi * frequency
     n_u = len(a.actuators)
@@ -183,6 +199,6 @@ def _between(name: str, other: str, found: Found) -> str:
     difference = np.abs(Ga - Gb)
     k, i, j = np.unravel_index(int(np.argmax(difference)), difference.shape)
     near = frequency[difference[:, i, j] > 0.5 * difference[k, i, j]]
-    return (f"To tell {name} from {other}, drive {a.actuators[j]} from {near.min():.3g} to {near.max():.3g} Hz and look "
-            f"at {a.sensors.names[i]}: there their predictions differ most, by {difference[k, i, j]:.2g} "
+    return (f"To tell {name} from {other}, drive {a.actuators[j]} from {near.min():.3g} to {near.max():.3g} Hz and "
+            f"look at {a.sensors.names[i]}: there their predictions differ most, by {difference[k, i, j]:.2g} "
             f"{a.sensors.unit}/V.")

@@ -9,6 +9,9 @@ from functools import cached_property
 import numpy as np
 import scipy.fft
 
+# Spectra kept for each record; the oldest go first.
+MOST_KEPT = 40
+
 
 @dataclass(frozen=True, eq=False)
 class RecordMotion:
@@ -61,5 +64,7 @@ class RecordMotion:
         """`spectrum` of samples that never change, under a key: computed once for each set of lines."""
         where = (key, len(omega), float(omega[0]), float(omega[-1]), float(np.sum(omega)))
         if where not in self._spectra:
+            while len(self._spectra) >= MOST_KEPT:
+                self._spectra.pop(next(iter(self._spectra)), None)
             self._spectra[where] = self.spectrum(samples(), omega)
         return self._spectra[where]

@@ -5,9 +5,9 @@
 
 x holds the six coordinates q of the payload and those that effects add (its modes); G (n_g, n_q) takes x to the
 displacement of every mount along x, y, z at the payload, G_c that of the chassis. z_pp and z_pf (n, n_g) are the
-mounts' complex stiffnesses: force on the payload by its own displacement, and by that of the chassis; without mass inside the
-mount they are equal. Z_0 is whatever else holds the payload, Z_f the part of it that moves with the floor. The chassis
-follows the floor displacement w through H_w and recoils with B: zero and one on a stiff floor.
+mounts' complex stiffnesses: force on the payload by its own displacement, and by that of the chassis; without mass
+inside the mount they are equal. Z_0 is whatever else holds the payload, Z_f the part of it that moves with the floor.
+The chassis follows the floor displacement w through H_w and recoils with B: zero and one on a stiff floor.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class Operators:
     follow: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        n, base = len(self.omega), self.base
+        base = self.base
         self.s = 1j * self.omega
         self.mounts = mount_geometry(base.rig)
         n_g = len(self.mounts.names)
@@ -211,8 +211,9 @@ def mount_geometry(rig: Rig) -> MountGeometry:
 class Assembled:
     """The table as `Operators` left it, ready to answer.
 
-    D (n, n_q, n_q) and its inverse, empty where it was not asked for; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp, slope_pf (n, n_g): the slopes are
-    derivatives by the mount's own complex stiffness k + s c. T (n_q, n_u) N/V with the factors of the drives apart.
+    D (n, n_q, n_q) and its inverse, empty where it was not asked for; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp,
+    slope_pf (n, n_g): the slopes are derivatives by the mount's own complex stiffness k + s c. T (n_q, n_u) N/V with the
+    factors of the drives apart.
     """
 
     ops: Operators

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, fit
 from avis_ctrl.identification.prediction_error import prediction_error
+from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
 
 MOST_ITERATIONS = 20
@@ -94,7 +96,8 @@ def at_the_edge(effect: ActiveEffect) -> str:
         span = parameter.high - parameter.low
         if not parameter.linear and not parameter.optional and (value > parameter.high - 1e-6 * span
                                                                 or value < parameter.low + 1e-6 * span):
-            return f"{parameter.name} of {effect.effect.name} runs to {value:.3g} {parameter.unit}, the end of its range"
+            return (f"{parameter.name} of {effect.effect.name} runs to {value:.3g} {parameter.unit}, the end of its "
+                    "range")
     return ""
 
 
@@ -106,14 +109,18 @@ def refit(model: TableModel, fitted: Sequence[SpectralBlock], held_out: Sequence
     ------
     InputError, ComputationError : as `fit`.
     """
-    found = fit(model, fitted, max_iterations=iterations)
-    return judged(found, held_out)
+    return judged(likelihood(model, fitted, iterations), held_out)
+
+
+def likelihood(model: TableModel, fitted: Sequence[SpectralBlock], iterations: int) -> LikelihoodFit:
+    """`identification.fit` of a table model, which has all that it asks of a `ResponseModel`."""
+    return fit(cast(ResponseModel, model), fitted, max_iterations=iterations)
 
 
 def judged(found: LikelihoodFit, held_out: Sequence[SpectralBlock]) -> Refit:
     """A fit with what it leaves of held-out blocks."""
     errors = [prediction_error(found.model, block, derivative=False) for block in held_out]
-    return Refit(found.model, found, sum(e.chi2 for e in errors), sum(e.dof for e in errors))
+    return Refit(cast(TableModel, found.model), found, sum(e.chi2 for e in errors), sum(e.dof for e in errors))
 
 
 def try_refit(model: TableModel, fitted: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock],
@@ -136,7 +143,3 @@ def probabilities(refits: Sequence[Refit]) -> np.ndarray:
     misfit = max(1.0, best.held_per_dof, best.fit.chi2_per_dof)
     weight = np.exp(-(criteria - criteria.min()) / (2 * misfit))
     return weight / weight.sum()
-
-
-def with_motion(model: TableModel, motion: Mapping) -> TableModel:
-    return replace(model, motion=motion)

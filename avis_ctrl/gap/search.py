@@ -8,14 +8,13 @@ as a pair. The shortest chain that brings the held-out residual to the noise is 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.effects.base import Effect, Seed, library
 from avis_ctrl.gap.data import thinned
-from avis_ctrl.gap.refit import Refit, probabilities, try_refit
+from avis_ctrl.gap.effects.base import Effect, Seed, library
+from avis_ctrl.gap.refit import Refit, try_refit
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.table_model import ActiveEffect, active
 from avis_ctrl.identification.spectra import SpectralBlock
@@ -32,6 +31,12 @@ LEAST_FALL = 20.0
 REFITS, REFITS_LATER, PARENTS, LONGEST = 10, 5, 2, 3
 # First on few lines and iterations; so many of a stage go on to all lines.
 COARSE_LINES, COARSE_ITERATIONS, PROMOTED = 140, 8, 3
+# Iterations on more lines, of the first stage and later.
+ITERATIONS = (20, 10)
+# Share of what the chain before it leaves over the noise that a second or third effect must take.
+TAKES = 0.8
+# One whose coarse refit leaves so many times the power that the best one leaves is not carried on.
+HOPELESS = 6.0
 # A name is refitted, at its best place, where its score is at least this share of the best one's.
 SHARE_OF_BEST = 0.02
 
@@ -55,13 +60,14 @@ class Found:
 
     chain : refits from the re-identified model to the last accepted one. pool : every refit, by stage.
     reached_noise : the last one leaves noise. significant : whether any score was, at the first stage.
-    scores : of the first stage.
+    scores : of the first stage. passed_over : refits to few lines that were too far behind to go on.
     """
 
     chain: tuple[Refit, ...]
     pool: tuple[tuple[Refit, ...], ...]
     reached_noise: bool
-    scores: tuple[Candidate, ...] = field(default=())
+    scores: tuple[Candidate, ...] = ()
+    passed_over: tuple[Refit, ...] = ()
 
     @property
     def best(self) -> Refit:
@@ -109,53 +115,82 @@ def shortlist(found: Sequence[Candidate], most: int) -> list[Candidate]:
 
 
 def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock],
-           progress: Progress = lambda text: None, effects: Sequence[Effect] | None = None) -> Found:
+           progress: Progress = lambda text: None, effects: Sequence[Effect] | None = None,
+           begin: tuple[Refit, ...] = ()) -> Found:
     """The shortest chain of effects that explains the gap of a re-identified model, or the best there is.
 
-    fitted, held_out : thinned blocks with noise.
+    fitted, held_out : thinned blocks with noise. begin : a chain from base that is to be extended only.
     """
     known = list(library().values()) if effects is None else list(effects)
+    best = begin or (base,)
+    parents = [best]
     pool: list[tuple[Refit, ...]] = []
-    parents: list[tuple[Refit, ...]] = [(base,)]
-    best: tuple[Refit, ...] = (base,)
+    passed_over: list[Refit] = []
     first: tuple[Candidate, ...] = ()
     few = [thinned(block, COARSE_LINES, seed=1) for block in fitted]
-    for depth in range(1, LONGEST + 1):
+    for depth in range(len(best), LONGEST + 1):
         rough: list[tuple[Refit, ...]] = []
         for chain in parents:
             scored = candidates(Score(chain[-1].model, fitted), known)
             first = first or tuple(scored)
             for one in shortlist(scored, REFITS if depth == 1 else REFITS_LATER):
-                progress(f"stage {depth}: {_words(chain[-1], one.effect)}")
+                progress(f"{_ordinal(depth)} effect: {_words(chain[-1], one.effect)}?")
                 found = try_refit(chain[-1].model.with_effect(one.effect), few, held_out, COARSE_ITERATIONS)
                 if found is not None:
                     rough.append((*chain, found))
-        made: list[tuple[Refit, ...]] = []
-        for chain in _distinct(rough)[:PROMOTED]:
-            progress(f"stage {depth}: refit of {' and '.join(chain[-1].labels)}")
-            if (found := try_refit(chain[-1].model, fitted, held_out)) is not None:
-                made.append((*chain[:-1], found))
-        made = _distinct(made)
+        made, left = _promoted(_distinct(rough), depth, fitted, held_out, progress)
+        passed_over += left
         pool.append(tuple(chain[-1] for chain in made))
         plausible = [chain for chain in made if not chain[-1].implausible()]
-        if not plausible:
+        if plausible and _better(plausible[0][-1], best[-1], depth):
+            best = plausible[0]
+        elif depth > 1 or not plausible:
             break
-        top = plausible[0]
-        if _better(top[-1], best[-1], depth):
-            best = top
-        if best[-1].held_per_dof <= NOISE and depth > len(best) - 1:
+        if best[-1].held_per_dof <= NOISE and len(best) <= depth:
             break
-        parents = plausible[:PARENTS]
+        near = HOPELESS * plausible[0][-1].held_per_dof
+        parents = [chain for chain in plausible[:PARENTS] if chain[-1].held_per_dof < near]
         if best[-1].held_per_dof <= NOISE:
             parents = [best]
-    return Found(best, tuple(pool), best[-1].held_per_dof <= NOISE, first)
+    return Found(best, tuple(pool), best[-1].held_per_dof <= NOISE, first, tuple(passed_over))
+
+
+def _promoted(rough: list[tuple[Refit, ...]], depth: int, fitted: Sequence[SpectralBlock],
+              held_out: Sequence[SpectralBlock], progress: Progress) -> tuple[list[tuple[Refit, ...]], list[Refit]]:
+    """The best of the coarse refits, refitted to more lines, best first; and those that were not."""
+    made: list[tuple[Refit, ...]] = []
+    left = [chain[-1] for chain in rough[PROMOTED:]]
+    for chain in rough[:PROMOTED]:
+        far = made and chain[-1].held_per_dof > HOPELESS * made[0][-1].held_per_dof
+        if far or (depth > 1 and _share(chain[-1], chain[-2]) < TAKES / 2):
+            left.append(chain[-1])
+            continue
+        progress(f"refit with {_words(chain[-2], chain[-1].model.effects[-1])}")
+        if (found := try_refit(chain[-1].model, fitted, held_out, ITERATIONS[min(depth, 2) - 1])) is not None:
+            made.append((*chain[:-1], found))
+    return _distinct(made), left
+
+
+def _share(found: Refit, before: Refit) -> float:
+    """Share of the excess over the noise that a further effect takes, on held-out data."""
+    excess = before.held_per_dof - 1.0
+    return (before.held_per_dof - found.held_per_dof) / excess if excess > 0 else 0.0
 
 
 def _better(found: Refit, best: Refit, depth: int) -> bool:
-    """Whether a longer chain is worth its length: on the criterion, and on the held-out data by themselves."""
+    """Whether a longer chain is worth its length: on the criterion, on the held-out data by themselves, and, of a
+    second effect on, because it takes most of what the chain before it leaves.
+
+    The last keeps out what only mends the first effect's law where that is not quite the table's.
+    """
     misfit = max(1.0, found.held_per_dof)
     fall, held = best.criterion - found.criterion, best.chi2_held - found.chi2_held
-    return fall / misfit > LEAST_FALL and held / misfit > LEAST_FALL / 2
+    worth = fall / misfit > LEAST_FALL and held / misfit > LEAST_FALL / 2
+    return worth and (depth == 1 or _share(found, best) > TAKES)
+
+
+def _ordinal(depth: int) -> str:
+    return ("first", "second", "third", "fourth")[depth - 1]
 
 
 def _distinct(chains: list[tuple[Refit, ...]]) -> list[tuple[Refit, ...]]:
@@ -167,17 +202,6 @@ def _distinct(chains: list[tuple[Refit, ...]]) -> list[tuple[Refit, ...]]:
 
 
 def _words(parent: Refit, effect: ActiveEffect) -> str:
-    names = [*(one.effect.name for one in parent.model.effects), f"{effect.effect.name} ({location(effect.place)})"]
+    before = [one.effect.name for one in parent.model.effects if one.effect.name != "large_motion"]
+    names = [*before, f"{effect.effect.name} ({location(effect.place)})"]
     return " and ".join(names)
-
-
-def alternatives(found: Found) -> list[tuple[Refit, float]]:
-    """Refits that differ from the chosen chain's end in its last effect, and the chosen one, with probabilities."""
-    depth = len(found.chain) - 1
-    if depth == 0:
-        return []
-    before = set(found.chain[-2].labels)
-    rivals = [one for one in found.pool[depth - 1] if before <= set(one.labels) and not one.implausible()]
-    if found.best not in rivals:
-        rivals.append(found.best)
-    return sorted(zip(rivals, probabilities(rivals).tolist(), strict=True), key=lambda pair: -pair[1])

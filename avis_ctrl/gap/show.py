@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from scipy import stats
@@ -16,6 +16,7 @@ from avis_ctrl.gap.result import Gap, HeatMap, NamedEffect, Stage, Where
 from avis_ctrl.gap.search import Found
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction_error import PredictionError, prediction_error
+from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.measurement.gates.finding import Limit, Picture, Series
 
@@ -38,7 +39,8 @@ class Left:
 
     @staticmethod
     def of(model: TableModel, blocks: Sequence[SpectralBlock]) -> Left:
-        return Left(tuple(prediction_error(model, block, derivative=False) for block in blocks), model.sensors.names,
+        return Left(tuple(prediction_error(cast(ResponseModel, model), block, derivative=False) for block in blocks),
+                    model.sensors.names,
                     model.inputs)
 
     @property
@@ -48,16 +50,16 @@ class Left:
     @property
     def nrmse(self) -> float:
         """R.m.s. over channels of error over y, in the band."""
-        return _relative(sum(np.sum(np.abs(e.error) ** 2, axis=(0, 2)) for e in self.errors), self.errors)
+        return _relative(np.sum([np.sum(np.abs(e.error) ** 2, axis=(0, 2)) for e in self.errors], axis=0), self.errors)
 
     @property
     def noise_nrmse(self) -> float:
         """What noise alone would leave."""
-        return _relative(sum(e.noise_share() for e in self.errors), self.errors)
+        return _relative(np.sum([e.noise_share() for e in self.errors], axis=0), self.errors)
 
 
 def _relative(power: np.ndarray, errors: Sequence[PredictionError]) -> float:
-    whole = sum(np.sum(np.abs(e.block.Y) ** 2, axis=(0, 2)) for e in errors)
+    whole = np.sum([np.sum(np.abs(e.block.Y) ** 2, axis=(0, 2)) for e in errors], axis=0)
     return float(np.sqrt(np.mean(power / whole)))
 
 
@@ -101,8 +103,8 @@ def opening(judgement: Judgement, ladder: Sequence[Stage], after: Left) -> str:
     """The one sentence."""
     first, last = ladder[1], ladder[-1]
     if judgement.verdict == "none":
-        return (f"No effect is missing: after re-identification the model leaves {_percent(first.nrmse)} of the held-out "
-                f"records, noise alone {_percent(after.noise_nrmse)}.")
+        return (f"No effect is missing: after re-identification the model leaves {_percent(first.nrmse)} of the "
+                f"held-out records, noise alone {_percent(after.noise_nrmse)}.")
     if judgement.verdict == "unexplained":
         return (f"Something is missing that the library has no name for: after re-identification the model leaves "
                 f"{_percent(first.nrmse)} of the held-out records, noise alone {_percent(after.noise_nrmse)}.")

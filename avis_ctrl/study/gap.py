@@ -83,8 +83,8 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
     """
     options, began = options or GapOptions(), time.monotonic()
     if not isinstance(measured, Campaign):
-        raise InputError("expected records in time; from frequency responses alone no fault of a signal can be told from "
-                         "one of the table", field="measurement")
+        raise InputError("expected records in time; from frequency responses alone no fault of a signal can be told "
+                         "from one of the table", field="measurement")
     named = in_words_of(rig, measured)
     assert isinstance(named, Campaign)  # as it was
     measured = named
@@ -123,7 +123,7 @@ def _design(gap: Gap, options: GapOptions, progress: Progress) -> tuple[DesignEf
 
 
 def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(y_baseline, y_updated), each (samples, n_y), of every record of another campaign of the rig, from u and floor."""
+    """(y_baseline, y_updated), each (samples, n_y), of every record of another campaign, from u and floor."""
     clock = (min(r.header.start_s for r in campaign.records),
              max(r.header.start_s + r.header.duration_s for r in campaign.records))
 

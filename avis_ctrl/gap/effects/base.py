@@ -37,6 +37,7 @@ class EffectParameter:
     none : value without the effect. low, high : what physics allows. size : one unit of it in a fit.
     linear : the effect vanishes as this goes to `none`, at first in proportion.
     grid : for one that is not linear, where to look for it. optional : one that may end at its bounds.
+    group : parameters of one group are judged by the size of the largest of them.
     """
 
     name: str
@@ -49,6 +50,7 @@ class EffectParameter:
     linear: bool = True
     grid: tuple[float, ...] = ()
     optional: bool = False
+    group: str = ""
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,7 @@ class Effect(ABC):
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         """Act on the table line by line."""
+        return None
 
     def volts(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
         """(samples, n_u) commanded volts that act, None where they are as commanded."""
@@ -148,14 +151,20 @@ class Effect(ABC):
         linear = [j for j, one in enumerate(parameters) if one.linear]
         for point in self.starts(score.model, place):
             effect = ActiveEffect(self, place, parameters, tuple(float(v) for v in point))
-            took = score.reduction(score.of_effect(effect))
+            A = score.of_effect(effect)
+            if not linear:
+                # It acts at full strength or not at all.
+                fall = float(2 * A[0] @ score.e - A[0] @ A[0])
+                if fall > 0:
+                    found.append(Seed(effect.values, fall, len(parameters)))
+                continue
+            took = score.reduction(A)
             values = list(effect.values)
             for c, j in zip(took.coefficients, linear, strict=False):
                 one = parameters[j]
                 values[j] = float(np.clip(one.none + c, one.low, one.high))
             wrong = any(values[j] == parameters[j].none for j in linear) and len(linear) == 1
-            backward = not linear and took.coefficients[0] <= 0
-            if not wrong and not backward:
+            if not wrong:
                 found.append(Seed(tuple(values), took.chi2, took.rank))
         return sorted(found, key=lambda seed: -seed.chi2)
 

@@ -8,6 +8,7 @@ product with a 21 x 21 matrix.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,8 +33,13 @@ def positions(parameters: Sequence[EffectParameter]) -> np.ndarray:
 
 def at_points(points: np.ndarray, axes: str, oblique: bool = False) -> np.ndarray:
     """(n, len(axes) or 6, 21): unit springs at each place along each axis, with oblique between the axes too."""
+    return _at_points(points.tobytes(), axes, oblique)
+
+
+@lru_cache(maxsize=16)
+def _at_points(points: bytes, axes: str, oblique: bool) -> np.ndarray:
     found = []
-    for point in points:
+    for point in np.frombuffer(points).reshape(-1, 3):
         G = point_map(point)
         pairs = [("xyz".index(a),) * 2 for a in axes] + ([(0, 1), (0, 2), (1, 2)] if oblique else [])
         found.append([symmetric_coordinates(np.outer(G[i], G[j]) if i == j else np.outer(G[i], G[j]) + np.outer(
@@ -54,6 +60,18 @@ def project(score: Score, dynamic: Callable[[np.ndarray], np.ndarray], key: Hash
     if key is not None:
         score.kept[key] = found
     return found
+
+
+def recoils(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """(6, N): by each way in which a chassis can recoil, receptance (n,) [1/mass times displacement per force]."""
+    columns = []
+    for part in score.parts:
+        made, answer = part.made, part.answer
+        through = np.swapaxes(made.G, 0, 1)[:6] @ (made.z_pf[:, :, None] * made.ops.mounts.chassis)
+        amount = part.s ** 2 * (made.M @ answer.x[:, :6]) * receptance(part.s[:, 0, 0])[:, None, None]
+        seen = answer.left[:, :, :6] @ through
+        columns.append(-np.moveaxis(seen[:, :, :, None] * amount[:, None], 2, 0))
+    return score.directions(columns)
 
 
 def residues(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> tuple[Reduction, np.ndarray]:

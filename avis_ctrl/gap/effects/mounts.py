@@ -9,7 +9,6 @@ import numpy as np
 from numba import njit
 
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, register
-from avis_ctrl.gap.effects.sensors import second_order
 from avis_ctrl.gap.operators import mount_geometry
 
 if TYPE_CHECKING:
@@ -41,7 +40,7 @@ class _OfMounts(Effect):
 
 @register
 class MountRelaxation(_OfMounts):
-    """Vertical stiffness k (1 + r s tau/(1 + s tau)): a Maxwell branch in parallel, a second chamber with an orifice."""
+    """Vertical stiffness k (1 + r s tau/(1 + s tau)): a Maxwell branch, a second chamber behind an orifice."""
 
     name = "mount_relaxation"
     title = "the vertical stiffness of the mounts rises with frequency (a second chamber, a Maxwell branch)"
@@ -49,7 +48,8 @@ class MountRelaxation(_OfMounts):
     confusable = ("structural_damping", "leveling_loop", "attached_oscillator")
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        return (EffectParameter("stiffness_ratio", "1", "stiffness of the branch over that at rest", 0.0, 0.0, 20.0, 0.1),
+        return (EffectParameter("stiffness_ratio", "1", "stiffness of the branch over that at rest", 0.0, 0.0, 20.0,
+                                0.1),
                 EffectParameter("corner_Hz", "Hz", "above which the branch acts", 0.0, 0.02, 300.0, 1.0, False,
                                 (0.3, 0.8, 1.5, 2.5, 4.0, 7.0, 15.0, 40.0)))
 
@@ -99,12 +99,12 @@ class MountSurge(_OfMounts):
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
         k = float(np.mean(mount_geometry(model.rig).stiffness[vertical(model)]))
-        grid = tuple(4 * k / (2 * np.pi * f) ** 2 for f in (10.0, 14.0, 20.0, 28.0, 40.0, 56.0, 80.0))
-        return (EffectParameter("mass_kg", "kg", "inside each mount", 0.0, 0.0, 500.0, grid[2], False, grid),
+        grid = tuple(4 * k / (2 * np.pi * f) ** 2 for f in np.geomspace(8.0, 110.0, 24))
+        return (EffectParameter("mass_kg", "kg", "inside each mount", 0.0, 0.0, 500.0, grid[8], False, grid),
                 EffectParameter("payload_share", "1", "of the mount's compliance between mass and payload", 0.5, 0.05,
                                 0.95, 0.2, False, (0.5,), True),
                 EffectParameter("bypass", "1", "of the mount's damping that bypasses the mass", 0.0, 0.0, 1.0, 0.2,
-                                False, (0.0, 0.9), True))
+                                False, (0.0, 0.8), True))
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         up = vertical(ops)
@@ -137,8 +137,8 @@ class LevelingLoop(_OfMounts):
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
         k = float(np.mean(mount_geometry(model.rig).stiffness))
-        gain = EffectParameter("integral_gain_N_per_ms", "N/(m s)", "force by displacement and second", 0.0, 0.0, 1e3 * k,
-                               0.1 * k)
+        gain = EffectParameter("integral_gain_N_per_ms", "N/(m s)", "force by displacement and second", 0.0, 0.0,
+                               1e3 * k, 0.1 * k)
         if place.endswith("plain"):
             return (gain,)
         return (gain, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, 0.01, 100.0, 1.0,
@@ -219,6 +219,12 @@ class ContactFriction(Effect):
         f = dahl(np.ascontiguousarray(record.deflection[:, own]), values["slip_m"])
         return -values["stiffness_N_per_m"] * f @ record.rows[own]
 
+    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
+                       ) -> np.ndarray | None:
+        unit = {"stiffness_N_per_m": 1.0, "slip_m": values["slip_m"]}
+        return values["stiffness_N_per_m"] * record.kept(f"dahl {values['slip_m']}", omega,
+                                                         lambda: np.asarray(self.force(record, place, unit)))
+
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         k, slip = values["stiffness_N_per_m"], values["slip_m"]
@@ -281,46 +287,3 @@ class StiffnessDrift(Effect):
             hours = (spans[0][1] - spans[0][0]) / 3600
             found["rate_per_hour"] = Reported(one.value / hours, one.std / hours, "1/h")
         return found
-
-
-@register
-class BaseCompliance(Effect):
-    """The chassis, a mass on something soft: it recoils from mounts and motors, and filters the floor.
-
-    B = inv(s^2 m + s c + k) along each axis; with rocking, the same about each axis.
-    """
-
-    name = "base_compliance"
-    title = "the chassis stands on something soft and recoils"
-    looks_like = "one more resonance in every channel, and less floor motion above it"
-    confusable = ("payload_flexible_mode", "attached_oscillator", "mount_surge")
-
-    def places(self, model: TableModel) -> tuple[str, ...]:
-        return ("chassis/translation", "chassis/rocking") if has_mounts(model) else ()
-
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        m = model.rig.mounted_body().mass
-        found = (EffectParameter("mass_kg", "kg", "of the chassis", 0.0, 0.05 * m, 200 * m, m, False, (m, 6 * m)),
-                 EffectParameter("vertical_Hz", "Hz", "of the chassis on its base, along z", 0.0, 1.0, 300.0, 10.0, False,
-                                 (7.0, 14.0, 28.0, 50.0)),
-                 EffectParameter("horizontal_Hz", "Hz", "of the chassis on its base, along x and y", 0.0, 1.0, 300.0,
-                                 10.0, False, (7.0, 14.0, 28.0, 50.0)),
-                 EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 1.0, 0.05, False, (0.06,), True))
-        if place.endswith("translation"):
-            return found
-        return (*found, EffectParameter("rocking_Hz", "Hz", "of the chassis on its base, about each axis", 0.0, 1.0, 300.0,
-                                        10.0, False, (20.0,)),
-                EffectParameter("gyration_m", "m", "radius of gyration of the chassis", 0.0, 0.05, 3.0, 0.5, False, (0.5,)))
-
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        n, m = len(ops.s), values["mass_kg"]
-        B, H = np.zeros((n, 6, 6), complex), np.zeros((n, 6, 3), complex)
-        for a, f in enumerate((values["horizontal_Hz"], values["horizontal_Hz"], values["vertical_Hz"])):
-            dynamic = second_order(ops.s, f, values["damping"])
-            B[:, a, a] = 1 / (m * dynamic)
-            H[:, a, a] = (dynamic - ops.s ** 2) / dynamic
-        if "rocking_Hz" in values:
-            inertia = m * values["gyration_m"] ** 2
-            for a in range(3, 6):
-                B[:, a, a] = 1 / (inertia * second_order(ops.s, values["rocking_Hz"], values["damping"]))
-        ops.recoil, ops.follow = B, H

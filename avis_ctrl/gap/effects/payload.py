@@ -9,7 +9,7 @@ import numpy as np
 
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register
 from avis_ctrl.gap.effects.impedance import at_points, positions, project, residues
-from avis_ctrl.gap.effects.sensors import axis_of, second_order
+from avis_ctrl.gap.effects.sensors import second_order
 from avis_ctrl.gap.operators import AddedCoordinate, mount_geometry
 from avis_ctrl.gap.score_algebra import reduction
 from avis_ctrl.rigs.rigid_body import point_map
@@ -85,11 +85,14 @@ class PayloadFlexibleMode(Effect):
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
         names = mount_geometry(model.rig).names
+        driven = np.any(shape_rows(model.rig, model.actuators, model.sensors.names)[0], axis=0)
         grid = tuple(np.geomspace(7.0, 140.0, 22))
         return (EffectParameter("frequency_Hz", "Hz", "of the mode, free", 0.0, 3.0, 400.0, 20.0, False, grid),
-                EffectParameter("damping", "1", "damping ratio of the mode", 0.0, 1e-4, 0.5, 0.02, False, (0.02,), True),
+                EffectParameter("damping", "1", "damping ratio of the mode", 0.0, 1e-4, 0.5, 0.02, False, (0.02,),
+                                True),
                 *(EffectParameter(f"shape_{name.replace('.', '_')}", "1/sqrt(kg)", f"mass-normalised shape at {name}",
-                                  0.0, -1.0, 1.0, 0.01) for name in names))
+                                  0.0, -1.0, 1.0, 0.01, optional=not own, group="shape")
+                  for name, own in zip(names, driven, strict=True)))
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         shape = np.array(list(values.values())[2:])
@@ -155,7 +158,7 @@ def place_of(values: Mapping[str, float]) -> np.ndarray:
 
 @register
 class AttachedOscillator(_AtPoint):
-    """A mass m on a spring and damper at a point: it adds m s^2 (2 z w s + w^2)/(s^2 + 2 z w s + w^2) along its rows."""
+    """A mass m on a spring and damper at a point: m s^2 (2 z w s + w^2)/(s^2 + 2 z w s + w^2) along its rows."""
 
     name = "attached_oscillator"
     title = "a sprung mass on the payload"
@@ -223,15 +226,15 @@ class CableStiffness(_AtPoint):
         return ("payload/axes", "payload/oblique")
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        size = 0.02 * float(np.mean(mount_geometry(model.rig).stiffness))
+        size = 0.02 * float(np.mean(np.diag(model.base.matrices.K)[:3])) / 4  # of one mount of four, on any rig
         most = 200 * size
         own = [EffectParameter(f"k_{axis}_N_per_m", "N/m", f"stiffness along {axis}", 0.0, 0.0, most, size)
                for axis in "xyz"]
         if place.endswith("oblique"):
             own += [EffectParameter(f"k_{axes}_N_per_m", "N/m", f"stiffness between {axes[0]} and {axes[1]}", 0.0,
                                     -most, most, size) for axes in ("xy", "xz", "yz")]
-        return (*own, EffectParameter("damping_s", "s", "damping over stiffness", 0.0, 0.0, 0.1, 1e-3, False, (0.0,), True),
-                *self.position())
+        return (*own, EffectParameter("damping_s", "s", "damping over stiffness", 0.0, 0.0, 0.1, 1e-3, False, (0.0,),
+                                      True), *self.position())
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         K = np.diag([values[f"k_{axis}_N_per_m"] for axis in "xyz"])

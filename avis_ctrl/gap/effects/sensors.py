@@ -118,7 +118,7 @@ class TiltCoupling(Effect):
 
     name = "tilt_coupling"
     title = "gravity: the horizontal sensors read g times the tilt as an acceleration"
-    looks_like = "horizontal outputs rise towards low frequency where the payload tilts, as g over the frequency squared"
+    looks_like = "horizontal outputs rise towards low frequency where the payload tilts, as g over frequency squared"
     confusable = ("leveling_loop", "com_offset")
 
     def places(self, model: TableModel) -> tuple[str, ...]:

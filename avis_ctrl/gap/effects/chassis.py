@@ -1,0 +1,145 @@
+"""What the mounts stand on: a chassis that recoils."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register
+from avis_ctrl.gap.effects.impedance import recoils
+from avis_ctrl.gap.effects.mounts import has_mounts
+from avis_ctrl.gap.effects.sensors import second_order
+from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.rigs.rigid_body import point_map
+
+if TYPE_CHECKING:
+    from avis_ctrl.gap.operators import Operators
+    from avis_ctrl.gap.score import Score
+    from avis_ctrl.gap.table_model import TableModel
+
+WAYS = ("x", "y", "z", "rx", "ry", "rz")
+# Below this the suspension's own modes are in the way of the first look.
+LOWEST_Hz = 7.0
+# Where a way of moving is looked for that the score finds nothing in [Hz].
+STIFF_Hz = 90.0
+
+
+@register
+class BaseCompliance(Effect):
+    """The chassis, a rigid body on something soft: it recoils from mounts and motors, and filters the floor.
+
+    c = B (f_mounts + (s C_b + K_b) w), B = inv(s^2 M_c + s C_b + K_b), each along its own axis (translation), or with
+    rotation too, the mass at its own height and the springs of the base at theirs.
+    """
+
+    name = "base_compliance"
+    title = "the chassis stands on something soft and recoils"
+    looks_like = "one more resonance in every channel, and less floor motion above it"
+    confusable = ("payload_flexible_mode", "attached_oscillator", "mount_surge")
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("chassis/translation", "chassis/rocking") if has_mounts(model) else ()
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        m = model.rig.mounted_body().mass
+
+        def frequency(way: str) -> EffectParameter:
+            about = f"along {way}" if len(way) == 1 else f"about {way[1]}"
+            return EffectParameter(f"{way}_Hz", "Hz", f"of the chassis on its base, {about}", 0.0, 1.0, 300.0, 10.0,
+                                   False, (20.0,), True)
+        found = (EffectParameter("mass_kg", "kg", "of the chassis", 0.0, 0.05 * m, 400 * m, m, False, (2 * m,)),
+                 EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 1.0, 0.05, False, (0.06,), True),
+                 *(frequency(way) for way in WAYS[:3]))
+        if place.endswith("translation"):
+            return found
+        return (*found, *(frequency(way) for way in WAYS[3:]),
+                *(EffectParameter(f"gyration_{axis}_m", "m", f"radius of gyration about {axis}", 0.0, 0.03, 5.0, 0.3,
+                                  False, (0.5,), True) for axis in "xyz"),
+                EffectParameter("centre_z_m", "m", "height of its mass over the table's centre", 0.0, -3.0, 1.0, 0.3,
+                                False, (-0.5,), True),
+                EffectParameter("base_z_m", "m", "height of its springs over its mass", 0.0, -2.0, 2.0, 0.3, False,
+                                (0.0,), True))
+
+    def seeds(self, score: Score, place: str) -> list[Seed]:
+        """Where each way of moving resonates best by itself; masses follow from all of them together."""
+        ways = WAYS[:3] if place.endswith("translation") else WAYS
+        zeta, grid = 0.06, np.geomspace(LOWEST_Hz, STIFF_Hz, 26)
+        rows, labels = [], []
+        for f in grid:
+            key = ("recoil", float(f))
+            if key not in score.kept:
+                score.kept[key] = recoils(score, lambda s, f=f: 1 / second_order(s, f, zeta))
+            rows.append(score.kept[key][:len(ways)])
+            labels += [(way, float(f)) for way in ways]
+        A = np.concatenate(rows)
+        gram, fall = A @ A.T, A @ score.e
+        best = _greedy(gram, fall, labels)
+        moving = [way for way in best if len(way) == 1]
+        if not moving:
+            return []
+        chosen = [labels.index((way, f)) for way, f in best.items()]
+        took = reduction(gram[np.ix_(chosen, chosen)], fall[chosen])
+        inverse = dict(zip(best, took.coefficients, strict=True))
+        # The way that was found first tells the mass best; one that would need another mass is no recoil.
+        leader = inverse[moving[0]]
+        if leader <= 0:
+            return []
+        best = {way: f for way, f in best.items() if len(way) > 1 or leader / 3 < inverse[way] < 3 * leader}
+        mass = self.parameters(score.model, place)[0]
+        m = float(np.clip(1 / leader, 2 * mass.low, mass.high / 2))
+        at = {way: best.get(way, STIFF_Hz) for way in ways}
+        values = [m, zeta, *(at[way] for way in ways[:3])]
+        if len(ways) > 3:
+            radii = [np.sqrt(1 / (inverse[way] * m)) if inverse.get(way, 0.0) > 0 else 0.6 for way in ways[3:]]
+            values += [*(at[way] for way in ways[3:]), *np.clip(radii, 0.1, 3.0).tolist(), -0.3, 0.0]
+        return [Seed(tuple(float(v) for v in values), took.chi2, 2 * len(best))]
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        m, zeta = values["mass_kg"], values["damping"]
+        ways = [way for way in WAYS if f"{way}_Hz" in values]
+        radii = [1.0, 1.0, 1.0, *(values[f"gyration_{axis}_m"] for axis in "xyz")] if len(ways) > 3 else [1.0] * 3
+        inertia = m * np.square(radii)
+        w = 2 * np.pi * np.array([values[f"{way}_Hz"] for way in ways])
+        k, c = inertia * w ** 2, 2 * zeta * inertia * w
+        s = ops.s[:, None, None]
+        if len(ways) == 3:
+            D = inertia * s[:, :, 0] ** 2 + s[:, :, 0] * c + k
+            B, H = np.zeros((len(s), 6, 6), complex), np.zeros((len(s), 6, 3), complex)
+            B[:, range(3), range(3)], H[:, range(3), range(3)] = 1 / D, (s[:, :, 0] * c + k) / D
+        else:
+            centre = np.array([0.0, 0.0, values["centre_z_m"]])
+            mass, spring = np.zeros((6, 6)), np.zeros((2, 6, 6))
+            G, below = point_map(centre), point_map(centre + np.array([0.0, 0.0, values["base_z_m"]]))
+            mass[3:, 3:] = np.diag(inertia[3:])
+            mass += G.T @ np.diag(inertia[:3]) @ G
+            for which, one in zip(spring, (k, c), strict=True):
+                which += below.T @ np.diag(one[:3]) @ below
+                which[3:, 3:] += np.diag(one[3:])
+            tied = spring[0] + s * spring[1]
+            B = np.linalg.inv(s ** 2 * mass + tied)
+            H = B @ tied[:, :, :3]
+        ops.recoil, ops.follow = B, H
+
+
+def _greedy(gram: np.ndarray, fall: np.ndarray, labels: list[tuple[str, float]]) -> dict[str, float]:
+    """Ways of moving and their frequencies, one after the other, each the best beside those before it.
+
+    A way that adds little, or would need a negative mass, is taken as stiff.
+    """
+    best: dict[str, float] = {}
+    took = 0.0
+    while True:
+        rows = [labels.index((way, f)) for way, f in best.items()]
+        trials = []
+        for k, (way, _) in enumerate(labels):
+            if way not in best:
+                own = [*rows, k]
+                one = reduction(gram[np.ix_(own, own)], fall[own])
+                if np.all(one.coefficients > 0):
+                    trials.append((one.chi2, k))
+        if not trials or max(trials)[0] < 1.05 * took:
+            return best
+        took, k = max(trials)
+        best[labels[k][0]] = labels[k][1]
