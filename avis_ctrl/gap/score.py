@@ -19,7 +19,7 @@ import numpy as np
 
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.score_algebra import SYMMETRIC, Reduction, reduction
-from avis_ctrl.gap.table_model import ActiveEffect, Acting, TableModel, _Answer, _Side
+from avis_ctrl.gap.table_model import Acting, ActiveEffect, TableModel, _Answer, _Side
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
 from avis_ctrl.identification.response import N_Q
 from avis_ctrl.identification.spectra import SpectralBlock, transient_columns

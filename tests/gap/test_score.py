@@ -56,8 +56,8 @@ def effect(name, place, values=None, model=MODEL):
     return active(library()[name], model, place, values)
 
 
-ABSENT = [("com_offset", "payload", None), ("sensor_gain", "Sz2", None), ("mount_relaxation", "isolators z", (0.0, 3.0)),
-          ("loop_delay", "loop", None)]
+ABSENT = [("com_offset", "payload", None), ("sensor_gain", "Sz2", None), ("loop_delay", "loop", None),
+          ("mount_relaxation", "isolators z", (0.0, 3.0))]
 
 
 @pytest.mark.parametrize("transient", [False, True], ids=["periodic", "with ends"])
