@@ -26,10 +26,13 @@ def gap(
                                                                 "what is excited")] = None,
     amplifier_Hz: Annotated[float | None, typer.Option("--amplifier-corner", help="first-order lag that the amplifiers "
                                                        "are known to have [Hz]")] = None,
-    design: Annotated[bool, typer.Option("--design", help="also design controllers on both models: what the effect does "
-                                         "to mu (about a minute more)")] = False,
-    design_file: Annotated[Path | None, typer.Option("--design-file", metavar="DESIGN.toml", help="with --design: whose "
-                                                     "axes, uncertainty and weights; by default z and phi_x")] = None,
+    design: Annotated[bool, typer.Option("--design", help="also design controllers on both models: what the effect "
+                                         "does to mu (about a minute more)")] = False,
+    design_file: Annotated[Path | None, typer.Option("--design-file", metavar="DESIGN.toml", help="with --design: "
+                                                     "whose axes, uncertainty and weights; by default z and "
+                                                     "phi_x")] = None,
+    effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="Python file with effects of "
+                                                 "your own, run before the search (docs/own_effect.md)")] = None,
     despite_gates: Annotated[bool, typer.Option("--despite-gates", help="go on where a gate says stop")] = False,
     seed: Annotated[int, typer.Option("--seed")] = 1,
 ) -> None:
@@ -48,6 +51,12 @@ def gap(
     from avis_ctrl.study.rig_channels import in_words_of
 
     console = Console(highlight=False)
+    own = None
+    if effects is not None:
+        from avis_ctrl.gap.effects.own import load_effects
+
+        own = load_effects(effects)
+        console.print(f"[dim]effects of your own: {', '.join(own.names)}[/]")
     start = load_rig(rig)
     mapping = parse_columns(columns) if columns else None
     measured = read_measurements(campaign, mapping, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
@@ -66,7 +75,7 @@ def gap(
         from avis_ctrl.study.gap_files import write_gap
 
         options = GapOptions(seed, band_Hz, True, despite_gates, amplifier_Hz, design or design_file is not None,
-                             design_file)
+                             design_file, own)
         found = find_gap(named, start, options, progress)
         progress("report")
         files = write_gap(folder, found.gap, gap_html(found), gap_pdf(found))

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 import avis_ctrl
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.gap.analysis import analyse
+from avis_ctrl.gap.effects.own import OwnEffects, try_out
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.simulate import simulate
 from avis_ctrl.gap.table_model import TableModel
@@ -43,7 +44,8 @@ class GapOptions:
 
     band_Hz : of the comparison; the excited one where None. design : synthesise controllers on both models, by
     design_file or by default z and phi_x. gates : look at the signals before anything else. despite_gates : go on where
-    a gate says stop. amplifier_corner_Hz : lag that the amplifiers are known to have.
+    a gate says stop. amplifier_corner_Hz : lag that the amplifiers are known to have. own_effects : of the user's own
+    file, beside the library.
     """
 
     seed: int = 1
@@ -53,6 +55,7 @@ class GapOptions:
     amplifier_corner_Hz: float | None = None
     design: bool = False
     design_file: Path | None = None
+    own_effects: OwnEffects | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +81,7 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
     Raises
     ------
     InputError : frequency responses instead of records, channels that are not the rig's, a gate that says stop,
-        records that drive nothing or tell no noise.
+        records that drive nothing or tell no noise, an effect of the user's own that fails.
     ComputationError : a fit that does not come to an end.
     """
     options, began = options or GapOptions(), time.monotonic()
@@ -90,6 +93,9 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
     measured = named
     if measured.records[0].header.u_unit != "V":
         raise InputError("expected commanded voltages in V", field="unit of u", value=measured.records[0].header.u_unit)
+    if options.own_effects is not None:
+        try_out(options.own_effects, TableModel(ResponseModel.of(rig, (), measured.y_unit, measured.y_names,
+                                                                 measured.u_names)))
     with threadpool_limits(1):
         findings = _gates(measured, rig, options, progress) if options.gates else ()
         gap = analyse(measured, rig, options.seed, options.band_Hz, options.amplifier_corner_Hz, None, progress)
@@ -138,7 +144,10 @@ def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.
 def provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float) -> dict[str, Any]:
     """What made this result: versions, hash of the inputs, seed, time."""
     text = repr(sorted((k, v.value) for k, v in rig.parameters().items())) + repr(options)
-    return {"avis_ctrl": avis_ctrl.__version__, "measurement": measured.source,
+    own = options.own_effects
+    told = {} if own is None else {"own_effects": f"{own.path.name}: {', '.join(own.names)}",
+                                   "own_effects_sha256": own.sha256}
+    return {"avis_ctrl": avis_ctrl.__version__, "measurement": measured.source, **told,
             "measurement_sha256": digest(measured), "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
             "seed": options.seed, "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
             "python": platform.python_version(),

@@ -193,7 +193,8 @@ def register(effect: type[Effect]) -> type[Effect]:
     if not name:
         raise InputError("expected an effect with a name", field="effect", value=effect.__name__)
     known = _registry.get(name)
-    if known is not None and type(known).__qualname__ != effect.__qualname__:
+    if known is not None and (type(known).__module__, type(known).__qualname__) != (effect.__module__,
+                                                                                    effect.__qualname__):
         raise InputError("expected a name that no other effect has", field="effect", value=name)
     _registry[name] = effect()
     return effect
@@ -204,3 +205,9 @@ def library() -> dict[str, Effect]:
     import avis_ctrl.gap.effects.shipped  # noqa: F401  (registers them)
 
     return dict(_registry)
+
+
+def restore(known: dict[str, Effect]) -> None:
+    """Make the library what it was, as `library` gave it."""
+    _registry.clear()
+    _registry.update(known)
