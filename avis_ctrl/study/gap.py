@@ -36,6 +36,8 @@ Progress = Callable[[str], None]
 # Gates that say stop on what `gap` itself recognises and names, or mends.
 NAMED_HERE = ("clipping", "hum", "signal to noise", "coherence", "repeatability", "level dependence", "periodicity",
               "spikes")
+# Samples of a record below which neither the gates nor a held-out third of it tell anything.
+FEWEST = 300
 
 
 @dataclass(frozen=True)
@@ -91,8 +93,7 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
     named = in_words_of(rig, measured)
     assert isinstance(named, Campaign)  # as it was
     measured = named
-    if measured.records[0].header.u_unit != "V":
-        raise InputError("expected commanded voltages in V", field="unit of u", value=measured.records[0].header.u_unit)
+    _require_records(measured, rig)
     if options.own_effects is not None:
         try_out(options.own_effects, TableModel(ResponseModel.of(rig, (), measured.y_unit, measured.y_names,
                                                                  measured.u_names)))
@@ -103,6 +104,19 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
         gap = replace(gap, seconds=seconds)
         design, note = _design(gap, options, progress)
     return GapFinding(gap, measured, findings, provenance(measured, rig, options, seconds), design, note)
+
+
+def _require_records(measured: Campaign, rig: Rig) -> None:
+    """What the gates take for granted. Raises InputError."""
+    if measured.records[0].header.u_unit != "V":
+        raise InputError("expected commanded voltages in V", field="unit of u", value=measured.records[0].header.u_unit)
+    if abs(measured.sample_rate_Hz / rig.sample_rate_Hz - 1) > 1e-6:
+        raise InputError(f"expected the rig's own {rig.sample_rate_Hz:g} Hz", field="sample_rate_Hz",
+                         value=measured.sample_rate_Hz)
+    for record in measured.records:
+        if record.header.samples < FEWEST:
+            raise InputError(f"expected at least {FEWEST} samples", field=f"record {record.header.name}: samples",
+                             value=record.header.samples)
 
 
 def _gates(measured: Campaign, rig: Rig, options: GapOptions, progress: Progress) -> tuple[Finding, ...]:

@@ -1,0 +1,186 @@
+"""`find_gap` from end to end on the independent truth, and what it says to input that is wrong."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from truth.cases import draw_case, rig, simulate_case
+
+from avis_ctrl.errors import AvisError, InputError
+from avis_ctrl.gap.result import VERDICTS
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.rigs import load_rig
+from avis_ctrl.study.gap import GapOptions, find_gap
+
+SIGNALS = {"mains_hum", "sensor_quantisation", "ground_motion"}
+
+
+def found_in(duration_s=20.0, **case):
+    drawn = draw_case(duration_s=duration_s, **case)
+    return drawn, find_gap(simulate_case(drawn), rig())
+
+
+# --- nothing, one, two, something else
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 21])
+def test_nothing_is_missing(seed):
+    _, found = found_in(seed=seed, kind="none")
+    assert found.gap.verdict == "none"
+    assert found.gap.effects == ()
+    assert [stage.name for stage in found.gap.stages] == ["nominal", "re-identified"]
+    assert found.gap.stages[1].chi2_per_dof < 1.21
+    assert found.gap.next_experiment is None
+    assert found.gap.where == ()
+
+
+# One of each family: seed, strength, duration, and the truth's name of the parameter by the report's.
+ONE = {"geophone_corner": (2, "clear", 20.0, {"corner_Hz": "corner_Hz"}),
+       "mains_hum": (3, "clear", 20.0, {"frequency_Hz": "frequency_Hz", "amplitude_V": "amplitude_V"}),
+       "actuator_gain": (5, "clear", 20.0, {"gain": "gain"}),
+       "actuator_lag": (6, "clear", 20.0, {"corner_Hz": "corner_Hz"}),
+       "actuator_saturation": (7, "clear", 20.0, {"limit_V": "limit_V"}),
+       "contact_friction": (9, "clear", 20.0, {}),  # each contact of its own: no one value is the true one
+       "product_of_inertia": (10, "clear", 20.0, {"Jxy_kgm2": "product_kgm2"})}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ONE)
+def test_one_effect_is_named_at_its_place_with_its_size(name):
+    seed, strength, duration_s, known = ONE[name]
+    case, found = found_in(duration_s, seed=seed, effect=name, strength=strength)
+    true, gap = case.effects[0], found.gap
+    assert [(one.name, one.location) for one in gap.effects] == [(true.name, true.location)]
+    assert gap.verdict == "explained"
+    for reported, truly in known.items():
+        estimate, value = gap.effects[0].parameters[reported], true.parameters[truly]
+        assert estimate.value == pytest.approx(value, abs=4 * estimate.std + 0.01 * abs(value))
+        assert estimate.std > 0
+    assert gap.effects[0].probability > 0.9
+    before, after = gap.stages[1], gap.stages[-1]
+    assert after.name == name
+    assert after.chi2_per_dof < 1.44
+    # Within 1.2 of the noise floor, or down by a factor of 10.
+    assert after.nrmse < 1.2 * gap.noise_nrmse or after.nrmse < 0.1 * before.nrmse
+    if name not in SIGNALS:
+        assert gap.updated.effects[-1].effect.name == name
+    require_contract(found.to_json())
+
+
+# --- the contract
+
+def require_contract(told):
+    """Keys, types and finite numbers of gap.json."""
+    json.loads(json.dumps(told, allow_nan=False))
+    assert {"format", "version", "verdict", "effects", "gap", "where", "next_experiment", "seconds"} <= set(told)
+    assert (told["format"], told["version"]) == ("avis-gap", 1)
+    assert told["verdict"] in VERDICTS
+    for one in told["effects"]:
+        assert set(one) == {"name", "location", "parameters", "probability", "indistinguishable_from"}
+        assert isinstance(one["name"], str)
+        assert isinstance(one["location"], str)
+        assert 0 <= one["probability"] <= 1
+        assert all(isinstance(name, str) and name != one["name"] for name in one["indistinguishable_from"])
+        assert one["parameters"]
+        for parameter in one["parameters"].values():
+            assert set(parameter) == {"value", "std", "unit"}
+            assert np.isfinite([parameter["value"], parameter["std"]]).all()
+            assert parameter["std"] >= 0
+    stages = [one["stage"] for one in told["gap"]]
+    assert stages[:2] == ["nominal", "re-identified"]
+    assert stages[2:] == sorted((one["name"] for one in told["effects"]), key=stages.index)
+    for one in told["gap"]:
+        assert set(one) == {"stage", "nrmse", "chi2_per_dof"}
+        assert one["nrmse"] > 0
+        assert one["chi2_per_dof"] > 0
+    for one in told["where"]:
+        assert set(one) == {"from_Hz", "to_Hz", "input", "output", "share"}
+        assert 0 <= one["from_Hz"] < one["to_Hz"]
+        assert 0 < one["share"] <= 1
+    assert sum(one["share"] for one in told["where"]) < 1 + 1e-9
+    assert told["next_experiment"] is None or isinstance(told["next_experiment"], str)
+    assert told["seconds"] > 0
+    if told["verdict"] == "none":
+        assert not told["effects"]
+        assert not told["where"]
+    if told["verdict"] == "unexplained":
+        assert not told["effects"]
+
+
+def test_verdicts_are_the_contracts_words(shared):
+    text = (shared / "contracts" / "gap.md").read_text(encoding="utf-8")
+    assert tuple(re.search(r'"verdict": "([^"]+)"', text)[1].split(" | ")) == VERDICTS
+
+
+# --- input that is wrong
+
+RIG = load_rig("avis")
+NAMES = RIG.equations_of_motion().actuators, RIG.geophones.names
+
+
+def campaign(samples=3000, drive=0.3, u_names=NAMES[0], y_names=NAMES[1], records=2, rate=1000.0, unit="V",
+             excitation="noise", change=lambda u, y: None):
+    rng = np.random.default_rng(1)
+    made = []
+    for k in range(records):
+        u, y = drive * rng.standard_normal((samples, len(u_names))), 0.1 * rng.standard_normal((samples, len(y_names)))
+        change(u, y)
+        made.append(Record(RecordHeader(f"{k:02d}", rate, samples, u_names, y_names, excitation, drive, 100.0 * k,
+                                        u_unit=unit), u, y))
+    return Campaign("avis", tuple(made))
+
+
+def nan(u, y):
+    y[7, 2] = np.nan
+
+
+def dead(u, y):
+    y[:, 1] = 0.25
+
+
+def responses():
+    f = np.linspace(1, 50, 20)
+    value = np.ones((20, 6, 8), complex)
+    return FrequencyResponse(f, value, None, None, *NAMES, dof=10.0, entry_variance=np.ones((20, 6, 8)))
+
+
+HOSTILE = {
+    "without drive": (lambda: campaign(drive=0.0), "drive"),
+    "at rest": (lambda: campaign(drive=0.0, excitation="rest"), "drive"),
+    "y of another rig": (lambda: campaign(y_names=tuple(f"S{k}" for k in range(6))), "S0"),
+    "u of another rig": (lambda: campaign(u_names=tuple(f"A{k}" for k in range(8))), "A0"),
+    "two samples": (lambda: campaign(samples=2), "samples"),
+    "a hundred samples": (lambda: campaign(samples=100), "samples"),
+    "NaN": (lambda: campaign(change=nan), "sample 7 of channel Sx2"),
+    "a dead channel": (lambda: campaign(change=dead), "channel"),
+    "another rate": (lambda: campaign(rate=500.0), "sample_rate"),
+    "newtons": (lambda: campaign(unit="N"), "unit of u = 'N': expected commanded voltages"),
+    "frequency responses": (responses, "expected records in time"),
+    "no record": (lambda: campaign(records=0), "expected at least one record")}
+
+
+@pytest.mark.parametrize("gates", [True, False], ids=["gates", "no gates"])
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_input_is_one_line(case, gates):
+    make, said = HOSTILE[case]
+    with pytest.raises(AvisError) as error:
+        find_gap(make(), RIG, GapOptions(gates=gates))
+    assert isinstance(error.value, InputError), error.value
+    assert "\n" not in str(error.value)
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize("band", [(60.0, 1.0), (-1.0, 20.0), (3.0, 3.0), (600.0, 700.0), (np.nan, 3.0)])
+def test_bands_that_are_none(band):
+    with pytest.raises(InputError, match="band_Hz"):
+        find_gap(campaign(), RIG, GapOptions(gates=False, band_Hz=band))
+
+
+def test_a_rig_of_other_channels():
+    with pytest.raises(InputError):
+        find_gap(replace(campaign(), rig="halcyonics"), load_rig("halcyonics"))
