@@ -118,6 +118,20 @@ def test_a_surge_without_mass_is_none():
     np.testing.assert_array_equal(model.response(OMEGA), BARE.response(OMEGA))
 
 
+@pytest.mark.parametrize(("name", "place"), EVERYWHERE)
+def test_what_is_reported_is_finite_at_every_bound(name, place):
+    """A refit may end there, also one that is only told among the runners-up."""
+    parameters = OWN[name].parameters(MOVING, place)
+    start = np.array(values_at(name, place), float)
+    for one in parameters:
+        for bound in (one.low, one.high):
+            values = {p.name: float(v) for p, v in zip(parameters, start, strict=True)} | {one.name: bound}
+            told = OWN[name].reported(MOVING, place, values, np.eye(len(start)) * 1e-6)
+            assert told
+            assert np.all(np.isfinite([(p.value, p.std) for p in told.values()])), (one.name, bound)
+            OWN[name].implausible(values, dict.fromkeys(values, 1e-3))
+
+
 # --- sensors
 
 def by_ratio(model, sensor):

@@ -61,8 +61,10 @@ class ActuatorLag(Effect):
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         tau, std = values["time_constant_s"], float(np.sqrt(max(covariance[0, 0], 0.0)))
-        return {"corner_Hz": Reported(1 / (2 * np.pi * tau), std / (2 * np.pi * tau ** 2), "Hz"),
-                "time_constant_s": Reported(tau, std, "s")}
+        found = {"time_constant_s": Reported(tau, std, "s")}
+        if tau <= 1e-9:  # at its bound there is no corner
+            return found
+        return {"corner_Hz": Reported(1 / (2 * np.pi * tau), std / (2 * np.pi * tau ** 2), "Hz"), **found}
 
 
 @register

@@ -117,6 +117,8 @@ class MountSurge(_OfMounts):
         found = super().reported(model, place, values, covariance)
         k = float(np.mean(mount_geometry(model.rig).stiffness[vertical(model)]))
         m, a = values["mass_kg"], values["payload_share"]
+        if m <= 0:  # at its bound there is no resonance
+            return found
         f = np.sqrt(k * (1 / a + 1 / (1 - a)) / m) / (2 * np.pi)
         # The standard deviation of the mass and of its place go into the frequency to first order.
         slope = np.array([-0.5 * f / m, 0.5 * f * (2 * a - 1) / (a * (1 - a)), 0.0])
