@@ -72,6 +72,27 @@ def test_one_effect_is_named_at_its_place_with_its_size(name):
     require_contract(found.to_json())
 
 
+@pytest.mark.slow
+def test_two_effects_are_both_named():
+    case, found = found_in(seed=16, kind="two", strength="clear")
+    assert {(one.name, one.location) for one in found.gap.effects} == {(one.name, one.location) for one in case.effects}
+    assert found.gap.verdict == "explained"
+    require_contract(found.to_json())
+
+
+@pytest.mark.slow
+def test_what_is_outside_the_library_is_not_named_as_something_else():
+    """Drag in proportion to the square of speed: significant, and no effect of the library."""
+    case, found = found_in(seed=15, effect="air_drag", strength="gross")
+    assert case.kind == "outside"
+    assert found.gap.effects == ()
+    assert found.gap.verdict == "unexplained"
+    assert found.gap.stages[1].chi2_per_dof > 10
+    assert found.gap.where
+    assert found.gap.next_experiment
+    require_contract(found.to_json())
+
+
 # --- the contract
 
 def require_contract(told):
