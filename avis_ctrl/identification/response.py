@@ -326,7 +326,12 @@ class ResponseModel:
 
 
 def positive(name: str) -> bool:
-    """Whether physics asks for a positive value: masses, stiffness, damping, force constants, sensitivities."""
+    """Whether physics asks for a positive value: masses, stiffness, damping, force constants, sensitivities.
+
+    Of a rig's own parameters; those of effects ("effect@place.parameter") have bounds of their own.
+    """
+    if "@" in name:
+        return False
     last = name.rpartition(".")[2]
     inertia = ("mass", "load.mass", "J1", "J2", "J3", "Ixx", "Iyy", "Izz")
     if name.startswith(("sensor.", "actuator.")) or name in inertia:

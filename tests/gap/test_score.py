@@ -140,6 +140,26 @@ def test_a_refit_gains_what_the_score_predicts(name, place, values, held):
     np.testing.assert_allclose(found, wanted, atol=0.05 * np.max(sizes))
 
 
+@pytest.mark.parametrize("variant", ["axes", "oblique"])
+def test_a_refit_moves_stiffnesses_that_are_zero_or_negative(variant):
+    """A cable along one direction: along some axis it has none, between axes less than none."""
+    along = np.array([0.0, 0.4525, -0.89]) if variant == "oblique" else np.array([0.0, 0.0, 1.0])
+    K, place, near = 2e4 * np.outer(along, along), [-0.1, -0.18, 0.2], [0.0, -0.3, 0.3]
+    own = [K[0, 0], K[1, 1], K[2, 2], *([K[0, 1], K[0, 2], K[1, 2]] if variant == "oblique" else [])]
+    where = f"payload/{variant}"
+    truth = MODEL.with_effect(effect("cable_stiffness", where, [*own, 2e-3, *place]))
+    blocks = [block(truth, np.random.default_rng(8), name=one) for one in ("00", "01")]
+    start = MODEL.with_effect(effect("cable_stiffness", where, [*(0.9 * k for k in own), 0.0, *near]))
+    found = fit(start, blocks, max_iterations=60)
+    assert found.iterations > 3
+    assert found.chi2_per_dof < 1.1
+    values = np.array(found.model.effects[0].values)
+    if variant == "oblique":
+        assert values[5] < -5e3
+    # A place along the cable's own line makes no difference.
+    np.testing.assert_allclose(np.cross(values[-3:] - place, along), 0, atol=0.05)  # 0.13 at the start
+
+
 def test_reduction_is_least_squares():
     rng = np.random.default_rng(6)
     A, e = rng.standard_normal((3, 50)) * [[1.0], [1e-6], [1e4]], rng.standard_normal(50)
