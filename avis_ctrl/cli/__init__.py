@@ -12,6 +12,7 @@ import typer
 import avis_ctrl
 from avis_ctrl.cli.design import design
 from avis_ctrl.cli.gap import gap
+from avis_ctrl.cli.gap_axis import gap_axis
 from avis_ctrl.cli.identify import identify, predict, single_axis
 from avis_ctrl.cli.measure import convert, excite, simulate_campaign
 from avis_ctrl.errors import AvisError
@@ -58,8 +59,9 @@ def doctor() -> None:
         raise typer.Exit(3)
 
 
-for command, name in ((design, "design"), (identify, "identify"), (gap, "gap"), (predict, "predict"), (excite, "excite"),
-                      (simulate_campaign, "simulate-campaign"), (convert, "convert"), (single_axis, "single-axis")):
+for command, name in ((design, "design"), (identify, "identify"), (gap, "gap"), (predict, "predict"),
+                      (gap_axis, "gap-axis"), (excite, "excite"), (simulate_campaign, "simulate-campaign"),
+                      (convert, "convert"), (single_axis, "single-axis")):
     app.command(name, epilog=LAYOUTS if name in ("identify", "gap", "convert") else None)(command)
 
 

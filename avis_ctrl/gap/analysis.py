@@ -117,15 +117,15 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
 
 
 def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, progress: Progress) -> Found:
-    """What was found, against the noise that is known now; searched on where that leaves more than noise."""
+    """What was found, against the noise that is known now; searched on where only that shows that more is left."""
     if len(found.chain) == 1:
-        if prepared.base.held_per_dof <= NOISE:
-            return replace(found, chain=(prepared.base,))
-        return search(prepared.base, prepared.thin, prepared.thin_held, progress, effects)
+        if found.reached_noise and prepared.base.held_per_dof > NOISE:
+            return search(prepared.base, prepared.thin, prepared.thin_held, progress, effects)
+        return replace(found, chain=(prepared.base,), reached_noise=prepared.base.held_per_dof <= NOISE)
     best = refit(found.best.model, prepared.thin, prepared.thin_held)
     chain = (prepared.base, *found.chain[1:-1], best)
     longer = replace(found, chain=chain, reached_noise=best.held_per_dof <= NOISE)
-    if longer.reached_noise or len(chain) > LONGEST:
+    if longer.reached_noise or not found.reached_noise or len(chain) > LONGEST:
         return longer
     on = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, chain)
     return replace(on, pool=(*found.pool, *on.pool), passed_over=(*found.passed_over, *on.passed_over),
@@ -143,8 +143,9 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     band = band_Hz or excited_band(halves.fitted)
     if not 0 <= band[0] < band[1]:
         raise InputError("expected the lower end first, the upper one after it", field="band_Hz", value=band)
-    nominal = TableModel(ResponseModel.of(rig, default_parameters(rig), campaign.y_unit, campaign.y_names,
-                                          campaign.u_names, True, amplifier_corner_Hz))
+    base = ResponseModel.of(rig, default_parameters(rig), campaign.y_unit, campaign.y_names, campaign.u_names, True,
+                            amplifier_corner_Hz)
+    nominal = TableModel(base, nominal=base)
     progress(f"re-identification of {len(nominal.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz; {halves.how}")
     rough = _rough(nominal, halves, band)
     if mended and max(mended.clipped.values()) > REPAIRED:

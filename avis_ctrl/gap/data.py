@@ -16,7 +16,7 @@ from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.prediction_error import prediction_error
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block
-from avis_ctrl.measurement.campaign import Campaign, RecordSource
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 
 # Records at levels within this factor are of one level.
 SAME_LEVEL = 1.25
@@ -113,7 +113,8 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campai
     for block in blocks:
         key = (block.kind, len(block.omega))
         if key not in known:
-            known[key] = (noise_from_residuals(quiet, [block], model=cast(ResponseModel, model))[0] if block.kind in kinds
+            shape = cast(ResponseModel, model)
+            known[key] = (noise_from_residuals(quiet, [block], model=shape)[0] if block.kind in kinds
                           else _local(left, block, band_Hz))
         like = known[key]
         assert like.noise is not None
@@ -127,6 +128,17 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campai
 def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:
     try:
         return measured_noise(campaign, block, band_Hz)
+    except AvisError:
+        pass
+    # A floor that is still in part of the band cannot be told from the drives there; its response is taken off already.
+    records = []
+    for source in campaign.records:
+        record = source.load()
+        records.append(Record(replace(record.header, floor_names=()), record.u, record.y, None))
+    try:
+        found = measured_noise(replace(campaign, records=tuple(records)), replace(block, kind="floor not measured"),
+                               band_Hz)
+        return replace(found, kind=block.kind)
     except AvisError as error:
         raise InputError(f"expected records that tell the noise apart from the response ({error})",
                          field=f"record {block.name}") from None
@@ -147,8 +159,8 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
     else:
         return None
     flat = np.mean(np.abs(block.Y) ** 2, axis=(0, 2))
-    left = prediction_error(cast(ResponseModel, model), block.with_noise(np.broadcast_to(np.diag(flat), (len(block.omega), *2 * flat.shape))
-                                                    .copy()), derivative=False)
+    weights = np.broadcast_to(np.diag(flat), (len(block.omega), *2 * flat.shape)).copy()
+    left = prediction_error(cast(ResponseModel, model), block.with_noise(weights), derivative=False)
     return Residual(block, left.error, left.white, np.zeros_like(left.error))
 
 

@@ -55,7 +55,7 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
     raised = faults.raised
     reasons = [f"the noise of {', '.join(raised)} is above the rig file's ambient level; the library has no name for "
                "that"] if raised else []
-    if own and not found.reached_noise:
+    if own and updated.held_per_dof > AT_THE_NOISE:
         refusal = refused(thin, base, updated)
         if refusal:
             reasons.append(f"{' and '.join(one.effect.name for one in own)} comes nearest, but {refusal}: not named")
@@ -169,8 +169,9 @@ def _considered(found: Found, updated: Refit) -> tuple[Considered, ...]:
     for rival in sorted(found.passed_over, key=lambda one: one.held_per_dof):
         own = effects_of(rival.model)
         rows.append(Considered(" and ".join(one.effect.name for one in own),
-                               " and ".join(location(one.place) for one in own), rival.held_per_dof, 0.0, rival.implausible() or "left far behind after a refit to few "
-                               f"lines: {rival.held_per_dof:.3g} times the noise's power", rival.reported(own[-1])))
+                               " and ".join(location(one.place) for one in own), rival.held_per_dof, 0.0,
+                               rival.implausible() or "left far behind after a refit to few lines: "
+                               f"{rival.held_per_dof:.3g} times the noise's power", rival.reported(own[-1])))
     return tuple(rows[:12])
 
 

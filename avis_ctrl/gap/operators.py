@@ -212,8 +212,8 @@ class Assembled:
     """The table as `Operators` left it, ready to answer.
 
     D (n, n_q, n_q) and its inverse, empty where it was not asked for; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp,
-    slope_pf (n, n_g): the slopes are derivatives by the mount's own complex stiffness k + s c. T (n_q, n_u) N/V with the
-    factors of the drives apart.
+    slope_pf (n, n_g): the slopes are derivatives by the mount's own complex stiffness k + s c. T (n_q, n_u) N/V,
+    without the factors of the drives.
     """
 
     ops: Operators

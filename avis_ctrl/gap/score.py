@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.score_algebra import SYMMETRIC, Reduction, reduction
 from avis_ctrl.gap.table_model import Acting, ActiveEffect, TableModel, _Answer, _Side
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
-from avis_ctrl.identification.response import N_Q
+from avis_ctrl.identification.response import N_Q, ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, transient_columns
 
 # Step of a linear parameter, in units of its size, at which its direction is taken.
@@ -44,7 +45,7 @@ class Part:
         self.body: np.ndarray | None = None
         self.answer = _Answer(self.made, self._acting(model))
         if block.transient:
-            columns, norms = transient_columns(block, model)
+            columns, norms = transient_columns(block, cast(ResponseModel, model))
             T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
             self.transient, R = np.linalg.qr(T.T)
             left = as_real(whitened(self.L, block.Y - self.answer.Y)[None])[0]

@@ -8,7 +8,7 @@ as a pair. The shortest chain that brings the held-out residual to the noise is 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from scipy import stats
 
@@ -16,7 +16,7 @@ from avis_ctrl.gap.data import thinned
 from avis_ctrl.gap.effects.base import Effect, Seed, library
 from avis_ctrl.gap.refit import Refit, try_refit
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.table_model import ActiveEffect, active
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
 from avis_ctrl.identification.spectra import SpectralBlock
 
 Progress = Callable[[str], None]
@@ -28,9 +28,11 @@ FALSE_ALARM = 1e-3
 # Fall of the criterion that a further effect must bring: odds of e^10 against it, before the number of candidates.
 LEAST_FALL = 20.0
 # Refits of the first stage, and of each parent later; parents kept; effects in a chain.
-REFITS, REFITS_LATER, PARENTS, LONGEST = 10, 5, 2, 3
+REFITS, REFITS_LATER, PARENTS, LONGEST = 9, 5, 2, 2
 # First on few lines and iterations; so many of a stage go on to all lines.
 COARSE_LINES, COARSE_ITERATIONS, PROMOTED = 140, 8, 3
+# Iterations in which the rig's parameters make room for an effect of the size that the score says.
+GIVE_WAY = 4
 # Iterations on more lines, of the first stage and later.
 ITERATIONS = (20, 10)
 # Share of what the chain before it leaves over the noise that a second or third effect must take.
@@ -135,7 +137,7 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
             first = first or tuple(scored)
             for one in shortlist(scored, REFITS if depth == 1 else REFITS_LATER):
                 progress(f"{_ordinal(depth)} effect: {_words(chain[-1], one.effect)}?")
-                found = try_refit(chain[-1].model.with_effect(one.effect), few, held_out, COARSE_ITERATIONS)
+                found = _coarse(chain[-1].model.with_effect(one.effect), one.effect, few, held_out)
                 if found is not None:
                     rough.append((*chain, found))
         made, left = _promoted(_distinct(rough), depth, fitted, held_out, progress)
@@ -153,6 +155,14 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
         if best[-1].held_per_dof <= NOISE:
             parents = [best]
     return Found(best, tuple(pool), best[-1].held_per_dof <= NOISE, first, tuple(passed_over))
+
+
+def _coarse(model: TableModel, effect: ActiveEffect, few: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock]
+            ) -> Refit | None:
+    """First the rig alone, for the seed took for granted that it gives way to the effect; then all together."""
+    held = try_refit(replace(model, fixed=model.fixed | set(effect.names)), few, held_out[:1], GIVE_WAY)
+    begin = model if held is None else replace(held.model, fixed=model.fixed)
+    return try_refit(begin, few, held_out, COARSE_ITERATIONS)
 
 
 def _promoted(rough: list[tuple[Refit, ...]], depth: int, fitted: Sequence[SpectralBlock],

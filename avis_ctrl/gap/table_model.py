@@ -60,8 +60,7 @@ class Acting:
 def active(effect: Effect, model: TableModel, place: str, values: Sequence[float] | None = None) -> ActiveEffect:
     """An effect at a place of a model, without strength where no values are given."""
     parameters = effect.parameters(model, place)
-    if values is None:
-        values = effect.starts(model, place)[0]
+    values = effect.starts(model, place)[0].tolist() if values is None else list(values)
     if len(values) != len(parameters):
         raise InputError(f"expected {len(parameters)} values", field=effect.name, value=list(values))
     return ActiveEffect(effect, place, parameters, tuple(float(v) for v in values))
@@ -73,12 +72,15 @@ class TableModel:
 
     base : the rig and its free parameters. effects : added, all their parameters free but those in `fixed`.
     motion : records in time by name, which effects that depend on amplitude or time need.
+    nominal : the rig as its file has it, which sizes the steps of a fit: a parameter that a wrong model has driven to
+        nothing must find its way back. None for the base itself.
     """
 
     base: ResponseModel
     effects: tuple[ActiveEffect, ...] = ()
     motion: Mapping[str, RecordMotion] = field(default_factory=dict)
     fixed: frozenset[str] = frozenset()
+    nominal: ResponseModel | None = None
 
     # What a fit and its blocks ask of a model.
     @property
@@ -129,11 +131,11 @@ class TableModel:
 
     def scales(self) -> np.ndarray:
         """(n_p,) one relative unit of each parameter."""
-        return np.concatenate([self.base.scales(), [self.effects[k].parameters[j].size for k, j in self._free]])
+        return np.concatenate([(self.nominal or self.base).scales(), [self.effects[k].parameters[j].size for k, j in self._free]])
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """(n_p,) lowest and highest values that physics allows."""
-        low, high = self.base.bounds()
+        low, high = (self.nominal or self.base).bounds()
         own = [self.effects[k].parameters[j] for k, j in self._free]
         return np.concatenate([low, [one.low for one in own]]), np.concatenate([high, [one.high for one in own]])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register
 from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.mounts import has_mounts
-from avis_ctrl.gap.effects.sensors import second_order
+from avis_ctrl.gap.effects.sensors import receptance
 from avis_ctrl.gap.score_algebra import reduction
 from avis_ctrl.rigs.rigid_body import point_map
 
@@ -70,7 +71,7 @@ class BaseCompliance(Effect):
         for f in grid:
             key = ("recoil", float(f))
             if key not in score.kept:
-                score.kept[key] = recoils(score, lambda s, f=f: 1 / second_order(s, f, zeta))
+                score.kept[key] = recoils(score, partial(receptance, frequency_Hz=f, damping=zeta))
             rows.append(score.kept[key][:len(ways)])
             labels += [(way, float(f)) for way in ways]
         A = np.concatenate(rows)

@@ -33,7 +33,8 @@ class LargeMotion(Effect):
         return ("payload",)
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        return tuple(EffectParameter(name, "1", text, 0.0, -3.0, 4.0, 1.0) for name, text in (
+        # Little room beyond 0 and 1, and a size above it: a gap of another origin must not lead a fit astray here.
+        return tuple(EffectParameter(name, "1", text, 0.0, -0.5, 1.5, 4.0) for name, text in (
             ("mounts", "second-order terms of mounts and inertia, 1 by Newton and Euler"),
             ("motors_turn", "share of the payload's rotation that turns the motors' axes"),
             ("sensors_turn", "share of it that turns the sensors' axes")))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register
 from avis_ctrl.gap.effects.impedance import at_points, positions, project, residues
-from avis_ctrl.gap.effects.sensors import second_order
+from avis_ctrl.gap.effects.sensors import receptance, second_order
 from avis_ctrl.gap.operators import AddedCoordinate, mount_geometry
 from avis_ctrl.gap.score_algebra import reduction
 from avis_ctrl.rigs.rigid_body import point_map
@@ -110,7 +111,7 @@ class PayloadFlexibleMode(Effect):
         at_actuators, at_sensors = shape_rows(model.rig, model.actuators, model.sensors.names)
         for f in frequency.grid:
             for zeta in damping.grid:
-                took, Q = residues(score, lambda s, f=f, zeta=zeta: 1 / second_order(s, f, zeta))
+                took, Q = residues(score, partial(receptance, frequency_Hz=f, damping=zeta))
                 # Q = a_s a_u^T with both from one shape: alternate between the two for the best of rank one.
                 U, sigma, Vt = np.linalg.svd(Q)
                 shape = at_actuators.T @ Vt[0]
@@ -194,7 +195,7 @@ class AttachedOscillator(_AtPoint):
         points = positions(parameters)
         for f in parameters[1].grid:
             for zeta in (0.03, 0.15):
-                G, b = project(score, lambda s, f=f, zeta=zeta: s ** 2 * oscillator(s, f, zeta),
+                G, b = project(score, partial(sprung, frequency_Hz=f, damping=zeta),
                                (f, zeta))
                 along = at_points(points, axes).sum(1)
                 mass = along @ b / np.einsum("pi,ij,pj->p", along, G, along)
@@ -211,6 +212,11 @@ def oscillator(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray
     """Force of a sprung mass over the force of the same mass fixed, (n,)."""
     w = 2 * np.pi * frequency_Hz
     return (2 * damping * w * s + w ** 2) / second_order(s, frequency_Hz, damping)
+
+
+def sprung(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
+    """Dynamic stiffness of a sprung mass of 1 kg, (n,)."""
+    return s ** 2 * oscillator(s, frequency_Hz, damping)
 
 
 @register

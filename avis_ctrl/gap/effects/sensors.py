@@ -22,6 +22,11 @@ def second_order(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarr
     return s ** 2 + 2 * damping * w * s + w ** 2
 
 
+def receptance(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
+    """1/(s^2 + 2 zeta w s + w^2), (n,): of a mode of unit mass."""
+    return 1 / second_order(s, frequency_Hz, damping)
+
+
 def axis_of(model: TableModel, sensor: str) -> str:
     """x, y or z: the earth axis that a sensor lies along; empty where it lies along none."""
     direction = model.rig.sensor_axes()[sensor][1]
