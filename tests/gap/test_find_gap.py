@@ -46,6 +46,8 @@ ONE = {"geophone_corner": (2, "clear", 20.0, {"corner_Hz": "corner_Hz"}),
        "actuator_lag": (6, "clear", 20.0, {"corner_Hz": "corner_Hz"}),
        "actuator_saturation": (7, "clear", 20.0, {"limit_V": "limit_V"}),
        "contact_friction": (9, "clear", 20.0, {}),  # each contact of its own: no one value is the true one
+       "cable_stiffness": (13, "clear", 20.0, {}),  # one oblique direction: nine numbers of which the truth tells one
+       "mount_relaxation": (12, "clear", 20.0, {"stiffness_ratio": "stiffness_ratio", "corner_Hz": "corner_Hz"}),
        "product_of_inertia": (10, "clear", 20.0, {"Jxy_kgm2": "product_kgm2"})}
 
 

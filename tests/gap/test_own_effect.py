@@ -109,8 +109,8 @@ def test_the_example_is_found_and_named(example):
 @pytest.mark.slow
 def test_candidates_can_be_given_as_objects(example):
     """In Python a class is enough; nothing has to be registered in a file."""
-    effect = base.library()[load_effects(example).names[0]]
-    gap = analyse(hidden(), rig(), effects=[effect, base.library()["geophone_corner"]])
+    own = load_effects(example).names[0]
+    gap = analyse(hidden(), rig(), effects=[base.library()[name] for name in (own, "geophone_corner")])
     assert [(one.name, one.location) for one in gap.effects] == [("sensor_lowpass", PLACE)]
 
 
