@@ -17,7 +17,7 @@ from avis_ctrl.gap.judgement import judge
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
 from avis_ctrl.gap.refit import Refit, judged, likelihood, refit
 from avis_ctrl.gap.result import Gap
-from avis_ctrl.gap.search import LONGEST, NOISE, Found, search
+from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, search
 from avis_ctrl.gap.show import shown
 from avis_ctrl.gap.signal_effects import (
     SignalFaults,
@@ -124,8 +124,8 @@ def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, p
         return replace(found, chain=(prepared.base,), reached_noise=prepared.base.held_per_dof <= NOISE)
     best = refit(found.best.model, prepared.thin, prepared.thin_held)
     chain = (prepared.base, *found.chain[1:-1], best)
-    longer = replace(found, chain=chain, reached_noise=best.held_per_dof <= NOISE)
-    if longer.reached_noise or not found.reached_noise or len(chain) > LONGEST:
+    longer = replace(found, chain=chain, reached_noise=best.held_per_dof <= CLOSED)
+    if longer.reached_noise or found.best.held_per_dof > CLOSED or len(chain) > LONGEST:
         return longer
     on = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, chain)
     return replace(on, pool=(*found.pool, *on.pool), passed_over=(*found.passed_over, *on.passed_over),

@@ -14,7 +14,7 @@ import numpy as np
 
 from avis_ctrl.gap.refit import Refit, probabilities, try_refit
 from avis_ctrl.gap.result import Considered, NamedEffect, Verdict
-from avis_ctrl.gap.search import Found, location
+from avis_ctrl.gap.search import CLOSED, Found, location
 from avis_ctrl.gap.signal_effects import SignalFaults, named
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.spectra import SpectralBlock
@@ -23,9 +23,6 @@ from avis_ctrl.identification.spectra import SpectralBlock
 MOST_SURE = 0.99
 # A rival as probable as this cannot be told apart.
 RIVAL = 0.05
-# Held-out chi-square per degree of freedom up to which a named effect has brought the residual to the noise: an r.m.s.
-# within 1.2 of it.
-AT_THE_NOISE = 1.44
 # Without a named effect: chi-square per degree of freedom from which a residual counts as a gap although no score is
 # significant: a tenth in r.m.s. above the noise, twice what its own uncertainty leaves open.
 UNEXPLAINED = 1.21
@@ -55,12 +52,12 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
     raised = faults.raised
     reasons = [f"the noise of {', '.join(raised)} is above the rig file's ambient level; the library has no name for "
                "that"] if raised else []
-    if own and updated.held_per_dof > AT_THE_NOISE:
+    if own and updated.held_per_dof > CLOSED:
         refusal = refused(thin, base, updated)
         if refusal:
             reasons.append(f"{' and '.join(one.effect.name for one in own)} comes nearest, but {refusal}: not named")
             own, updated = [], base
-    residual_left = updated.held_per_dof > (AT_THE_NOISE if own else UNEXPLAINED) or bool(raised)
+    residual_left = updated.held_per_dof > (CLOSED if own else UNEXPLAINED) or bool(raised)
     effects = [*_table_effects(found, updated, own), *signal]
     if effects:
         verdict: Verdict = "partly explained" if residual_left else "explained"

@@ -23,6 +23,9 @@ Progress = Callable[[str], None]
 # Held-out chi-square per degree of freedom up to which a residual counts as noise: an r.m.s. within 5 % of the noise,
 # which is what the noise's own estimate of some hundred degrees of freedom and its bias near resonances leave open.
 NOISE = 1.10
+# With an effect named the gap counts as closed from here: an r.m.s. within 1.2 of the noise. What is then left is as
+# likely the effect's own law, not quite that of the table, as a second effect: none is looked for.
+CLOSED = 1.44
 # Chance of a significant score on clean data, over all candidates of a stage.
 FALSE_ALARM = 1e-3
 # Fall of the criterion that a further effect must bring: odds of e^10 against it, before the number of candidates.
@@ -148,12 +151,10 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
             best = plausible[0]
         elif depth > 1 or not plausible:
             break
-        if best[-1].held_per_dof <= NOISE and len(best) <= depth:
+        if best[-1].held_per_dof <= CLOSED:
             break
         near = HOPELESS * plausible[0][-1].held_per_dof
         parents = [chain for chain in plausible[:PARENTS] if chain[-1].held_per_dof < near]
-        if best[-1].held_per_dof <= NOISE:
-            parents = [best]
     return Found(best, tuple(pool), best[-1].held_per_dof <= NOISE, first, tuple(passed_over))
 
 

@@ -131,7 +131,8 @@ class TableModel:
 
     def scales(self) -> np.ndarray:
         """(n_p,) one relative unit of each parameter."""
-        return np.concatenate([(self.nominal or self.base).scales(), [self.effects[k].parameters[j].size for k, j in self._free]])
+        own = [self.effects[k].parameters[j].size for k, j in self._free]
+        return np.concatenate([(self.nominal or self.base).scales(), own])
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """(n_p,) lowest and highest values that physics allows."""
