@@ -46,7 +46,7 @@ def gap(
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.rigs import load_rig
-    from avis_ctrl.study.files import open_folder
+    from avis_ctrl.study.files import open_folder, write_whole
     from avis_ctrl.study.gap_names import GAP_FILES
     from avis_ctrl.study.rig_channels import in_words_of
 
@@ -79,6 +79,10 @@ def gap(
         found = find_gap(named, start, options, progress)
         progress("report")
         files = write_gap(folder, found.gap, gap_html(found), gap_pdf(found))
+        if found.design is not None and found.design.files:
+            start = open_folder(folder / "design", tuple(found.design.files))
+            for name, text in found.design.files.items():
+                write_whole(start / name, text.encode())
     _summary(console, found)
     console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
 

@@ -16,6 +16,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.realise import Realised, realise
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.table_model import TableModel
@@ -117,7 +118,9 @@ def design_effect(gap: Gap, design: Path | Design | None = None,
     ComputationError : no controller for the baseline.
     """
     with threadpool_limits(1):
-        return compare_designs(gap.baseline, gap.updated, _asked(design, gap.baseline.rig), progress)
+        # The second-order terms of large rotations are nothing at rest.
+        still = [model.without(f"{LargeMotion.name}@payload") for model in (gap.baseline, gap.updated)]
+        return compare_designs(*still, _asked(design, gap.baseline.rig), progress)
 
 
 def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
