@@ -80,9 +80,9 @@ def gap(
         progress("report")
         files = write_gap(folder, found.gap, gap_html(found), gap_pdf(found))
         if found.design is not None and found.design.files:
-            start = open_folder(folder / "design", tuple(found.design.files))
+            onward = open_folder(folder / "design", tuple(found.design.files))
             for name, text in found.design.files.items():
-                write_whole(start / name, text.encode())
+                write_whole(onward / name, text.encode())
     _summary(console, found)
     console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
 

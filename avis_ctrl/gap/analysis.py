@@ -13,9 +13,9 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.data import Halves, blocks_of, divide, thinned, with_noise
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.judgement import judge
+from avis_ctrl.gap.judgement import effects_of, judge
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
-from avis_ctrl.gap.refit import Refit, judged, likelihood, refit
+from avis_ctrl.gap.refit import Refit, judged, likelihood, refit, try_refit
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, search
 from avis_ctrl.gap.show import shown
@@ -44,6 +44,8 @@ from avis_ctrl.rigs.rig import Rig
 Progress = Callable[[str], None]
 # Share of a channel's samples beyond its limits from which repaired samples are predicted anew.
 REPAIRED = 1e-5
+# How often, each time with the better model that the last repair allowed.
+REPAIRS = 3
 # Second-order terms as Newton and Euler have them, with sensors fixed to the payload and forces along earth axes.
 BY_PHYSICS = (1.0, 0.0, 1.0)
 
@@ -122,7 +124,9 @@ def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, p
         if found.reached_noise and prepared.base.held_per_dof > NOISE:
             return search(prepared.base, prepared.thin, prepared.thin_held, progress, effects)
         return replace(found, chain=(prepared.base,), reached_noise=prepared.base.held_per_dof <= NOISE)
-    best = refit(found.best.model, prepared.thin, prepared.thin_held)
+    best = _without_spare(refit(found.best.model, prepared.thin, prepared.thin_held), prepared)
+    if len(effects_of(best.model)) < len(found.chain) - 1:
+        found = replace(found, chain=(found.chain[0], best))
     chain = (prepared.base, *found.chain[1:-1], best)
     longer = replace(found, chain=chain, reached_noise=best.held_per_dof <= CLOSED)
     if longer.reached_noise or found.best.held_per_dof > CLOSED or len(chain) > LONGEST:
@@ -130,6 +134,15 @@ def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, p
     on = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, chain)
     return replace(on, pool=(*found.pool, *on.pool), passed_over=(*found.passed_over, *on.passed_over),
                    scores=found.scores)
+
+
+def _without_spare(best: Refit, prepared: Prepared) -> Refit:
+    """The first of two effects left out, where the second closes the gap by itself."""
+    own = effects_of(best.model)
+    if len(own) < 2:
+        return best
+    alone = try_refit(best.model.without(own[0].label), prepared.thin, prepared.thin_held)
+    return alone if alone is not None and alone.held_per_dof <= min(CLOSED, best.held_per_dof + 0.05) else best
 
 
 def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = None,
@@ -150,9 +163,11 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     rough = _rough(nominal, halves, band)
     if mended and max(mended.clipped.values()) > REPAIRED:
         progress("clipped samples: what the model expects behind the limits")
-        campaign = repair(campaign, rig, predicted(campaign, rough), converter).campaign
-        halves = divide(campaign)
-        rough = _rough(rough, halves, band)
+        original = campaign
+        for _ in range(REPAIRS):
+            campaign = repair(original, rig, predicted(original, rough), converter).campaign
+            halves = divide(campaign)
+            rough = _rough(rough, halves, band)
     left = left_by(campaign, rough)
     raw_held = blocks_of(halves.held_out, rough, band)
     hum = find_hum(left)
@@ -171,9 +186,9 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     motion = with_large_motion(motion_of(_parts(halves), rough, campaign), rough)
     model = replace(rough, motion=motion)
     # The large motion's own coefficients are physics; they are free because the source leaves open what turns.
-    base = refit(model.with_effect(active(LargeMotion(), model, "payload", BY_PHYSICS)),
-                 [thinned(block) for block in fitted], [thinned(block) for block in held_out])
-    return Prepared(campaign, halves, band, fitted, held_out, unmasked, how, replace(nominal, motion=motion), base,
+    again = refit(model.with_effect(active(LargeMotion(), model, "payload", BY_PHYSICS)),
+                  [thinned(block) for block in fitted], [thinned(block) for block in held_out])
+    return Prepared(campaign, halves, band, fitted, held_out, unmasked, how, replace(nominal, motion=motion), again,
                     SignalFaults(converter, hum))
 
 

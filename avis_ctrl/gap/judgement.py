@@ -8,13 +8,13 @@ most of the gap and comes out the same from data that share nothing: half of the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avis_ctrl.gap.refit import Refit, probabilities, try_refit
 from avis_ctrl.gap.result import Considered, NamedEffect, Verdict
-from avis_ctrl.gap.search import CLOSED, Found, location
+from avis_ctrl.gap.search import CLOSED, LEAST_FALL, Found, location
 from avis_ctrl.gap.signal_effects import SignalFaults, named
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.spectra import SpectralBlock
@@ -28,6 +28,8 @@ RIVAL = 0.05
 UNEXPLAINED = 1.21
 # With something left: share of the excess that the named effects must take.
 MOST_OF_IT = 0.97
+# With nothing left: share that they must take at least, or what else closed the gap was the noise, better known.
+EARNED = 0.5
 # Halves agree within so many standard deviations (of parameters, widened by the misfit), or within this share.
 AGREE_STD, AGREE_SHARE = 4.0, 0.15
 LARGE_MOTION = "large_motion"
@@ -47,8 +49,13 @@ class Judgement:
 
 def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Refit, faults: SignalFaults) -> Judgement:
     """Weigh what a search and the signals brought."""
-    signal = named(faults)
     own = effects_of(updated.model)
+    if own and not earned(base, updated):
+        own, updated = [], base
+    if updated.held_per_dof > CLOSED:
+        # What a wrong model leaves of the records is no measure of the noise in them.
+        faults = replace(faults, noise=None)
+    signal = named(faults)
     raised = faults.raised
     reasons = [f"the noise of {', '.join(raised)} is above the rig file's ambient level; the library has no name for "
                "that"] if raised else []
@@ -71,6 +78,14 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
 def effects_of(model: TableModel) -> list[ActiveEffect]:
     """Effects beside the second-order terms that every model holds."""
     return [one for one in model.effects if one.effect.name != LARGE_MOTION]
+
+
+def earned(base: Refit, updated: Refit) -> bool:
+    """Whether named effects take their part of the gap as the noise is known in the end."""
+    excess = base.held_per_dof - 1.0
+    if excess < 0.1:
+        return base.chi2_held - updated.chi2_held > LEAST_FALL
+    return base.held_per_dof - updated.held_per_dof > EARNED * excess
 
 
 def refused(thin: Sequence[SpectralBlock], base: Refit, updated: Refit) -> str:

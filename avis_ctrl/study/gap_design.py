@@ -119,8 +119,8 @@ def design_effect(gap: Gap, design: Path | Design | None = None,
     """
     with threadpool_limits(1):
         # The second-order terms of large rotations are nothing at rest.
-        still = [model.without(f"{LargeMotion.name}@payload") for model in (gap.baseline, gap.updated)]
-        return compare_designs(*still, _asked(design, gap.baseline.rig), progress)
+        before, after = (model.without(f"{LargeMotion.name}@payload") for model in (gap.baseline, gap.updated))
+        return compare_designs(before, after, _asked(design, gap.baseline.rig), progress)
 
 
 def compare_designs(baseline: TableModel, updated: TableModel, design: Design,

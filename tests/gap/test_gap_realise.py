@@ -36,8 +36,8 @@ LINEAR = [
     ("product_of_inertia", "Jxy", (5.0,)), ("mount_relaxation", "isolators z", (0.4, 3.0)),
     ("mount_surge", "isolators z", (3.0, 0.4, 0.3)), ("leveling_loop", "isolators 1-3 z/plain", (5e4,)),
     ("leveling_loop", "isolators 1-3 z/lag", (5e4, 0.5)),
-    ("base_compliance", "chassis/translation", (2000.0, 14.0, 20.0, 0.06)),
-    ("base_compliance", "chassis/rocking", (2000.0, 14.0, 20.0, 0.06, 25.0, 0.6)),
+    ("base_compliance", "chassis/translation", (2000.0, 0.06, 20.0, 20.0, 14.0)),
+    ("base_compliance", "chassis/rocking", (2000.0, 0.06, 20.0, 20.0, 14.0, 25.0, 25.0, 25.0, 0.6, 0.6, 0.6, 0.0, 0.0)),
     ("attached_oscillator", "payload/z", (20.0, 12.0, 0.04, 0.3, -0.2)),
     ("attached_oscillator", "payload/xyz", (20.0, 12.0, 0.04, 0.3, -0.2, 0.1)),
     ("cable_stiffness", "payload/axes", (1e4, 2e4, 3e3, 5e-3, 0.3, 0.2, 0.1)),
@@ -219,7 +219,7 @@ def test_the_order_of_a_delay():
 
 def test_refusals(rig, plain):
     with pytest.raises(InputError, match="chassis with a mass"):
-        realise(with_one(plain, "base_compliance", "chassis/translation", (0.0, 14.0, 20.0, 0.06)))
+        realise(with_one(plain, "base_compliance", "chassis/translation", (0.0, 0.06, 20.0, 20.0, 14.0)))
     with pytest.raises(InputError, match="sensors of velocity"):
         realise(TableModel(ResponseModel.of(rig, ("mass",), unit="m/s^2", sampled=False)))
     ideal = TableModel(ResponseModel.of(rig, ("mass",), unit="m/s", sampled=False))

@@ -168,7 +168,7 @@ def test_two_effects_at_once():
 
 
 @pytest.mark.parametrize(("name", "place", "values"), [
-    ("base_compliance", "chassis/rocking", [5e3, 40.0, 30.0, 0.05, 35.0, 0.8]),
+    ("base_compliance", "chassis/rocking", [5e3, 0.05, 30.0, 30.0, 40.0, 35.0, 35.0, 35.0, 0.8, 0.8, 0.8, 0.0, 0.0]),
     ("payload_flexible_mode", "payload", [60.0, 0.02, *np.linspace(-0.02, 0.02, 12)])])
 def test_cubic_mounts_on_a_table_with_more_coordinates(name, place, values):
     """A chassis that recoils a little, a payload that bends a little: the march has their coordinates."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -240,7 +241,8 @@ class CableStiffness(_AtPoint):
             own += [EffectParameter(f"k_{axes}_N_per_m", "N/m", f"stiffness between {axes[0]} and {axes[1]}", 0.0,
                                     -most, most, size) for axes in ("xy", "xz", "yz")]
         return (*own, EffectParameter("damping_s", "s", "damping over stiffness", 0.0, 0.0, 0.1, 1e-3, False, (0.0,),
-                                      True), *self.position())
+                                      True),
+                *(replace(one, optional=True) for one in self.position()))
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         K = np.diag([values[f"k_{axis}_N_per_m"] for axis in "xyz"])
