@@ -98,6 +98,8 @@ def predict(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="output folder of avis identify or avis gap")],
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="another campaign of the same rig")],
     out: Annotated[Path, typer.Option("--out", metavar="PRED.h5", help="file to write")],
+    effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="file of own effects that the "
+                                                 "models of avis gap hold")] = None,
 ) -> None:
     """What a found model would have measured, from the campaign's u and floor alone.
 
@@ -114,6 +116,10 @@ def predict(
     measured = read_measurements(campaign)
     if not isinstance(measured, Campaign):
         raise InputError("expected records, found frequency responses", file=campaign)
+    if effects is not None:
+        from avis_ctrl.gap.effects.own import load_effects
+
+        load_effects(effects)
     if (folder / GAP_FILE).exists():
         from avis_ctrl.study.gap_files import gap_rig, write_gap_predictions
 
