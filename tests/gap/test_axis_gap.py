@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from avis_ctrl.cli import gap_axis as command
+from avis_ctrl.cli.gap_axis import gap_axis
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.single_axis import find_axis_gap, find_axis_gap_in
 from avis_ctrl.gap.single_axis.levels import compare
@@ -380,10 +380,10 @@ def test_the_command_writes_gap_json(tmp_path, capsys):
     data = drive(coulomb)
     table = np.column_stack([data[name] for name in ("time", "position", "force")])
     np.savetxt(tmp_path / "drive.csv", table, delimiter=",", header="t,q,F", comments="")
-    command.gap_axis("drive", tmp_path / "drive.csv", columns="t=t,position=q,force=F", out=tmp_path / "out")
+    gap_axis("drive", tmp_path / "drive.csv", columns="t=t,position=q,force=F", out=tmp_path / "out")
     assert "Coulomb friction" in capsys.readouterr().out
     import json
     written = json.loads((tmp_path / "out" / "gap.json").read_text())
     assert written["format"] == "avis-gap-axis" and written["effects"][0]["name"] == "coulomb_friction"
     with pytest.raises(InputError, match="ROLE=NAME"):
-        command.gap_axis("drive", tmp_path / "drive.csv", columns="t")
+        gap_axis("drive", tmp_path / "drive.csv", columns="t")
