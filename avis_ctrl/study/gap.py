@@ -35,7 +35,7 @@ from avis_ctrl.study.rig_channels import in_words_of
 Progress = Callable[[str], None]
 # Gates that say stop on what `gap` itself recognises and names, or mends.
 NAMED_HERE = ("clipping", "hum", "signal to noise", "coherence", "repeatability", "level dependence", "periodicity",
-              "spikes")
+              "spikes", "missing samples")
 # Samples of a record below which neither the gates nor a held-out third of it tell anything.
 FEWEST = 300
 
@@ -101,7 +101,8 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
         findings = _gates(measured, rig, options, progress) if options.gates else ()
         gap = analyse(measured, rig, options.seed, options.band_Hz, options.amplifier_corner_Hz, None, progress)
         seconds = time.monotonic() - began
-        gap = replace(gap, seconds=seconds)
+        stops = tuple(f"gate {one.gate}: {one.sentence}" for one in findings if one.severity == "stop")
+        gap = replace(gap, seconds=seconds, sentences=(*gap.sentences, *stops))
         design, note = _design(gap, options, progress)
     return GapFinding(gap, measured, findings, provenance(measured, rig, options, seconds), design, note)
 
