@@ -22,13 +22,12 @@ from avis_ctrl.gap.show import shown
 from avis_ctrl.gap.signal_effects import (
     SignalFaults,
     converter_faults,
-    find_hum,
     left_by,
     levels,
     predicted,
     without_hum,
 )
-from avis_ctrl.gap.signals.hum import HumFinding, polluted
+from avis_ctrl.gap.signals.hum import HumFinding, find_hum, polluted
 from avis_ctrl.gap.signals.leftover import Leftover
 from avis_ctrl.gap.signals.repair import repair
 from avis_ctrl.gap.table_model import TableModel, active
@@ -82,9 +81,8 @@ class Prepared:
 
     def measured_with(self, model: TableModel, left: tuple[Leftover, ...]) -> Prepared:
         """The same with the noise that a model's residual in time gives, and the re-identified model refitted."""
-        fitted, how = _noise(self.fitted, self.halves, left, model, self.band_Hz)
-        held_out, _ = _noise(self.held_out, self.halves, left, model, self.band_Hz)
-        unmasked = _noise(self.unmasked, self.halves, left, model, self.band_Hz)[0] if self.faults.hum else held_out
+        groups = (self.fitted, self.held_out, self.unmasked)
+        (fitted, held_out, unmasked), how = _noise(groups, self.halves, left, model, self.band_Hz)
         made = replace(self, fitted=fitted, held_out=held_out, unmasked=unmasked, noise=how)
         return replace(made, base=refit(self.base.model, made.thin, made.thin_held))
 
@@ -132,8 +130,7 @@ def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, p
     if longer.reached_noise or found.best.held_per_dof > CLOSED or len(chain) > LONGEST:
         return longer
     on = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, chain)
-    return replace(on, pool=(*found.pool, *on.pool), passed_over=(*found.passed_over, *on.passed_over),
-                   scores=found.scores)
+    return replace(on, pool=(*found.pool, *on.pool), passed_over=(*found.passed_over, *on.passed_over))
 
 
 def _without_spare(best: Refit, prepared: Prepared) -> Refit:
@@ -180,9 +177,7 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     fitted = _masked(blocks_of(halves.fitted, rough, band), halves.fitted, hum)
     held_out = _masked(blocks_of(halves.held_out, rough, band), halves.held_out, hum)
     progress("noise, and second-order terms of large rotations")
-    fitted, how = _noise(fitted, halves, left, rough, band)
-    held_out, _ = _noise(held_out, halves, left, rough, band)
-    unmasked = _noise(raw_held, halves, left, rough, band)[0] if hum else held_out
+    (fitted, held_out, unmasked), how = _noise((fitted, held_out, raw_held), halves, left, rough, band)
     motion = with_large_motion(motion_of(_parts(halves), rough, campaign), rough)
     model = replace(rough, motion=motion)
     # The large motion's own coefficients are physics; they are free because the source leaves open what turns.
@@ -192,9 +187,9 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
                     SignalFaults(converter, hum))
 
 
-def _noise(blocks: Sequence[SpectralBlock], halves: Halves, left: tuple[Leftover, ...], model: TableModel,
-           band: tuple[float, float]) -> tuple[list[SpectralBlock], str]:
-    """Blocks with the noise of the fitted records, from what a model leaves of them in time."""
+def _noise(groups: Sequence[list[SpectralBlock]], halves: Halves, left: tuple[Leftover, ...], model: TableModel,
+           band: tuple[float, float]) -> tuple[list[list[SpectralBlock]], str]:
+    """Groups of blocks with the noise of the fitted records, from what a model leaves of them in time; a sentence."""
     of = {one.header.name: one for one in left}
     records = []
     for source in halves.fitted.records:
@@ -202,7 +197,10 @@ def _noise(blocks: Sequence[SpectralBlock], halves: Halves, left: tuple[Leftover
         e = of[whole.header.name].e[start:stop]
         record = source.load()
         records.append(Record(record.header, record.u, e, record.floor))
-    return with_noise(blocks, halves.fitted, replace(halves.fitted, records=tuple(records)), model, band)
+    every = [block for group in groups for block in group]
+    made, how = with_noise(every, halves.fitted, replace(halves.fitted, records=tuple(records)), model, band)
+    ends = np.cumsum([len(group) for group in groups])
+    return [made[end - len(group):end] for group, end in zip(groups, ends, strict=True)], how
 
 
 def _parts(halves: Halves) -> Campaign:

@@ -10,7 +10,7 @@ import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.identification.campaign_fit import Portion, driven_inputs, measured_noise
+from avis_ctrl.identification.campaign_fit import divided, driven_inputs, measured_noise
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.prediction_error import prediction_error
@@ -65,26 +65,15 @@ def divide(campaign: Campaign) -> Halves:
                       f"records {', '.join(sorted(chosen))} held out, each beside a fitted one of its level")
     parts = [_parted(record) for record in driven]
     quiet = tuple(record for record in campaign.records if record not in driven)
-    return Halves(_campaign(campaign, (*(first for first, _ in parts), *quiet)),
-                  _campaign(campaign, tuple(last for _, last in parts)),
+    return Halves(replace(campaign, records=(*(first for first, _ in parts), *quiet)),
+                  replace(campaign, records=tuple(last for _, last in parts)),
                   "the last third of every record held out, for no two records are alike")
 
 
-def _campaign(campaign: Campaign, records: tuple[RecordSource, ...]) -> Campaign:
-    return Campaign(campaign.rig, records, campaign.source, campaign.notes)
-
-
 def _parted(record: RecordSource) -> tuple[RecordSource, RecordSource]:
-    h = record.header
-    if h.samples < 300:
-        raise InputError("expected at least 300 samples, of which a third is held out", value=h.samples,
-                         field=f"record {h.name}")
-    at = 2 * h.samples // 3
-    if h.period_samples and h.periods >= 2:
-        at = max(round(2 * h.periods / 3), 1) * h.period_samples
-    last = Portion(record, at, h.samples)
-    last.header = replace(last.header, name=f"{h.name} (end)")
-    return Portion(record, 0, at), last
+    first, last = divided(record)
+    last.header = replace(last.header, name=f"{record.header.name} (end)")
+    return first, last
 
 
 def blocks_of(campaign: Campaign, model: TableModel, band_Hz: tuple[float, float]) -> list[SpectralBlock]:
@@ -108,10 +97,10 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campai
     """
     quiet = [found for record in campaign.records if (found := _silent(record, model, band_Hz)) is not None]
     kinds = {one.block.kind for one in quiet}
-    known: dict[tuple[str, int], SpectralBlock] = {}
+    known: dict[tuple[str, bytes], SpectralBlock] = {}
     made = []
     for block in blocks:
-        key = (block.kind, len(block.omega))
+        key = (block.kind, block.omega.tobytes())
         if key not in known:
             shape = cast(ResponseModel, model)
             known[key] = (noise_from_residuals(quiet, [block], model=shape)[0] if block.kind in kinds

@@ -66,11 +66,6 @@ class MountGeometry:
         """Which of the rows are along an axis."""
         return np.array([name.endswith("." + axis) for name in self.names])
 
-    def numbers(self) -> np.ndarray:
-        """(n_g,) which mount each row is of, from 1."""
-        order = list(dict.fromkeys(name.rpartition(".")[0] for name in self.names))
-        return np.array([1 + order.index(name.rpartition(".")[0]) for name in self.names])
-
 
 @dataclass(frozen=True, eq=False)
 class AddedCoordinate:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-N_Q = 6
+from avis_ctrl.identification.response import N_Q
+
 SYMMETRIC = tuple((i, j) for i in range(N_Q) for j in range(i, N_Q))
 
 

@@ -64,14 +64,12 @@ class Found:
     """The end of a search.
 
     chain : refits from the re-identified model to the last accepted one. pool : every refit, by stage.
-    reached_noise : the last one leaves noise. significant : whether any score was, at the first stage.
-    scores : of the first stage. passed_over : refits to few lines that were too far behind to go on.
+    reached_noise : the last one leaves noise. passed_over : refits to few lines that were too far behind to go on.
     """
 
     chain: tuple[Refit, ...]
     pool: tuple[tuple[Refit, ...], ...]
     reached_noise: bool
-    scores: tuple[Candidate, ...] = ()
     passed_over: tuple[Refit, ...] = ()
 
     @property
@@ -131,13 +129,11 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
     parents = [best]
     pool: list[tuple[Refit, ...]] = []
     passed_over: list[Refit] = []
-    first: tuple[Candidate, ...] = ()
     few = [thinned(block, COARSE_LINES, seed=1) for block in fitted]
     for depth in range(len(best), LONGEST + 1):
         rough: list[tuple[Refit, ...]] = []
         for chain in parents:
             scored = candidates(Score(chain[-1].model, fitted), known)
-            first = first or tuple(scored)
             for one in shortlist(scored, REFITS if depth == 1 else REFITS_LATER):
                 progress(f"{_ordinal(depth)} effect: {_words(chain[-1], one.effect)}?")
                 found = _coarse(chain[-1].model.with_effect(one.effect), one.effect, few, held_out)
@@ -155,7 +151,7 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
             break
         near = HOPELESS * plausible[0][-1].held_per_dof
         parents = [chain for chain in plausible[:PARENTS] if chain[-1].held_per_dof < near]
-    return Found(best, tuple(pool), best[-1].held_per_dof <= NOISE, first, tuple(passed_over))
+    return Found(best, tuple(pool), best[-1].held_per_dof <= NOISE, tuple(passed_over))
 
 
 def _coarse(model: TableModel, effect: ActiveEffect, few: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock]

@@ -14,7 +14,7 @@ from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.result import NamedEffect
 from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
-from avis_ctrl.gap.signals.hum import HumFinding, find_hum, subtract
+from avis_ctrl.gap.signals.hum import HumFinding, subtract
 from avis_ctrl.gap.signals.leftover import Estimate, Leftover, leftovers
 from avis_ctrl.gap.signals.noise_level import NoiseLevels, noise_levels
 from avis_ctrl.gap.simulate import simulate
@@ -112,6 +112,3 @@ def named(faults: SignalFaults) -> list[NamedEffect]:
 
 def _reported(parameters: Mapping[str, Estimate]) -> dict[str, Reported]:
     return {name: Reported(float(p.value), float(p.std), p.unit) for name, p in parameters.items()}
-
-
-__all__ = ["SignalFaults", "converter_faults", "find_hum", "left_by", "levels", "named", "predicted", "without_hum"]

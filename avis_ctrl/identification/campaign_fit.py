@@ -66,7 +66,7 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
         if len(others) >= 2 and driven[name] <= set().union(*others):
             rest = tuple(other for other in names if other != name)
             return Split(campaign.only(rest), campaign.only((name,)), f"record {name} held out")
-    parts = [_divided(record) for record in campaign.records]
+    parts = [divided(record) for record in campaign.records]
     return Split(replace(campaign, records=tuple(first for first, _ in parts)),
                  replace(campaign, records=tuple(last for _, last in parts)),
                  "the last third of every record held out, for too few records excite every input")
@@ -78,7 +78,11 @@ def driven_inputs(record: RecordSource) -> set[str]:
     return {name for name, column in zip(piece.header.u_names, piece.u.T, strict=True) if np.any(column)}
 
 
-def _divided(record: RecordSource) -> tuple[RecordSource, RecordSource]:
+def divided(record: RecordSource) -> tuple[Portion, Portion]:
+    """The first two thirds of a record, whole periods of a periodic one, and the last third.
+
+    Raises InputError for fewer than 300 samples.
+    """
     h = record.header
     if h.samples < 300:
         raise InputError("expected at least 300 samples, of which a third is held out", value=h.samples,

@@ -9,6 +9,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import AvisError, ComputationError, InputError
+from avis_ctrl.gap.data import SAME_LEVEL
 from avis_ctrl.gap.simulate import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.campaign_fit import driven_inputs, excited_band
@@ -21,8 +22,6 @@ from avis_ctrl.measurement.frequency_response.local_polynomial import local_poly
 
 # What a method begins with that measures beside a model.
 BESIDE = "response of the model with what it leaves: "
-# Levels within this factor are one; what depends on amplitude is not averaged over them.
-SAME_LEVEL = 1.25
 
 
 @dataclass(frozen=True, eq=False)

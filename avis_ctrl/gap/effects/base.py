@@ -82,6 +82,7 @@ class Effect(ABC):
     name : of the contract. title : in words, for a sentence. looks_like : what it does to responses.
     confusable : names of effects that look alike in part of the data.
     nonlinear : depends on amplitude or time; acts through `volts` or `force`.
+    strength : the parameter to which `force` is in proportion, empty where to none.
     """
 
     name: ClassVar[str]
@@ -89,6 +90,7 @@ class Effect(ABC):
     looks_like: ClassVar[str]
     confusable: ClassVar[tuple[str, ...]] = ()
     nonlinear: ClassVar[bool] = False
+    strength: ClassVar[str] = ""
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         """Where it can act on this table; empty where it cannot."""
@@ -120,7 +122,11 @@ class Effect(ABC):
 
     def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
                        ) -> np.ndarray | None:
-        """(n, 6) of `force` on lines omega; effects that are linear in their force keep that of a unit."""
+        """(n, 6) of `force` on lines omega; where that is in proportion to `strength`, the one of a unit is kept."""
+        if self.strength:
+            unit = {**values, self.strength: 1.0}
+            return values[self.strength] * record.kept(f"{self.name} {unit}", omega,
+                                                       lambda: np.asarray(self.force(record, place, unit)))
         force = self.force(record, place, values)
         return None if force is None else record.spectrum(force, omega)
 

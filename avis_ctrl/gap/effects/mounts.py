@@ -164,6 +164,7 @@ class CubicStiffness(_OfMounts):
     looks_like = "vertical resonances rise with level, and third harmonics appear"
     confusable = ("actuator_saturation", "contact_friction")
     nonlinear = True
+    strength = "k3_N_per_m3"
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
         size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model) ** 2
@@ -173,11 +174,6 @@ class CubicStiffness(_OfMounts):
     def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
         up = record.vertical
         return -values["k3_N_per_m3"] * (record.deflection[:, up] ** 3 @ record.rows[up])
-
-    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
-        unit = record.kept("cubic", omega, lambda: np.asarray(self.force(record, place, {"k3_N_per_m3": 1.0})))
-        return values["k3_N_per_m3"] * unit
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         return "mounts that soften with amplitude" if values["k3_N_per_m3"] < 0 else ""
@@ -206,6 +202,7 @@ class ContactFriction(Effect):
     looks_like = "stiffness and damping that depend on level: stiffer at the low one, lossier between"
     confusable = ("cubic_stiffness", "structural_damping", "actuator_saturation")
     nonlinear = True
+    strength = "stiffness_N_per_m"
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return ("actuators",) if has_mounts(model) else ()
@@ -220,12 +217,6 @@ class ContactFriction(Effect):
         own = record.driven_rows
         f = dahl(np.ascontiguousarray(record.deflection[:, own]), values["slip_m"])
         return -values["stiffness_N_per_m"] * f @ record.rows[own]
-
-    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
-        unit = {"stiffness_N_per_m": 1.0, "slip_m": values["slip_m"]}
-        return values["stiffness_N_per_m"] * record.kept(f"dahl {values['slip_m']}", omega,
-                                                         lambda: np.asarray(self.force(record, place, unit)))
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
@@ -263,6 +254,7 @@ class StiffnessDrift(Effect):
     looks_like = "resonances move from record to record, in the order of time and not of level"
     confusable = ("cubic_stiffness",)
     nonlinear = True
+    strength = "relative_change"
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return ("isolators",) if has_mounts(model) else ()
@@ -274,11 +266,6 @@ class StiffnessDrift(Effect):
         begin, end = record.campaign_s
         when = (record.time_s - (begin + end) / 2) / (end - begin)
         return -values["relative_change"] * ((record.deflection * record.stiffness * when[:, None]) @ record.rows)
-
-    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
-        unit = record.kept("drift", omega, lambda: np.asarray(self.force(record, place, {"relative_change": 1.0})))
-        return values["relative_change"] * unit
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
