@@ -206,3 +206,12 @@ def test_long_records_are_looked_at_in_pieces_and_that_is_said(rng):
 def test_expectation_refuses_what_cannot_be(field):
     with pytest.raises(InputError, match=next(iter(field))):
         Expectation(**field)
+
+
+@pytest.mark.parametrize("samples", [2, 3, 4, 5, 8, 15, 16, 17, 40])
+def test_records_of_a_few_samples_end_in_no_error_and_no_stop(samples, rng):
+    """Shorter than one segment of any length: nothing can be said of them, so nothing is."""
+    names = tuple("abcdef"), tuple("uvw")
+    header = RecordHeader("00", 100.0, samples, names[1], names[0], "noise", 0.1, 0.0, None)
+    campaign = Campaign("", (Record(header, rng.standard_normal((samples, 3)), rng.standard_normal((samples, 6))),))
+    assert not [one for one in examine(campaign, None) if one.severity == "stop"]

@@ -275,11 +275,17 @@ def _order(names: tuple[str, ...], expected: tuple[str, ...] | None, rows: int) 
     return [expected.index(n) for n in names] if set(names) <= set(expected) and len(expected) == rows else None
 
 
+# Two samples are always alike up to a constant and a factor; this many are not by chance.
+FEWEST_ALIKE = 8
+
+
 def _copies(seen: Excerpt) -> list[tuple[int, int, float, float]]:
     """(i, k, scale, rest): channels with y_k = scale y_i up to a constant, within COPY of its r.m.s."""
     y = seen.first.y - seen.first.y.mean(axis=0)
     S = y.T @ y
-    found = []
+    found: list[tuple[int, int, float, float]] = []
+    if len(y) < FEWEST_ALIKE:
+        return found
     for i in range(len(S)):
         for k in range(i + 1, len(S)):
             if S[i, i] > 0 and S[k, k] > 0:

@@ -80,13 +80,15 @@ def segment_length(samples: int, inputs: int) -> int:
 
 
 def spectra(u: np.ndarray, y: np.ndarray, rate_Hz: float, length: int, wrap: bool) -> Spectra:
-    """Spectra of half-overlapping Hann segments."""
+    """Spectra of half-overlapping Hann segments; none of a record that is shorter than one."""
     if wrap:
         u, y = (np.concatenate([a, a[: length // 2]]) for a in (u, y))
     window = signal.get_window("hann", length)
     scale = np.sqrt(2 / (rate_Hz * np.sum(window**2)))
 
     def cut(a: np.ndarray) -> np.ndarray:
+        if len(a) < length:
+            return np.zeros((0, length // 2 + 1, a.shape[1]), complex)
         parts = np.lib.stride_tricks.sliding_window_view(a, length, axis=0)[:: length // 2]
         parts = parts - parts.mean(axis=-1, keepdims=True)
         return scale * np.moveaxis(np.fft.rfft(parts * window), -1, 1)
