@@ -10,6 +10,7 @@ import pytest
 from assembled_table import Assembly, chain, mount_map
 
 from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.effects.mounts import drifted
 from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.record_motion import mount_rows
 from avis_ctrl.gap.search import location
@@ -295,9 +296,19 @@ def test_drift_is_a_spring_that_grows_with_time():
     d = np.random.default_rng(2).standard_normal((100, 12)) * 1e-5
     k = np.array([value for one in RIG.isolators for value in one.stiffness])
     G = np.vstack([mount_map(one.position) for one in RIG.isolators])
-    force = OWN["stiffness_drift"].force(motion(d, start_s=8.0), "isolators", {"relative_change": 0.2})
+    force = OWN["stiffness_drift"].force(motion(d, start_s=8.0), "isolators/linear", {"relative_change": 0.2})
     when = (8.0 + np.arange(100) / 1000 - 5.0) / 10.0
     np.testing.assert_allclose(force, -0.2 * when[:, None] * ((d * k) @ G), rtol=1e-12)
+
+
+def test_a_settling_drift_solves_its_equation():
+    """tau p' = (end - p), from -0.5 to 0.5 over the campaign, and the linear one where tau is long."""
+    t, tau = np.linspace(0.0, 1.0, 20001), 0.25
+    p = drifted(t, tau)
+    assert p[0] == pytest.approx(-0.5) and p[-1] == pytest.approx(0.5)
+    left = tau * np.gradient(p, t) + p
+    np.testing.assert_allclose(left[1:-1], left[1:-1].mean(), atol=1e-6)
+    np.testing.assert_allclose(drifted(t, 1e4), drifted(t, 0.0), atol=1e-4)
 
 
 def test_saturation_clips_the_commanded_volts():

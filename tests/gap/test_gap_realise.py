@@ -147,7 +147,7 @@ def test_friction_at_rest_is_stiffness_of_the_driven_mounts(rig, plain):
 
 @pytest.mark.parametrize("when", [-0.5, 0.0, 0.5])
 def test_drift_is_the_stiffness_of_that_moment(rig, plain, when):
-    model = with_one(plain, "stiffness_drift", "isolators", (0.3,))
+    model = with_one(plain, "stiffness_drift", "isolators/linear", (0.3,))
     changes = {name: (1 + 0.3 * when) * one.value for name, one in rig.parameters().items() if ".k_" in name}
     other = realise(replace(plain, base=replace(plain.base, rig=rig.with_parameters(changes))))
     made = realise(model, when=when)

@@ -132,7 +132,7 @@ NONLINEAR = [  # name, place, values, what Runge-Kutta takes, when, least effect
     ("contact_friction", "actuators", [3e4, 1e-7], {"friction": (3e4, 1e-7)}, {}, 0.01, 1e-4),
     ("contact_friction", "actuators", [3e4, 1e-3], {"friction": (3e4, 1e-3)}, {}, 0.5, 2e-3),
     ("contact_friction", "actuators", [3e5, 1e-6], {"friction": (3e5, 1e-6)}, {}, 0.5, 2e-2),
-    ("stiffness_drift", "isolators", [0.3], {"drift": (0.3, -100.0, 150.0)}, {"start_s": 100.0,
+    ("stiffness_drift", "isolators/linear", [0.3], {"drift": (0.3, -100.0, 150.0)}, {"start_s": 100.0,
                                                                               "campaign_s": (0.0, 150.0)}, 0.1, 1e-4),
 ]
 

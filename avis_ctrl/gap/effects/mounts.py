@@ -247,7 +247,10 @@ def dahl(deflection, slip):
 
 @register
 class StiffnessDrift(Effect):
-    """Every stiffness times 1 + change (t - middle)/(length of the campaign)."""
+    """Every stiffness times 1 + change p(t), p = -0.5 .. 0.5 from begin to end of the campaign.
+
+    linear : p = (t - middle)/T. settling : as exp(-t/tau) towards an end, as after a change of temperature or pressure.
+    """
 
     name = "stiffness_drift"
     title = "the mounts' stiffness changes over the campaign"
@@ -257,15 +260,21 @@ class StiffnessDrift(Effect):
     strength = "relative_change"
 
     def places(self, model: TableModel) -> tuple[str, ...]:
-        return ("isolators",) if has_mounts(model) else ()
+        return ("isolators/linear", "isolators/settling") if has_mounts(model) else ()
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        return (EffectParameter("relative_change", "1", "of every stiffness over the campaign", 0.0, -0.9, 0.9, 0.02),)
+        change = EffectParameter("relative_change", "1", "of every stiffness over the campaign", 0.0, -0.9, 0.9, 0.02)
+        if not place.endswith("settling"):
+            return (change,)
+        T = next((one.campaign_s[1] - one.campaign_s[0] for one in model.motion.values()), 1.0)
+        return (change, EffectParameter("time_constant_s", "s", "of the approach to the end", 0.0, 0.01 * T, 10 * T, T,
+                                        False, (0.1 * T, 0.3 * T, T), True))
 
     def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
         begin, end = record.campaign_s
-        when = (record.time_s - (begin + end) / 2) / (end - begin)
-        return -values["relative_change"] * ((record.deflection * record.stiffness * when[:, None]) @ record.rows)
+        through = drifted((record.time_s - begin) / (end - begin), values.get("time_constant_s", 0.0) / (end - begin))
+        push = record.deflection * record.stiffness * through[:, None]
+        return -values["relative_change"] * (push @ record.rows)
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
@@ -276,3 +285,10 @@ class StiffnessDrift(Effect):
             hours = (spans[0][1] - spans[0][0]) / 3600
             found["rate_per_hour"] = Reported(one.value / hours, one.std / hours, "1/h")
         return found
+
+
+def drifted(when: np.ndarray, time_constant: float) -> np.ndarray:
+    """-0.5 .. 0.5 as `when` goes from 0 to 1: linear, or for a time constant > 0 in the same units settling."""
+    if time_constant <= 0:
+        return np.asarray(when - 0.5)
+    return np.expm1(-when / time_constant) / np.expm1(-1 / time_constant) - 0.5
