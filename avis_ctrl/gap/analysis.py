@@ -15,7 +15,7 @@ from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.judgement import effects_of, judge
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
-from avis_ctrl.gap.refit import Refit, judged, likelihood, refit, try_refit
+from avis_ctrl.gap.refit import Refit, judged, likelihood, refit, scattered, try_refit
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, search
 from avis_ctrl.gap.show import shown
@@ -230,5 +230,5 @@ def _masked(blocks: Sequence[SpectralBlock], campaign: Campaign, hum: HumFinding
 def _final(prepared: Prepared, found: Found) -> tuple[Refit, Refit]:
     """Re-identified and updated model with what they leave of all held-out lines; the last one fitted to many lines."""
     many = [thinned(block, FINAL_LINES) for block in prepared.fitted]
-    best = judged(likelihood(found.best.model, many, FINAL_ITERATIONS), prepared.held_out)
+    best = scattered(judged(likelihood(found.best.model, many, FINAL_ITERATIONS), prepared.held_out), many)
     return (judged(found.chain[0].fit, prepared.held_out), best) if len(found.chain) > 1 else (best, best)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
 import numpy as np
 
 from avis_ctrl.errors import AvisError
+from avis_ctrl.gap.covariance import clustered, directions, widest
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, fit
@@ -25,12 +26,14 @@ class Refit:
     """A model fitted to `fitted` blocks, and its chi-square on `held_out` ones.
 
     free : how many combinations of parameters the data determine.
+    robust : (n_p, n_p) covariance of the parameters by the score's scatter (`gap.covariance`), where it was computed.
     """
 
     model: TableModel
     fit: LikelihoodFit
     chi2_held: float
     dof_held: int
+    robust: np.ndarray | None = None
 
     @property
     def chi2_fit(self) -> float:
@@ -55,28 +58,36 @@ class Refit:
         return tuple(one.label for one in self.model.effects)
 
     @cached_property
-    def covariance(self) -> np.ndarray:
-        """(n_p, n_p) of the parameters, units as theirs; directions that the data do not determine left out."""
+    def _of_noise(self) -> np.ndarray:
+        """(n_p, n_p) of the parameters by noise alone; directions that the data do not determine left out."""
         information = self.fit.information
-        values, vectors = np.linalg.eigh(information.relative)
-        known = values > 1e-10 * values[-1]
-        C = (vectors[:, known] / values[known]) @ vectors[:, known].T
-        return C * np.outer(information.scale, information.scale)
+        B = directions(information.relative) * information.scale[:, None]
+        return B @ B.T
 
-    def covariance_of(self, effect: ActiveEffect) -> np.ndarray:
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """(n_p, n_p) of the parameters, units as theirs: of noise and, where it is known, of the score's scatter."""
+        return self.widened(1.0)
+
+    def widened(self, inflation: float) -> np.ndarray:
+        """The same with that of noise times a factor."""
+        made = [self._of_noise * inflation]
+        return widest(made if self.robust is None else [*made, self.robust])
+
+    def covariance_of(self, effect: ActiveEffect, inflation: float = 1.0) -> np.ndarray:
         """(n, n) of an effect's parameters, zero for those that are held."""
-        names = self.model.names
+        names, whole = self.model.names, self.widened(inflation)
         rows = [names.index(name) if name in names else -1 for name in effect.names]
         C = np.zeros((len(rows), len(rows)))
         for i, a in enumerate(rows):
             for j, b in enumerate(rows):
                 if a >= 0 and b >= 0:
-                    C[i, j] = self.covariance[a, b]
+                    C[i, j] = whole[a, b]
         return C
 
     def reported(self, effect: ActiveEffect, inflation: float = 1.0) -> dict[str, Reported]:
-        """Parameters of one of its effects, as a person reads them."""
-        return effect.effect.reported(self.model, effect.place, effect.by_name, self.covariance_of(effect) * inflation)
+        """Parameters of one of its effects, as a person reads them; the covariance of noise times `inflation`."""
+        return effect.effect.reported(self.model, effect.place, effect.by_name, self.covariance_of(effect, inflation))
 
     def implausible(self) -> str:
         """Why physics forbids the values of some effect; empty where it does not."""
@@ -121,6 +132,11 @@ def judged(found: LikelihoodFit, held_out: Sequence[SpectralBlock]) -> Refit:
     """A fit with what it leaves of held-out blocks."""
     errors = [prediction_error(found.model, block, derivative=False) for block in held_out]
     return Refit(cast(TableModel, found.model), found, sum(e.chi2 for e in errors), sum(e.dof for e in errors))
+
+
+def scattered(found: Refit, fitted: Sequence[SpectralBlock]) -> Refit:
+    """The same with the covariance that the scatter of the score over the fitted blocks gives."""
+    return replace(found, robust=clustered(found.model, fitted, found.fit.information))
 
 
 def try_refit(model: TableModel, fitted: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock],

@@ -371,8 +371,10 @@ def integrate(P, x, u, first, switch, floor, ks, dt, y, trace):
                 decay = np.exp(-0.5 * h * P.lag[j]) if P.lag.size > 0 and P.lag[j] > 0 else 0.0
                 if decay > 0:               # first-order lag under a held voltage, exactly
                     drive[0, j] = lagged[j]
-                    drive[1, j] = held + (lagged[j] - held) * decay
                     drive[2, j] = held + (lagged[j] - held) * decay * decay
+                    # Simpson's rule of the stages then has the exact mean, however short the lag is in steps.
+                    mean = held + (lagged[j] - held) * (1 - decay * decay) / (h * P.lag[j])
+                    drive[1, j] = (6 * mean - drive[0, j] - drive[2, j]) / 4
                     lagged[j] = drive[2, j]
                 else:
                     drive[0, j] = drive[1, j] = drive[2, j] = held

@@ -153,6 +153,13 @@ def test_the_closed_form_tells_the_effect_from_its_absence(effect):
     assert misfit(plant_with(effect, damping=5.0), plant_with(None, damping=5.0)).max() > 5e-3
 
 
+def test_a_lag_of_half_a_step_in_closed_form():
+    """The stages of a step must hold the mean of an exponential that is over within it, not Simpson's guess of it."""
+    plant = plant_with(None, damping=5.0)
+    plant.extra["lag"] = np.full(8, 2 * np.pi * 600.0)
+    assert misfit(plant, plant).max() < 1.5e-4
+
+
 def test_maxwell_branch_in_closed_form():
     seed = next(s for s in range(50) if draw_case(s, effect="mount_relaxation").effects[0].details["orifice"] == 0)
     plant = plant_with("mount_relaxation", seed, damping=5.0)
