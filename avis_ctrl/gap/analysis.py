@@ -11,12 +11,13 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.data import Halves, blocks_of, divide, thinned, with_noise
+from avis_ctrl.gap.detectable import detectable
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.judgement import effects_of, judge
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
 from avis_ctrl.gap.refit import Refit, judged, likelihood, refit, scattered, try_refit
-from avis_ctrl.gap.result import Gap
+from avis_ctrl.gap.result import Detectable, Gap
 from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, search
 from avis_ctrl.gap.show import shown
 from avis_ctrl.gap.signal_effects import (
@@ -113,7 +114,12 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     base, updated = _final(prepared, found)
     faults = replace(prepared.faults, noise=levels(left, updated.model, prepared.faults.hum, prepared.faults.converter))
     judgement = judge(prepared.thin, found, base, updated, faults)
-    return shown(prepared, found, base, updated, judgement, seed, time.monotonic() - began)
+    limits: tuple[Detectable, ...] = ()
+    if judgement.verdict == "none":
+        progress("how large an effect would have had to be to be seen")
+        limits = detectable(base.model, prepared.thin, effects)
+    gap = shown(prepared, found, base, updated, judgement, seed, time.monotonic() - began)
+    return replace(gap, detectable=limits)
 
 
 def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, progress: Progress) -> Found:

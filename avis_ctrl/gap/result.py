@@ -75,6 +75,18 @@ class Considered:
     parameters: Mapping[str, Reported] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Detectable:
+    """A parameter of an absent effect, and the smallest departure from none that the data would have shown: three
+    standard deviations on the fitted records. Infinite where re-identification would absorb it."""
+
+    name: str
+    location: str
+    parameter: str
+    value: float
+    unit: str
+
+
 @dataclass(frozen=True, eq=False)
 class HeatMap:
     """Residual power over noise power, (n_bands, n_columns), before and after naming, on held-out records.
@@ -100,6 +112,8 @@ class Gap:
     baseline, updated : models (updated is the baseline where nothing was named).
     considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.
     pictures : plain data for plots. held_out : how the records were divided. seed, seconds.
+    covariance : (n_p, n_p) of the updated model's parameters.
+    detectable : where the verdict is none, how large effects would have had to be to be seen; else empty.
     """
 
     verdict: Verdict
@@ -119,6 +133,7 @@ class Gap:
     seed: int
     seconds: float
     covariance: np.ndarray | None = None
+    detectable: tuple[Detectable, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """gap.json of the contract, format "avis-gap" version 1."""

@@ -39,7 +39,7 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("loop_delay", "delay_s", "delay_s", offset=NOMINAL_DELAY_S),
     *(Equivalent("product_of_inertia", "product_kgm2", f"{place}_kgm2") for place in ("Jxy", "Jxz", "Jyz")),
     *(Equivalent("com_offset", f"{axis}_m", f"offset_{axis}_m") for axis in "xyz"),
-    # Mounts and contacts of the truth scatter by up to 10 % about these.
+    # Mounts and contacts of the truth scatter by up to 10 and 20 % about these, their means.
     Equivalent("cubic_stiffness", "cubic_N_per_m3", "k3_N_per_m3"),
     Equivalent("contact_friction", "coulomb_N", "force_N"),
     Equivalent("stiffness_drift", "change", "relative_change"),

@@ -301,6 +301,15 @@ def test_drift_is_a_spring_that_grows_with_time():
     np.testing.assert_allclose(force, -0.2 * when[:, None] * ((d * k) @ G), rtol=1e-12)
 
 
+def test_a_drift_is_reported_of_the_stiffness_at_the_beginning():
+    """From 0.9 to 1.1 of the one half-way: two ninths of what it was."""
+    model = with_effect("stiffness_drift", "isolators/linear", [0.2])
+    told = OWN["stiffness_drift"].reported(model, "isolators/linear", {"relative_change": 0.2}, np.diag([1e-6]))
+    assert told["relative_change"].value == pytest.approx(2 / 9)
+    slope = (0.2001 / (1 - 0.2001 / 2) - 0.1999 / (1 - 0.1999 / 2)) / 2e-4
+    assert told["relative_change"].std == pytest.approx(1e-3 * slope, rel=1e-6)
+
+
 def test_a_settling_drift_solves_its_equation():
     """tau p' = (end - p), from -0.5 to 0.5 over the campaign, and the linear one where tau is long."""
     t, tau = np.linspace(0.0, 1.0, 20001), 0.25

@@ -13,12 +13,17 @@ Drawn = tuple[str, dict[str, float], dict[str, Any]]
 LADDER_HZ = np.geomspace(0.04, 400.0, 7)     # corners of the Maxwell rungs
 
 
+def _about_one(uneven: np.ndarray) -> np.ndarray:
+    """Factors of single mounts with mean one, so that the hidden parameter is the mean that one number can report."""
+    return uneven / uneven.mean()
+
+
 def _contact_friction(d: Draw) -> Drawn:
     stretch = float(np.mean(d.middle.stretch))
     sliding = stretch * d.between(0.1, 1.0)              # displacement after which a contact slips
     stuck = 3.3e4 * d.size(0.001, 0.5)                   # N/m, against 2e4-5e4 of a mount
     coulomb = stuck * sliding
-    uneven = d.rng.uniform(0.8, 1.2, 8)
+    uneven = _about_one(d.rng.uniform(0.8, 1.2, 8))
     lugre = d.rng.random() < 0.35
     return "actuators", {"coulomb_N": coulomb, "stiffness_N_per_m": stuck}, {
         "coulomb_each_N": (coulomb * uneven).tolist(), "stiffness_each": (stuck * uneven).tolist(),
@@ -160,7 +165,8 @@ def _apply_mount_surge(plant: Plant, h: Hidden) -> None:
 def _cubic_stiffness(d: Draw) -> Drawn:
     relative = d.size(0.0005, 0.3)              # stiffening by statistical linearisation at the highest level
     cubic = relative * float(np.mean(d.plant.k[:, 2])) / (3 * float(np.mean(d.high.stretch[:, 2])) ** 2)
-    return "isolators z", {"cubic_N_per_m3": cubic}, {"uneven": d.rng.uniform(0.9, 1.1, 4).tolist()}
+    return "isolators z", {"cubic_N_per_m3": cubic}, {
+        "uneven": _about_one(d.rng.uniform(0.9, 1.1, 4)).tolist()}
 
 
 def _apply_cubic_stiffness(plant: Plant, h: Hidden) -> None:

@@ -279,7 +279,11 @@ class StiffnessDrift(Effect):
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         found = super().reported(model, place, values, covariance)
-        one = found["relative_change"]
+        # The model's change is of the stiffness half-way; a person's, of what it was at the beginning.
+        half_way = found["relative_change"]
+        begin = 1 - half_way.value / 2
+        one = Reported(half_way.value / begin, half_way.std / begin ** 2, half_way.unit)
+        found["relative_change"] = one
         spans = [record.campaign_s for record in model.motion.values()]
         if spans:
             hours = (spans[0][1] - spans[0][0]) / 3600
