@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.mounts import REFERENCE_Hz
+from avis_ctrl.gap.effects.mounts import REFERENCE_Hz, surge_omega
 from avis_ctrl.gap.effects.payload import place_of, shape_rows
 from avis_ctrl.gap.operators import MountGeometry, mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
@@ -195,28 +195,25 @@ def ladder(power: float) -> tuple[float, list[tuple[float, float]]]:
 def _surge(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
     """A mass in every vertical mount: r_m = its displacement against the chassis, v_m its velocity.
 
-    r_m' = v_m - v_c,  m v_m' = a z (r - r_m) - b z r_m,  f = -(a - 1) z r + a z r_m beside the mount itself,
-    z = k + s c (1 - bypass), 1/a + 1/b = 1.
+    r_m' = v_m - v_c,  m v_m' = a k (r - r_m) + a c (v - v_m) - b k r_m - b c (v_m - v_c), and beside the mount itself
+    f = -(a - 1) k r + a k r_m - a c (v - v_m), with the springs' own c and 1/a + 1/b = 1.
     """
     up = table.mounts.along("z")
-    G, k, c = table.G[up], table.mounts.stiffness[up], table.mounts.damping[up] * (1 - values["bypass"])
-    share, m, count = values["payload_share"], values["mass_kg"], int(np.sum(up))
-    total = gain(np.zeros(table.shape))
-    if m == 0:
-        return total
+    G, stiffness = table.G[up], table.mounts.stiffness[up]
+    omega, share, zeta = surge_omega(values), values["payload_share"], values["damping_ratio"]
     a, b = 1 / share, 1 / (1 - share)
-    for j in range(count):
-        g = G[j]
-        A = np.array([[0.0, 1.0], [-(a + b) * k[j] / m, -(a + b) * c[j] / m]])
+    total = gain(np.zeros(table.shape))
+    for g, k, w in zip(G, stiffness, omega, strict=True):
+        m, c = (a + b) * k / w ** 2, 2 * zeta * k / w
+        A = np.array([[0.0, 1.0], [-w ** 2, -2 * zeta * w]])
         B, D = np.zeros((2, table.shape[1])), np.zeros(table.shape)
         B[0, table.v_c] = -g
-        B[1, table.r], B[1, table.v] = a * k[j] / m * g, a * c[j] / m * g
-        B[1, table.v_c] = -a * c[j] / m * g + (a + b) * c[j] / m * g
+        B[1, table.r], B[1, table.v] = a * k / m * g, a * c / m * g
+        B[1, table.v_c] = b * c / m * g
         C = np.zeros((table.shape[0], 2))
-        C[:table.n] = np.outer(g, [a * k[j], a * c[j]])
+        C[:table.n] = np.outer(g, [a * k, a * c])
         outer = np.outer(g, g)
-        D[:table.n, table.r], D[:table.n, table.v] = -(a - 1) * k[j] * outer, -(a - 1) * c[j] * outer
-        D[:table.n, table.v_c] = (a - 1) * c[j] * outer - a * c[j] * outer
+        D[:table.n, table.r], D[:table.n, table.v] = -(a - 1) * k * outer, -a * c * outer
         total = total + StateSpace(A, B, C, D)
     return _plain(total)
 

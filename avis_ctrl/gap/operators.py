@@ -86,11 +86,13 @@ class Operators:
     ----------
     s : (n,) j omega. base : rig, sensors, actuators. mounts : their geometry.
     stiffness_factor, damping_factor : (n, n_g) complex, multiply the mounts' k and c.
-    internal_mass : (n_g,) kg inside each mount. payload_share : (n_g,) of the mount's compliance between that mass and
-        the payload. outer_damping : (n_g,) share of c that bypasses the mass.
+    internal_omega, internal_damping : (n_g,) rad/s and ratio of the resonance of a mass inside each mount, infinite
+        for none; the mount's own c bypasses the mass. payload_share : (n_g,) of the mount's compliance between that
+        mass and the payload.
     extra, extra_floor : (n, 6, 6) and (n, 6, 3) N/m, dynamic stiffness on q, and force by floor displacement.
     rows : (1 or n, n_y, 6) displacement seen by each sensor. sense : (n, n_y) chain and s^p, without sensitivity.
     sensor_gain : (n_y,) factors. drive : (n, n_u) factors on the volts. delay_s, amplifier_corner_Hz : of the drives.
+    inner : (n, 6, m) forces on q by unit impulses on what an effect holds inside.
     added : coordinates beside the six. recoil, follow : (n, 6, 6) B and (n, 6, 3) H_w, None for a stiff floor.
     """
 
@@ -100,9 +102,9 @@ class Operators:
     mounts: MountGeometry = field(init=False)
     stiffness_factor: np.ndarray = field(init=False)
     damping_factor: np.ndarray = field(init=False)
-    internal_mass: np.ndarray = field(init=False)
+    internal_omega: np.ndarray = field(init=False)
+    internal_damping: np.ndarray = field(init=False)
     payload_share: np.ndarray = field(init=False)
-    outer_damping: np.ndarray = field(init=False)
     extra: np.ndarray | None = None
     extra_floor: np.ndarray | None = None
     rows: np.ndarray = field(init=False)
@@ -114,6 +116,7 @@ class Operators:
     added: list[AddedCoordinate] = field(default_factory=list)
     recoil: np.ndarray | None = None
     follow: np.ndarray | None = None
+    inner: list[np.ndarray] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         base = self.base
@@ -121,7 +124,8 @@ class Operators:
         self.mounts = mount_geometry(base.rig)
         n_g = len(self.mounts.names)
         self.stiffness_factor, self.damping_factor = np.ones((1, n_g), complex), np.ones((1, n_g), complex)
-        self.internal_mass, self.outer_damping, self.payload_share = np.zeros(n_g), np.zeros(n_g), np.full(n_g, 0.5)
+        self.internal_omega, self.internal_damping = np.full(n_g, np.inf), np.zeros(n_g)
+        self.payload_share = np.full(n_g, 0.5)
         self.rows = base.matrices.R[None]
         sense = chain_response(base, self.omega) * self.s ** POWER[base.sensors.motion]
         self.sense = np.repeat(sense[:, None], len(base.sensors.names), axis=1)
@@ -207,8 +211,8 @@ class Assembled:
     """The table as `Operators` left it, ready to answer.
 
     D (n, n_q, n_q) and its inverse, empty where it was not asked for; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp,
-    slope_pf (n, n_g): the slopes are derivatives by the mount's own complex stiffness k + s c. T (n_q, n_u) N/V,
-    without the factors of the drives.
+    slope_pf (n, n_g): the slopes are derivatives by the mount's stiffness k; by its c both are s damping_factor.
+    T (n_q, n_u) N/V, without the factors of the drives.
     """
 
     ops: Operators
@@ -228,6 +232,25 @@ class Assembled:
     @property
     def n_q(self) -> int:
         return self.G.shape[1]
+
+    def forces_of_states(self) -> np.ndarray:
+        """(n, n_q, m) forces on the coordinates by unit impulses on what moves inside beside the payload: the modes,
+        masses inside mounts, and the chassis; and what effects say of their own (`Operators.inner`)."""
+        ops, n = self.ops, len(self.ops.s)
+        F = [np.broadcast_to(np.eye(self.n_q)[None, :, N_Q:], (n, self.n_q, self.n_q - N_Q)).astype(complex)]
+        inside = np.flatnonzero(np.isfinite(ops.internal_omega))
+        if inside.size:
+            w, share = ops.internal_omega[inside], ops.payload_share[inside]
+            g = np.broadcast_to(ops.stiffness_factor, self.z_pp.shape)[:, inside]
+            g = g + 2 * ops.internal_damping[inside] * ops.s[:, None] / w
+            by_mass = g / share / (g + (ops.s[:, None] / w) ** 2)
+            F.append(self.G.T[:, inside] * by_mass[:, None, :])
+        if ops.recoil is not None:
+            moves = ops.recoil[:, :, np.any(ops.recoil, axis=(0, 1))]
+            F.append(self.G.T @ (self.z_pf[:, :, None] * (ops.mounts.chassis @ moves)))
+        for one in ops.inner:
+            F.append(np.concatenate([one, np.zeros((n, self.n_q - N_Q, one.shape[2]))], axis=1))
+        return np.concatenate(F, axis=2)
 
     def floor_force(self, w: np.ndarray) -> np.ndarray:
         """(n, n_q, m) force of floor displacement w (n, 3, m)."""
@@ -260,8 +283,9 @@ class Assembled:
 def assemble(ops: Operators, invert: bool = True) -> Assembled:
     """Form D, and invert it where asked for."""
     base, mounts, s = ops.base, ops.mounts, ops.s[:, None]
-    z = mounts.stiffness * ops.stiffness_factor + s * mounts.damping * ops.damping_factor
-    z_pp, z_pf, slope_pp, slope_pf = _with_internal_mass(z, s, ops)
+    slope_pp, slope_pf = _with_internal_mass(s, ops)
+    around = s * mounts.damping * ops.damping_factor
+    z_pp, z_pf = mounts.stiffness * slope_pp + around, mounts.stiffness * slope_pf + around
     mat = base.matrices
     T, rows = mat.T.astype(complex), ops.rows
     G = mounts.payload
@@ -288,19 +312,17 @@ def assemble(ops: Operators, invert: bool = True) -> Assembled:
     return Assembled(ops, D, inverse, M, G, z_pp, z_pf, slope_pp, slope_pf, T, rows, volts, folded)
 
 
-def _with_internal_mass(z: np.ndarray, s: np.ndarray, ops: Operators):
-    """z_pp, z_pf and their slopes by z, for a mass m between springs a z and b z in series, 1/a + 1/b = 1.
+def _with_internal_mass(s: np.ndarray, ops: Operators) -> tuple[np.ndarray, np.ndarray]:
+    """(n, n_g) what multiplies the mounts' k in z_pp and z_pf, with a mass m between springs a k and b k in series.
 
-    z_pf = a b z^2/d, z_pp = a z - a^2 z^2/d with d = (a + b) z + s^2 m; damping that bypasses the mass is added after.
+    With 1/a + 1/b = 1, w^2 = (a + b) k/m, and g the factor of k, loss 2 zeta s/w of both springs included,
+
+        z_pf/k = g^2/(g + s^2/w^2),     z_pp/k = a g - (a/b) g^2/(g + s^2/w^2).
     """
-    m, share = ops.internal_mass, ops.outer_damping
-    if not np.any(m):
-        one = np.ones_like(z)
-        return z, z, one, one
+    factor, w = ops.stiffness_factor, ops.internal_omega
+    if not np.any(np.isfinite(w)):
+        return factor, factor
     a, b = 1 / ops.payload_share, 1 / (1 - ops.payload_share)
-    around = s * ops.mounts.damping * ops.damping_factor * share
-    inner = z - around
-    d = (a + b) * inner + s ** 2 * m
-    bent = (2 * inner * d - (a + b) * inner ** 2) / d ** 2
-    return (a * inner - a ** 2 * inner ** 2 / d + around, a * b * inner ** 2 / d + around, a - a ** 2 * bent,
-            a * b * bent)
+    g = factor + 2 * ops.internal_damping * s / w
+    through = g ** 2 / (g + (s / w) ** 2)
+    return a * g - a / b * through, through

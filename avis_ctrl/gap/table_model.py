@@ -203,6 +203,19 @@ class TableModel:
         n, n_in = len(omega), len(self.inputs)
         return self.driven(omega, np.broadcast_to(np.eye(n_in, dtype=complex), (n, n_in, n_in)), False).Y
 
+    def inner_transients(self, omega: np.ndarray) -> np.ndarray:
+        """(n, n_y, n_t): y by unit initial states of what effects hold inside: modes, masses in mounts, a chassis.
+
+        Of a lightly damped one much of what it holds at the ends of a record stays to be seen.
+        """
+        n_y = len(self.sensors.names)
+        if not any(one.effect.holds_states for one in self.effects):
+            return np.zeros((len(omega), n_y, 0), complex)
+        made = assemble(self.operators(omega))
+        ops, F = made.ops, made.forces_of_states()
+        Y = (_gain(made) * ops.sense[:, :, None]) * (made.rows @ (made.inverse @ F))
+        return np.concatenate([Y, ops.s[:, None, None] * Y], axis=2)
+
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
         """As `ResponseModel.driven`: y by spectra of the inputs, and its derivative by the free parameters."""
         return self._driven(np.asarray(omega, float), U, None, derivative)
@@ -346,14 +359,10 @@ class _Answer:
                 dY[j, :, k] = self.Y[:, k] / model.sensors.sensitivity[k]
             elif match := _MOUNT.fullmatch(name):
                 k = rows[f"isolator{match[1]}.{match[3]}"]
-                pp, pf = made.slope_pp[:, k, None], made.slope_pf[:, k, None]
                 if match[2] == "k":
-                    factor = ops.stiffness_factor[:, k, None]
+                    push = made.slope_pf[:, k, None] * chassis[:, k] - made.slope_pp[:, k, None] * own[:, k]
                 else:
-                    factor = s[:, :, 0] * ops.damping_factor[:, k, None]
-                    if (share := ops.outer_damping[k]) and ops.internal_mass[k]:
-                        pp, pf = pp * (1 - share) + share, pf * (1 - share) + share
-                push = -factor * (pp * own[:, k] - pf * chassis[:, k])
+                    push = s[:, :, 0] * ops.damping_factor[:, k, None] * (chassis[:, k] - own[:, k])
                 dY[j] = through[:, :, k, None] * push[:, None, :]
             elif name == "loop_delay_s":
                 raise InputError("expected the effect loop_delay in the place of this parameter", field="parameters",

@@ -246,6 +246,10 @@ class ResponseModel:
         U = block.U if body is None else np.concatenate([block.U, body], axis=1)
         return self.driven(block.omega, U, derivative)
 
+    def inner_transients(self, omega: np.ndarray) -> np.ndarray:
+        """(n, n_y, 0): y by initial states beside those of body and sensors, of which this model has none."""
+        return np.zeros((len(omega), len(self.sensors.names), 0), complex)
+
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
         """y for spectra of the inputs, and its derivative by the free parameters.
 

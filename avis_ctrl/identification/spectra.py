@@ -150,7 +150,8 @@ def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.nd
     """(n, n_y, n_t) columns, for real coefficients, of what the ends of a record leave in its spectra; (n_t,) norms.
 
     Impulse and step on the body (12), the two states of each sensor's chain, and a constant and a slope in frequency
-    for each sensor, which hold the aliases of the others. The columns have unit norm; each was divided by its own.
+    for each sensor, which hold the aliases of the others; last, the states that a model has inside beside the body.
+    The columns have unit norm; each was divided by its own.
     """
     n, n_y, n_in = len(block.omega), block.Y.shape[1], len(model.inputs)
     s = 1j * block.omega
@@ -161,6 +162,6 @@ def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.nd
     shapes = [np.ones(n), s] if len(poles) == 1 else [
         *(s ** k / np.polyval(poles[::-1], s) for k in range(len(poles) - 1)), np.ones(n), s]
     chains = np.stack(shapes, -1)[:, None, :, None] * np.eye(n_y)[:, None, :]
-    columns = np.concatenate([body, chains.reshape(n, n_y, -1)], axis=2)
+    columns = np.concatenate([body, chains.reshape(n, n_y, -1), model.inner_transients(block.omega)], axis=2)
     norms = np.linalg.norm(columns, axis=(0, 1))
     return columns / norms, norms

@@ -82,33 +82,40 @@ def test_structural_loss(eta):
     assert np.angle(causal[1]) == pytest.approx(np.pi / 2 * slope, rel=1e-9)
 
 
-@pytest.mark.parametrize(("mass", "share", "bypass"), [(20.0, 0.5, 0.0), (5.0, 0.3, 0.0), (60.0, 0.7, 0.8)])
-def test_surge_is_a_mass_between_two_springs(mass, share, bypass):
+@pytest.mark.parametrize(("frequency", "share", "zeta", "uneven"), [
+    (20.0, 0.5, 0.0, (0.0, 0.0, 0.0)), (45.0, 0.3, 0.02, (0.0, 0.0, 0.0)), (12.0, 0.7, 0.3, (0.03, -0.02, 0.01))])
+def test_surge_is_a_mass_between_two_springs(frequency, share, zeta, uneven):
     table = Assembly(RIG, 4).mounts(without="z")
+    offsets = (*uneven, -sum(uneven))
     for i, (G, one) in enumerate(zip(table.maps, RIG.isolators, strict=True)):
         k, c, z = one.stiffness[2], one.damping[2], np.array([0, 0, 1])
-        inner = (1 - bypass) * c
-        table.spring(table.row(G[2], **{f"e{i}": -1.0}), k / share, inner / share)
-        table.spring(table.row(**{f"e{i}": 1.0}), k / (1 - share), inner / (1 - share), z)
-        table.spring(table.row(G[2]), 0.0, bypass * c, z)
+        upper, lower, w = k / share, k / (1 - share), 2 * np.pi * frequency * (1 + offsets[i])
+        mass = (upper + lower) / w ** 2
+        damper = 2 * zeta * np.sqrt((upper + lower) * mass)
+        table.spring(table.row(G[2], **{f"e{i}": -1.0}), upper, damper * upper / (upper + lower))
+        table.spring(table.row(**{f"e{i}": 1.0}), lower, damper * lower / (upper + lower), z)
+        table.spring(table.row(G[2]), 0.0, c, z)
         table.mass(table.row(**{f"e{i}": 1.0}), mass)
-    agree(with_effect("mount_surge", "isolators z", [mass, share, bypass]), table)
+    agree(with_effect("mount_surge", "isolators z", [frequency, share, zeta, *uneven]), table)
 
 
-def test_surge_keeps_the_static_stiffness_and_resonates_at_sqrt_4k_over_m():
+def test_surge_keeps_the_static_stiffness_and_resonates_where_it_says():
     quiet = replace(BARE, base=replace(BARE.base, rig=RIG.with_parameters(
         {f"isolator{i}.c_z": 1e-3 for i in range(1, 5)} | {f"isolator{i}.k_z": 4e4 for i in range(1, 5)})))
-    values = [12.0, 0.5, 0.0]
+    f0, share = 18.4, 0.4
+    values = [f0, share, 1e-3, 0.0, 0.0, 0.0]
     assert added_stiffness("mount_surge", "isolators z", values, 1e-4, quiet)[0, 2, 2] == pytest.approx(0, abs=1e-2)
-    f0 = np.sqrt(4 * 4e4 / 12.0) / (2 * np.pi)
-    f = np.linspace(0.9 * f0, 1.1 * f0, 2001)
+    f = np.linspace(0.9 * f0, 1.1 * f0, 4001)
     peak = np.abs(added_stiffness("mount_surge", "isolators z", values, f, quiet)[:, 2, 2])
     assert f[np.argmax(peak)] == pytest.approx(f0, rel=1e-4)
     model = with_effect("mount_surge", "isolators z", values, quiet)
-    told = library()["mount_surge"].reported(model, "isolators z", dict(zip(
-        ("mass_kg", "payload_share", "bypass"), values, strict=True)), np.diag([0.12 ** 2, 0.0, 0.0]))["frequency_Hz"]
-    assert told.value == pytest.approx(f0)
-    assert told.std == pytest.approx(f0 * 0.12 / 12 / 2)  # f goes as m^-1/2
+    names = [one.name for one in library()["mount_surge"].parameters(model, "isolators z")]
+    told = library()["mount_surge"].reported(model, "isolators z", dict(zip(names, values, strict=True)),
+                                             np.diag([0.1 ** 2, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert told["frequency_Hz"].value == f0
+    mass = 4e4 * (1 / share + 1 / (1 - share)) / (2 * np.pi * f0) ** 2
+    assert told["mass_kg"].value == pytest.approx(mass)
+    assert told["mass_kg"].std == pytest.approx(mass * 2 * 0.1 / f0)  # m goes as f^-2
 
 
 @pytest.mark.parametrize("valve", [None, 0.4])
@@ -261,7 +268,7 @@ def test_cable_along_the_axes_and_oblique():
     ("structural_damping", "isolators/complex", [0.1]),
     ("attached_oscillator", "payload/xyz", [10.0, 8.0, 0.05, 0.3, 0.2, 0.1]),
     ("cable_stiffness", "payload/axes", [500.0, 500.0, 500.0, 1e-3, 0.3, 0.2, 0.1]),
-    ("mount_surge", "isolators z", [20.0, 0.4, 0.3])])
+    ("mount_surge", "isolators z", [20.0, 0.4, 0.03, 0.02, 0.01, -0.01])])
 def test_passive_at_every_frequency(name, place, values):
     """Power taken by a motion, w/2 q^H Im(Z) q, is never negative: of the effect itself, or of the mounts with it."""
     Z = added_stiffness(name, place, values, F) if name != "mount_surge" else dynamic_stiffness(
@@ -275,7 +282,7 @@ def test_passive_at_every_frequency(name, place, values):
     ("mount_relaxation", "isolators z", [0.5, 2.0]),
     ("attached_oscillator", "payload/xyz", [10.0, 8.0, 0.05, 0.3, 0.2, 0.1]),
     ("com_offset", "payload", [0.02, 0.01, -0.03]),
-    ("mount_surge", "isolators z", [20.0, 0.3, 0.5]),
+    ("mount_surge", "isolators z", [20.0, 0.3, 0.05, 0.0, 0.02, 0.01]),
     ("base_compliance", "chassis/rocking", list(CHASSIS.values())),
     ("payload_flexible_mode", "payload", [25.0, 0.01, *np.linspace(-0.02, 0.03, 12)])])
 def test_reciprocity(name, place, values):

@@ -34,7 +34,7 @@ LINEAR = [
     ("actuator_lag", "actuators", (TAU,)), ("loop_delay", "loop", (2e-3,)),
     ("com_offset", "payload", (0.02, 0.01, -0.03)),
     ("product_of_inertia", "Jxy", (5.0,)), ("mount_relaxation", "isolators z", (0.4, 3.0)),
-    ("mount_surge", "isolators z", (3.0, 0.4, 0.3)), ("leveling_loop", "isolators 1-3 z/plain", (5e4,)),
+    ("mount_surge", "isolators z", (40.0, 0.4, 0.03, 0.01, -0.02, 0.02)), ("leveling_loop", "isolators 1-3 z/plain", (5e4,)),
     ("leveling_loop", "isolators 1-3 z/lag", (5e4, 0.5)),
     ("base_compliance", "chassis/translation", (2000.0, 0.06, 20.0, 20.0, 14.0)),
     ("base_compliance", "chassis/rocking", (2000.0, 0.06, 20.0, 20.0, 14.0, 25.0, 25.0, 25.0, 0.6, 0.6, 0.6, 0.0, 0.0)),

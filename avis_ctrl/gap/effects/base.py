@@ -83,6 +83,7 @@ class Effect(ABC):
     confusable : names of effects that look alike in part of the data.
     nonlinear : depends on amplitude or time; acts through `volts` or `force`.
     strength : the parameter to which `force` is in proportion, empty where to none.
+    holds_states : has resonances of its own, whose states at the ends of a record are to be found with its transient.
     """
 
     name: ClassVar[str]
@@ -91,6 +92,7 @@ class Effect(ABC):
     confusable: ClassVar[tuple[str, ...]] = ()
     nonlinear: ClassVar[bool] = False
     strength: ClassVar[str] = ""
+    holds_states: ClassVar[bool] = False
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         """Where it can act on this table; empty where it cannot."""

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 # Frequency at which the mounts' stiffness is meant where it depends on frequency.
 REFERENCE_Hz = 3.0
+# Where a resonance inside the mounts is looked for.
+SURGE_Hz = tuple(np.geomspace(8.0, 150.0, 24).tolist())
 
 
 def has_mounts(model: TableModel) -> bool:
@@ -90,39 +92,52 @@ class StructuralDamping(_OfMounts):
 
 @register
 class MountSurge(_OfMounts):
-    """A mass inside every vertical mount, between two springs in series that have the mount's stiffness together."""
+    """A mass inside every vertical mount, between two springs in series that have the mount's stiffness together.
+
+    Frequency and damping ratio are those of the mass between payload and chassis at rest; both springs have the same
+    loss, and the mount's own dashpot is beside them. Mounts may differ in frequency about their mean.
+    """
 
     name = "mount_surge"
     title = "an internal resonance of the mounts (mass of spring, diaphragm or piston)"
     looks_like = "a resonance far above the suspension's along z, in every vertical channel alike"
     confusable = ("payload_flexible_mode", "attached_oscillator", "base_compliance")
+    holds_states = True
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        k = float(np.mean(mount_geometry(model.rig).stiffness[vertical(model)]))
-        grid = tuple(4 * k / (2 * np.pi * f) ** 2 for f in np.geomspace(8.0, 110.0, 24))
-        return (EffectParameter("mass_kg", "kg", "inside each mount", 0.0, 0.0, 500.0, grid[8], False, grid),
+        count = int(np.sum(vertical(model)))
+        return (EffectParameter("frequency_Hz", "Hz", "of the mass inside the mounts", np.inf, 4.0, 400.0, 20.0, False,
+                                SURGE_Hz),
                 EffectParameter("payload_share", "1", "of the mount's compliance between mass and payload", 0.5, 0.05,
                                 0.95, 0.2, False, (0.5,), True),
-                EffectParameter("bypass", "1", "of the mount's damping that bypasses the mass", 0.0, 0.0, 1.0, 0.2,
-                                False, (0.0, 0.8), True))
+                EffectParameter("damping_ratio", "1", "of that resonance", 0.0, 0.0, 1.0, 0.05, False, (0.03, 0.15),
+                                True),
+                *(EffectParameter(f"uneven_{i}", "1", f"frequency of mount {i} over the mean, less one", 0.0, -0.2, 0.2,
+                                  0.02, False, (0.0,), True) for i in range(1, count)))
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         up = vertical(ops)
-        ops.internal_mass = ops.internal_mass + values["mass_kg"] * up
+        ops.internal_omega[up] = surge_omega(values)
         ops.payload_share = np.where(up, values["payload_share"], ops.payload_share)
-        ops.outer_damping = np.where(up, values["bypass"], ops.outer_damping)
+        ops.internal_damping = np.where(up, values["damping_ratio"], ops.internal_damping)
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
+        """The mass with the standard deviations of frequency and share only: that of the stiffness is not known here."""
         found = super().reported(model, place, values, covariance)
         k = float(np.mean(mount_geometry(model.rig).stiffness[vertical(model)]))
-        m, a = values["mass_kg"], values["payload_share"]
-        if m <= 0:  # at its bound there is no resonance
-            return found
-        f = np.sqrt(k * (1 / a + 1 / (1 - a)) / m) / (2 * np.pi)
-        # The standard deviation of the mass and of its place go into the frequency to first order.
-        slope = np.array([-0.5 * f / m, 0.5 * f * (2 * a - 1) / (a * (1 - a)), 0.0])
-        return {"frequency_Hz": Reported(f, float(np.sqrt(max(slope @ covariance @ slope, 0.0))), "Hz"), **found}
+        f, a = values["frequency_Hz"], values["payload_share"]
+        m = k / (a * (1 - a) * (2 * np.pi * f) ** 2)
+        slope = np.zeros(len(values))
+        slope[:2] = -2 * m / f, -m * (1 - 2 * a) / (a * (1 - a))
+        mass = Reported(m, float(np.sqrt(max(slope @ covariance @ slope, 0.0))), "kg")
+        return {"frequency_Hz": found.pop("frequency_Hz"), "mass_kg": mass, **found}
+
+
+def surge_omega(values: Mapping[str, float]) -> np.ndarray:
+    """(mounts,) rad/s of the resonance inside each."""
+    uneven = [value for name, value in values.items() if name.startswith("uneven_")]
+    return 2 * np.pi * values["frequency_Hz"] * (1 + np.array([*uneven, -sum(uneven)]))
 
 
 @register

@@ -81,6 +81,7 @@ class PayloadFlexibleMode(Effect):
     title = "the payload bends: a mode beside its rigid motion"
     looks_like = "a resonance above the suspension's, in rows and columns that share one shape"
     confusable = ("attached_oscillator", "mount_surge", "base_compliance")
+    holds_states = True
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return ("payload",) if shape_points(model) is not None else ()
@@ -166,6 +167,7 @@ class AttachedOscillator(_AtPoint):
     title = "a sprung mass on the payload"
     looks_like = "a pair of peak and dip at its own frequency, in every channel that moves its place"
     confusable = ("payload_flexible_mode", "mount_surge", "base_compliance")
+    holds_states = True
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return ("payload/z", "payload/xyz", "payload/x", "payload/y")
@@ -185,7 +187,9 @@ class AttachedOscillator(_AtPoint):
         h = oscillator(ops.s, values["frequency_Hz"], values["damping"])
         axes = ["xyz".index(axis) for axis in place.partition("/")[2]]
         Z = values["mass_kg"] * ops.s ** 2 * h
-        ops.add_impedance(np.repeat(Z[:, None], len(axes), axis=1), point_map(place_of(values))[axes])
+        rows = point_map(place_of(values))[axes]
+        ops.add_impedance(np.repeat(Z[:, None], len(axes), axis=1), rows)
+        ops.inner.append(h[:, None, None] * rows.T)
 
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
