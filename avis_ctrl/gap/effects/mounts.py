@@ -8,18 +8,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, register
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Seed, register
 from avis_ctrl.gap.operators import mount_geometry
+from avis_ctrl.gap.table_model import ActiveEffect
 
 if TYPE_CHECKING:
     from avis_ctrl.gap.motion import RecordMotion
     from avis_ctrl.gap.operators import Operators
+    from avis_ctrl.gap.score import Score
     from avis_ctrl.gap.table_model import TableModel
 
 # Frequency at which the mounts' stiffness is meant where it depends on frequency.
 REFERENCE_Hz = 3.0
 # Where a resonance inside the mounts is looked for.
-SURGE_Hz = tuple(np.geomspace(8.0, 150.0, 24).tolist())
+SURGE_Hz = tuple(np.geomspace(8.0, 150.0, 28).tolist())
 
 
 def has_mounts(model: TableModel) -> bool:
@@ -110,10 +112,21 @@ class MountSurge(_OfMounts):
                                 SURGE_Hz),
                 EffectParameter("payload_share", "1", "of the mount's compliance between mass and payload", 0.5, 0.05,
                                 0.95, 0.2, False, (0.5,), True),
-                EffectParameter("damping_ratio", "1", "of that resonance", 0.0, 0.0, 1.0, 0.05, False, (0.03, 0.15),
-                                True),
+                EffectParameter("damping_ratio", "1", "of that resonance", 0.0, 0.0, 1.0, 0.05, False,
+                                (0.015, 0.05, 0.15), True),
                 *(EffectParameter(f"uneven_{i}", "1", f"frequency of mount {i} over the mean, less one", 0.0, -0.2, 0.2,
                                   0.02, False, (0.0,), True) for i in range(1, count)))
+
+    def seeds(self, score: Score, place: str) -> list[Seed]:
+        """Over frequency and damping, by what the change of the response takes of the residual when it may be of any
+        positive size: where the rig's parameters have given way, its size at full strength is wrong, not its shape."""
+        parameters, found = self.parameters(score.model, place), []
+        for point in self.starts(score.model, place):
+            values = tuple(float(v) for v in point)
+            took = score.reduction(score.of_effect(ActiveEffect(self, place, parameters, values)))
+            if took.coefficients[0] > 0:
+                found.append(Seed(values, took.chi2, len(parameters)))
+        return sorted(found, key=lambda seed: -seed.chi2)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         up = vertical(ops)
