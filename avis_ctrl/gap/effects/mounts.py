@@ -136,7 +136,7 @@ class MountSurge(_OfMounts):
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
-        """The mass with the standard deviations of frequency and share only: that of the stiffness is not known here."""
+        """The standard deviation of the mass is of frequency and share only; the stiffness is taken as it is."""
         found = super().reported(model, place, values, covariance)
         k = float(np.mean(mount_geometry(model.rig).stiffness[vertical(model)]))
         f, a = values["frequency_Hz"], values["payload_share"]
