@@ -118,7 +118,7 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     if judgement.verdict == "none":
         progress("how large an effect would have had to be to be seen")
         limits = detectable(base.model, prepared.thin, effects)
-    gap = shown(prepared, found, base, updated, judgement, seed, time.monotonic() - began)
+    gap = shown(prepared, found, base, updated, judgement, seed, time.monotonic() - began, faults.noise)
     return replace(gap, detectable=limits)
 
 

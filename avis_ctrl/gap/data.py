@@ -24,6 +24,8 @@ SAME_LEVEL = 1.25
 THIN_LINES = 450
 # Below this [Hz] lie the resonances of a table: there no line is left out before the others.
 DENSE_BELOW_Hz = 8.0
+# Periods of a record from which the first one may be left to the transient.
+SETTLED = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +116,13 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campai
     return made, f"noise measured by a local polynomial model of the records: {dof}"
 
 
+def all_silent(campaign: Campaign, blocks: Sequence[SpectralBlock]) -> bool:
+    """Whether `with_noise` finds lines on which the drives are silent for every kind of block."""
+    kinds = {"floor measured" if r.header.floor_names else "floor not measured" for r in campaign.records
+             if (r.header.period_samples and r.header.periods >= SETTLED) or not driven_inputs(r)}
+    return {block.kind for block in blocks} <= kinds
+
+
 def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:
     try:
         return measured_noise(campaign, block, band_Hz)
@@ -137,7 +146,7 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
     """What the model leaves on lines without drive: of a record at rest all, of a periodic one those between its
     harmonics, once the first period has carried the transient of the start away. None where there are none."""
     h = record.header
-    if h.period_samples and h.periods >= 3:
+    if h.period_samples and h.periods >= SETTLED:
         segment = record.load(h.period_samples, h.periods * h.period_samples)
         block = record_block(segment, model.base, band_Hz)
         lines = np.rint(block.omega * segment.header.samples / (2 * np.pi * h.sample_rate_Hz)).astype(int)

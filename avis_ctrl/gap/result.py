@@ -101,6 +101,47 @@ class HeatMap:
 
 
 @dataclass(frozen=True, eq=False)
+class PowerShares:
+    """What accounts for the power of each output on the lines that the drives excite, in the records of one level.
+
+    Attributes
+    ----------
+    level_V : mean over the records. excitation, records : of the group. bands_Hz : (n_bands + 1,) edges.
+    outputs : names. shares : (n_bands, n_y) by part, which add up to one: "model" follows the measured inputs as the
+        updated model has it; "missing" follows them linearly, but not as the model has it; "nonlinear" depends on
+        amplitude or time; "unmeasured" is motion from inputs that are not measured, and all noise where that of the
+        sensors is not known; "sensors" their own noise, absent where it is not known.
+    whole : (n_y,) by part, of the power of all bands together.
+    how : noise was told from nonlinearity on lines where the drives are "silent", by several "levels", or not at all:
+        "one level", where "nonlinear" holds the model's own terms only, and "unmeasured" whatever else is not linear.
+    """
+
+    level_V: float
+    excitation: str
+    records: tuple[str, ...]
+    bands_Hz: np.ndarray
+    outputs: tuple[str, ...]
+    shares: Mapping[str, np.ndarray]
+    whole: Mapping[str, np.ndarray]
+    how: Literal["silent", "levels", "one level"]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordGap:
+    """What the models leave of one record, r.m.s. over that of the noise, on lines drawn for all records alike.
+
+    start_s : on the campaign's clock. held_out : no fit has seen it.
+    """
+
+    name: str
+    level_V: float
+    start_s: float
+    held_out: bool
+    before: float
+    after: float
+
+
+@dataclass(frozen=True, eq=False)
 class Gap:
     """Everything that was found.
 
@@ -114,6 +155,7 @@ class Gap:
     pictures : plain data for plots. held_out : how the records were divided. seed, seconds.
     covariance : (n_p, n_p) of the updated model's parameters.
     detectable : where the verdict is none, how large effects would have had to be to be seen; else empty.
+    shares : what accounts for the outputs' power, by level, the lowest first. records : what each record leaves.
     """
 
     verdict: Verdict
@@ -134,6 +176,8 @@ class Gap:
     seconds: float
     covariance: np.ndarray | None = None
     detectable: tuple[Detectable, ...] = ()
+    shares: tuple[PowerShares, ...] = ()
+    records: tuple[RecordGap, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """gap.json of the contract, format "avis-gap" version 1."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, cast
@@ -10,15 +10,18 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from scipy import stats
 
+from avis_ctrl.gap.data import all_silent, thinned
+from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.judgement import Judgement, effects_of
+from avis_ctrl.gap.power_shares import power_shares
 from avis_ctrl.gap.refit import Refit
-from avis_ctrl.gap.result import Gap, HeatMap, NamedEffect, Stage, Where
+from avis_ctrl.gap.result import Gap, HeatMap, NamedEffect, PowerShares, RecordGap, Stage, Where
 from avis_ctrl.gap.search import Found
+from avis_ctrl.gap.signals.noise_level import NoiseLevels
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction_error import PredictionError, prediction_error
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
-from avis_ctrl.measurement.gates.finding import Limit, Picture, Series
 
 if TYPE_CHECKING:
     from avis_ctrl.gap.analysis import Prepared
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
 PLACE_ALARM = 0.01
 MOST_PLACES = 10
 BANDS_PER_OCTAVE = 2
+# Lines of each record from which its place in level and time, and the shares of power, are told.
+SHOWN_LINES = 1200
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +69,8 @@ def _relative(power: np.ndarray, errors: Sequence[PredictionError]) -> float:
 
 
 def shown(prepared: Prepared, found: Found, base: Refit, updated: Refit, judgement: Judgement, seed: int,
-          seconds: float) -> Gap:
-    """The gap as it is reported."""
+          seconds: float, noise: NoiseLevels | None = None) -> Gap:
+    """The gap as it is reported. noise : of floor and sensors, where it is known."""
     blocks, unmasked = prepared.held_out, prepared.unmasked
     before, after = Left.of(base.model, blocks), Left.of(judgement.updated.model, blocks)
     ladder = [Stage("nominal", *_figures(Left.of(prepared.nominal, unmasked))),
@@ -74,10 +79,12 @@ def shown(prepared: Prepared, found: Found, base: Refit, updated: Refit, judgeme
     where = places(before)
     remaining = places(after) if judgement.verdict in ("partly explained", "unexplained") else ()
     sentences = (opening(judgement, ladder, after), *judgement.reasons, prepared.noise)
+    sensors = None if noise is None else {name: one.value for name, one in noise.sensors.items()}
+    records, shares = _every(prepared, base.model, judgement.updated.model, sensors)
     return Gap(judgement.verdict, judgement.effects, tuple(ladder), where if judgement.verdict != "none" else (),
                remaining, after.noise_nrmse, judgement.next_experiment, base.model, judgement.updated.model,
                judgement.considered, heat_map(before, after), sentences,
-               pictures(prepared, before, after), prepared.halves.how, seed, seconds, judgement.updated.covariance)
+               (), prepared.halves.how, seed, seconds, judgement.updated.covariance, shares, records)
 
 
 def _figures(left: Left) -> tuple[float, float]:
@@ -116,11 +123,27 @@ def opening(judgement: Judgement, ladder: Sequence[Stage], after: Left) -> str:
 
 def in_words(one: NamedEffect) -> str:
     """An effect with its place, first parameters and probability."""
-    sizes = ", ".join(f"{name} = {p.value:.5g} +- {p.std:.2g} {'' if p.unit == '1' else p.unit}".rstrip()
-                      for name, p in list(one.parameters.items())[:3])
+    sizes = ", ".join(f"{spoken(name, p.unit)} {_sized(p)}" for name, p in list(one.parameters.items())[:3])
     ties = f", or {' or '.join(one.indistinguishable_from)}, which this data cannot tell from it" \
         if one.indistinguishable_from else ""
     return f"{one.title} ({one.name}, {one.location}: {sizes}; probability {one.probability:.2f}{ties})"
+
+
+def spoken(name: str, unit: str) -> str:
+    """A parameter's name without its unit, which stands behind the number."""
+    tail = unit.replace(" ", "").replace("^", "").replace("/", "_per_")
+    return name.removesuffix(f"_{tail}").replace("_", " ")
+
+
+def _sized(p: Reported) -> str:
+    """value +- standard deviation unit, both to the second digit of the latter."""
+    unit = "" if p.unit == "1" else f" {p.unit}"
+    if not (np.isfinite(p.std) and p.std > 0 and np.isfinite(p.value)):
+        return f"{p.value:.5g}{unit}"
+    places = 1 - int(np.floor(np.log10(float(f"{p.std:.1e}"))))
+    power = int(np.floor(np.log10(max(abs(p.value), p.std)))) if places > 6 else 0
+    value, std = (f"{v / 10.0 ** power:.{max(places + power, 0)}f}" for v in (p.value, p.std))
+    return f"({value} +- {std})e{power}{unit}" if power else f"{value} +- {std}{unit}"
 
 
 def _percent(share: float) -> str:
@@ -199,31 +222,19 @@ def _ratios(left: Left, edges: np.ndarray) -> np.ndarray:
     return found
 
 
-def pictures(prepared: Prepared, before: Left, after: Left) -> tuple[Picture, ...]:
-    """Residual spectra over the noise, and what each record leaves by level and by time."""
-    edges = edges_of(before.errors)
-    centre = np.sqrt(edges[1:] * edges[:-1])
-    spectra = Picture(
-        "What the models leave of the held-out records, over the noise", "frequency [Hz]", "residual / noise, r.m.s.",
-        tuple(Series(name, centre, np.sqrt(np.nanmean(_ratios(left, edges), axis=1)))
-              for name, left in (("re-identified", before), ("with the named effects", after))),
-        (Limit("noise", 1.0),), "log", "log")
-    return (spectra, *_by_record(prepared, before, after))
-
-
-def _by_record(prepared: Prepared, before: Left, after: Left) -> tuple[Picture, ...]:
+def _every(prepared: Prepared, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
+           ) -> tuple[tuple[RecordGap, ...], tuple[PowerShares, ...]]:
+    """What the models leave of each record, fitted ones too, and what accounts for the outputs' power; on SHOWN_LINES
+    lines of each record."""
+    held = {block.name for block in prepared.held_out}
+    blocks = [thinned(block, SHOWN_LINES) for block in (*prepared.fitted, *prepared.held_out)]
     headers = {r.header.name: r.header for r in (*prepared.halves.fitted.records, *prepared.halves.held_out.records)}
-    own = [headers[e.block.name] for e in before.errors]
+    last = Left.of(after, blocks).errors
+    first = last if after is before else Left.of(before, blocks).errors
 
-    def ratio(left: Left) -> np.ndarray:
-        return np.array([np.sqrt(e.chi2 / e.dof) for e in left.errors])
-
-    made = []
-    for title, label, x in (("Dependence on level", "level [V r.m.s.]", [h.level_V for h in own]),
-                            ("Dependence on time", "start of the record [s]", [h.start_s for h in own])):
-        order = np.argsort(x)
-        made.append(Picture(f"{title}: what each held-out record leaves", label, "residual / noise, r.m.s.",
-                            tuple(Series(name, np.array(x)[order], ratio(left)[order], "points")
-                                  for name, left in (("re-identified", before), ("with the named effects", after))),
-                            (Limit("noise", 1.0),)))
-    return tuple(made)
+    def ratio(e: PredictionError) -> float:
+        return float(np.sqrt(e.chi2 / e.dof))
+    records = [RecordGap(name, headers[name].level_V, headers[name].start_s, name in held, ratio(a), ratio(b))
+               for name, a, b in ((a.block.name, a, b) for a, b in zip(first, last, strict=True))]
+    shares = power_shares(last, headers, after, all_silent(prepared.halves.fitted, blocks), sensors_rms)
+    return tuple(sorted(records, key=lambda one: one.name)), shares

@@ -70,6 +70,7 @@ class Curve:
     """x, y (n,); a value that is not finite leaves a gap. Without a label it is not in the legend.
 
     error : (n,) half lengths of error bars along `along`. bars : width of bars drawn from the axis, 0 for none.
+    hollow : points are rings.
     """
 
     x: np.ndarray
@@ -81,6 +82,7 @@ class Curve:
     error: np.ndarray | None = None
     along: Literal["x", "y"] = "y"
     bars: float = 0.0
+    hollow: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,7 +100,8 @@ def _key(entry: Curve | Band) -> Any:
     if isinstance(entry, Band):
         return Patch(facecolor=entry.style.colour, alpha=0.25)
     if not entry.line:
-        return Line2D([], [], color=entry.style.colour, marker="o", markersize=3.5, linestyle="none")
+        return Line2D([], [], color=entry.style.colour, marker="o", markersize=3.5, linestyle="none",
+                      markerfacecolor="none" if entry.hollow else entry.style.colour)
     return Line2D([], [], marker="o" if entry.points else None, markersize=3, **_line(entry.style))
 
 
@@ -116,6 +117,8 @@ def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> None:
         look = _line(curve.style)
         if not curve.line:
             look["linestyle"] = "none"
+        if curve.hollow:
+            look |= {"markerfacecolor": "none", "markersize": 4.5}
         if curve.bars:
             ax.set_axisbelow(True)
             ax.bar(curve.x, curve.y, curve.bars, color=curve.style.colour)
@@ -124,7 +127,7 @@ def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> None:
             error = {f"{curve.along}err": np.where(np.isfinite(curve.error), curve.error, np.nan)}
             ax.errorbar(curve.x, curve.y, **error, fmt="none", ecolor=curve.style.colour, elinewidth=0.9, capsize=1.8)
         ax.plot(curve.x, np.where(np.isfinite(curve.y), curve.y, np.nan), marker="o" if curve.points else None,
-                markersize=3, **look)
+                **{"markersize": 3, **look})
     _scale(ax, "x", panel.x, panel.x.range)
     _scale(ax, "y", panel.y, log_range(panel) if panel.y.scale == "log" else panel.y.range)
     if panel.heat is None:

@@ -86,6 +86,8 @@ def _curve(curve: Curve) -> dict[str, Any]:
 def _more(curve: Curve) -> dict[str, Any]:
     """Error bars, and bars in the place of a line."""
     more: dict[str, Any] = {}
+    if curve.hollow:
+        more["marker"] = {"size": 8, "color": curve.style.colour, "symbol": "circle-open", "line": {"width": 1.6}}
     if curve.error is not None:
         more[f"error_{curve.along}"] = {"type": "data", "array": _numbers(curve.error), "color": curve.style.colour,
                                         "thickness": 1.3, "width": 3}

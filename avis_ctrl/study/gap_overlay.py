@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import cast
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.gap.data import SAME_LEVEL
+from avis_ctrl.gap.judgement import effects_of
 from avis_ctrl.gap.simulate import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.campaign_fit import driven_inputs, excited_band
@@ -31,10 +34,11 @@ class GapOverlay:
     Attributes
     ----------
     frequency_Hz : (n,). inputs, outputs : names. unit : of an entry.
-    measured, baseline, updated : (n, n_y, n_u) complex. updated is of the model without those of its effects that
-        depend on amplitude or time, for they have no frequency response.
+    measured, baseline, updated : (n, n_y, n_u) complex. Effects that depend on amplitude or time have no frequency
+        response: with them, `updated` is measured as `measured` is, from what the model simulates of the same records.
     measured_std : (n, n_y, n_u) of real part, imaginary part and, where it is small, magnitude.
-    records : that the measured response is from. method : how, in words. left_out : effects that `updated` lacks.
+    records : that the measured response is from. method : how, in words.
+    simulated : effects for which `updated` was measured from a simulation. left_out : effects that `updated` lacks.
     """
 
     frequency_Hz: np.ndarray
@@ -48,6 +52,7 @@ class GapOverlay:
     records: tuple[str, ...]
     method: str
     left_out: tuple[str, ...] = ()
+    simulated: tuple[str, ...] = ()
 
 
 @lru_cache(maxsize=1)  # asked for by each format of the report
@@ -55,10 +60,12 @@ def gap_overlay(campaign: Campaign, baseline: TableModel, updated: TableModel) -
     """The overlay of the records of the level that most of them have (of all where these are too few), or a sentence
     why there is none."""
     refused = "no record drives the actuators"
+    ends = [(r.header.start_s, r.header.start_s + r.header.duration_s) for r in campaign.records]
+    clock = (min(start for start, _ in ends), max(end for _, end in ends))
     with threadpool_limits(1):
         for records in selections(campaign):
             try:
-                return _overlay(records, baseline, updated)
+                return _overlay(records, baseline, updated, clock)
             except AvisError as error:
                 refused = str(error)
     return f"No frequency response could be measured for figures: {refused}"
@@ -77,19 +84,42 @@ def selections(campaign: Campaign) -> list[Campaign]:
     return [campaign.only(one) for one in names]
 
 
-def _overlay(records: Campaign, baseline: TableModel, updated: TableModel) -> GapOverlay:
+def _overlay(records: Campaign, baseline: TableModel, updated: TableModel, clock: tuple[float, float]) -> GapOverlay:
     linear = replace(updated, effects=tuple(one for one in updated.effects if not one.effect.nonlinear))
-    measured = _measured(records, excited_band(records), linear)
+    loaded = replace(records, records=tuple(one.load() for one in records.records))
+    beside = None if (measured := _best_linear(loaded)) else _less(loaded, _simulated(loaded, linear, clock))
+    if measured is None:
+        assert beside is not None
+        measured = _regressed_on_grid(beside)
     if missing := [name for name in measured.inputs if name not in baseline.inputs]:
         raise InputError(f"the model's inputs are {', '.join(baseline.inputs)}", field="inputs", value=missing)
     rows = [measured.outputs.index(name) for name in baseline.sensors.names]
     before, after = (_response(model, measured) for model in (baseline, linear))
     value = measured.value[:, rows] + (after if measured.method.startswith(BESIDE) else 0.0)
+    named = tuple(one.effect.name for one in effects_of(updated) if one.effect.nonlinear)
+    left_out = named
+    if named:
+        with suppress(AvisError):
+            after, left_out = _with_nonlinear(loaded, beside, updated, measured, after, clock), ()
     return GapOverlay(measured.frequency_Hz, tuple(measured.inputs), baseline.sensors.names,
                       f"{measured.output_unit} per {measured.input_unit}", value,
                       measured.standard_deviation[:, rows] / np.sqrt(2), before, after,
-                      tuple(r.header.name for r in records.records), measured.method,
-                      tuple(one.effect.name for one in updated.effects if one.effect.nonlinear))
+                      tuple(r.header.name for r in records.records), measured.method, left_out,
+                      () if left_out else named)
+
+
+def _with_nonlinear(records: Campaign, beside: Campaign | None, updated: TableModel, measured: FrequencyResponse,
+                    linear: np.ndarray, clock: tuple[float, float]) -> np.ndarray:
+    """(n, n_y, n_u) that the method of `measured` finds in the records as the whole model simulates them."""
+    made = _simulated(records, updated, clock)
+    rows = [measured.outputs.index(name) for name in updated.sensors.names]
+    if beside is not None:
+        # y_model - y_linear = (y - y_linear) - (y - y_model)
+        left = _less(beside, _less(records, made))
+        return linear + _regressed(left, excited_band(records), measured.frequency_Hz).value[:, rows]
+    left = _less(records, _less(records, made))
+    found = best_linear_approximation(left, band_Hz=excited_band(records))
+    return found.at(np.searchsorted(found.frequency_Hz, measured.frequency_Hz)).value[:, rows]
 
 
 def _response(model: TableModel, like: FrequencyResponse) -> np.ndarray:
@@ -100,36 +130,49 @@ def _response(model: TableModel, like: FrequencyResponse) -> np.ndarray:
     return model.driven(like.omega, U, False).Y
 
 
-def _measured(records: Campaign, band_Hz: tuple[float, float], model: TableModel) -> FrequencyResponse:
-    """The best linear approximation where the records allow one; otherwise what the model leaves of the records,
-    regressed on the inputs: of the records themselves the windows would round off the resonances."""
+def _best_linear(records: Campaign) -> FrequencyResponse | None:
+    """The best linear approximation on few enough lines for a figure; None where the records allow none."""
     try:
-        found = best_linear_approximation(records, band_Hz=band_Hz)
-        keep = np.searchsorted(found.frequency_Hz, np.geomspace(found.frequency_Hz[0], found.frequency_Hz[-1], POINTS))
-        return found.at(np.unique(np.clip(keep, 0, len(found.frequency_Hz) - 1)))
+        found = best_linear_approximation(records, band_Hz=excited_band(records))
     except AvisError:
-        left = replace(records, records=tuple(_left(one.load(), model) for one in records.records))
-        step = 1 / min(one.header.duration_s for one in records.records)
-        low, high = np.ceil(band_Hz[0] / step - 1e-9) * step, np.floor(band_Hz[1] / step + 1e-9) * step
-        if not 0 < low < high:
-            raise InputError("expected a band with lines of every record", field="band_Hz", value=band_Hz) from None
-        grid = np.clip(np.geomspace(low, high, min(POINTS, round((high - low) / step) + 1)), low, high)
-        found = _regressed(left, band_Hz, grid)
-        return replace(found, method=f"{BESIDE}{found.method}")
+        return None
+    keep = np.searchsorted(found.frequency_Hz, np.geomspace(found.frequency_Hz[0], found.frequency_Hz[-1], POINTS))
+    return found.at(np.unique(np.clip(keep, 0, len(found.frequency_Hz) - 1)))
 
 
-def _left(record: Record, model: TableModel) -> Record:
-    """A record less what the model reads in it, from rest at its start."""
-    h = record.header
-    for field, wanted, there in (("y", model.sensors.names, h.y_names), ("u", model.actuators, h.u_names)):
-        if missing := [name for name in wanted if name not in there]:
-            raise InputError(f"the record has {', '.join(there)}", field=f"record {h.name}: {field} names",
-                             value=missing)
-    y = record.y.copy()
-    u = record.u[:, [h.u_names.index(name) for name in model.actuators]]
-    y[:, [h.y_names.index(name) for name in model.sensors.names]] -= simulate(
-        model, u, record.floor, h.sample_rate_Hz, start_s=h.start_s).y
-    return replace(record, y=y)
+def _regressed_on_grid(beside: Campaign) -> FrequencyResponse:
+    """What a model leaves of the records, regressed on the inputs: of the records themselves the windows would round
+    off the resonances."""
+    band_Hz, step = excited_band(beside), 1 / min(one.header.duration_s for one in beside.records)
+    low, high = np.ceil(band_Hz[0] / step - 1e-9) * step, np.floor(band_Hz[1] / step + 1e-9) * step
+    if not 0 < low < high:
+        raise InputError("expected a band with lines of every record", field="band_Hz", value=band_Hz)
+    grid = np.clip(np.geomspace(low, high, min(POINTS, round((high - low) / step) + 1)), low, high)
+    found = _regressed(beside, band_Hz, grid)
+    return replace(found, method=f"{BESIDE}{found.method}")
+
+
+def _simulated(records: Campaign, model: TableModel, clock: tuple[float, float]) -> Campaign:
+    """The records with what the model reads in them in the place of y, from rest at their start."""
+    made = []
+    for record in cast(tuple[Record, ...], records.records):
+        h = record.header
+        for field, wanted, there in (("y", model.sensors.names, h.y_names), ("u", model.actuators, h.u_names)):
+            if missing := [name for name in wanted if name not in there]:
+                raise InputError(f"the record has {', '.join(there)}", field=f"record {h.name}: {field} names",
+                                 value=missing)
+        y = np.zeros_like(record.y)
+        u = record.u[:, [h.u_names.index(name) for name in model.actuators]]
+        y[:, [h.y_names.index(name) for name in model.sensors.names]] = simulate(
+            model, u, record.floor, h.sample_rate_Hz, start_s=h.start_s, campaign_s=clock).y
+        made.append(replace(record, y=y))
+    return replace(records, records=tuple(made))
+
+
+def _less(records: Campaign, others: Campaign) -> Campaign:
+    """The records with the others' y taken off."""
+    pairs = zip(cast(tuple[Record, ...], records.records), cast(tuple[Record, ...], others.records), strict=True)
+    return replace(records, records=tuple(replace(one, y=one.y - other.y) for one, other in pairs))
 
 
 def _regressed(left: Campaign, band_Hz: tuple[float, float], grid: np.ndarray) -> FrequencyResponse:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Reported, library
-from avis_ctrl.gap.result import Considered, Gap, HeatMap, NamedEffect, Stage, Where
+from avis_ctrl.gap.result import Considered, Gap, HeatMap, NamedEffect, PowerShares, RecordGap, Stage, Where
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
@@ -65,24 +65,32 @@ def heat() -> HeatMap:
 
 
 def pictures() -> tuple[Picture, ...]:
-    """One of each kind."""
-    f = np.geomspace(0.8, 60.0, 60)
-    levels = np.array([0.05, 0.1, 0.2])
-    hump = np.exp(-(np.log(f / 3.1) / 0.4) ** 2)
-    coherence = Picture("Sz1: coherence", "frequency [Hz]", "share of the power [-]", (
-        Series("explained by the model", f, 0.97 - 0.3 * hump), Series("noise", f, 0.02 + 0 * f),
-        Series("nonlinearity", f, 0.005 + 0 * f), Series("unmeasured inputs", f, 0.01 + 0 * f)), x_scale="log")
-    level = Picture("Error against level", "level of the drives [V]", "n.r.m.s. error [%]", (
-        Series("re-identified", levels, np.array([12.0, 12.1, 11.9]), "points"),
-        Series("updated", levels, np.array([1.1, 1.0, 1.05]), "points")), x_scale="log", y_scale="log")
-    time = Picture("Error over the campaign", "time [s]", "n.r.m.s. error [%]", (
-        Series("re-identified", np.arange(0, 360, 30.0), 12 + 0.1 * np.sin(np.arange(12)), "points"),
-        Series("updated", np.arange(0, 360, 30.0), 1 + 0.03 * np.cos(np.arange(12)), "points")), y_scale="log")
+    """What a finder may draw beside the rest."""
     other = Picture("Score of every effect", "effect", "score over its 99.9 % quantile [-]",
                     (Series("score", np.arange(3.0), np.array([80.0, 12.0, 0.4]), "bars"),),
                     (Limit("significant above", 1.0),), y_scale="log",
                     x_names=("com_offset", "product_of_inertia", "loop_delay"))
-    return (coherence, level, time, other)
+    return (other,)
+
+
+def shares() -> tuple[PowerShares, ...]:
+    """Two levels; noise falls and nonlinearity rises with the level."""
+    edges = np.geomspace(0.8, 60.0, 13)
+    hump = np.repeat(np.exp(-(np.log(np.sqrt(edges[1:] * edges[:-1]) / 3.1) / 0.4) ** 2)[:, None], len(OUTPUTS), axis=1)
+    made = []
+    for volts, names in ((0.05, ("00", "04")), (0.2, ("01", "02", "05"))):
+        parts = {"missing": 1e-4 + 0 * hump, "nonlinear": 0.1 * volts * hump, "unmeasured": 1e-4 / volts ** 2 * hump,
+                 "sensors": 1e-6 / volts ** 2 + 0 * hump}
+        parts = {"model": 1 - sum(parts.values()), **parts}
+        made.append(PowerShares(volts, "noise", names, edges, OUTPUTS, parts,
+                                {key: value.mean(axis=0) for key, value in parts.items()}, "levels"))
+    return tuple(made)
+
+
+def by_record() -> tuple[RecordGap, ...]:
+    """A gap that grows with the level; two records held out."""
+    return tuple(RecordGap(f"{k:02d}", volts, 70.0 * k, k > 3, 40 * volts, 1.0 + 0.01 * k)
+                 for k, volts in enumerate((0.05, 0.1, 0.2, 0.1, 0.05, 0.2)))
 
 
 def explained(campaign: Campaign) -> Gap:
@@ -107,14 +115,14 @@ def explained(campaign: Campaign) -> Gap:
                 "and (−11.9 ± 0.2) mm along y; probability above 99.9 %.",
                 "The held-out records confirm it at both levels."),
                pictures(), "records 04, 05 held out, each beside a fitted one of its level", 1, 41.5,
-               np.diag((1e-3 * np.maximum(np.abs(updated.values), 1e-3)) ** 2) if n else None)
+               np.diag((1e-3 * np.maximum(np.abs(updated.values), 1e-3)) ** 2) if n else None, shares(), by_record())
 
 
 def minimal(gap: Gap, verdict: str = "none") -> Gap:
     """Nothing but what the class asks for."""
     return replace(gap, verdict=verdict, effects=(), stages=(), where=(), remaining=(), noise_nrmse=float("nan"),
                    next_experiment=None, updated=gap.baseline, considered=(), heat=None, sentences=(), pictures=(),
-                   held_out="", covariance=None)
+                   held_out="", covariance=None, shares=(), records=())
 
 
 def with_verdict(gap: Gap, verdict: str) -> Gap:

@@ -12,22 +12,23 @@ from gap_stand_in import Finds
 from test_report import HOSTILE, Reader, pdf_text
 
 from avis_ctrl.gap.effects.base import Reported, library
+from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.result import VERDICTS, HeatMap, Stage, Where
 from avis_ctrl.gap.table_model import active
-from avis_ctrl.measurement.gates.finding import Finding, Picture, Series
+from avis_ctrl.measurement.gates.finding import Finding
 from avis_ctrl.report import gap_html, gap_pdf
 from avis_ctrl.report.figures import Figure, Heat, Panel
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import edges_of, spectrum, worst_pairs
 from avis_ctrl.report.gap.content import document
-from avis_ctrl.report.gap.dependence import kind
+from avis_ctrl.report.gap.opening import detectable
 from avis_ctrl.report.gap.places import heat_map
 from avis_ctrl.report.matplotlib_backend import svg
 from avis_ctrl.report.pieces import Mark, Paragraph, Section, Table
 from avis_ctrl.report.plotly_backend import graph
 from avis_ctrl.study.gap_overlay import GapOverlay, gap_overlay, selections
 
-NAMED = {"gap_spectrum", "ladder", "gap_responses", "heat_map", "gap_coherence_0", "gap_level_0", "gap_time_0",
+NAMED = {"gap_spectrum", "ladder", "gap_responses", "heat_map", "gap_records", "gap_coherence", "gap_coherence_lowest",
          "gap_other_0", "gap_mu"}
 
 
@@ -204,14 +205,15 @@ def test_responses_show_the_gap_and_that_it_closes(found):
     assert far[0][pairs[0]] == pytest.approx(far[0].max())
 
 
-def test_an_effect_without_a_response_is_said_to_be_left_out(found):
+def test_an_effect_without_a_response_is_measured_from_its_simulation(found):
     base = found.gap.baseline
     updated = base.with_effect(active(library()["cubic_stiffness"], base, library()["cubic_stiffness"].places(base)[0]))
     seen = gap_overlay(found.measured, base, updated)
-    assert isinstance(seen, GapOverlay) and seen.left_out == ("cubic_stiffness",)
-    np.testing.assert_allclose(seen.updated, seen.baseline, rtol=1e-9)
+    assert isinstance(seen, GapOverlay) and seen.simulated == ("cubic_stiffness",) and not seen.left_out
+    # Of no strength: what is measured of its simulation is the linear model's response.
+    np.testing.assert_allclose(seen.updated, seen.baseline, rtol=1e-3, atol=1e-4 * np.abs(seen.baseline).max())
     text = prose(section(replace(found, gap=replace(found.gap, updated=updated, covariance=None)), "before_after"))
-    assert "without cubic stiffness" in text
+    assert "Cubic stiffness has no frequency response of its own" in text
 
 
 def test_records_of_one_level_come_first(found):
@@ -225,13 +227,71 @@ def test_records_of_one_level_come_first(found):
     assert "no record drives" in gap_overlay(quiet, found.gap.baseline, found.gap.updated)
 
 
-@pytest.mark.parametrize(("title", "x", "y", "expected"), [
-    ("Sz1", "frequency [Hz]", "coherence [-]", "coherence"),
-    ("Gain at three levels", "frequency [Hz]", "gain [-]", "level"),
-    ("Error", "level [V]", "error [%]", "level"), ("Error", "time [s]", "error [%]", "time"),
-    ("Scores", "effect", "score [-]", "other")])
-def test_pictures_find_their_place(title, x, y, expected):
-    assert kind(Picture(title, x, y, (Series("a", np.arange(2.0), np.arange(2.0)),))) == expected
+def test_records_stand_by_level_and_time_fitted_ones_open(found):
+    by_level, by_time = figures(section(found, "dependence"))["gap_records"].panels
+    for panel, field in ((by_level, "level_V"), (by_time, "start_s")):
+        for held, word in ((True, "held out"), (False, "fitted")):
+            own = [one for one in found.gap.records if one.held_out == held]
+            for label, value in (("re-identified", "before"), ("updated", "after")):
+                curve = next(c for c in panel.curves if c.label == f"{label}, {word}")
+                assert curve.hollow is not held and curve.points
+                np.testing.assert_allclose(curve.x, [getattr(one, field) for one in own])
+                np.testing.assert_allclose(curve.y, [getattr(one, value) for one in own])
+    markers = [t["marker"].get("symbol") for t in graph(figures(section(found, "dependence"))["gap_records"])["data"]]
+    assert markers.count("circle-open") == 4
+    one = replace(found, gap=stand_in.with_verdict(found.gap, "none"))
+    assert {e.label for e in figures(section(one, "dependence"))["gap_records"].legend()} == {
+        "re-identified, fitted", "re-identified, held out", "noise alone"}
+
+
+def test_shares_of_power_are_drawn_and_tabled(found):
+    part = section(found, "dependence")
+    drawn, low = figures(part)["gap_coherence"], figures(part)["gap_coherence_lowest"]
+    assert "0.2 V" in drawn.caption.replace("0.200", "0.2") and "0.05" in low.caption
+    assert [panel.title for panel in drawn.panels] == list(stand_in.OUTPUTS)
+    top = found.gap.shares[1]
+    for curve, key in zip(drawn.panels[2].curves, top.shares, strict=True):
+        shown = np.nan_to_num(np.asarray(curve.y)[::2])
+        np.testing.assert_allclose(shown, np.where(top.shares[key][:, 2] > 1e-9, top.shares[key][:, 2], 0))
+    rows = tables(part)[0].rows
+    assert len(rows) == len(stand_in.OUTPUTS) and len(rows[0]) == 6
+    assert "lowest level" in prose(part)
+    alone = replace(top, how="one level", shares={k: v for k, v in top.shares.items() if k != "sensors"},
+                    whole={k: v for k, v in top.whole.items() if k != "sensors"})
+    text = prose(section(replace(found, gap=replace(found.gap, shares=(alone,))), "dependence"))
+    assert "cannot be told from nonlinearity" in text and "counts as unmeasured inputs" in text
+
+
+def test_none_says_from_which_size_on_an_effect_would_show(found):
+    gap = stand_in.with_verdict(found.gap, "none")
+    assert "seen from this size" not in " ".join(t.caption for t in tables(section(replace(found, gap=gap), "result")))
+    object.__setattr__(gap, "detectable", (("actuator_lag", "actuators", "time_constant_s", 3.1e-5, "s"),))
+    rows = tables(section(replace(found, gap=gap), "result")) if hasattr(replace(gap), "detectable") else [
+        p for p in detectable(gap) if isinstance(p, Table)]
+    assert rows[-1].rows == (("actuator lag", "actuators", "time constant", "3.10e−5 s"),)
+
+
+def test_terms_that_every_model_holds_are_no_effect(found):
+    base = found.gap.baseline
+    large = active(LargeMotion(), base, "payload", (1.0, 0.0, 1.0))
+    gap = replace(found.gap, baseline=base.with_effect(large), updated=found.gap.updated.with_effect(large),
+                  covariance=None)
+    part = section(replace(found, gap=gap), "parameters")
+    assert not [row for t in tables(part) for row in t.rows if "large" in row[0]]
+    assert "no effect" in prose(part) and "motors turn" in prose(part)
+
+
+@pytest.mark.parametrize(("name", "read"), [
+    ("stiffness_N_per_m", "stiffness"), ("integral_gain_N_per_ms", "integral gain"),
+    ("time_constant_s", "time constant"), ("k3_N_per_m3", "k3"), ("mass_kg", "mass"), ("damping", "damping")])
+def test_parameters_are_read_without_their_units(name, read):
+    assert wording.parameter(name) == read
+
+
+def test_sentences_of_the_finder_are_set_in_type():
+    assert wording.said("noise of 3 +- 1 V") == "Noise of 3 ± 1 V."
+    assert wording.said("actuator_lag comes nearest, but no") == "actuator_lag comes nearest, but no."
+    assert wording.said("Is it?") == "Is it?"
 
 
 def test_controller_only_where_there_is_one(found):
@@ -256,7 +316,7 @@ def test_next_to_nothing_found(found, verdict, tmp_path):
     poor = Finds(stand_in.minimal(found.gap, verdict), found.measured)
     page = Reader(gap_html(poor).encode()).text
     assert "No map of channels and frequencies was computed." in page
-    assert "No pictures were made of: level, time, coherence." in page
+    assert "What each record leaves was not stated." in page and "No shares of power were computed" in page
     assert "No other candidate was refitted." in page or "No candidate was refitted" in page
     if verdict == "none":
         text = pdf_text(gap_pdf(poor), tmp_path)

@@ -110,23 +110,29 @@ def _stages(gap: Gap) -> Table:
 
 def responses(seen: GapOverlay, named: bool) -> list[Piece]:
     """The pairs of input and output that disagree most, and in words what is drawn."""
-    pairs = worst_pairs(seen)
+    pairs, who = worst_pairs(seen), "updated" if named else "re-identified"
     text = (f"Frequency responses, measured from records {', '.join(seen.records)}, those that were fitted among them: "
             f"{seen.method}. Shown are the {len(pairs)} paths on which the re-identified model is furthest off, in "
             "standard deviations of the measured response; no two have the same output.")
     if seen.method.startswith(BESIDE):
-        text += (f" The records allow no response that is measured without a model: the points are the "
-                 f"{'updated' if named else 're-identified'} model's response plus what it leaves in the records, "
-                 "regressed on the inputs. An error narrower than a window of lines does not show here, but in the "
-                 "residual above.")
+        text += (" These records allow no response that is measured without a model: the points are the linear part "
+                 f"of the {who} model plus what it leaves in the records, regressed on the inputs in windows of lines. "
+                 "They lean on that model: an error of it that is narrower than a window does not show here, but in "
+                 "the residual above.")
+    if seen.simulated:
+        text += (f" {words.joined(list(map(wording.titled, seen.simulated))).capitalize()} has no frequency response "
+                 "of its own: that of the updated model is measured in the same way, from what the model simulates of "
+                 "the same records.")
     if seen.left_out:
         names = words.joined(list(map(wording.titled, seen.left_out)))
         text += (f" The drawn response of the updated model is without {names}: what depends on amplitude or time has "
                  "no frequency response.")
+    points = (f"the {who} model's response plus what it leaves in the records, regressed on the inputs (points)"
+              if seen.method.startswith(BESIDE) else "measured (points)")
     panels = [panel for i, j in pairs for panel in (_magnitude(seen, i, j, named), _residual(seen, i, j, named))]
-    figure = Figure("gap_responses", "Left: magnitude, measured (points) with a band of two standard deviations to "
+    figure = Figure("gap_responses", f"Left: magnitude, {points} with a band of two standard deviations to "
                     "each side. Right: magnitude of the complex difference between measured and model; with noise "
-                    "alone 86 % of the points lie below the dotted line.", tuple(panels), 2, 0.85)
+                    "alone 86 % of the points lie below the dotted line.", tuple(panels), 2, 0.68)
     return [Paragraph(text), figure]
 
 

@@ -2,50 +2,79 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+import numpy as np
+
+from avis_ctrl.gap.result import Gap, RecordGap
 from avis_ctrl.measurement.gates.finding import Picture
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, level
+from avis_ctrl.report.gap.before_after import AFTER, BEFORE, NOISE
+from avis_ctrl.report.gap.coherence import coherence
 from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.identification.pictures import figure_of
 from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Section
 
-GROUPS = (("coherence", "Coherence: what noise, nonlinearity and unmeasured inputs account for"),
-          ("level", "Dependence on level"), ("time", "Dependence on time"), ("other", "Further pictures"))
-CAPTIONS = {"coherence": "How much of each output's power the inputs account for, and what accounts for the rest.",
-            "level": "What depends on the level of the drive; a linear model leaves the same relative error at "
-                     "every level.",
-            "time": "What changes over the campaign.", "other": "What else was looked at."}
 # Panels of one figure.
 TOGETHER = 6
 
 
 def dependence(found: Found) -> Section:
-    """Pictures of the finder, by what they are about."""
-    pictures = [p for p in found.gap.pictures if any(len(s.x) for s in p.series)]
+    """What each record leaves by level and by time, shares of power, and pictures of the finder."""
+    gap = found.gap
     pieces: list[Piece] = []
-    for group, title in GROUPS:
-        own = [p for p in pictures if kind(p) == group]
-        if own:
-            pieces += [Heading(title), *_figures(group, own)]
-    missing = [word for group, word in (("level", "level"), ("time", "time"), ("coherence", "coherence"))
-               if not any(kind(p) == group for p in pictures)]
-    if missing:
-        pieces.append(Paragraph(f"No pictures were made of: {', '.join(missing)}.", "note"))
+    if gap.records:
+        pieces.append(by_record(gap))
+    else:
+        pieces.append(Paragraph("What each record leaves was not stated.", "note"))
+    pieces.append(Heading("Coherence: what noise, nonlinearity and unmeasured inputs account for"))
+    pieces += coherence(gap.shares) if gap.shares else [
+        Paragraph("No shares of power were computed: the driven records have too few lines for their inputs.", "note")]
+    own = [p for p in gap.pictures if any(len(s.x) for s in p.series)]
+    if own:
+        pieces += [Heading("Further pictures"), *_figures(own)]
     return Section("Level, time and coherence", "dependence", tuple(pieces))
 
 
-def kind(picture: Picture) -> str:
-    """What a picture is about, by its title and axes."""
-    title, x = picture.title.lower(), picture.x_label.lower()
-    if "coherence" in title or "coherence" in picture.y_label.lower():
-        return "coherence"
-    if "level" in title or "level" in x or "amplitude" in title or "amplitude" in x:
-        return "level"
-    return "time" if x.startswith("time") or "drift" in title or "over time" in title else "other"
+def by_record(gap: Gap) -> Figure:
+    """Residual over noise of every record, by level and by time; held-out records filled."""
+    panels = (_panel(gap, "By level", Axis("level of the drives, r.m.s. [V]"), lambda one: one.level_V),
+              _panel(gap, "By time", Axis("start of the record, time [s]"), lambda one: one.start_s))
+    return Figure("gap_records", "What each record leaves, over the noise. Filled: held-out records; open: fitted. "
+                  "The error of a linear model that lacks something linear grows in proportion to the level; one that "
+                  "is the same at every level is noise, and one that bends away depends on amplitude. A slope over "
+                  "time is drift. The lines are drawn at random, dense where the resonances are, for all records "
+                  "alike: the figures differ from those of all lines in the ladder.", panels, 2, 0.85)
 
 
-def _figures(group: str, pictures: Sequence[Picture]) -> list[Piece]:
+def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> Panel:
+    sides = [("re-identified", BEFORE, lambda one: one.before)]
+    if gap.effects:
+        sides.append(("updated", AFTER, lambda one: one.after))
+    curves = []
+    for label, style, value in sides:
+        for held, word in ((False, "fitted"), (True, "held out")):
+            some = [one for one in gap.records if one.held_out == held]
+            curves.append(Curve(np.array([of(one) for one in some]), np.array([value(one) for one in some]),
+                                f"{label}, {word}", Style(style.colour), points=True, line=False, hollow=not held))
+    low, high = _limits([of(one) for one in gap.records])
+    curves.append(level(low, high, 1.0, "noise alone", NOISE))
+    values = np.array([v for one in gap.records for v in (one.before, one.after)])
+    values = values[np.isfinite(values) & (values > 0)]
+    y = Axis("residual / noise, r.m.s. [-]", "log", (float(min(values.min(initial=1.0), 1.0)) / 1.5,
+                                                     float(max(values.max(initial=1.0), 1.0)) * 1.5))
+    return Panel(Axis(x.label, "linear", (low, high)), y, tuple(curves), (), title)
+
+
+def _limits(values: Sequence[float]) -> tuple[float, float]:
+    low, high = min(values), max(values)
+    room = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
+    return low - room, high + room
+
+
+def _figures(pictures: Sequence[Picture]) -> list[Piece]:
     parts = [pictures[k:k + TOGETHER] for k in range(0, len(pictures), TOGETHER)]
-    return [figure_of(f"gap_{group}_{k}", CAPTIONS[group] + (f" Part {k + 1} of {len(parts)}." if len(parts) > 1
-                                                             else ""), part, 2, 0.85 if len(part) > 1 else 0.75)
+    return [figure_of(f"gap_other_{k}", "What else was looked at." + (f" Part {k + 1} of {len(parts)}."
+                                                                      if len(parts) > 1 else ""), part, 2,
+                      0.85 if len(part) > 1 else 0.75)
             for k, part in enumerate(parts)]

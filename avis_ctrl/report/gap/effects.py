@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from avis_ctrl.gap.judgement import LARGE_MOTION
 from avis_ctrl.gap.result import Gap, NamedEffect
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
@@ -21,7 +22,7 @@ def parameters(found: Found) -> Section:
         pieces.append(Paragraph("No effect is named, so the updated model is the re-identified one."))
     if len(gap.baseline.values):
         both = " and updated" if gap.effects else ""
-        pieces.append(Fold(f"The rig's own parameters, re-identified{both}", (_rig(gap),)))
+        pieces.append(Fold(f"The rig's own parameters, re-identified{both}", (_rig(gap), *_always(gap))))
     return Section("Parameters", "parameters", tuple(pieces))
 
 
@@ -61,6 +62,8 @@ def _rig(gap: Gap) -> Table:
     units, sigma = dict(zip(gap.baseline.names, gap.baseline.units, strict=True)), _deviations(gap)
     rows = []
     for name, value in before.items():
+        if name.startswith(f"{LARGE_MOTION}@"):
+            continue
         new = after.get(name, np.nan)
         shown, spread = words.with_deviation(new, sigma[name]) if name in sigma else (words.number(new, 5),
                                                                                      "not stated")
@@ -73,6 +76,23 @@ def _rig(gap: Gap) -> Table:
     return table("A model that lacks an effect bends its own parameters to make up for it; the change is what they "
                  "give back. A large one is no error: it may lie along a direction that the data hardly know.",
                  ("parameter", "re-identified", "updated", "± 1 σ", "change", "unit"), rows, "lrrrrl")
+
+
+def _always(gap: Gap) -> list[Piece]:
+    """Second-order terms that every model holds, which are no effect."""
+    own = [(name, value) for name, value in zip(gap.updated.names, gap.updated.values, strict=True)
+           if name.startswith(f"{LARGE_MOTION}@")]
+    if not own:
+        return []
+    sigma = _deviations(gap)
+    told = []
+    for name, value in own:
+        size, spread = words.with_deviation(value, sigma.get(name, np.nan))
+        told.append(f"{wording.titled(name.rpartition('.')[2])} {size} ± {spread}" if name in sigma else
+                    f"{wording.titled(name.rpartition('.')[2])} {words.number(value)}")
+    return [Paragraph("Every model, with or without a named effect, also holds the second-order terms of large "
+                      "rotations, which are physics of any table and no effect. They enter with factors, 0 or 1 by "
+                      f"theory, that are fitted along, often poorly known: {'; '.join(told)}.", "note")]
 
 
 def _deviations(gap: Gap) -> dict[str, float]:

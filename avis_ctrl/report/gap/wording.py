@@ -25,6 +25,9 @@ CLAIMS = {
                    "re-identified one.",
 }
 PERCENT = 100.0
+# What names of parameters end in, the longer before what it ends in itself.
+UNITS = ("_N_per_ms", "_m_per_s2", "_N_per_m3", "_Ns_per_m", "_N_per_m",
+         "_kgm2", "_per_s", "_Hz", "_deg", "_rad", "_kg", "_s", "_m", "_V", "_N")
 
 
 def titled(name: str) -> str:
@@ -73,10 +76,17 @@ def quantities(parameters: Mapping[str, Reported]) -> str:
 
 def parameter(name: str) -> str:
     """A parameter's name without its unit, which stands behind the number."""
-    for tail in ("_Hz", "_s", "_m", "_kg", "_V", "_N", "_N_per_m", "_Ns_per_m", "_kgm2", "_deg", "_rad"):
-        if name.endswith(tail):
-            return name.removesuffix(tail).replace("_", " ")
-    return name.replace("_", " ")
+    tail = next((tail for tail in UNITS if name.endswith(tail)), "")
+    return name.removesuffix(tail).replace("_", " ")
+
+
+def said(text: str) -> str:
+    """A sentence of the finder as printed: begins large, ends in a stop, with signs instead of their typed form."""
+    text = text.replace(" +- ", " ± ").strip()
+    first = text.partition(" ")[0].rstrip(":;,.")
+    # An effect's name is written as it is.
+    text = text if "_" in first else text[:1].upper() + text[1:]
+    return text if not text or text.endswith((".", "!", "?")) else f"{text}."
 
 
 def place(one: Where) -> str:

@@ -1,0 +1,288 @@
+"""Which share of each output's power the model, noise, nonlinearity and unmeasured inputs account for.
+
+In a window of lines the outputs of all records of one level are split, with G the linear part of the model,
+
+    y = G u + (model's nonlinear terms) + e,    e_lin = y - G u = A c + r,    e = A c' + r'
+
+where A has the columns G_kj u_j, constant and, where lines allow it, linear over the window: c is a relative error of
+each path. Where that leaves more than noise, a common denominator is tried, for poles that lie elsewhere than the
+model's (local rational method; McKelvey and Guerin, IFAC Proc. 45-16 (2012) 424-429). r is what no response near the
+model's, linear in the measured inputs, accounts for: the incoherent part, whose share is one less the multiple
+coherence (Bendat and Piersol, Random Data, 4th ed., 2010, section 7.3). Its power is that of noise, unmeasured inputs
+and nonlinearity. Each squared residual is divided by one less its leverage, so that unknowns cost no power (MacKinnon
+and White, J. Econometrics 29 (1985) 305-325).
+
+Noise does not know of the drives. It is measured where these are silent; without such lines it is taken for what is
+left, nonlinear terms of the model taken off, at the lowest level: whatever is more at a higher level is not linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+from avis_ctrl.gap.data import SAME_LEVEL
+from avis_ctrl.gap.result import PowerShares
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.prediction_error import PredictionError
+from avis_ctrl.measurement.campaign import RecordHeader
+
+BANDS_PER_OCTAVE = 3
+# Lines of a window by unknowns of its regression, and by unknowns where the error may be linear over it.
+LEAST_LINES, LINEAR_LINES = 3, 8
+# Part of the strongest line's power below which the drives leave a line alone.
+DRIVEN = 1e-6
+# Leverage from which on a line says nothing of the noise.
+MOST_LEVERAGE = 0.9
+# Chance that an error of the model is seen in a window of noise, and nonlinearity in a band of it.
+ALARM, SCATTER = 1e-3, 0.05
+# Times the noise from which on an error may be one of a pole, the part of it that must go, rounds of that fit, and the
+# least value of its denominator, which is one in the middle of the window.
+EXCESS, GAINED, POLE_ROUNDS, NEAREST_POLE = 1.5, 0.8, 4, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Driven lines of the records of one level, by frequency.
+
+    frequency_Hz (n,); Y, left, beyond (n, n_y): outputs, what the whole model leaves of them, what its linear part
+    leaves; columns (n, n_y, n_u): G_kj u_j; noise (n, n_y): measured power.
+    """
+
+    frequency_Hz: np.ndarray
+    Y: np.ndarray
+    left: np.ndarray
+    beyond: np.ndarray
+    columns: np.ndarray
+    noise: np.ndarray
+
+    def some(self, keep: np.ndarray) -> Lines:
+        return Lines(self.frequency_Hz[keep], self.Y[keep], self.left[keep], self.beyond[keep], self.columns[keep],
+                     self.noise[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Power a line, (n_bands, n_y) each: of the output; incoherent in the linear part's error and in the model's;
+    coherent in the model's error; measured noise. lines (n_bands,): how many; effective
+    (n_bands, n_y): as many alike lines scatter as these do."""
+
+    whole: np.ndarray
+    incoherent: np.ndarray
+    left_incoherent: np.ndarray
+    missing: np.ndarray
+    noise: np.ndarray
+    lines: np.ndarray
+    effective: np.ndarray
+
+
+def power_shares(errors: Sequence[PredictionError], headers: Mapping[str, RecordHeader], model: TableModel,
+                 silent_noise: bool, sensors_rms: Mapping[str, float] | None) -> tuple[PowerShares, ...]:
+    """For each level, the lowest first; empty where no record drives the actuators with lines enough.
+
+    Parameters
+    ----------
+    errors : what `model` leaves of each block. headers : of the blocks' records by name.
+    silent_noise : the blocks' noise was measured where the drives are silent.
+    sensors_rms : own noise of each output's channel (white at the sample rate), unit of y; None where not known.
+    """
+    found = []
+    for group in _levels(errors, headers):
+        own = [headers[e.block.name] for e in group]
+        found.append((own, lines_of(group, model)))
+    if not found:
+        return ()
+    edges = bands([lines for _, lines in found])
+    if len(edges) < 2:
+        return ()
+    splits = [split(lines, edges) for _, lines in found]
+    names = model.sensors.names
+    sensors = None if sensors_rms is None else np.array([sensors_rms.get(name, 0.0) for name in names]) ** 2
+    several = len({own[0].excitation for own, _ in found}) == 1 and len(found) > 1
+    how: Literal["silent", "levels", "one level"] = "silent" if silent_noise else "levels" if several else "one level"
+    lowest = splits[0].left_incoherent
+    made = []
+    for (own, _), one in zip(found, splits, strict=True):
+        noise = one.noise if how == "silent" else lowest if how == "levels" else one.left_incoherent
+        parts = attributed(one, noise, sensors)
+        whole = {key: np.sum(value * (one.whole * one.lines[:, None]), axis=0)
+                 / np.sum(one.whole * one.lines[:, None], axis=0) for key, value in parts.items()}
+        made.append(PowerShares(float(np.mean([h.level_V for h in own])), own[0].excitation,
+                                tuple(sorted(h.name for h in own)), edges, names, parts, whole, how))
+    return tuple(made)
+
+
+def attributed(one: Split, noise: np.ndarray, sensors: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Shares (n_bands, n_y) that add up to one; noise : power a line of it, sensors : (n_y,) the part of the sensors'
+    own, None where that is not known."""
+    incoherent = np.minimum(one.incoherent, one.whole)
+    missing = np.minimum(one.missing, one.whole - incoherent)
+    # Within its own scatter the incoherent part is noise; as many lines count as share its power.
+    scatter = incoherent < stats.f.isf(SCATTER, 2 * one.effective, 2 * one.effective) * noise
+    noise = np.where(scatter, incoherent, np.minimum(noise, incoherent))
+    own = np.zeros_like(noise) if sensors is None else np.minimum(noise, sensors)
+    parts = {"model": one.whole - missing - incoherent, "missing": missing, "nonlinear": incoherent - noise,
+             "unmeasured": noise - own} | ({} if sensors is None else {"sensors": own})
+    return {key: value / one.whole for key, value in parts.items()}
+
+
+def _levels(errors: Sequence[PredictionError], headers: Mapping[str, RecordHeader]) -> list[list[PredictionError]]:
+    """Driven records of one level and excitation; the lowest level first."""
+    driven = sorted((e for e in errors if headers[e.block.name].excitation not in ("rest", "floor")),
+                    key=lambda e: (headers[e.block.name].excitation, headers[e.block.name].level_V))
+    groups: list[list[PredictionError]] = []
+    for e in driven:
+        h = headers[e.block.name]
+        first = headers[groups[-1][0].block.name] if groups else None
+        if first and h.excitation == first.excitation and h.level_V <= SAME_LEVEL * first.level_V:
+            groups[-1].append(e)
+        else:
+            groups.append([e])
+    return sorted(groups, key=lambda group: headers[group[0].block.name].level_V)
+
+
+def lines_of(errors: Sequence[PredictionError], model: TableModel) -> Lines:
+    """Lines that the drives excite, of several records."""
+    linear = replace(model, effects=tuple(one for one in model.effects if not one.effect.nonlinear))
+    n_a = len(model.actuators)
+    known: dict[bytes, np.ndarray] = {}
+    made = []
+    for e in errors:
+        block = e.block
+        key = block.omega.tobytes()
+        if key not in known:
+            known[key] = linear.response(block.omega)
+        columns = known[key] * block.U[:, None, :, 0]
+        answered = (block.Y - e.plain)[:, :, 0]
+        left = e.error[:, :, 0]
+        power = np.sum(np.abs(block.U[:, :n_a, 0]) ** 2, axis=1)
+        assert block.noise is not None
+        noise = np.real(np.einsum("nkk->nk", block.noise[:, 0]))
+        every = Lines(block.omega / (2 * np.pi), answered + left, left, answered + left - columns.sum(axis=2), columns,
+                      noise)
+        made.append(every.some(power > DRIVEN * power.max(initial=0.0)))
+    joined = Lines(*(np.concatenate([getattr(one, field) for one in made]) for field in Lines.__dataclass_fields__))
+    return joined.some(np.argsort(joined.frequency_Hz, kind="stable"))
+
+
+def bands(groups: Sequence[Lines]) -> np.ndarray:
+    """Edges in Hz: BANDS_PER_OCTAVE to the octave, but none with fewer lines of any level than its unknowns ask for."""
+    low = min(float(one.frequency_Hz[0]) for one in groups if len(one.frequency_Hz))
+    high = max(float(one.frequency_Hz[-1]) for one in groups if len(one.frequency_Hz)) * (1 + 1e-9)
+    grid = np.geomspace(low, high, max(int(np.ceil(BANDS_PER_OCTAVE * np.log2(high / low))), 1) + 1)
+    least = [LEAST_LINES * _unknowns(one.columns) for one in groups]
+
+    def enough(a: float, b: float) -> bool:
+        return all(np.searchsorted(one.frequency_Hz, b) - np.searchsorted(one.frequency_Hz, a) >= n
+                   for one, n in zip(groups, least, strict=True))
+    edges = [low]
+    for edge in grid[1:]:
+        if enough(edges[-1], edge):
+            edges.append(float(edge))
+    if len(edges) > 1:
+        edges[-1] = high
+    return np.array(edges)
+
+
+def _unknowns(columns: np.ndarray) -> int:
+    return int(np.count_nonzero(np.any(columns, axis=(0, 1))))
+
+
+def split(lines: Lines, edges: np.ndarray) -> Split:
+    """Powers a line by band; a band with many lines is cut into windows, each with its own regression."""
+    n_y = lines.Y.shape[1]
+    found = np.zeros((5, len(edges) - 1, n_y))
+    count, alike = np.zeros(len(edges) - 1), np.ones((len(edges) - 1, n_y))
+    for b, (low, high) in enumerate(pairwise(np.searchsorted(lines.frequency_Hz, edges))):
+        count[b] = high - low
+        least = LINEAR_LINES * _unknowns(lines.columns[low:high])
+        for at in np.array_split(np.arange(low, high), max((high - low) // max(least, 1), 1)):
+            found[:, b] += _window(lines, at)
+        found[:, b] /= max(count[b], 1)
+        noise = lines.noise[low:high]
+        alike[b] = np.sum(noise, axis=0) ** 2 / np.sum(noise ** 2, axis=0)
+    return Split(found[0], found[1], found[2], found[3], found[4], count, alike)
+
+
+def _window(lines: Lines, at: np.ndarray) -> np.ndarray:
+    """(5, n_y) sums of power over the lines of a window."""
+    f = lines.frequency_Hz[at]
+    x = 2 * (f - f.mean()) / max(float(np.ptp(f)), 1e-12)
+    sums = np.zeros((5, lines.Y.shape[1]))
+    for k in range(lines.Y.shape[1]):
+        A = lines.columns[at, k]
+        A, model = A[:, np.any(A, axis=0)], A.sum(axis=1)
+        sigma = np.sqrt(lines.noise[at, k])
+        sums[0, k] = np.sum(np.abs(lines.Y[at, k]) ** 2)
+        sums[4, k] = np.sum(sigma ** 2)
+        for row, e in ((1, lines.beyond[at, k]), (2, lines.left[at, k])):
+            error, leverage = _smooth(A, e, x, sigma)
+            if np.sum(np.abs(error / sigma) ** 2 / (1 - leverage)) > EXCESS * len(at):
+                error, leverage = _with_poles(A, model + e, x, sigma, (error, leverage))
+            apart = np.abs(error) ** 2 / (1 - leverage)
+            sums[row, k] = np.sum(apart)
+            if row == 2:
+                sums[3, k] = max(np.sum(np.abs(e - error) ** 2 - leverage * apart), 0.0)
+    return sums
+
+
+def _smooth(A: np.ndarray, e: np.ndarray, x: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residual (n,) of e after a smooth relative error of each column of A, and leverage (n,) of each line; e itself
+    where that error is not significant."""
+    if len(e) >= LINEAR_LINES * A.shape[1]:
+        A = np.hstack([A, A * x[:, None]])
+    Q = _basis(A / sigma[:, None])
+    white, p = e / sigma, Q.shape[1]
+    inside = Q.conj().T @ white
+    power, whole = float(np.sum(np.abs(inside) ** 2)), float(np.sum(np.abs(white) ** 2))
+    rest = len(e) - p
+    if p == 0 or rest <= 0 or power / p < stats.f.isf(ALARM, 2 * p, 2 * rest) * (whole - power) / rest:
+        return e, np.zeros(len(e))
+    return e - sigma * (Q @ inside), _leverage(Q)
+
+
+def _with_poles(A: np.ndarray, y: np.ndarray, x: np.ndarray, sigma: np.ndarray, plain: tuple[np.ndarray, np.ndarray]
+                ) -> tuple[np.ndarray, np.ndarray]:
+    """As `_smooth`, of a response whose poles lie elsewhere than the model's: y = A b(x) / a(x), a of second degree.
+
+    By iterated linear least squares (Sanathanan and Koerner, IEEE Trans. Autom. Control 8 (1963) 56-58); `plain` where
+    that is no better by more than its own unknowns can make it, or lines are too few.
+    """
+    unknowns = 2 * A.shape[1] + 2
+    if len(y) < 2 * unknowns:
+        return plain
+    numerator = np.hstack([A, A * x[:, None]])
+    powers = np.stack([x, x ** 2], axis=1)
+    a = np.ones(len(x), complex)
+    best, least = plain, GAINED * np.sum(np.abs(plain[0] / sigma) ** 2 / (1 - plain[1]))
+    for _ in range(POLE_ROUNDS):
+        weight = 1 / (sigma * np.abs(a))
+        K = np.hstack([numerator, -powers * y[:, None]]) * weight[:, None]
+        size = np.linalg.norm(K, axis=0)
+        found = np.linalg.lstsq(K / size, y * weight, rcond=1e-10)[0] / size
+        a = 1 + powers @ found[-2:]
+        if np.min(np.abs(a)) < NEAREST_POLE:
+            break
+        error = y - (numerator @ found[:-2]) / a
+        leverage = _leverage(_basis(K))
+        chi2 = np.sum(np.abs(error / sigma) ** 2 / (1 - leverage))
+        if chi2 < least:
+            best, least = (error, leverage), chi2
+    return best
+
+
+def _leverage(Q: np.ndarray) -> np.ndarray:
+    return np.minimum(np.sum(np.abs(Q) ** 2, axis=1), MOST_LEVERAGE)
+
+
+def _basis(A: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of the columns' span, each column alike, without directions that are round-off."""
+    if not A.size:
+        return np.zeros((len(A), 0), complex)
+    U, s, _ = np.linalg.svd(A / np.linalg.norm(A, axis=0), full_matrices=False)
+    return U[:, s > 1e-10 * s[0]]
