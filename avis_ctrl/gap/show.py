@@ -84,7 +84,8 @@ def shown(prepared: Prepared, found: Found, base: Refit, updated: Refit, judgeme
     return Gap(judgement.verdict, judgement.effects, tuple(ladder), where if judgement.verdict != "none" else (),
                remaining, after.noise_nrmse, judgement.next_experiment, base.model, judgement.updated.model,
                judgement.considered, heat_map(before, after), sentences,
-               (), prepared.halves.how, seed, seconds, judgement.updated.covariance, shares, records)
+               (), prepared.halves.how, seed, seconds, judgement.updated.covariance,
+               shares=shares, records=records)
 
 
 def _figures(left: Left) -> tuple[float, float]:

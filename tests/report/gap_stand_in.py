@@ -115,7 +115,8 @@ def explained(campaign: Campaign) -> Gap:
                 "and (−11.9 ± 0.2) mm along y; probability above 99.9 %.",
                 "The held-out records confirm it at both levels."),
                pictures(), "records 04, 05 held out, each beside a fitted one of its level", 1, 41.5,
-               np.diag((1e-3 * np.maximum(np.abs(updated.values), 1e-3)) ** 2) if n else None, shares(), by_record())
+               np.diag((1e-3 * np.maximum(np.abs(updated.values), 1e-3)) ** 2) if n else None,
+               shares=shares(), records=by_record())
 
 
 def minimal(gap: Gap, verdict: str = "none") -> Gap:

@@ -13,7 +13,7 @@ from test_report import HOSTILE, Reader, pdf_text
 
 from avis_ctrl.gap.effects.base import Reported, library
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.result import VERDICTS, HeatMap, Stage, Where
+from avis_ctrl.gap.result import VERDICTS, Detectable, HeatMap, Stage, Where
 from avis_ctrl.gap.table_model import active
 from avis_ctrl.measurement.gates.finding import Finding
 from avis_ctrl.report import gap_html, gap_pdf
@@ -21,7 +21,6 @@ from avis_ctrl.report.figures import Figure, Heat, Panel
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import edges_of, spectrum, worst_pairs
 from avis_ctrl.report.gap.content import document
-from avis_ctrl.report.gap.opening import detectable
 from avis_ctrl.report.gap.places import heat_map
 from avis_ctrl.report.matplotlib_backend import svg
 from avis_ctrl.report.pieces import Mark, Paragraph, Section, Table
@@ -264,11 +263,13 @@ def test_shares_of_power_are_drawn_and_tabled(found):
 
 def test_none_says_from_which_size_on_an_effect_would_show(found):
     gap = stand_in.with_verdict(found.gap, "none")
-    assert "seen from this size" not in " ".join(t.caption for t in tables(section(replace(found, gap=gap), "result")))
-    object.__setattr__(gap, "detectable", (("actuator_lag", "actuators", "time_constant_s", 3.1e-5, "s"),))
-    rows = tables(section(replace(found, gap=gap), "result")) if hasattr(replace(gap), "detectable") else [
-        p for p in detectable(gap) if isinstance(p, Table)]
-    assert rows[-1].rows == (("actuator lag", "actuators", "time constant", "3.10e−5 s"),)
+    assert not tables(section(replace(found, gap=gap), "remaining"))
+    seen = (Detectable("actuator_lag", "actuators", "time_constant_s", 3.1e-5, "s"),
+            Detectable("sensor_gain", "Sz1", "gain", float("inf"), "1"))
+    one = replace(found, gap=replace(gap, detectable=seen))
+    assert tables(section(one, "remaining"))[0].rows == (
+        ("actuator lag", "actuators", "time constant", "3.1e−5 s"), ("sensor gain", "Sz1", "gain", "at no size"))
+    assert "would have been seen" in prose(section(one, "result"))
 
 
 def test_terms_that_every_model_holds_are_no_effect(found):

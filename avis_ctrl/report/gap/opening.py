@@ -22,8 +22,9 @@ def opening(found: Found) -> Section:
     if gap.effects:
         pieces.append(_effects(gap))
     pieces += [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from]
-    if gap.verdict in ("none", "unexplained"):
-        pieces += detectable(gap)
+    if gap.detectable:
+        pieces.append(Paragraph("From which size on an effect would have been seen stands in the section on what "
+                                "remains."))
     if gap.sentences[1:]:
         pieces.append(Bullets(tuple(map(wording.said, gap.sentences[1:]))))
     warned = list(dict.fromkeys(f.gate for f in found.findings if f.severity in ("warning", "stop")))
@@ -76,19 +77,6 @@ def _group(one: NamedEffect) -> str:
 def _stage(name: str) -> str:
     return {"nominal": "with the model as its file has it", "re-identified": "after re-identification"}.get(
         name, f"with {wording.titled(name)}")
-
-
-def detectable(gap: Gap) -> list[Piece]:
-    """From which size on an effect would have been seen; nothing where that was not computed."""
-    found = getattr(gap, "detectable", None) or ()
-    if not found:
-        return []
-    rows = [(wording.titled(name), location, wording.parameter(parameter),
-             f"{words.number(float(value))} {'' if unit == '1' else words.unit(unit)}".rstrip())
-            for name, location, parameter, value, unit in found]
-    return [table("An effect would have been seen from this size on, by itself at its place, with the noise of this "
-                  "campaign; what is smaller may be there.",
-                  ("effect", "place", "parameter", "seen from"), rows, "lllr")]
 
 
 def _effects(gap: Gap) -> Table:
