@@ -11,10 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
+from avis_ctrl.gap.data import SAME_LEVEL
 from avis_ctrl.gap.refit import Refit, probabilities, try_refit
 from avis_ctrl.gap.result import Considered, NamedEffect, Verdict
-from avis_ctrl.gap.search import CLOSED, LEAST_FALL, Found, location
+from avis_ctrl.gap.score import Score
+from avis_ctrl.gap.search import CLOSED, LEAST_FALL, Found, Rival, location
 from avis_ctrl.gap.signal_effects import SignalFaults, named
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.spectra import SpectralBlock
@@ -33,6 +36,8 @@ EARNED = 0.5
 # Halves agree within so many standard deviations (of parameters, widened by the misfit), or within this share.
 AGREE_STD, AGREE_SHARE = 4.0, 0.15
 LARGE_MOTION = "large_motion"
+# A linear effect whose strength differs from level to level by this share, and by chance less often than that, is none.
+UNEQUAL_SHARE, UNEQUAL = 0.25, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,19 +57,25 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
     own = effects_of(updated.model)
     if own and not earned(base, updated):
         own, updated = [], base
-    if updated.held_per_dof > CLOSED:
+    if updated.held_per_dof > CLOSED or found.beaten is not None:
         # What a wrong model leaves of the records is no measure of the noise in them.
         faults = replace(faults, noise=None)
     signal = named(faults)
     raised = faults.raised
     reasons = [f"the noise of {', '.join(raised)} is above the rig file's ambient level; the library has no name for "
                "that"] if raised else []
+    refused_by_level = False
     if own and updated.held_per_dof > CLOSED:
         refusal = refused(thin, base, updated)
         if refusal:
             reasons.append(f"{' and '.join(one.effect.name for one in own)} comes nearest, but {refusal}: not named")
             own, updated = [], base
-    residual_left = updated.held_per_dof > (CLOSED if own else UNEXPLAINED) or bool(raised)
+    elif own and (refusal := unequal_levels(thin, updated)):
+        reasons.append(f"{' and '.join(one.effect.name for one in own)} comes nearest, but {refusal}: not named")
+        own, updated, refused_by_level = [], base, True
+    reasons += _beyond(found, updated, own)
+    residual_left = (updated.held_per_dof > (CLOSED if own else UNEXPLAINED) or bool(raised) or refused_by_level
+                     or found.beaten is not None)
     effects = [*_table_effects(found, updated, own), *signal]
     if effects:
         verdict: Verdict = "partly explained" if residual_left else "explained"
@@ -73,6 +84,32 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
     ties = [(one.name, other) for one in effects for other in one.indistinguishable_from]
     return Judgement(verdict, tuple(effects), updated, _considered(found, updated), tuple(reasons),
                      _next(ties, found, verdict))
+
+
+def _beyond(found: Found, updated: Refit, own: Sequence[ActiveEffect]) -> list[str]:
+    """What the gap behaves like where the library has no name for it, or has one that is no more than as good."""
+    if (rival := found.beaten) is not None:
+        nearest = " and ".join(one.effect.name for one in effects_of(rival.against.model))
+        return [f"it behaves most like {rival.words}, {_amount(rival)}; the library has no name for that, and "
+                f"{nearest}, which comes nearest, leaves {rival.against.held_per_dof:.3g} times the noise's power, "
+                f"this {rival.refit.held_per_dof:.3g}"]
+    if own:
+        return [f"{rival.words}, {_amount(rival)}, for which the library has no name, explains the data as well"
+                for rival in _equal(found, updated)]
+    return []
+
+
+def _equal(found: Found, updated: Refit) -> list[Rival]:
+    """Competitors that are as good as what is named."""
+    return [one for one in found.rivals if one.left < 1 - RIVAL and set(one.against.labels) == set(updated.labels)]
+
+
+def _amount(rival: Rival) -> str:
+    """Parameters of a competitor in words."""
+    last = rival.refit.model.effects[-1]
+    reported = rival.refit.reported(last, max(rival.refit.fit.chi2_per_dof, 1.0))
+    return ", ".join(f"{name} {one.value:.3g} +- {one.std:.1g} {one.unit}".rstrip(" 1") for name, one in
+                     sorted(reported.items(), key=lambda item: -abs(item[1].value) / max(item[1].std, 1e-300))[:2])
 
 
 def effects_of(model: TableModel) -> list[ActiveEffect]:
@@ -102,6 +139,49 @@ def refused(thin: Sequence[SpectralBlock], base: Refit, updated: Refit) -> str:
         if all(halves) and (why := _disagree(updated, halves, what)):
             return why
     return ""
+
+
+def unequal_levels(thin: Sequence[SpectralBlock], updated: Refit) -> str:
+    """Why a linear effect is none: its strength is another one at another level; empty where it is the same.
+
+    Each level's own strength is tested to first order against one for all (Rao's score), all other parameters free.
+    """
+    model = updated.model
+    levels = {block.name: model.motion[block.name].level_V for block in thin if block.name in model.motion}
+    groups = _levels(list(levels.values()))
+    if len(groups) < 2 or len(levels) < len(thin):
+        return ""
+    score = Score(model, thin)
+    misfit = max(1.0, score.chi2 / score.dof)
+    for one in effects_of(model):
+        strength = [j for j, p in enumerate(one.parameters) if p.linear]
+        if one.effect.nonlinear or len(strength) != 1:
+            continue
+        row = model.names.index(one.names[strength[0]]) if one.names[strength[0]] in model.names else None
+        if row is None:
+            continue
+        dY = [model.answer(part.block, part.body).dY[row:row + 1] for part in score.parts]
+        A = np.concatenate([score.directions([d * (levels[b.name] in group) for d, b in zip(dY, thin, strict=True)])
+                            for group in groups[1:]])
+        took = score.reduction(A)
+        of_level = np.concatenate([[0.0], took.coefficients])
+        size = abs(one.values[strength[0]] - one.parameters[strength[0]].none)
+        p = float(stats.chi2.sf(took.chi2 / misfit, max(took.rank, 1)))
+        if p < UNEQUAL and np.ptp(of_level) > UNEQUAL_SHARE * size:
+            return (f"its {one.parameters[strength[0]].name} differs by {np.ptp(of_level) / size:.0%} of its strength "
+                    f"between the records' levels (by chance {p:.0e})")
+    return ""
+
+
+def _levels(levels: Sequence[float]) -> list[list[float]]:
+    """Levels that are the same within SAME_LEVEL, together."""
+    groups: list[list[float]] = []
+    for level in sorted(set(levels)):
+        if groups and level <= SAME_LEVEL * groups[-1][0]:
+            groups[-1].append(level)
+        else:
+            groups.append([level])
+    return groups
 
 
 def _disagree(updated: Refit, halves: tuple[list[SpectralBlock], list[SpectralBlock]], what: str) -> str:
@@ -141,6 +221,7 @@ def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect]) -> lis
         rivals = [r for stage in found.pool for r in stage
                   if others <= set(r.labels) and len(r.labels) == len(updated.labels) and not r.implausible()]
         p = probabilities(rivals) if rivals else np.ones(0)
+        unnamed = min((r.left for r in _equal(found, updated)), default=1.0)
         by_name: dict[tuple[str, str], float] = {}
         for rival, share in zip(rivals, p, strict=True):
             last = next(e for e in rival.model.effects if e.label not in others)
@@ -149,7 +230,7 @@ def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect]) -> lis
         key = (one.effect.name, location(one.place))
         ties = tuple(sorted({name for (name, _), share in by_name.items() if share >= RIVAL and name != key[0]}))
         made.append(NamedEffect(*key, one.effect.title, updated.reported(one, misfit),
-                                min(by_name.get(key, 1.0), MOST_SURE), ties,
+                                min(by_name.get(key, 1.0) * unnamed, MOST_SURE), ties,
                                 _gain(found, updated), one.label))
     return made
 

@@ -28,6 +28,8 @@ class RecordMotion:
     before : samples of the record before the block's first one, held in all arrays; cut off by `spectrum`.
     large_force, turned_force, turned_reading : (samples, 6), (samples, 6) N and N m, (samples, n_y) m/s^2: second-order
         terms of large rotations (`effects.large_motion`), empty where they were not asked for.
+    actuators, sensors : names of the columns of volts and y. y : (samples, n_y) measured, empty where not every sensor
+        of the model was.
     """
 
     name: str
@@ -45,6 +47,9 @@ class RecordMotion:
     large_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     turned_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     turned_reading: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    actuators: tuple[str, ...] = ()
+    sensors: tuple[str, ...] = ()
+    y: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     _spectra: dict[tuple, np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property

@@ -50,16 +50,17 @@ def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = No
     ends = [(one.header.start_s, one.header.start_s + one.header.duration_s) for one in clock]
     campaign_s = (min(start for start, _ in ends), max(end for _, end in ends))
     linear = linear_part(model)
-    known: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    known: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     found = {}
     for record in campaign.records:
         source, begin, stop = origin(record)
         if id(source) not in known:
-            known[id(source)] = _volts_and_deflection(source.load(), linear)
-        volts, deflection = known[id(source)]
+            known[id(source)] = _in_time(source.load(), linear)
+        volts, deflection, y = known[id(source)]
         h = record.header
         found[h.name] = RecordMotion(h.name, h.sample_rate_Hz, h.start_s, campaign_s, volts[:stop], deflection[:stop],
-                                     *mount_rows(model), h.level_V, begin)
+                                     *mount_rows(model), h.level_V, begin, actuators=model.actuators,
+                                     sensors=model.sensors.names, y=y[:stop])
     return found
 
 
@@ -87,7 +88,8 @@ def limited_inputs(model: TableModel, record: Record) -> tuple[np.ndarray, np.nd
     return np.clip(u, -limit, limit), floor
 
 
-def _volts_and_deflection(record: Record, linear: TableModel) -> tuple[np.ndarray, np.ndarray]:
+def _in_time(record: Record, linear: TableModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Volts (samples, n_u), deflection (samples, n_g), and y (samples, n_y) where all of it was measured."""
     h = record.header
     u, floor = limited_inputs(linear, record)
     lines = line_response(linear, h.samples, h.sample_rate_Hz)
@@ -95,11 +97,13 @@ def _volts_and_deflection(record: Record, linear: TableModel) -> tuple[np.ndarra
     deflection = lines.in_time(lines.deflection(x, floor))
     rows = [h.y_names.index(name) for name in linear.sensors.names if name in h.y_names]
     if not rows or not deflection.size:  # nothing measured, or a rig without mounts of their own
-        return u, deflection
+        return u, deflection, np.zeros((0, 0))
     seen = np.array([name in h.y_names for name in linear.sensors.names])
     left = record.y[:, rows] - lines.in_time(lines.sensed(x, u))[:, seen]
     left = left - left.mean(0)
-    return u, deflection + _unmodelled(left, lines, seen) if np.any(left) else deflection
+    if np.any(left):
+        deflection = deflection + _unmodelled(left, lines, seen)
+    return u, deflection, record.y[:, rows] if np.all(seen) else np.zeros((0, 0))
 
 
 def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.ndarray:

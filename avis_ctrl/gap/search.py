@@ -3,17 +3,23 @@
 A stage scores every effect at every place against the present model, refits the promising ones together with all
 parameters of the rig, and keeps the few best as parents of the next stage: two effects that hide each other are found
 as a pair. The shortest chain that brings the held-out residual to the noise is taken.
+
+What the library has no name for (`effects.beyond`) is scored and refitted beside it, in places of its own, so that no
+name loses its place. A competitor that explains the data decisively better than an effect takes that name away.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 from scipy import stats
 
 from avis_ctrl.gap.data import thinned
 from avis_ctrl.gap.effects.base import Effect, Seed, library
+from avis_ctrl.gap.effects.beyond import beyond
 from avis_ctrl.gap.refit import Refit, try_refit
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
@@ -44,6 +50,57 @@ TAKES = 0.8
 HOPELESS = 6.0
 # A name is refitted, at its best place, where its score is at least this share of the best one's.
 SHARE_OF_BEST = 0.02
+# Competitors from beyond the library: coarse refits, and refits to more lines, in the place of each effect.
+OUTSIDE_REFITS, OUTSIDE_PROMOTED = 3, 1
+# One is tried where its score is at least this share of the best one's of the library.
+OUTSIDE_SHARE = 0.3
+# How many times as probable as one of them an effect of the library is beforehand, and the probability at which its
+# name is given up.
+PRIOR, GIVEN_UP = 10.0, 0.05
+# Share of what the library's best leaves over the noise below which a competitor counts as the whole of the gap.
+OF_THE_REST = 0.03
+# The effect that stays of a pair is the same with the competitor within so many deviations, or this share.
+HOLDS_STD, HOLDS = 4.0, 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """A competitor from beyond the library.
+
+    refit : with it in the place of what `against` has. words : what it is.
+    """
+
+    refit: Refit
+    against: Refit
+    words: str
+
+    @property
+    def odds(self) -> float:
+        """-2 log of how many times as probable as the effects it is held against, beforehand and by the data.
+
+        By chi2 and by the criterion, whichever is the worse for the competitor: an effect of the library must not
+        lose its name to one that fits no better because it has a parameter that this table makes no use of.
+        """
+        new, old = self.refit, self.against
+        misfit = max(1.0, min(new.held_per_dof, old.held_per_dof))
+        fall = min(old.criterion - new.criterion, old.chi2_fit + old.chi2_held - new.chi2_fit - new.chi2_held)
+        return 2 * math.log(PRIOR) - fall / misfit
+
+    @property
+    def left(self) -> float:
+        """Probability of the effects that it is held against."""
+        return 1 / (1 + math.exp(-min(max(self.odds, -1400.0), 1400.0) / 2))
+
+    @property
+    def wins(self) -> bool:
+        """Hardly anything is left of the probability of the others, and the held-out data by themselves say so."""
+        return self.left < GIVEN_UP and self.refit.chi2_held < self.against.chi2_held
+
+    @property
+    def closes(self) -> bool:
+        """It leaves noise, or next to nothing of what the others leave: no need to look for a pair."""
+        excess = self.refit.held_per_dof - 1.0
+        return self.refit.held_per_dof <= CLOSED or excess < OF_THE_REST * (self.against.held_per_dof - 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +122,15 @@ class Found:
 
     chain : refits from the re-identified model to the last accepted one. pool : every refit, by stage.
     reached_noise : the last one leaves noise. passed_over : refits to few lines that were too far behind to go on.
+    rivals : from beyond the library. beaten : the one that took names away from the chain, if any did.
     """
 
     chain: tuple[Refit, ...]
     pool: tuple[tuple[Refit, ...], ...]
     reached_noise: bool
     passed_over: tuple[Refit, ...] = ()
+    rivals: tuple[Rival, ...] = ()
+    beaten: Rival | None = None
 
     @property
     def best(self) -> Refit:
@@ -125,20 +185,19 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
     fitted, held_out : thinned blocks with noise. begin : a chain from base that is to be extended only.
     """
     known = list(library().values()) if effects is None else list(effects)
+    data = _Data(fitted, held_out, [thinned(block, COARSE_LINES, seed=1) for block in fitted], progress)
     best = begin or (base,)
     parents = [best]
     pool: list[tuple[Refit, ...]] = []
     passed_over: list[Refit] = []
-    few = [thinned(block, COARSE_LINES, seed=1) for block in fitted]
+    rivals: list[Rival] = []
     for depth in range(len(best), LONGEST + 1):
         rough: list[tuple[Refit, ...]] = []
+        worth = 0.0
         for chain in parents:
             scored = candidates(Score(chain[-1].model, fitted), known)
-            for one in shortlist(scored, REFITS if depth == 1 else REFITS_LATER):
-                progress(f"{_ordinal(depth)} effect: {_words(chain[-1], one.effect)}?")
-                found = _coarse(chain[-1].model.with_effect(one.effect), one.effect, few, held_out)
-                if found is not None:
-                    rough.append((*chain, found))
+            worth = max([worth, *(one.worth for one in scored[:1])])
+            rough += _rough(chain, shortlist(scored, REFITS if depth == 1 else REFITS_LATER), data, depth)
         made, left = _promoted(_distinct(rough), depth, fitted, held_out, progress)
         passed_over += left
         pool.append(tuple(chain[-1] for chain in made))
@@ -147,11 +206,87 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
             best = plausible[0]
         elif depth > 1 or not plausible:
             break
+        if depth == 1:
+            rivals += _rivals(base, plausible[0][-1], data, OUTSIDE_SHARE * worth)
+            if rivals and rivals[-1].wins and rivals[-1].closes:
+                return Found((base,), tuple(pool), False, tuple(passed_over), tuple(rivals), rivals[-1])
         if best[-1].held_per_dof <= CLOSED:
             break
         near = HOPELESS * plausible[0][-1].held_per_dof
         parents = [chain for chain in plausible[:PARENTS] if chain[-1].held_per_dof < near]
-    return Found(best, tuple(pool), best[-1].held_per_dof <= NOISE, tuple(passed_over))
+    found = Found(best, tuple(pool), best[-1].held_per_dof <= NOISE, tuple(passed_over), tuple(rivals))
+    return _contested(found, data)
+
+
+@dataclass(frozen=True, eq=False)
+class _Data:
+    """Blocks that are fitted, held out, and fitted on few lines."""
+
+    fitted: Sequence[SpectralBlock]
+    held_out: Sequence[SpectralBlock]
+    few: Sequence[SpectralBlock]
+    progress: Progress
+
+
+def _rough(chain: tuple[Refit, ...], chosen: Sequence[Candidate], data: _Data, depth: int) -> list[tuple[Refit, ...]]:
+    """Coarse refits of what a shortlist holds."""
+    made = []
+    for one in chosen:
+        data.progress(f"{_ordinal(depth)} effect: {_words(chain[-1], one.effect)}?")
+        found = _coarse(chain[-1].model.with_effect(one.effect), one.effect, data.few, data.held_out)
+        if found is not None:
+            made.append((*chain, found))
+    return made
+
+
+def _rivals(parent: Refit, against: Refit, data: _Data, least: float) -> list[Rival]:
+    """The best competitor from beyond the library in the place of the effects that `against` has beyond `parent`."""
+    scored = [one for one in candidates(Score(parent.model, data.fitted), list(beyond().values())) if one.worth > least]
+    rough: list[Refit] = []
+    for one in shortlist(scored, OUTSIDE_REFITS):
+        data.progress(f"beyond the library: {one.effect.effect.title}?")
+        found = _coarse(parent.model.with_effect(one.effect), one.effect, data.few, data.held_out)
+        if found is not None:
+            rough.append(found)
+    made = []
+    for coarse in sorted(rough, key=lambda r: r.chi2_fit + r.chi2_held)[:OUTSIDE_PROMOTED]:
+        if coarse.held_per_dof > HOPELESS * against.held_per_dof:
+            continue
+        if (found := try_refit(coarse.model, data.fitted, data.held_out, ITERATIONS[0])) is not None:
+            last = found.model.effects[-1]
+            made.append(Rival(found, against, last.effect.said(last.place, last.by_name)))
+    return made
+
+
+def _contested(found: Found, data: _Data) -> Found:
+    """The chain without names that a competitor takes away."""
+    chain = found.chain
+    for one in found.rivals if len(chain) > 1 else ():
+        alone = replace(one, against=chain[-1])
+        if alone.wins:
+            return replace(found, chain=chain[:1], reached_noise=False, beaten=alone)
+    if len(chain) < 3 or chain[-1].held_per_dof > CLOSED:
+        return found
+    # A pair: each of its effects may stand for something else.
+    first, second = (one.label for one in chain[-1].model.effects[-2:])
+    for kept, dropped in ((first, second), (second, first)):
+        parent = (chain[1] if kept == first else
+                  try_refit(chain[-1].model.without(dropped), data.fitted, data.held_out, ITERATIONS[1]))
+        for one in _rivals(parent, chain[-1], data, 0.0) if parent is not None else ():
+            found = replace(found, rivals=(*found.rivals, one))
+            if one.wins and parent is not None:
+                stays = _same(parent, one.refit, kept)
+                return replace(found, chain=(chain[0], parent) if stays else chain[:1], reached_noise=False, beaten=one)
+    return found
+
+
+def _same(one: Refit, other: Refit, label: str) -> bool:
+    """Whether an effect has the same parameters in two refits: within a seventh of its size, or their deviations."""
+    a, b = (next(e for e in r.model.effects if e.label == label) for r in (one, other))
+    std = np.sqrt([np.maximum(np.diag(r.covariance_of(e)), 0.0) * max(r.fit.chi2_per_dof, 1.0)
+                   for r, e in ((one, a), (other, b))]).max(axis=0)
+    return all(abs(x - y) <= max(HOLDS_STD * s, HOLDS * abs(x - p.none))
+               for x, y, s, p in zip(a.values, b.values, std, a.parameters, strict=True) if p.linear)
 
 
 def _coarse(model: TableModel, effect: ActiveEffect, few: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock]

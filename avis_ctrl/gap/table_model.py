@@ -49,12 +49,13 @@ class ActiveEffect:
 
 @dataclass(frozen=True, eq=False)
 class Acting:
-    """What acts on the table: U (n, n_u + 3 [+ 12], m), internal force (n, 6, m), and displacement (n, n_y, m) that the
-    sensors read beside the payload's own."""
+    """What acts on the table: U (n, n_u + 3 [+ 12], m), internal force (n, 6, m), displacement (n, n_y, m) that the
+    sensors read beside the payload's own, and what their outputs hold in addition (n, n_y, m)."""
 
     U: np.ndarray
     force: np.ndarray | None = None
     reading: np.ndarray | None = None
+    output: np.ndarray | None = None
 
 
 def active(effect: Effect, model: TableModel, place: str, values: Sequence[float] | None = None) -> ActiveEffect:
@@ -247,11 +248,12 @@ class TableModel:
                              field=f"block {block.name}")
         total: np.ndarray | None = None
         seen: np.ndarray | None = None
+        output: np.ndarray | None = None
         for one in self.effects:
-            volts = one.effect.volts(record, one.place, one.by_name)
+            volts = one.effect.volts_spectrum(record, one.place, one.by_name, block.omega)
             if volts is not None:
                 U = U.copy()
-                U[:, :len(self.actuators), 0] = record.spectrum(volts, block.omega)
+                U[:, :len(self.actuators), 0] = volts
             force = one.effect.force_spectrum(record, one.place, one.by_name, block.omega)
             if force is not None:
                 total = force[:, :, None] if total is None else total + force[:, :, None]
@@ -259,7 +261,10 @@ class TableModel:
             if reading is not None:
                 moved = -reading[:, :, None] / (block.omega ** 2)[:, None, None]
                 seen = moved if seen is None else seen + moved
-        return Acting(U, total, seen)
+            added = one.effect.output_spectrum(record, one.place, one.by_name, block.omega)
+            if added is not None:
+                output = added[:, :, None] if output is None else output + added[:, :, None]
+        return Acting(U, total, seen, output)
 
     def _by_effects(self, omega, U, block, made: Assembled, answer: _Answer, dY: np.ndarray) -> None:
         """Central differences of the whole response by the effects' parameters."""
@@ -308,7 +313,7 @@ class _Drive:
             total[:, :N_Q] += U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
         if force is not None:
             total[:, :N_Q] += force
-        self.total, self.reading = total, acting.reading
+        self.total, self.reading, self.output = total, acting.reading, acting.output
 
 
 def _gain(made: Assembled) -> np.ndarray:
@@ -322,7 +327,8 @@ def _read(made: Assembled, x: np.ndarray, drive: _Drive) -> np.ndarray:
     moved = made.rows @ x
     if drive.reading is not None:
         moved = moved + drive.reading
-    return _gain(made) * (made.ops.sense[:, :, None] * moved + alias)
+    Y = _gain(made) * (made.ops.sense[:, :, None] * moved + alias)
+    return Y if drive.output is None else Y + drive.output
 
 
 class _Answer:

@@ -84,6 +84,7 @@ class Effect(ABC):
     nonlinear : depends on amplitude or time; acts through `volts` or `force`.
     strength : the parameter to which `force` is in proportion, empty where to none.
     holds_states : has resonances of its own, whose states at the ends of a record are to be found with its transient.
+    outside : of `effects.beyond`, refitted beside the library and never named.
     """
 
     name: ClassVar[str]
@@ -93,6 +94,7 @@ class Effect(ABC):
     nonlinear: ClassVar[bool] = False
     strength: ClassVar[str] = ""
     holds_states: ClassVar[bool] = False
+    outside: ClassVar[bool] = False
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         """Where it can act on this table; empty where it cannot."""
@@ -120,6 +122,21 @@ class Effect(ABC):
 
     def reading(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
         """(samples, n_y) acceleration along the sensors beside the payload's own, None for none."""
+        return None
+
+    def said(self, place: str, values: Mapping[str, float]) -> str:
+        """In words, with its place, for a sentence."""
+        return f"{self.title} ({place})"
+
+    def volts_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
+                       ) -> np.ndarray | None:
+        """(n, n_u) of `volts` on lines omega."""
+        volts = self.volts(record, place, values)
+        return None if volts is None else record.spectrum(volts, omega)
+
+    def output_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
+                        ) -> np.ndarray | None:
+        """(n, n_y) that the outputs hold beside what the sensors read, in the unit of y; None for none."""
         return None
 
     def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray

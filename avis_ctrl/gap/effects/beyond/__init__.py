@@ -1,0 +1,46 @@
+"""Physics and faults that the library has no name for, refitted beside its candidates.
+
+The library is fixed; what can go wrong on a table is not. A fault without a name looks like some effect that has one:
+crosstalk of two sensors like a tilted sensor, a dead zone like a lower force constant. Of candidates from the library
+alone the nearest would win, and be named in the place of the fault. Here stands what an engineer would think of beside
+the library, in few parameters: where one of these explains the data better, nothing is named, and the verdict says in
+words what the table behaves like. None of them is ever named or part of a model that is handed out.
+
+They act as all effects do. Those at one sensor or one motor are many and simple: what they do to first order is known
+without the table's being assembled anew (`first_order`).
+"""
+
+from __future__ import annotations
+
+from avis_ctrl.gap.effects.beyond.base import Beyond
+from avis_ctrl.gap.effects.beyond.drives import (
+    DeadZone,
+    DriveAbsolute,
+    DriveCrosstalk,
+    DriveCubic,
+    DriveQuadratic,
+    ForceByDeflection,
+    ForceBySquare,
+    ForceDrift,
+    MotorLate,
+)
+from avis_ctrl.gap.effects.beyond.sensors import (
+    ClockRate,
+    SensorCrosstalk,
+    SensorCrosstalkOfAll,
+    SensorCubic,
+    SensorLate,
+    SensorQuadratic,
+    SensorResonance,
+)
+from avis_ctrl.gap.effects.beyond.table import Gyroscope, QuadraticDrag, QuadraticStiffness
+
+_BEYOND: tuple[type[Beyond], ...] = (
+    SensorCrosstalk, SensorCrosstalkOfAll, SensorLate, SensorResonance, SensorQuadratic, SensorCubic, ClockRate,
+    MotorLate, DriveCrosstalk, DriveQuadratic, DriveAbsolute, DriveCubic, DeadZone, ForceByDeflection, ForceBySquare,
+    ForceDrift, QuadraticStiffness, QuadraticDrag, Gyroscope)
+
+
+def beyond() -> dict[str, Beyond]:
+    """Every one of them by name."""
+    return {kind.name: kind() for kind in _BEYOND}

@@ -1,0 +1,92 @@
+"""What those beyond the library have in common: never named, and known to first order in closed form."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed
+
+if TYPE_CHECKING:
+    from avis_ctrl.gap.motion import RecordMotion
+    from avis_ctrl.gap.score import Part, Score
+    from avis_ctrl.gap.table_model import TableModel
+
+
+class Beyond(Effect):
+    """One that is never named."""
+
+    outside = True
+    looks_like = "what the library has no name for"
+
+
+class FirstOrder(Beyond):
+    """One of which `first_order` (k, n, n_y, m) is known: y by each linear parameter, on the lines of a block."""
+
+    @abstractmethod
+    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
+        """(k, n, n_y, m)."""
+
+    def seeds(self, score: Score, place: str) -> list[Seed]:
+        found = []
+        for point in self.starts(score.model, place):
+            took = score.reduction(score.directions([self.first_order(part, place, point) for part in score.parts]))
+            values = self._begin(score.model, place, point, took.coefficients)
+            found.append(Seed(tuple(float(v) for v in values), took.chi2, took.rank))
+        return sorted(found, key=lambda seed: -seed.chi2)
+
+    def _begin(self, model: TableModel, place: str, point: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+        parameters, values = self.parameters(model, place), np.array(point, float)
+        linear = [j for j, one in enumerate(parameters) if one.linear]
+        for j, c in zip(linear, coefficients, strict=True):
+            values[j] = np.clip(parameters[j].none + c, parameters[j].low, parameters[j].high)
+        return values
+
+
+def only(Y: np.ndarray, j: int, column: np.ndarray) -> np.ndarray:
+    """(1, n, n_y, m): column (n, m) in channel j, nothing in the others."""
+    out = np.zeros((1, *Y.shape), complex)
+    out[0, :, j] = column
+    return out
+
+
+def motion(part: Part) -> RecordMotion:
+    return part.model.motion[part.block.name]
+
+
+def by_volts(part: Part) -> np.ndarray:
+    """(n, n_y, n_u) y by the volts of each motor."""
+    kept = part.__dict__.get("by_volts")
+    if kept is None:
+        kept = part.answer.left @ (part.made.T * part.made.volts[:, None, :])
+        part.__dict__["by_volts"] = kept
+    return kept
+
+
+def pairs(names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(f"{a}/{b}" for a in names for b in names if a != b)
+
+
+def at(every: np.ndarray, names: tuple[str, ...], place: str) -> np.ndarray:
+    """(n, channels) of a place alone; all where it is none of the channels."""
+    return every * (np.array(names) == place) if place in names else every
+
+
+def timing(what: str) -> tuple[EffectParameter, ...]:
+    return (EffectParameter("delay_s", "s", f"delay of this {what} beside the others", 0.0, -0.05, 0.1, 1e-3),
+            EffectParameter("time_constant_s", "s", f"first-order lag of this {what} alone", 0.0, 0.0, 0.3, 1e-3))
+
+
+def late(s: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
+    return np.exp(-s * values["delay_s"]) / (1 + s * values["time_constant_s"])
+
+
+class Late(FirstOrder):
+    """exp(-s T)/(1 + s tau). To first order both are one."""
+
+    def _begin(self, model: TableModel, place: str, point: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+        late = float(np.sum(coefficients))
+        return np.array([late / 2, late / 2]) if late > 0 else np.array([late, 0.0])

@@ -1,0 +1,91 @@
+"""Physics of payload and mounts that the library has no name for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avis_ctrl.gap.effects.base import EffectParameter
+from avis_ctrl.gap.effects.beyond.base import Beyond
+from avis_ctrl.gap.effects.mounts import has_mounts, largest_rms
+from avis_ctrl.gap.operators import mount_geometry
+
+if TYPE_CHECKING:
+    from avis_ctrl.gap.motion import RecordMotion
+    from avis_ctrl.gap.operators import Operators
+    from avis_ctrl.gap.table_model import TableModel
+
+
+class QuadraticStiffness(Beyond):
+    """Force -k2 d^2 at every vertical mount: an air spring is stiffer in than out."""
+
+    name = "quadratic_stiffness"
+    title = "mounts of unlike stiffness up and down"
+    nonlinear = True
+    strength = "k2_N_per_m2"
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("isolators z",) if has_mounts(model) else ()
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model)
+        return (EffectParameter("k2_N_per_m2", "N/m^2", "quadratic stiffness of each mount", 0.0, -1e4 * size,
+                                1e4 * size, size),)
+
+    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+        up = record.vertical
+        return -values["k2_N_per_m2"] * (record.deflection[:, up] ** 2 @ record.rows[up])
+
+    def said(self, place: str, values: Mapping[str, float]) -> str:
+        return "vertical mounts with a term in the square of their deflection"
+
+
+class QuadraticDrag(Beyond):
+    """Force -c |v| v at every mount along each axis: air, or oil that is pressed through an orifice."""
+
+    name = "quadratic_drag"
+    title = "drag in proportion to the square of velocity"
+    nonlinear = True
+    strength = "drag_Ns2_per_m2"
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("payload",) if has_mounts(model) else ()
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        size = 10.0 / max(largest_rms(model) * 10.0, 1e-9)
+        return (EffectParameter("drag_Ns2_per_m2", "N s^2/m^2", "of the payload", 0.0, -1e4 * size, 1e4 * size, size),)
+
+    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+        v = np.gradient(record.deflection @ np.linalg.pinv(record.rows).T, 1 / record.sample_rate_Hz, axis=0)
+        force = np.zeros_like(v)
+        force[:, :3] = -values["drag_Ns2_per_m2"] * np.linalg.norm(v[:, :3], axis=1, keepdims=True) * v[:, :3]
+        return force
+
+    def said(self, place: str, values: Mapping[str, float]) -> str:
+        return "drag on the payload in proportion to the square of velocity"
+
+
+class Gyroscope(Beyond):
+    """Moment h x w of a rotor with angular momentum h on the payload: s W, W skew-symmetric, on the rotations."""
+
+    name = "gyroscope"
+    title = "a rotor on the payload"
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("payload",)
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        return tuple(EffectParameter(f"h{axis}_Nms", "N m s", f"angular momentum about {axis}", 0.0, -1e6, 1e6, 1.0,
+                                     group="h") for axis in "xyz")
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        x, y, z = (values[f"h{axis}_Nms"] for axis in "xyz")
+        W = np.zeros((6, 6))
+        W[3:, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        Z = ops.s[:, None, None] * W
+        ops.extra = Z if ops.extra is None else ops.extra + Z
+
+    def said(self, place: str, values: Mapping[str, float]) -> str:
+        return "a rotor on the payload (moments at right angles to its tilting)"
