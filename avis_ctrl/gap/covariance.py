@@ -13,7 +13,8 @@ corrections of Bell and McCaffrey, Survey Methodology 28, 2002).
 
 What a law that is not quite the table's leaves of a band is alike in all records, what depends on level or time in one
 of them only. So two ways to cluster are tried, the bands of all records and those of each, and of each parameter the
-larger variance counts. Whole records would be clusters, too; there are three or four, too few to tell a variance.
+larger variance counts. Whole records are too few to be clusters; where their own estimates differ by more than noise
+explains, the variance between them is added.
 
 What no scatter shows is an error that all clusters share: a misfit that looks like a change of the parameter itself.
 """
@@ -23,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import stats
 
 from avis_ctrl.gap.score import Part
 from avis_ctrl.gap.table_model import TableModel
@@ -34,6 +36,10 @@ BANDS_PER_OCTAVE = 3
 ROUND_OFF = 1e-12
 # Share of a direction that must be determined without a cluster, or that cluster alone says what it is.
 ALONE = 1e-6
+# Records whose estimates differ less than chance does in all but this share of cases are of one mind.
+CHANCE = 0.01
+# Share of the information on a parameter that records must hold each by itself for their estimates to be compared.
+SEPARATE = 0.25
 
 
 def clustered(model: TableModel, blocks: Sequence[SpectralBlock], information: Information) -> np.ndarray:
@@ -43,8 +49,10 @@ def clustered(model: TableModel, blocks: Sequence[SpectralBlock], information: I
     """
     J, e, record, band = _residuals(model, blocks)
     J *= information.scale[:, None]
-    made = [sandwich(J, e, cluster) for cluster in (record * (band.max() + 1) + band, band)]
-    return widest(made) * np.outer(information.scale, information.scale)
+    C = widest([sandwich(J, e, cluster) for cluster in (record * (band.max() + 1) + band, band)])
+    own = np.diag(C)
+    wider = np.sqrt(1 + np.divide(between(J, e, record), own, out=np.zeros_like(own), where=own > 0))
+    return C * np.outer(wider, wider) * np.outer(information.scale, information.scale)
 
 
 def directions(relative: np.ndarray) -> np.ndarray:
@@ -86,6 +94,37 @@ def sandwich(J: np.ndarray, e: np.ndarray, cluster: np.ndarray) -> np.ndarray:
         a = along @ (raised * (along.T @ (own @ e[cluster == one])))
         S += np.outer(a, a)
     return root @ S @ root.T
+
+
+def between(J: np.ndarray, e: np.ndarray, record: np.ndarray) -> np.ndarray:
+    """(n_p,) variance of each parameter between records, beyond what noise lets single records differ.
+
+    What depends on level makes every record ask for another value, and a fit follows the loudest. The estimate of a
+    record alone is one step from the fit; of their spread about the mean, Q, what exceeds its expectation (DerSimonian
+    and Laird, Controlled Clinical Trials 7, 1986), where Q is significant at CHANCE. Zero for what only records
+    together determine, a drift for one.
+    """
+    root = directions(J @ J.T)
+    W = root.T @ J
+    estimates, variances = [], []
+    for one in np.unique(record):
+        own = W[:, record == one]
+        share, along = np.linalg.eigh(own @ own.T)
+        share = np.maximum(share, ROUND_OFF)
+        estimates.append(root @ (along / share) @ (along.T @ (own @ e[record == one])))
+        variances.append(np.sum((root @ along) ** 2 / share, axis=1))
+    dof = len(estimates) - 1
+    if dof < 1:
+        return np.zeros(len(J))
+    x, v = np.array(estimates), np.array(variances)
+    w = np.divide(1.0, v, out=np.zeros_like(v), where=v > 0)
+    total = np.maximum(w.sum(axis=0), np.finfo(float).tiny)
+    Q = np.sum(w * (x - (w * x).sum(axis=0) / total) ** 2, axis=0)
+    weight = total - np.sum(w ** 2, axis=0) / total
+    found = np.divide(Q - dof, weight, out=np.zeros_like(Q), where=weight > 0)
+    separate = total * np.sum(root ** 2, axis=1) > SEPARATE
+    differ = stats.chi2.sf(Q, dof) < CHANCE
+    return np.where(separate & differ, found, 0.0)
 
 
 def _residuals(model: TableModel, blocks: Sequence[SpectralBlock]

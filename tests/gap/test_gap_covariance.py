@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from test_score import MODEL, OMEGA, block, effect
 
-from avis_ctrl.gap.covariance import clustered, directions, sandwich, widest
+from avis_ctrl.gap.covariance import between, clustered, directions, sandwich, widest
 from avis_ctrl.gap.refit import refit, scattered
 from avis_ctrl.identification.information import Information
 
@@ -62,6 +62,35 @@ def test_intervals_cover_where_neighbours_err_together():
     promised, found = inside / draws
     assert np.all(promised < 0.6)
     assert np.all((found > 0.90) & (found < 0.98))
+
+
+def test_records_that_ask_for_other_values_count_by_their_spread():
+    """A slope that differs by 0.5 r.m.s. between eight records, one of them ten times as loud; and none that does."""
+    rng, draws = np.random.default_rng(6), 200
+    record = np.repeat(np.arange(8), 100)
+    x = rng.standard_normal(800) * np.where(record == 0, 10.0, 1.0)
+    found = []
+    for spread in (0.5, 0.0):
+        for _ in range(draws):
+            y = x * (1 + spread * rng.standard_normal(8))[record] + 0.3 * rng.standard_normal(800)
+            J = x[None] / 0.3
+            theta = float(x @ y / (x @ x))
+            found.append(between(J, (y - theta * x) / 0.3, record)[0])
+    assert np.mean(found[:draws]) == pytest.approx(0.25, rel=0.25)
+    assert np.mean(np.array(found[draws:]) > 0) < 0.04  # of one in a hundred
+
+
+def test_what_records_tell_together_only_is_no_difference_between_them():
+    """A trend over eight records, each with an offset in common: within one the two are all but the same."""
+    rng = np.random.default_rng(8)
+    record = np.repeat(np.arange(8), 100)
+    within = np.tile(np.linspace(-1, 1, 100), 8)
+    J = np.array([np.ones(800), record + 1e-3 * within])
+    offset, slope = rng.standard_normal((2, 8))
+    e = projector(J) @ (rng.standard_normal(800) + offset[record] + slope[record] * within)
+    found = between(J, e, record)
+    assert found[1] == 0.0
+    assert between(J[:1], e, record)[0] > 0.1  # the offset alone is told by each
 
 
 @given(st.integers(0, 10 ** 6))

@@ -307,10 +307,13 @@ class StiffnessDrift(Effect):
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         found = super().reported(model, place, values, covariance)
-        # The model's change is of the stiffness half-way; a person's, of what it was at the beginning.
-        half_way = found["relative_change"]
-        begin = 1 - half_way.value / 2
-        one = Reported(half_way.value / begin, half_way.std / begin ** 2, half_way.unit)
+        # The model's change is of the stiffness that the record's motion was found with; a person's is of what the
+        # table's stiffness was at the beginning.
+        own = found["relative_change"]
+        known = float(np.sum(mount_geometry(model.effective.rig).stiffness))
+        ratio = next((float(np.sum(one.stiffness)) / known for one in model.motion.values()), 1.0)
+        begin = 1 - own.value * ratio / 2
+        one = Reported(own.value * ratio / begin, own.std * ratio / begin ** 2, own.unit)
         found["relative_change"] = one
         spans = [record.campaign_s for record in model.motion.values()]
         if spans:
