@@ -18,8 +18,10 @@ import numpy as np
 from scipy.optimize import nnls
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.mounts import REFERENCE_Hz, surge_omega
-from avis_ctrl.gap.effects.payload import place_of, shape_rows
+from avis_ctrl.gap.effects.attached import elements
+from avis_ctrl.gap.effects.flexible_mode import modes, shape_rows
+from avis_ctrl.gap.effects.mounts import LEVELED, REFERENCE_Hz, surge_omega
+from avis_ctrl.gap.effects.payload import place_of, tie
 from avis_ctrl.gap.operators import MountGeometry, mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.response import Matrices
@@ -219,13 +221,14 @@ def _surge(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
 
 
 def _leveling(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
-    G = table.rows(table.mounts.payload[table.mounts.along("z")][:3])
-    poles = [0.0]
-    size = values["integral_gain_N_per_ms"]
+    """Payload against chassis, as the valves feel it."""
+    own = np.flatnonzero(table.mounts.along("z"))[:LEVELED]
+    G, k = table.G[own], table.mounts.stiffness[own]
+    poles, size = [0.0], 2 * np.pi * values["rate_Hz"]
     if "valve_corner_Hz" in values:
         corner = 2 * np.pi * values["valve_corner_Hz"]
         poles, size = [0.0, -corner], size * corner
-    return impedance(table, G.T @ G, cascade([], poles, size))
+    return impedance(table, G.T @ (k[:, None] * G), cascade([], poles, size))
 
 
 def _friction(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
@@ -241,35 +244,39 @@ def _drift(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
 
 
 def _cable(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
-    K = np.diag([values[f"k_{axis}_N_per_m"] for axis in "xyz"])
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        K[i, j] = K[j, i] = values.get(f"k_{'xyz'[i]}{'xyz'[j]}_N_per_m", 0.0)
+    K = tie(values)
     G = table.rows(point_map(place_of(values)))
     return _static(table, G.T @ K @ G, values["damping_s"] * G.T @ K @ G)
 
 
 def _oscillator(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
-    """m s (2 z w s + w^2)/(s^2 + 2 z w s + w^2) on the velocity of its place."""
-    G = table.rows(point_map(place_of(values)))[["xyz".index(axis) for axis in place.partition("/")[2]]]
-    w, zeta, m = 2 * np.pi * values["frequency_Hz"], values["damping"], values["mass_kg"]
-    poles = np.roots([1.0, 2 * zeta * w, w ** 2])
-    h = cascade([0.0, -w / (2 * zeta)], poles, 2 * zeta * w * m)
-    return impedance(table, G.T @ G, h, "v")
+    """m s (2 z w s + w^2)/(s^2 + 2 z w s + w^2) on the velocity of its place, along each of its directions."""
+    total, zeta = gain(np.zeros(table.shape)), values["damping"]
+    for row, mass, frequency in elements(place, values):
+        w, g = 2 * np.pi * frequency, table.rows(row)
+        poles = np.roots([1.0, 2 * zeta * w, w ** 2])
+        h = cascade([0.0, -w / (2 * zeta)], poles, 2 * zeta * w * mass)
+        total = total + impedance(table, g.T @ g, h, "v")
+    return _plain(total)
 
 
 def _flexible(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
-    """Mode coordinate e and its velocity; the mounts and motors push it, and it deflects them."""
-    shape = np.array(list(values.values())[2:])
+    """Coordinates e of the modes and their velocities; the mounts and motors push them, and they deflect the mounts."""
+    own = [mode for mode in modes(values) if np.any(mode[2])]
+    if not own:
+        return gain(np.zeros(table.shape))
+    shape = np.array([mode[2] for mode in own])  # (modes, n_g)
+    w, zeta = (np.array([mode[k] for mode in own]) * (2 * np.pi if k == 0 else 1.0) for k in (0, 1))
     at_actuators, at_sensors = shape_rows(table.model.rig, table.model.actuators, table.model.sensors.names)
-    w, zeta = 2 * np.pi * values["frequency_Hz"], values["damping"]
-    G, k, c = table.G, table.mounts.stiffness, table.mounts.damping
+    G, k, c, n = table.G, table.mounts.stiffness, table.mounts.damping, len(own)
     constants = np.linalg.norm(table.matrices.T[:3], axis=0)
-    A = np.array([[0.0, 1.0], [-w ** 2 - shape @ (k * shape), -2 * zeta * w - shape @ (c * shape)]])
-    B, C = np.zeros((2, table.shape[1])), np.zeros((table.shape[0], 2))
-    B[1, table.r], B[1, table.v], B[1, table.v_c] = -(shape * k) @ G, -(shape * c) @ G, (shape * c) @ G
-    B[1, table.u] = (at_actuators @ shape) * constants
-    C[:table.n, 0], C[:table.n, 1] = -G.T @ (k * shape), -G.T @ (c * shape)
-    C[table.n:, 1] = at_sensors @ shape
+    A = np.block([[np.zeros((n, n)), np.eye(n)],
+                  [-np.diag(w ** 2) - (shape * k) @ shape.T, -np.diag(2 * zeta * w) - (shape * c) @ shape.T]])
+    B, C = np.zeros((2 * n, table.shape[1])), np.zeros((table.shape[0], 2 * n))
+    B[n:, table.r], B[n:, table.v], B[n:, table.v_c] = -(shape * k) @ G, -(shape * c) @ G, (shape * c) @ G
+    B[n:, table.u] = (shape @ at_actuators.T) * constants
+    C[:table.n, :n], C[:table.n, n:] = -G.T @ (shape * k).T, -G.T @ (shape * c).T
+    C[table.n:, n:] = at_sensors @ shape.T
     return StateSpace(A, B, C, np.zeros(table.shape))
 
 

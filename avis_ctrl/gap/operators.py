@@ -92,7 +92,8 @@ class Operators:
     extra, extra_floor : (n, 6, 6) and (n, 6, 3) N/m, dynamic stiffness on q, and force by floor displacement.
     rows : (1 or n, n_y, 6) displacement seen by each sensor. sense : (n, n_y) chain and s^p, without sensitivity.
     sensor_gain : (n_y,) factors. drive : (n, n_u) factors on the volts. delay_s, amplifier_corner_Hz : of the drives.
-    inner : (n, 6, m) forces on q by unit impulses on what an effect holds inside.
+    inner : (n, 6, m) forces on q by unit impulses on what an effect holds inside. decays : the same of states of first
+        order, of which an impulse is all there is.
     added : coordinates beside the six. recoil, follow : (n, 6, 6) B and (n, 6, 3) H_w, None for a stiff floor.
     """
 
@@ -117,6 +118,7 @@ class Operators:
     recoil: np.ndarray | None = None
     follow: np.ndarray | None = None
     inner: list[np.ndarray] = field(default_factory=list)
+    decays: list[np.ndarray] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         base = self.base

@@ -214,8 +214,9 @@ class TableModel:
             return np.zeros((len(omega), n_y, 0), complex)
         made = assemble(self.operators(omega))
         ops, F = made.ops, made.forces_of_states()
-        Y = (_gain(made) * ops.sense[:, :, None]) * (made.rows @ (made.inverse @ F))
-        return np.concatenate([Y, ops.s[:, None, None] * Y], axis=2)
+        seen = (_gain(made) * ops.sense[:, :, None]) * (made.rows @ made.inverse)
+        Y = seen @ F
+        return np.concatenate([Y, ops.s[:, None, None] * Y, *(seen[:, :, :N_Q] @ one for one in ops.decays)], axis=2)
 
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
         """As `ResponseModel.driven`: y by spectra of the inputs, and its derivative by the free parameters."""

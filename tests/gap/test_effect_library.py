@@ -344,12 +344,13 @@ MOVING, BLOCK = _moving()
 VALUES = {"geophone_corner": [4.8, 0.5], "sensor_gain": [1.05], "sensor_misalignment": [2.0, -3.0],
           "tilt_coupling": [9.8], "actuator_gain": [0.95], "actuator_lag": [2e-3], "loop_delay": [0.7e-3],
           "actuator_saturation": [1.0], "mount_relaxation": [0.3, 3.0], "structural_damping": [0.06],
-          "mount_surge": [30.0, 0.45, 0.02, 0.01, -0.02, 0.03], "leveling_loop": [1e4, 0.5],
+          "mount_surge": [30.0, 0.45, 0.02, 0.01, -0.02, 0.03], "leveling_loop": [0.04, 0.5],
           "cubic_stiffness": [1e13], "contact_friction": [3e3, 1e-5], "stiffness_drift": [0.03, 3.0],
           "base_compliance": [1000.0, 0.05, 9.0, 10.0, 14.0, 20.0, 25.0, 30.0, 0.4, 0.5, 0.6, -0.4, -0.1],
           "com_offset": [0.01, -0.02, 0.03],
-          "product_of_inertia": [2.0], "payload_flexible_mode": [30.0, 0.02, *np.linspace(-0.02, 0.03, 12)],
-          "attached_oscillator": [10.0, 12.0, 0.05, 0.3, 0.2, 0.1],
+          "product_of_inertia": [2.0], "payload_flexible_mode": [
+              x for f in (30.0, 42.0, 55.0) for x in (f, 0.02, *np.linspace(-0.02, f / 1000, 12))],
+          "attached_oscillator": [2.0, 1.0, -2.0, 12.0, 0.05, 0.3, 0.2, 0.1],
           "cable_stiffness": [500.0, 400.0, 300.0, 50.0, 40.0, 30.0, 1e-3, 0.3, 0.2, 0.1]}
 
 
@@ -357,6 +358,8 @@ def values_at(name, place):
     values, parameters = VALUES[name], OWN[name].parameters(MOVING, place)
     if name == "cable_stiffness" and place.endswith("axes"):
         values = [*values[:3], *values[6:]]
+    if name == "attached_oscillator" and place.endswith("axes"):
+        values = [10.0, 12.0, 9.0, 15.0, *values[4:]]
     return values[:len(parameters)]
 
 

@@ -120,15 +120,15 @@ def test_surge_keeps_the_static_stiffness_and_resonates_where_it_says():
 
 @pytest.mark.parametrize("valve", [None, 0.4])
 def test_leveling_integrates_the_deflection_of_three_mounts(valve):
-    gain = 3e4
-    values = [gain] if valve is None else [gain, valve]
+    rate = 0.1
+    values = [rate] if valve is None else [rate, valve]
     model = with_effect("leveling_loop", f"isolators 1-3 z/{'plain' if valve is None else 'lag'}", values)
     true = []
     for f in F:
         s, table = 2j * np.pi * f, Assembly(RIG).mounts()
-        law = gain / s / (1 + s / (2 * np.pi * valve) if valve else 1)
-        for G in table.maps[:3]:
-            table.spring(table.row(G[2]), law, floor=[0, 0, 1])
+        law = 2 * np.pi * rate / s / (1 + s / (2 * np.pi * valve) if valve else 1)
+        for G, k in zip(table.maps[:3], VERTICAL, strict=False):
+            table.spring(table.row(G[2]), k * law, floor=[0, 0, 1])
         true.append(table.response([f])[0])
     np.testing.assert_allclose(model.response(OMEGA), true, rtol=1e-9, atol=1e-20)
     # An integral undoes a static force on three mounts; the fourth alone cannot hold the vertical axis there.
@@ -137,7 +137,7 @@ def test_leveling_integrates_the_deflection_of_three_mounts(valve):
 
 def test_an_integrator_feeds_energy_in():
     """The one law of the library that is active: its loss is negative at every frequency."""
-    Z = added_stiffness("leveling_loop", "isolators 1-3 z/plain", [1e4], F)
+    Z = added_stiffness("leveling_loop", "isolators 1-3 z/plain", [0.04], F)
     assert np.all(np.linalg.eigvalsh((Z - np.conj(np.swapaxes(Z, 1, 2))) / 2j)[:, 0] < 0)
 
 

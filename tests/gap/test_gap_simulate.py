@@ -93,11 +93,11 @@ def relaxing(ratio, corner_Hz):
     return table
 
 
-def leveled(integral):
-    """The integral of the deflection pushes back at the first three mounts."""
+def leveled(rate_Hz):
+    """The integral of the deflection pushes back at the first three mounts, each as it is stiff."""
     table = Table(RIG)
-    for G in table.maps[:3]:
-        table.attach(G[2], [[0.0]], [[1.0, 0]], [0, 0, -integral])
+    for G, one in zip(table.maps[:3], RIG.isolators, strict=False):
+        table.attach(G[2], [[0.0]], [[1.0, 0]], [0, 0, -2 * np.pi * rate_Hz * one.stiffness[2]])
     return table
 
 
@@ -111,7 +111,7 @@ LINEAR = [
     ("attached_oscillator", "payload/z", [20.0, 12.0, 0.03, 0.3, -0.2],
      attached(20.0, 12.0, 0.03, [0.3, -0.2, 0.0], 2), {}),
     ("mount_relaxation", "isolators z", [0.8, 2.5], relaxing(0.8, 2.5), {}),
-    ("leveling_loop", "isolators 1-3 z/plain", [2e4], leveled(2e4), {}),
+    ("leveling_loop", "isolators 1-3 z/plain", [0.07], leveled(0.07), {}),
     ("actuator_lag", "actuators", [4e-3], lagging(4e-3), {}),
     ("loop_delay", "loop", [2.5e-3], Table(RIG), {"delay_substeps": round(3.5 * SUBSTEPS)}),
 ]

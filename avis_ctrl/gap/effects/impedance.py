@@ -55,11 +55,47 @@ def project(score: Score, dynamic: Callable[[np.ndarray], np.ndarray], key: Hash
     """
     if key is not None and key in score.kept:
         return score.kept[key]
-    A = score.directions([part.by_impedance(dynamic(part.s[:, 0, 0])) for part in score.parts])
+    A = unit_matrices(score, dynamic)
     found = A @ A.T, A @ score.e
     if key is not None:
         score.kept[key] = found
     return found
+
+
+def unit_matrices(score: Score, dynamic: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """(21, N): by each symmetric unit matrix times dynamic(s)."""
+    return score.directions([part.by_impedance(dynamic(part.s[:, 0, 0])) for part in score.parts])
+
+
+def peaks(score: Score, most: int = 5) -> tuple[float, ...]:
+    """Frequencies [Hz] at which the residual's power stands out most of its neighbourhood, strongest first.
+
+    A lightly damped resonance that the model lacks leaves its peak there, narrower than any grid.
+    """
+    if "peaks" in score.kept:
+        return score.kept["peaks"]
+    omega, power, start = [], [], 0
+    for part in score.parts:
+        n = len(part.block.omega)
+        e = score.e[start:start + 2 * part.block.Y.size].reshape(2, n, -1)
+        start += 2 * part.block.Y.size
+        omega.append(part.block.omega)
+        power.append(np.mean(e ** 2, axis=(0, 2)))
+    f, P = np.concatenate(omega) / (2 * np.pi), np.concatenate(power)
+    # Mean power in steps of 2 %, against the median about it.
+    step = np.floor(np.log(f) / 0.02).astype(int)
+    step -= step.min()
+    count = np.bincount(step)
+    seen = count > 0
+    mean = np.bincount(step, P)[seen] / count[seen]
+    centre = np.exp(np.bincount(step, P * np.log(f))[seen] / np.maximum(np.bincount(step, P)[seen], 1e-300))
+    about = np.array([np.median(mean[max(k - 10, 0):k + 11]) for k in range(len(mean))])
+    found: list[float] = []
+    for k in np.argsort(-mean / about):
+        if len(found) < most and mean[k] > 1.5 * about[k] and all(abs(np.log(centre[k] / one)) > 0.06 for one in found):
+            found.append(float(centre[k]))
+    score.kept["peaks"] = tuple(found)
+    return score.kept["peaks"]
 
 
 def recoils(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
@@ -77,6 +113,13 @@ def recoils(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.
 def residues(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> tuple[Reduction, np.ndarray]:
     """Best residues (n_y, n_u) of a mode of that receptance over all paths, displacement per newton, without any tie
     between them."""
+    A = paths(score, receptance)
+    took = reduction(A @ A.T, A @ score.e)
+    return took, took.coefficients.reshape(len(score.model.sensors.names), -1)
+
+
+def paths(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """(n_y n_u, N): by the residue of each path, displacement per newton."""
     columns = []
     for part in score.parts:
         ops, answer = part.made.ops, part.answer
@@ -87,6 +130,4 @@ def residues(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> tu
         for i in range(n_y):
             out[i, :, :, i] = seen[:, i, None] * np.moveaxis(force, 1, 0)
         columns.append(out.reshape(n_y * n_u, *answer.Y.shape))
-    A = score.directions(columns)
-    took = reduction(A @ A.T, A @ score.e)
-    return took, took.coefficients.reshape(n_y, n_u)
+    return score.directions(columns)

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 REFERENCE_Hz = 3.0
 # Where a resonance inside the mounts is looked for.
 SURGE_Hz = tuple(np.geomspace(8.0, 150.0, 28).tolist())
+# Mounts with a leveling valve: a fourth would be one too many to level a plane.
+LEVELED = 3
 
 
 def has_mounts(model: TableModel) -> bool:
@@ -50,6 +52,7 @@ class MountRelaxation(_OfMounts):
     title = "the vertical stiffness of the mounts rises with frequency (a second chamber, a Maxwell branch)"
     looks_like = "vertical resonances higher and more damped than low frequencies say"
     confusable = ("structural_damping", "leveling_loop", "attached_oscillator")
+    holds_states = True
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("stiffness_ratio", "1", "stiffness of the branch over that at rest", 0.0, 0.0, 20.0,
@@ -61,6 +64,8 @@ class MountRelaxation(_OfMounts):
         x = ops.s / (2 * np.pi * values["corner_Hz"])
         branch = values["stiffness_ratio"] * x / (1 + x)
         ops.stiffness_factor = ops.stiffness_factor + branch[:, None] * vertical(ops)
+        rows = mount_geometry(ops.base.rig).payload[vertical(ops)].T
+        ops.decays.append(rows / (ops.s + 2 * np.pi * values["corner_Hz"])[:, None, None])
 
 
 @register
@@ -155,32 +160,52 @@ def surge_omega(values: Mapping[str, float]) -> np.ndarray:
 
 @register
 class LevelingLoop(_OfMounts):
-    """Force -g integral of the deflection at the first three mounts, through a valve with a lag."""
+    """Every leveled mount k (1 + w/s), w = 2 pi rate, with a valve that lags k (1 + w/(s (1 + s tau))).
+
+    A valve lets air in at a rate by the height of the payload over the chassis; what air does to height, and so the
+    force by it, goes with the mount's own stiffness.
+    """
 
     name = "leveling_loop"
     title = "the leveling integrates the position of isolators 1-3"
     looks_like = "phase and gain change at the lowest frequencies, vertical and tilting channels only"
     confusable = ("mount_relaxation", "tilt_coupling", "cable_stiffness")
+    holds_states = True
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return ("isolators 1-3 z/plain", "isolators 1-3 z/lag") if has_mounts(model) else ()
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        k = float(np.mean(mount_geometry(model.rig).stiffness))
-        gain = EffectParameter("integral_gain_N_per_ms", "N/(m s)", "force by displacement and second", 0.0, 0.0,
-                               1e3 * k, 0.1 * k)
+        rate = EffectParameter("rate_Hz", "Hz", "of the integrator, over 2 pi", 0.0, 0.0, 100.0, 0.02)
         if place.endswith("plain"):
-            return (gain,)
-        return (gain, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, 0.01, 100.0, 1.0,
-                                      False, (0.1, 1.0)))
+            return (rate,)
+        return (rate, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, 0.01, 100.0, 1.0,
+                                      False, (0.1, 0.3, 1.0, 3.0)))
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        rows = mount_geometry(ops.base.rig).payload[vertical(ops)][:3]
-        Z = values["integral_gain_N_per_ms"] / ops.s
+        ratio = 2 * np.pi * values["rate_Hz"] / ops.s
         if "valve_corner_Hz" in values:
-            Z = Z / (1 + ops.s / (2 * np.pi * values["valve_corner_Hz"]))
-        Z = np.repeat(Z[:, None], 3, axis=1)
-        ops.add_impedance(Z, rows, Z)
+            ratio = ratio / (1 + ops.s / (2 * np.pi * values["valve_corner_Hz"]))
+        ops.stiffness_factor = ops.stiffness_factor + ratio[:, None] * leveled(ops)
+        # Each integrator starts with a force of its own, each valve with an opening.
+        rows = mount_geometry(ops.base.rig).payload[leveled(ops)].T
+        ops.decays.append(rows / ops.s[:, None, None])
+        if "valve_corner_Hz" in values:
+            ops.decays.append(rows / (ops.s + 2 * np.pi * values["valve_corner_Hz"])[:, None, None])
+
+    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+                 ) -> dict[str, Reported]:
+        """With the mean force by displacement and second over the leveled mounts, at their stiffness as fitted."""
+        found = super().reported(model, place, values, covariance)
+        rate, g = found["rate_Hz"], mount_geometry(model.rig)
+        by_rate = 2 * np.pi * float(np.mean(g.stiffness[leveled(model)]))
+        return {**found, "integral_gain_N_per_ms": Reported(by_rate * rate.value, by_rate * rate.std, "N/(m s)")}
+
+
+def leveled(model_or_ops) -> np.ndarray:
+    """(n_g,) which mount rows the leveling acts on: the first three vertical ones."""
+    up = vertical(model_or_ops)
+    return up & (np.cumsum(up) <= LEVELED)
 
 
 @register

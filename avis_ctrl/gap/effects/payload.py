@@ -1,18 +1,15 @@
-"""What a model may lack of the payload: where its mass is, what bends, what is attached or tied to it."""
+"""What a model may lack of the payload: where its mass is, and what ties it to the ground."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register
-from avis_ctrl.gap.effects.impedance import at_points, positions, project, residues
-from avis_ctrl.gap.effects.sensors import receptance, second_order
-from avis_ctrl.gap.operators import AddedCoordinate, mount_geometry
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Seed, register
+from avis_ctrl.gap.effects.impedance import at_points, positions, project
 from avis_ctrl.gap.score_algebra import reduction
 from avis_ctrl.rigs.rigid_body import point_map
 
@@ -69,84 +66,7 @@ class ProductOfInertia(Effect):
         return {name: model.rig.parameters()[name].value + values[f"{place}_kgm2"]}
 
 
-@register
-class PayloadFlexibleMode(Effect):
-    """A mode of the payload beside its rigid motion, mass-normalised shape over the mounts' points.
-
-    Motors and sensors sit in the isolators and move with these points. The mode's own coordinate e obeys
-    e'' + 2 z w e' + w^2 e = sum of shape times force, the forces of the mounts included.
-    """
-
-    name = "payload_flexible_mode"
-    title = "the payload bends: a mode beside its rigid motion"
-    looks_like = "a resonance above the suspension's, in rows and columns that share one shape"
-    confusable = ("attached_oscillator", "mount_surge", "base_compliance")
-    holds_states = True
-
-    def places(self, model: TableModel) -> tuple[str, ...]:
-        return ("payload",) if shape_points(model) is not None else ()
-
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        names = mount_geometry(model.rig).names
-        driven = np.any(shape_rows(model.rig, model.actuators, model.sensors.names)[0], axis=0)
-        grid = tuple(np.geomspace(7.0, 140.0, 22))
-        return (EffectParameter("frequency_Hz", "Hz", "of the mode, free", 0.0, 3.0, 400.0, 20.0, False, grid),
-                EffectParameter("damping", "1", "damping ratio of the mode", 0.0, 1e-4, 0.5, 0.02, False, (0.02,),
-                                True),
-                *(EffectParameter(f"shape_{name.replace('.', '_')}", "1/sqrt(kg)", f"mass-normalised shape at {name}",
-                                  0.0, -1.0, 1.0, 0.01, optional=not own, group="shape")
-                  for name, own in zip(names, driven, strict=True)))
-
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        shape = np.array(list(values.values())[2:])
-        if not np.any(shape):
-            return
-        at_actuators, at_sensors = shape_rows(ops.base.rig, ops.base.actuators, ops.base.sensors.names)
-        ops.added.append(AddedCoordinate(second_order(ops.s, values["frequency_Hz"], values["damping"]), shape,
-                                         at_actuators @ shape, at_sensors @ shape))
-
-
-    def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Residues over all paths at each frequency, of which the symmetric part of rank one is the shape."""
-        model, found = score.model, []
-        frequency, damping = self.parameters(model, place)[:2]
-        at_actuators, at_sensors = shape_rows(model.rig, model.actuators, model.sensors.names)
-        for f in frequency.grid:
-            for zeta in damping.grid:
-                took, Q = residues(score, partial(receptance, frequency_Hz=f, damping=zeta))
-                # Q = a_s a_u^T with both from one shape: alternate between the two for the best of rank one.
-                U, sigma, Vt = np.linalg.svd(Q)
-                shape = at_actuators.T @ Vt[0]
-                sign = float(U[:, 0] @ (at_sensors @ shape))
-                size = float(np.sum((at_sensors @ shape) ** 2))
-                if sign <= 0 or size == 0:
-                    continue
-                shape = shape * np.sqrt(sigma[0] * sign / size)
-                share = float(sigma[0] ** 2 / np.sum(sigma ** 2))
-                found.append(Seed((f, zeta, *shape), took.chi2 * share, took.rank))
-        return sorted(found, key=lambda seed: -seed.chi2)
-
-
-def shape_points(model: TableModel) -> bool | None:
-    """Whether every motor and sensor sits in a mount, along an earth axis; None where not."""
-    try:
-        shape_rows(model.rig, model.actuators, model.sensors.names)
-    except (KeyError, AttributeError):
-        return None
-    return True
-
-
-def shape_rows(rig, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """(n_u, n_g) and (n_y, n_g): which mount and axis each motor and each sensor sits in."""
-    order = {name: k for k, name in enumerate(mount_geometry(rig).names)}
-    motors = {motor.name: f"isolator{motor.isolator}.{motor.axis}" for motor in rig.motors}
-    g = rig.geophones
-    places = {name: f"isolator{i}.{axis}" for name, i, axis in zip(g.names, g.isolator, g.axis, strict=True)}
-    return (np.eye(len(order))[[order[motors[name]] for name in actuators]],
-            np.eye(len(order))[[order[places[name]] for name in sensors]])
-
-
-class _AtPoint(Effect):
+class AtPoint(Effect):
     """Something at a point of the payload."""
 
     def position(self) -> tuple[EffectParameter, ...]:
@@ -160,72 +80,7 @@ def place_of(values: Mapping[str, float]) -> np.ndarray:
 
 
 @register
-class AttachedOscillator(_AtPoint):
-    """A mass m on a spring and damper at a point: m s^2 (2 z w s + w^2)/(s^2 + 2 z w s + w^2) along its rows."""
-
-    name = "attached_oscillator"
-    title = "a sprung mass on the payload"
-    looks_like = "a pair of peak and dip at its own frequency, in every channel that moves its place"
-    confusable = ("payload_flexible_mode", "mount_surge", "base_compliance")
-    holds_states = True
-
-    def places(self, model: TableModel) -> tuple[str, ...]:
-        return ("payload/z", "payload/xyz", "payload/x", "payload/y")
-
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        mass = model.rig.mounted_body().mass
-        frequencies = tuple(np.geomspace(1.2, 90.0, 28))
-        axes = place.partition("/")[2]
-        across = [one for one in self.position() if axes == "xyz" or one.name != f"{axes}_m"]
-        return (EffectParameter("mass_kg", "kg", "sprung mass", 0.0, 0.0, mass, 0.01 * mass),
-                EffectParameter("frequency_Hz", "Hz", "of the mass on its spring", 0.0, 0.3, 300.0, 10.0, False,
-                                frequencies),
-                EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 2.0, 0.05, False, (0.05,), True),
-                *across)
-
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        h = oscillator(ops.s, values["frequency_Hz"], values["damping"])
-        axes = ["xyz".index(axis) for axis in place.partition("/")[2]]
-        Z = values["mass_kg"] * ops.s ** 2 * h
-        rows = point_map(place_of(values))[axes]
-        ops.add_impedance(np.repeat(Z[:, None], len(axes), axis=1), rows)
-        ops.inner.append(h[:, None, None] * rows.T)
-
-
-    def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Over frequency, damping and a grid of places; the mass follows."""
-        model, found = score.model, []
-        parameters = self.parameters(model, place)
-        axes = place.partition("/")[2]
-        points = positions(parameters)
-        for f in parameters[1].grid:
-            for zeta in (0.03, 0.15):
-                G, b = project(score, partial(sprung, frequency_Hz=f, damping=zeta),
-                               (f, zeta))
-                along = at_points(points, axes).sum(1)
-                mass = along @ b / np.einsum("pi,ij,pj->p", along, G, along)
-                chi2 = mass * (along @ b)
-                k = int(np.argmax(np.where(mass > 0, chi2, -np.inf)))
-                if mass[k] > 0:
-                    at = [points[k]["xyz".index(one.name[0])] for one in parameters[3:]]
-                    found.append(Seed((min(float(mass[k]), 0.5 * parameters[0].high), f, zeta, *at), float(chi2[k]),
-                                      1 + len(at)))
-        return sorted(found, key=lambda seed: -seed.chi2)
-
-
-def oscillator(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
-    """Force of a sprung mass over the force of the same mass fixed, (n,)."""
-    w = 2 * np.pi * frequency_Hz
-    return (2 * damping * w * s + w ** 2) / second_order(s, frequency_Hz, damping)
-
-
-def sprung(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
-    """Dynamic stiffness of a sprung mass of 1 kg, (n,)."""
-    return s ** 2 * oscillator(s, frequency_Hz, damping)
-
-
-@register
-class CableStiffness(_AtPoint):
+class CableStiffness(AtPoint):
     """A spring, with a little damping, from a point of the payload to the chassis: three axes, or one direction."""
 
     name = "cable_stiffness"
@@ -249,11 +104,7 @@ class CableStiffness(_AtPoint):
                 *(replace(one, optional=True) for one in self.position()))
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        K = np.diag([values[f"k_{axis}_N_per_m"] for axis in "xyz"])
-        for axes in ("xy", "xz", "yz"):
-            i, j = "xyz".index(axes[0]), "xyz".index(axes[1])
-            K[i, j] = K[j, i] = values.get(f"k_{axes}_N_per_m", 0.0)
-        k, V = np.linalg.eigh(K)
+        k, V = np.linalg.eigh(tie(values))
         rows = V.T @ point_map(place_of(values))
         Z = k * (1 + ops.s * values["damping_s"])[:, None]
         ops.add_impedance(Z, rows, Z)
@@ -281,11 +132,27 @@ class CableStiffness(_AtPoint):
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         if "k_xy_N_per_m" not in values:
             return ""
-        K = np.diag([values[f"k_{axis}_N_per_m"] for axis in "xyz"])
-        for axes in ("xy", "xz", "yz"):
-            K["xyz".index(axes[0]), "xyz".index(axes[1])] = K["xyz".index(axes[1]), "xyz".index(axes[0])] = values[
-                f"k_{axes}_N_per_m"]
-        least = float(np.linalg.eigvalsh(K)[0])
+        k = np.linalg.eigvalsh(tie(values))
         slack = 3 * max((std[f"k_{axis}_N_per_m"] for axis in "xyz"), default=0.0)
-        return f"a cable with a negative stiffness, {least:.3g} N/m" if least < -slack - 1e-3 * K.max() else ""
+        return f"a cable with a negative stiffness, {k[0]:.3g} N/m" if k[0] < -slack - 1e-3 * k[-1] else ""
 
+    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+                 ) -> dict[str, Reported]:
+        """The largest principal stiffness before all others; to first order it moves by v^T dK v, v its direction."""
+        k, V = np.linalg.eigh(tie(values))
+        v, slope = V[:, -1], np.zeros(len(values))
+        for j, name in enumerate(values):
+            if name.startswith("k_"):
+                a, b = "xyz".index(name[2]), "xyz".index(name[3] if name[3] != "_" else name[2])
+                slope[j] = v[a] * v[b] * (1 if a == b else 2)
+        std = float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
+        return {"stiffness_N_per_m": Reported(float(k[-1]), std, "N/m"),
+                **super().reported(model, place, values, covariance)}
+
+
+def tie(values: Mapping[str, float]) -> np.ndarray:
+    """(3, 3) N/m: stiffness of a cable from its values by name."""
+    K = np.diag([values[f"k_{axis}_N_per_m"] for axis in "xyz"])
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        K[a, b] = K[b, a] = values.get(f"k_{'xyz'[a]}{'xyz'[b]}_N_per_m", 0.0)
+    return K

@@ -1,0 +1,165 @@
+"""Modes of a payload that bends: one, two or three beside its rigid motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Seed, register
+from avis_ctrl.gap.effects.impedance import paths, peaks
+from avis_ctrl.gap.effects.sensors import receptance, second_order
+from avis_ctrl.gap.operators import AddedCoordinate, mount_geometry
+from avis_ctrl.gap.score_algebra import reduction
+
+if TYPE_CHECKING:
+    from avis_ctrl.gap.operators import Operators
+    from avis_ctrl.gap.score import Score
+    from avis_ctrl.gap.table_model import TableModel
+
+# Variants by number of modes.
+COUNTS = {"": 1, "two": 2, "three": 3}
+# A further mode is looked for where it takes this share of what the modes before it leave over the noise, and more than
+# chance would.
+FURTHER = 0.25
+
+
+@register
+class PayloadFlexibleMode(Effect):
+    """Modes of the payload beside its rigid motion, mass-normalised shapes over the mounts' points.
+
+    Motors and sensors sit in the isolators and move with these points. Each mode's own coordinate e obeys
+    e'' + 2 z w e' + w^2 e = sum of shape times force, the forces of the mounts included.
+    """
+
+    name = "payload_flexible_mode"
+    title = "the payload bends: a mode beside its rigid motion"
+    looks_like = "a resonance above the suspension's, in rows and columns that share one shape"
+    confusable = ("attached_oscillator", "mount_surge", "base_compliance")
+    holds_states = True
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("payload", "payload/two", "payload/three") if shape_points(model) is not None else ()
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        names = mount_geometry(model.rig).names
+        driven = np.any(shape_rows(model.rig, model.actuators, model.sensors.names)[0], axis=0)
+        grid = tuple(np.geomspace(7.0, 140.0, 22))
+        found: list[EffectParameter] = []
+        for k in range(COUNTS[place.partition("/")[2]]):
+            of, of_mode = ("", "of the mode") if k == 0 else (f"_{k + 1}", f"of mode {k + 1}")
+            found += [
+                EffectParameter(f"frequency{of}_Hz", "Hz", f"{of_mode}, free", 0.0, 3.0, 400.0, 20.0, False, grid),
+                EffectParameter(f"damping{of}", "1", f"damping ratio {of_mode}", 0.0, 1e-4, 0.5, 0.02, False, (0.02,),
+                                True),
+                *(EffectParameter(f"shape{of}_{name.replace('.', '_')}", "1/sqrt(kg)",
+                                  f"mass-normalised shape {of_mode} at {name}", 0.0, -1.0, 1.0, 0.01, optional=not own,
+                                  group=f"shape{of}") for name, own in zip(names, driven, strict=True))]
+        return tuple(found)
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        at_actuators, at_sensors = shape_rows(ops.base.rig, ops.base.actuators, ops.base.sensors.names)
+        for frequency, zeta, shape in modes(values):
+            if np.any(shape):
+                ops.added.append(AddedCoordinate(second_order(ops.s, frequency, zeta), shape, at_actuators @ shape,
+                                                 at_sensors @ shape))
+
+    def seeds(self, score: Score, place: str) -> list[Seed]:
+        """Residues over all paths at the frequencies that take most, of which the symmetric part of rank one is each
+        mode's shape."""
+        count = COUNTS[place.partition("/")[2]]
+        return [seed for n, seed in _modes_one_by_one(score, self.parameters(score.model, "payload")[0].grid)
+                if n == count]
+
+    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+                 ) -> dict[str, Reported]:
+        """The modes in the order of their frequencies."""
+        found = list(super().reported(model, place, values, covariance).items())
+        own = len(found) // COUNTS[place.partition("/")[2]]
+        each = sorted((found[k:k + own] for k in range(0, len(found), own)), key=lambda mode: mode[0][1].value)
+        return dict(zip((name for name, _ in found), (value for mode in each for _, value in mode), strict=True))
+
+
+def modes(values: Mapping[str, float]) -> list[tuple[float, float, np.ndarray]]:
+    """(frequency in Hz, damping ratio, shape (n_g,)) of each mode."""
+    numbers, count = np.array(list(values.values())), sum(name.startswith("frequency") for name in values)
+    return [(float(own[0]), float(own[1]), own[2:]) for own in np.split(numbers, count)]
+
+
+def shape_points(model: TableModel) -> bool | None:
+    """Whether every motor and sensor sits in a mount, along an earth axis; None where not."""
+    try:
+        shape_rows(model.rig, model.actuators, model.sensors.names)
+    except (KeyError, AttributeError):
+        return None
+    return True
+
+
+def shape_rows(rig, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """(n_u, n_g) and (n_y, n_g): which mount and axis each motor and each sensor sits in."""
+    order = {name: k for k, name in enumerate(mount_geometry(rig).names)}
+    motors = {motor.name: f"isolator{motor.isolator}.{motor.axis}" for motor in rig.motors}
+    g = rig.geophones
+    places = {name: f"isolator{i}.{axis}" for name, i, axis in zip(g.names, g.isolator, g.axis, strict=True)}
+    return (np.eye(len(order))[[order[motors[name]] for name in actuators]],
+            np.eye(len(order))[[order[places[name]] for name in sensors]])
+
+
+def _modes_one_by_one(score: Score, grid: Sequence[float]) -> list[tuple[int, Seed]]:
+    """(number of modes, seed), the best first: each further mode beside those before it."""
+    if "modes" in score.kept:
+        return score.kept["modes"]
+    frequencies = [(f, 0.02) for f in grid] + [(f, zeta) for f in peaks(score) if f > grid[0] for zeta in (0.005, 0.02)]
+    kept = [paths(score, partial(receptance, frequency_Hz=f, damping=zeta)).astype(np.float32)
+            for f, zeta in frequencies]
+    e, found = score.e.astype(np.float32), []
+    own = [((A @ A.T).astype(float), (A @ e).astype(float)) for A in kept]
+    chosen: list[int] = []
+    before = 0.0
+    for count in COUNTS.values():
+        tries = []
+        for k in range(len(frequencies)):
+            if all(abs(np.log(frequencies[k][0] / frequencies[j][0])) > 0.08 for j in chosen):
+                G, b = _joint([*chosen, k], kept, own)
+                took = reduction(G, b)
+                tries.append((took.chi2, k, took.coefficients))
+        chi2, best, _ = max(tries, key=lambda one: one[0])
+        gain, paths_of_one = chi2 - before, len(kept[0])
+        chance = paths_of_one + 6 * np.sqrt(2 * paths_of_one)
+        if count > 1 and gain < max(FURTHER * (score.chi2 - score.dof - before),
+                                    chance * max(1.0, score.chi2 / score.dof)):
+            break
+        chosen.append(best)
+        for taken, k, residues in sorted(tries, key=lambda one: -one[0])[:4]:
+            if seed := _seed(score.model, [frequencies[j] for j in (*chosen[:-1], k)], residues, taken):
+                found.append((count, seed))
+        before = chi2
+    score.kept["modes"] = sorted(found, key=lambda one: (one[0], -one[1].chi2))
+    return score.kept["modes"]
+
+
+def _joint(chosen: Sequence[int], kept: Sequence[np.ndarray], own: Sequence[tuple[np.ndarray, np.ndarray]]
+           ) -> tuple[np.ndarray, np.ndarray]:
+    """Gram matrix and product with the residual of several frequencies' paths together."""
+    G = np.block([[own[i][0] if i == j else (kept[i] @ kept[j].T).astype(float) for j in chosen] for i in chosen])
+    return G, np.concatenate([own[i][1] for i in chosen])
+
+
+def _seed(model: TableModel, at: Sequence[tuple[float, float]], residues: np.ndarray, chi2: float) -> Seed | None:
+    """Shapes from residues (modes n_y n_u,); None where some mode's would be negative."""
+    at_actuators, at_sensors = shape_rows(model.rig, model.actuators, model.sensors.names)
+    values: list[float] = []
+    share, total = 0.0, 0.0
+    for (f, zeta), own in sorted(zip(at, np.split(residues, len(at)), strict=True), key=lambda one: one[0][0]):
+        # Q = a_s a_u^T with both from one shape: the size by the best of rank one.
+        U, sigma, Vt = np.linalg.svd(own.reshape(len(at_sensors), -1))
+        shape = at_actuators.T @ Vt[0]
+        sign = float(U[:, 0] @ (at_sensors @ shape))
+        size = float(np.sum((at_sensors @ shape) ** 2))
+        if sign <= 0 or size == 0:
+            return None
+        values += [f, zeta, *(shape * np.sqrt(sigma[0] * sign / size))]
+        share, total = share + sigma[0] ** 2, total + float(np.sum(sigma ** 2))
+    return Seed(tuple(float(v) for v in values), chi2 * float(share / total), len(residues))
