@@ -245,7 +245,7 @@ class Assembled:
             w, share = ops.internal_omega[inside], ops.payload_share[inside]
             g = np.broadcast_to(ops.stiffness_factor, self.z_pp.shape)[:, inside]
             g = g + 2 * ops.internal_damping[inside] * ops.s[:, None] / w
-            by_mass = g / share / (g + (ops.s[:, None] / w) ** 2)
+            by_mass = g * (1 - share) / (g + (ops.s[:, None] / w) ** 2)
             F.append(self.G.T[:, inside] * by_mass[:, None, :])
         if ops.recoil is not None:
             moves = ops.recoil[:, :, np.any(ops.recoil, axis=(0, 1))]

@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from avis_ctrl.errors import AvisError
+from avis_ctrl.gap.data import thinned
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register
 from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.mounts import has_mounts
 from avis_ctrl.gap.effects.sensors import receptance
+from avis_ctrl.gap.refit import likelihood
+from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.identification.maximum_likelihood import LikelihoodFit
+from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs.rigid_body import point_map
 
 if TYPE_CHECKING:
     from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import TableModel
 
 WAYS = ("x", "y", "z", "rx", "ry", "rz")
 # Below this the suspension's own modes are in the way of the first look.
 LOWEST_Hz = 7.0
 # Where a way of moving is looked for that the score finds nothing in [Hz].
 STIFF_Hz = 90.0
+# Starts of which the most promising are followed: mass over the payload's, frequencies alike along all ways, and
+# radii of gyration and heights [m] of a frame of a table's size.
+TRIAL_MASS, TRIAL_Hz = 2.0, tuple(np.geomspace(10.0, 90.0, 7).tolist())
+SHAPE = (0.45, 0.45, 0.45, -0.4, -0.1)
+# Lines of a record, iterations, and how many are followed, only where the gap is more than this times the noise.
+TRIAL_LINES, TRIAL_ITERATIONS, TRIED, PLAIN = 50, 4, 1, 1.3
 
 
 @register
@@ -65,6 +76,35 @@ class BaseCompliance(Effect):
                                 (0.0,), True))
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
+        """Short fits to few lines: from where each way of moving resonates best by itself, and from the most promising
+        of like frequencies along all ways, where one step of all parameters together is expected to lead furthest."""
+        blocks = [thinned(part.block, TRIAL_LINES, seed=2) for part in score.parts]
+        scale = score.chi2 / max(Score(score.model, blocks).chi2, 1.0)
+        own = self._by_ways(score, place)
+        trials = [] if score.chi2 < PLAIN * score.dof else self._alike(score.model, place, blocks)
+        found = []
+        for values in [*(one.values for one in own), *trials[:TRIED]]:
+            begin = score.model.with_effect(ActiveEffect(self, place, self.parameters(score.model, place), values))
+            if (made := _short_fit(begin, blocks)) is not None:
+                found.append(Seed(made.model.effects[-1].values, score.chi2 - scale * made.chi2, len(values)))
+        found = [one for one in found if one.chi2 > 0] or own
+        return sorted(found, key=lambda seed: -seed.chi2)
+
+    def _alike(self, model: TableModel, place: str, blocks: Sequence[SpectralBlock]) -> list[tuple[float, ...]]:
+        """Starts of one frequency along all ways, the most promising first."""
+        parameters, found = self.parameters(model, place), []
+        payload = model.rig.mounted_body().mass
+        shape = () if place.endswith("translation") else SHAPE
+        for f in TRIAL_Hz:
+            values = (TRIAL_MASS * payload, 0.05, *[f] * (6 if shape else 3), *shape)
+            try:
+                left = Score(model.with_effect(ActiveEffect(self, place, parameters, values)), blocks).chi2
+            except (AvisError, np.linalg.LinAlgError):
+                continue
+            found.append((left, values))
+        return [values for _, values in sorted(found)]
+
+    def _by_ways(self, score: Score, place: str) -> list[Seed]:
         """Where each way of moving resonates best by itself; masses follow from all of them together."""
         ways = WAYS[:3] if place.endswith("translation") else WAYS
         zeta, grid = 0.06, np.geomspace(LOWEST_Hz, STIFF_Hz, 26)
@@ -123,6 +163,13 @@ class BaseCompliance(Effect):
             B = np.linalg.inv(s ** 2 * mass + tied)
             H = B @ tied[:, :, :3]
         ops.recoil, ops.follow = B, H
+
+
+def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock]) -> LikelihoodFit | None:
+    try:
+        return likelihood(model, blocks, TRIAL_ITERATIONS)
+    except (AvisError, np.linalg.LinAlgError, FloatingPointError):
+        return None
 
 
 def _greedy(gram: np.ndarray, fall: np.ndarray, labels: list[tuple[str, float]]) -> dict[str, float]:

@@ -1,0 +1,79 @@
+"""What resonates inside mounts and under them: states at the ends of a record, and whether the search finds it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from truth.cases import draw_case, rig, simulate_case
+
+from avis_ctrl.gap.analysis import prepare
+from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.operators import assemble
+from avis_ctrl.gap.search import CLOSED, search
+from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.identification.parameter_sets import default_parameters
+from avis_ctrl.identification.response import ResponseModel
+
+OMEGA = 2 * np.pi * np.geomspace(0.5, 80.0, 40)
+
+
+def with_effect(name: str, place: str, values: list[float]) -> TableModel:
+    bare = TableModel(ResponseModel.of(rig(), default_parameters(rig())))
+    return bare.with_effect(active(library()[name], bare, place, values))
+
+
+def test_a_push_on_the_mass_inside_a_mount():
+    """Against the table with the four masses as coordinates of their own."""
+    f, share, zeta, uneven = 17.0, 0.4, 0.05, np.array([0.02, -0.01, 0.03, -0.04])
+    made = assemble(with_effect("mount_surge", "isolators z", [f, share, zeta, *uneven[:3]]).operators(OMEGA))
+    mounts, s = made.ops.mounts, 1j * OMEGA[:, None]
+    up = mounts.along("z")
+    G, k, c, w = mounts.payload[up], mounts.stiffness[up], mounts.damping[up], 2 * np.pi * f * (1 + uneven)
+    upper, lower = (k / part * (1 + 2 * zeta * s / w) for part in (share, 1 - share))
+    mass = k * (1 / share + 1 / (1 - share)) / w ** 2
+    full = np.zeros((len(OMEGA), 10, 10), complex)
+    full[:, :6, :6] = made.D + G.T @ ((upper + s * c - made.z_pp[:, up])[:, :, None] * G)
+    full[:, :6, 6:] = -G.T * upper[:, None]
+    full[:, 6:, :6] = np.swapaxes(full[:, :6, 6:], 1, 2)
+    full[:, range(6, 10), range(6, 10)] = upper + lower + s ** 2 * mass
+    np.testing.assert_allclose(made.inverse @ made.forces_of_states(), np.linalg.inv(full)[:, :6, 6:], rtol=1e-9)
+
+
+@pytest.mark.parametrize(("place", "values"), [
+    ("chassis/translation", [900.0, 0.05, 9.0, 11.0, 14.0]),
+    ("chassis/rocking", [900.0, 0.05, 9.0, 11.0, 14.0, 10.0, 12.0, 13.0, 0.4, 0.5, 0.6, -0.45, -0.2])])
+def test_a_push_on_the_chassis(place, values):
+    """Against payload and chassis as two bodies: what the payload's momentum gains the chassis loses."""
+    model = with_effect("base_compliance", place, values)
+    made = assemble(model.operators(OMEGA))
+    moves, S = made.ops.recoil, 1j * OMEGA[:, None, None]
+    ways = np.flatnonzero(np.any(moves, axis=(0, 1)))
+    G, under = made.G, made.ops.mounts.chassis[:, ways]
+    z = made.z_pp[:, :, None]
+    inertia = S ** 2 * made.M
+    full = np.concatenate([
+        np.concatenate([inertia + G.T @ (z * G), -G.T @ (z * under)], axis=2),
+        np.concatenate([inertia[:, ways], np.linalg.inv(moves[:, ways][:, :, ways])], axis=2)], axis=1)
+    found, true = made.inverse @ made.forces_of_states(), np.linalg.inv(full)[:, :6, 6:]
+    np.testing.assert_allclose(found, true, atol=1e-9 * np.abs(true).max())
+    assert model.inner_transients(OMEGA).shape == (len(OMEGA), 6, 2 * len(ways))
+
+
+def test_what_holds_no_states_leaves_none():
+    model = with_effect("actuator_gain", "Az1", [1.1])
+    assert model.inner_transients(OMEGA).shape == (len(OMEGA), 6, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "seed", "strength", "parameter"), [
+    ("mount_surge", 20000, "clear", "frequency_Hz"), ("mount_surge", 20001, "gross", "frequency_Hz"),
+    ("base_compliance", 20000, "clear", "mass_kg"), ("base_compliance", 20001, "gross", "mass_kg")])
+def test_one_is_found_from_the_first_look(name, seed, strength, parameter):
+    """The search among this one effect closes the gap, at the truth's frequency or mass within its scatter of 3 %."""
+    case = draw_case(seed, effect=name, strength=strength, duration_s=30.0)
+    made = prepare(simulate_case(case), rig())
+    found = search(made.base, made.thin, made.thin_held, effects=[library()[name]])
+    assert found.best.held_per_dof < CLOSED < made.base.held_per_dof
+    effect = found.best.model.effects[-1]
+    told = found.best.reported(effect)[parameter].value
+    assert told == pytest.approx(case.effects[0].parameters[parameter], rel=0.03)
