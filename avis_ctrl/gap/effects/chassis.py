@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -86,7 +86,8 @@ class BaseCompliance(Effect):
         for values in [*(one.values for one in own), *trials[:TRIED]]:
             begin = score.model.with_effect(ActiveEffect(self, place, self.parameters(score.model, place), values))
             if (made := _short_fit(begin, blocks)) is not None:
-                found.append(Seed(made.model.effects[-1].values, score.chi2 - scale * made.chi2, len(values)))
+                reached = cast(TableModel, made.model).effects[-1].values
+                found.append(Seed(reached, score.chi2 - scale * made.chi2, len(values)))
         found = [one for one in found if one.chi2 > 0] or own
         return sorted(found, key=lambda seed: -seed.chi2)
 
