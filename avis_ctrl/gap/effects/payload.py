@@ -130,6 +130,8 @@ class CableStiffness(AtPoint):
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+        if not any(values[name] > 3 * std[name] for name in (f"k_{axis}_N_per_m" for axis in "xyz")):
+            return "a cable that the data do not tell from none"
         if "k_xy_N_per_m" not in values:
             return ""
         k = np.linalg.eigvalsh(tie(values))
