@@ -208,7 +208,9 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
             break
         if depth == 1:
             rivals += _rivals(base, plausible[0][-1], data, OUTSIDE_SHARE * worth)
-            if rivals and rivals[-1].wins and rivals[-1].closes:
+            # On a table without a gap nothing is to be taken away.
+            gap = len(best) > 1 or base.held_per_dof > CLOSED
+            if gap and rivals and rivals[-1].wins and rivals[-1].closes:
                 return Found((base,), tuple(pool), False, tuple(passed_over), tuple(rivals), rivals[-1])
         if best[-1].held_per_dof <= CLOSED:
             break
@@ -249,7 +251,7 @@ def _rivals(parent: Refit, against: Refit, data: _Data, least: float) -> list[Ri
         if found is not None:
             rough.append(found)
     made = []
-    for coarse in sorted(rough, key=lambda r: r.chi2_fit + r.chi2_held)[:OUTSIDE_PROMOTED]:
+    for coarse in sorted(rough, key=lambda r: r.criterion)[:OUTSIDE_PROMOTED]:
         if coarse.held_per_dof > HOPELESS * against.held_per_dof:
             continue
         if (found := try_refit(coarse.model, data.fitted, data.held_out, ITERATIONS[0])) is not None:
