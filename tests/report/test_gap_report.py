@@ -265,10 +265,12 @@ def test_none_says_from_which_size_on_an_effect_would_show(found):
     gap = stand_in.with_verdict(found.gap, "none")
     assert not tables(section(replace(found, gap=gap), "remaining"))
     seen = (Detectable("actuator_lag", "actuators", "time_constant_s", 3.1e-5, "s"),
-            Detectable("sensor_gain", "Sz1", "gain", float("inf"), "1"))
+            Detectable("sensor_gain", "Sz1", "gain", float("inf"), "1"),
+            Detectable("actuator_gain", "Ax2", "gain", 3e-4, "1"), Detectable("actuator_gain", "Az1", "gain", 1e-4, "1"))
     one = replace(found, gap=replace(gap, detectable=seen))
     assert tables(section(one, "remaining"))[0].rows == (
-        ("actuator lag", "actuators", "time constant", "3.1e−5 s"), ("sensor gain", "Sz1", "gain", "at no size"))
+        ("actuator lag", "actuators", "time constant", "3.1e−5 s"), ("sensor gain", "Sz1", "gain", "at no size"),
+        ("actuator gain", "Az1 (best) to Ax2", "gain", "1.0e−4 to 3.0e−4"))
     assert "would have been seen" in prose(section(one, "result"))
 
 

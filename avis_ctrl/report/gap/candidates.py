@@ -8,6 +8,8 @@ from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.pieces import Fold, Paragraph, Piece, Section, table
 
 FIRST = 12
+# Parameters of a candidate that a row has room for.
+MOST = 4
 
 
 def candidates(found: Found) -> Section:
@@ -17,7 +19,7 @@ def candidates(found: Found) -> Section:
         return Section("Runners-up", "considered", (Paragraph(_none(found)),))
     header = ("candidate", "chi-square / dof", "probability", "best size", "why it was not named")
     rows = [(wording.candidate(one), words.number(one.chi2_per_dof, 4), wording.probability(one.probability),
-             wording.quantities(one.parameters) or "not stated", one.reason) for one in ranked]
+             wording.quantities(one.parameters, MOST) or "not stated", one.reason) for one in ranked]
     pieces: list[Piece] = [table("Candidates that were refitted together with all parameters of the rig, with "
                                  "chi-square on held-out data, and why each lost.", header, rows[:FIRST], "lrrll")]
     if rows[FIRST:]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from avis_ctrl.gap.result import Gap
+from avis_ctrl.gap.result import Detectable, Gap
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.finding import Found
@@ -25,16 +25,26 @@ def remaining(found: Found) -> Section:
 
 
 def detectable(gap: Gap) -> Table:
-    """From which size on each effect of the library would have been seen."""
-    rows = []
+    """From which size on each effect of the library would have been seen; over its places, from the best to the worst.
+    """
+    groups: dict[tuple[str, str, str], list[Detectable]] = {}
     for one in gap.detectable:
-        unit = "" if one.unit in ("", "1") else f" {words.unit(one.unit)}"
-        size = f"{words.number(one.value, 2)}{unit}" if np.isfinite(one.value) else "at no size"
-        rows.append((wording.titled(one.name), one.location, wording.parameter(one.parameter), size))
+        groups.setdefault((one.name, one.parameter, one.unit), []).append(one)
+    rows = []
+    for (name, parameter, _), members in groups.items():
+        ordered = sorted(members, key=lambda one: one.value)
+        where = ordered[0].location if len(ordered) == 1 else f"{ordered[0].location} (best) to {ordered[-1].location}"
+        ends = [ordered[0]] if len(ordered) == 1 else [ordered[0], ordered[-1]]
+        rows.append((wording.titled(name), where, wording.parameter(parameter), " to ".join(_seen(one) for one in ends)))
     return table("An effect that is absent, by itself at its place, would have been seen from this size on: three "
-                 "standard deviations of the fit. What is smaller may be there. \"At no size\": re-identification of "
-                 "the rig's own parameters would take it up.", ("effect", "place", "parameter", "seen from"), rows,
-                 "lllr")
+                 "standard deviations of the fit, at the best and at the worst of its places. What is smaller may be "
+                 "there. \"At no size\": re-identification of the rig's own parameters would take it up.",
+                 ("effect", "place", "parameter", "seen from"), rows, "lllr")
+
+
+def _seen(one: Detectable) -> str:
+    unit = "" if one.unit in ("", "1") else f" {words.unit(one.unit)}"
+    return f"{words.number(one.value, 2)}{unit}" if np.isfinite(one.value) else "at no size"
 
 
 def _left(gap: Gap) -> str:

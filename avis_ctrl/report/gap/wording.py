@@ -69,9 +69,10 @@ def quantity(one: Reported) -> str:
     return f"({value} ± {sigma}){unit}" if unit else f"{value} ± {sigma}"
 
 
-def quantities(parameters: Mapping[str, Reported]) -> str:
-    """Name = value ± std unit, of each."""
-    return "; ".join(f"{parameter(name)} {quantity(one)}" for name, one in parameters.items())
+def quantities(parameters: Mapping[str, Reported], most: int | None = None) -> str:
+    """Name = value ± std unit, of each, or of the first ones."""
+    told = [f"{parameter(name)} {quantity(one)}" for name, one in parameters.items()]
+    return "; ".join([*told[:most], *([f"and {len(told) - most} more"] if most and len(told) > most else [])])
 
 
 def parameter(name: str) -> str:
