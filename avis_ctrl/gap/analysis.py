@@ -18,7 +18,7 @@ from avis_ctrl.gap.judgement import effects_of, judge
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
 from avis_ctrl.gap.refit import Refit, judged, likelihood, refit, scattered, try_refit
 from avis_ctrl.gap.result import Detectable, Gap
-from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, search
+from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, definite, search
 from avis_ctrl.gap.show import shown
 from avis_ctrl.gap.signal_effects import (
     SignalFaults,
@@ -133,10 +133,11 @@ def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, p
         found = replace(found, chain=(found.chain[0], best))
     chain = (prepared.base, *found.chain[1:-1], best)
     longer = replace(found, chain=chain, reached_noise=best.held_per_dof <= CLOSED)
-    if longer.reached_noise or found.best.held_per_dof > CLOSED or len(chain) > LONGEST:
+    if found.best.held_per_dof > CLOSED or len(chain) > LONGEST or (longer.reached_noise and not definite(best)):
         return longer
     on = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, chain)
-    return replace(on, pool=(*found.pool, *on.pool), passed_over=(*found.passed_over, *on.passed_over))
+    return replace(on, pool=(*found.pool, *on.pool), passed_over=(*found.passed_over, *on.passed_over),
+                   rivals=(*found.rivals, *on.rivals))
 
 
 def _without_spare(best: Refit, prepared: Prepared) -> Refit:

@@ -30,7 +30,8 @@ Progress = Callable[[str], None]
 # which is what the noise's own estimate of some hundred degrees of freedom and its bias near resonances leave open.
 NOISE = 1.10
 # With an effect named the gap counts as closed from here: an r.m.s. within 1.2 of the noise. What is then left is as
-# likely the effect's own law, not quite that of the table, as a second effect: none is looked for.
+# likely the effect's own law, not quite that of the table, as a second effect: none is looked for unless that law is
+# certain (`Effect.idealised`).
 CLOSED = 1.44
 # Chance of a significant score on clean data, over all candidates of a stage.
 FALSE_ALARM = 1e-3
@@ -306,7 +307,7 @@ def _promoted(rough: list[tuple[Refit, ...]], depth: int, fitted: Sequence[Spect
     left = [chain[-1] for chain in rough[PROMOTED:]]
     for chain in rough[:PROMOTED]:
         far = made and chain[-1].held_per_dof > HOPELESS * made[0][-1].held_per_dof
-        if far or (depth > 1 and _share(chain[-1], chain[-2]) < TAKES / 2):
+        if far or (depth > 1 and not definite(chain[-2]) and _share(chain[-1], chain[-2]) < TAKES / 2):
             left.append(chain[-1])
             continue
         progress(f"refit with {_words(chain[-2], chain[-1].model.effects[-1])}")
@@ -321,16 +322,22 @@ def _share(found: Refit, before: Refit) -> float:
     return (before.held_per_dof - found.held_per_dof) / excess if excess > 0 else 0.0
 
 
+def definite(closed: Refit) -> bool:
+    """Whether what effects leave of a gap that they close can be a faint second one: none of them is idealised."""
+    return closed.held_per_dof <= CLOSED and not any(one.effect.idealised for one in closed.model.effects)
+
+
 def _better(found: Refit, best: Refit, depth: int) -> bool:
     """Whether a longer chain is worth its length: on the criterion, on the held-out data by themselves, and, of a
     second effect on, because it takes most of what the chain before it leaves.
 
-    The last keeps out what only mends the first effect's law where that is not quite the table's.
+    The last keeps out what only mends the first effect's law where that is not quite the table's; beside an effect of
+    which the law is certain a faint second one may be small.
     """
     misfit = max(1.0, found.held_per_dof)
     fall, held = best.criterion - found.criterion, best.chi2_held - found.chi2_held
     worth = fall / misfit > LEAST_FALL and held / misfit > LEAST_FALL / 2
-    return worth and (depth == 1 or _share(found, best) > TAKES)
+    return worth and (depth == 1 or definite(best) or _share(found, best) > TAKES)
 
 
 def _ordinal(depth: int) -> str:

@@ -266,7 +266,8 @@ def test_none_says_from_which_size_on_an_effect_would_show(found):
     assert not tables(section(replace(found, gap=gap), "remaining"))
     seen = (Detectable("actuator_lag", "actuators", "time_constant_s", 3.1e-5, "s"),
             Detectable("sensor_gain", "Sz1", "gain", float("inf"), "1"),
-            Detectable("actuator_gain", "Ax2", "gain", 3e-4, "1"), Detectable("actuator_gain", "Az1", "gain", 1e-4, "1"))
+            Detectable("actuator_gain", "Ax2", "gain", 3e-4, "1"),
+            Detectable("actuator_gain", "Az1", "gain", 1e-4, "1"))
     one = replace(found, gap=replace(gap, detectable=seen))
     assert tables(section(one, "remaining"))[0].rows == (
         ("actuator lag", "actuators", "time constant", "3.1e−5 s"), ("sensor gain", "Sz1", "gain", "at no size"),

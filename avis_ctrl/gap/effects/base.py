@@ -85,6 +85,8 @@ class Effect(ABC):
     strength : the parameter to which `force` is in proportion, empty where to none.
     holds_states : has resonances of its own, whose states at the ends of a record are to be found with its transient.
     outside : of `effects.beyond`, refitted beside the library and never named.
+    idealised : its law stands for several of real tables (friction, loss, bending): a little that it leaves is more
+        likely its own law than a second effect. Not so of geometry, gains and first-order lags.
     """
 
     name: ClassVar[str]
@@ -95,6 +97,7 @@ class Effect(ABC):
     strength: ClassVar[str] = ""
     holds_states: ClassVar[bool] = False
     outside: ClassVar[bool] = False
+    idealised: ClassVar[bool] = True
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         """Where it can act on this table; empty where it cannot."""

@@ -48,6 +48,7 @@ class GeophoneCorner(_OfSensor):
 
     name = "geophone_corner"
     title = "a geophone's suspension frequency is not the one that its compensation filter assumes"
+    idealised = False
     looks_like = "one output is off around and below the suspension frequency, by the same factor from every input"
     confusable = ("sensor_gain",)
 
@@ -74,6 +75,7 @@ class SensorGain(_OfSensor):
 
     name = "sensor_gain"
     title = "a sensor's sensitivity is not the one of the rig file"
+    idealised = False
     looks_like = "one output is off by the same real factor at every frequency and from every input"
     confusable = ("geophone_corner",)
 
@@ -90,6 +92,7 @@ class SensorMisalignment(_OfSensor):
 
     name = "sensor_misalignment"
     title = "a sensor's axis is tilted, so that it sees another axis too"
+    idealised = False
     looks_like = "one output holds a share of the motion along another axis at its place, at every frequency"
     confusable = ("sensor_gain", "com_offset")
 
@@ -123,6 +126,7 @@ class TiltCoupling(Effect):
 
     name = "tilt_coupling"
     title = "gravity: the horizontal sensors read g times the tilt as an acceleration"
+    idealised = False
     looks_like = "horizontal outputs rise towards low frequency where the payload tilts, as g over frequency squared"
     confusable = ("leveling_loop", "com_offset")
 

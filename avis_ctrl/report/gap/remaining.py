@@ -35,7 +35,8 @@ def detectable(gap: Gap) -> Table:
         ordered = sorted(members, key=lambda one: one.value)
         where = ordered[0].location if len(ordered) == 1 else f"{ordered[0].location} (best) to {ordered[-1].location}"
         ends = [ordered[0]] if len(ordered) == 1 else [ordered[0], ordered[-1]]
-        rows.append((wording.titled(name), where, wording.parameter(parameter), " to ".join(_seen(one) for one in ends)))
+        size = " to ".join(_seen(one) for one in ends)
+        rows.append((wording.titled(name), where, wording.parameter(parameter), size))
     return table("An effect that is absent, by itself at its place, would have been seen from this size on: three "
                  "standard deviations of the fit, at the best and at the worst of its places. What is smaller may be "
                  "there. \"At no size\": re-identification of the rig's own parameters would take it up.",
