@@ -74,8 +74,8 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
         reasons.append(f"{' and '.join(one.effect.name for one in own)} comes nearest, but {refusal}: not named")
         own, updated, refused_by_level = [], base, True
     reasons += _beyond(found, updated, own)
-    residual_left = (updated.held_per_dof > (CLOSED if own or signal else UNEXPLAINED) or bool(raised) or refused_by_level
-                     or found.beaten is not None)
+    most = CLOSED if own or signal else UNEXPLAINED
+    residual_left = updated.held_per_dof > most or bool(raised) or refused_by_level or found.beaten is not None
     effects = [*_table_effects(found, updated, own), *signal]
     if effects:
         verdict: Verdict = "partly explained" if residual_left else "explained"
