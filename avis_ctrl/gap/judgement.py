@@ -17,7 +17,7 @@ from avis_ctrl.gap.data import SAME_LEVEL
 from avis_ctrl.gap.refit import Refit, probabilities, try_refit
 from avis_ctrl.gap.result import Considered, NamedEffect, Verdict
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.search import CLOSED, LEAST_FALL, Found, Rival, location
+from avis_ctrl.gap.search import CLOSED, FALSE_ALARM, LEAST_FALL, Found, Rival, known_noise, location
 from avis_ctrl.gap.signal_effects import SignalFaults, named
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.spectra import SpectralBlock
@@ -55,7 +55,10 @@ class Judgement:
 def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Refit, faults: SignalFaults) -> Judgement:
     """Weigh what a search and the signals brought."""
     own = effects_of(updated.model)
-    if own and not earned(base, updated):
+    if own and not earned(base, updated, known_noise(thin)):
+        own, updated = [], base
+    faint = undetermined(updated)
+    if own and faint:
         own, updated = [], base
     if updated.held_per_dof > CLOSED or found.beaten is not None:
         # What a wrong model leaves of the records is no measure of the noise in them.
@@ -64,6 +67,7 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
     raised = faults.raised
     reasons = [f"the noise of {', '.join(raised)} is above the rig file's ambient level; the library has no name for "
                "that"] if raised else []
+    reasons += [faint] if faint else []
     refused_by_level = False
     if own and updated.held_per_dof > CLOSED:
         refusal = refused(thin, base, updated)
@@ -117,12 +121,34 @@ def effects_of(model: TableModel) -> list[ActiveEffect]:
     return [one for one in model.effects if one.effect.name != LARGE_MOTION]
 
 
-def earned(base: Refit, updated: Refit) -> bool:
-    """Whether named effects take their part of the gap as the noise is known in the end."""
+def earned(base: Refit, updated: Refit, stretch: float = 1.0) -> bool:
+    """Whether named effects take their part of the gap as the noise is known in the end.
+
+    stretch : of differences of chi-square by the noise's own uncertainty (`known_noise`).
+    """
     excess = base.held_per_dof - 1.0
     if excess < 0.1:
-        return base.chi2_held - updated.chi2_held > LEAST_FALL
+        return base.chi2_held - updated.chi2_held > LEAST_FALL * stretch
     return base.held_per_dof - updated.held_per_dof > EARNED * excess
+
+
+def undetermined(updated: Refit) -> str:
+    """Why an effect is not told from none: its strength is within its own uncertainty (A. Wald's test, with the
+    covariance that the scatter over bands and records gives), or beyond what physics allows. Empty where it is told.
+    """
+    if why := updated.implausible():
+        names = " and ".join(one.effect.name for one in effects_of(updated.model))
+        return f"{names} comes nearest, but that is not possible ({why}): not named"
+    misfit = max(updated.fit.chi2_per_dof, updated.held_per_dof, 1.0)
+    for one in effects_of(updated.model):
+        linear = [j for j, p in enumerate(one.parameters) if p.linear]
+        size = np.array([one.parameters[j].size for j in linear])
+        away = np.array([one.values[j] - one.parameters[j].none for j in linear]) / size
+        C = updated.covariance_of(one, misfit)[np.ix_(linear, linear)] / np.outer(size, size)
+        known = np.linalg.matrix_rank(C, hermitian=True) if linear else 0
+        if known and float(stats.chi2.sf(away @ np.linalg.pinv(C, hermitian=True) @ away, known)) > FALSE_ALARM:
+            return f"{one.effect.name} comes nearest, but these records do not tell its strength from none: not named"
+    return ""
 
 
 def refused(thin: Sequence[SpectralBlock], base: Refit, updated: Refit) -> str:

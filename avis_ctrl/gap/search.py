@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from avis_ctrl.gap.data import thinned
 from avis_ctrl.gap.effects.base import Effect, Seed, library
@@ -148,7 +147,8 @@ def candidates(score: Score, effects: Sequence[Effect]) -> list[Candidate]:
     model, found = score.model, []
     taken = {(one.effect.name, location(one.place)) for one in model.effects}
     tried = 0
-    misfit = max(1.0, score.chi2 / score.dof)
+    # Where the model is far off, so is the noise that a score is held against.
+    stretch = max(1.0, score.chi2 / score.dof) * known_noise([part.block for part in score.parts])
     for effect in effects:
         if effect.nonlinear and not model.motion:
             continue
@@ -158,9 +158,16 @@ def candidates(score: Score, effects: Sequence[Effect]) -> list[Candidate]:
             tried += 1
             seeds = effect.seeds(score, place)
             found += [(active(effect, model, place, seed.values), seed) for seed in seeds[:1]]
-    # Where the model is far off, so is the noise that a score is held against.
-    return sorted((Candidate(one, seed, min(1.0, tried * float(stats.chi2.sf(seed.chi2 / misfit, seed.directions))))
-                   for one, seed in found), key=lambda c: -c.worth)
+    return sorted((Candidate(one, seed, min(1.0, tried * seed.chance(stretch))) for one, seed in found),
+                  key=lambda c: -c.worth)
+
+
+def known_noise(blocks: Sequence[SpectralBlock]) -> float:
+    """How much larger chi-square is on average because the noise is known from some degrees of freedom only: that of n
+    channels weighted by a covariance of nu complex ones has the mean n nu/(nu - n) (H. Hotelling 1931)."""
+    channels = blocks[0].Y.shape[1]
+    dof = min(block.dof for block in blocks)
+    return 1.0 if np.isinf(dof) else float(dof / max(dof - channels, 0.5 * dof))
 
 
 def shortlist(found: Sequence[Candidate], most: int) -> list[Candidate]:
@@ -203,7 +210,7 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
         passed_over += left
         pool.append(tuple(chain[-1] for chain in made))
         plausible = [chain for chain in made if not chain[-1].implausible()]
-        if plausible and _better(plausible[0][-1], best[-1], depth):
+        if plausible and _better(plausible[0][-1], best[-1], depth, known_noise(fitted)):
             best = plausible[0]
         elif depth > 1 or not plausible:
             break
@@ -327,14 +334,14 @@ def definite(closed: Refit) -> bool:
     return closed.held_per_dof <= CLOSED and not any(one.effect.idealised for one in closed.model.effects)
 
 
-def _better(found: Refit, best: Refit, depth: int) -> bool:
+def _better(found: Refit, best: Refit, depth: int, stretch: float) -> bool:
     """Whether a longer chain is worth its length: on the criterion, on the held-out data by themselves, and, of a
     second effect on, because it takes most of what the chain before it leaves.
 
     The last keeps out what only mends the first effect's law where that is not quite the table's; beside an effect of
     which the law is certain a faint second one may be small.
     """
-    misfit = max(1.0, found.held_per_dof)
+    misfit = max(1.0, found.held_per_dof) * stretch
     fall, held = best.criterion - found.criterion, best.chi2_held - found.chi2_held
     worth = fall / misfit > LEAST_FALL and held / misfit > LEAST_FALL / 2
     return worth and (depth == 1 or definite(best) or _share(found, best) > TAKES)

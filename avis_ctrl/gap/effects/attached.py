@@ -148,7 +148,7 @@ def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed
         G, b = project(score, partial(sprung, frequency_Hz=f, damping=zeta), ("sprung", f, zeta))
         chi2, k, d, mass = _best_direction(G, b, points)
         a = min(np.sqrt(mass), 0.7 * most) * d
-        return Seed((*a, f, zeta, *points[k]), chi2, 7) if mass > 0 else None
+        return Seed((*a, f, zeta, *points[k]), chi2, 7, len(parameters[3].grid) * len(DAMPINGS)) if mass > 0 else None
 
     grid = parameters[3].grid
     found = [seed for f in grid for zeta in DAMPINGS if (seed := at(f, zeta))]
@@ -196,7 +196,7 @@ def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> li
                 break
             before = chi2
             own = [frequencies[j] for j in triple]
-            found.append(Seed((min(mass, 0.5 * parameters[0].high), *own, zeta, *points[k]), chi2, 8))
+            found.append(Seed((min(mass, 0.5 * parameters[0].high), *own, zeta, *points[k]), chi2, 8, len(frequencies) ** 3))
             k = _best_point(kept, e, axes, triple)
     return found
 

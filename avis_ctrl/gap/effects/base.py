@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from scipy import stats
 
 from avis_ctrl.errors import InputError
 
@@ -57,12 +58,21 @@ class EffectParameter:
 class Seed:
     """Where a refit may begin: values of all parameters, and by how much chi2 falls there to first order.
 
-    directions : along how many the data could have made it fall.
+    directions : along how many the data could have made it fall. looks : at how many frequencies, or other values of
+    what shapes the effect, the best was sought. seen : the fall by which its significance is judged, where that is not
+    chi2 (on fewer data).
     """
 
     values: tuple[float, ...]
     chi2: float
     directions: int
+    looks: int = 1
+    seen: float | None = None
+
+    def chance(self, stretch: float) -> float:
+        """Probability of as large a fall by noise alone, of which the power is `stretch` times the stated one."""
+        fall = self.chi2 if self.seen is None else self.seen
+        return min(1.0, self.looks * float(stats.chi2.sf(fall / stretch, self.directions)))
 
 
 @dataclass(frozen=True)
@@ -177,14 +187,15 @@ class Effect(ABC):
 
         parameters, found = self.parameters(score.model, place), []
         linear = [j for j, one in enumerate(parameters) if one.linear]
-        for point in self.starts(score.model, place):
+        starts = self.starts(score.model, place)
+        for point in starts:
             effect = ActiveEffect(self, place, parameters, tuple(float(v) for v in point))
             A = score.of_effect(effect)
             if not linear:
                 # It acts at full strength or not at all.
                 fall = float(2 * A[0] @ score.e - A[0] @ A[0])
                 if fall > 0:
-                    found.append(Seed(effect.values, fall, len(parameters)))
+                    found.append(Seed(effect.values, fall, len(parameters), len(starts)))
                 continue
             took = score.reduction(A)
             values = list(effect.values)
@@ -193,7 +204,7 @@ class Effect(ABC):
                 values[j] = float(np.clip(one.none + c, one.low, one.high))
             wrong = any(values[j] == parameters[j].none for j in linear) and len(linear) == 1
             if not wrong:
-                found.append(Seed(tuple(values), took.chi2, took.rank))
+                found.append(Seed(tuple(values), took.chi2, took.rank, len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:

@@ -79,7 +79,8 @@ class BaseCompliance(Effect):
         """Short fits to few lines: from where each way of moving resonates best by itself, and from the most promising
         of like frequencies along all ways, where one step of all parameters together is expected to lead furthest."""
         blocks = [thinned(part.block, TRIAL_LINES, seed=2) for part in score.parts]
-        scale = score.chi2 / max(Score(score.model, blocks).chi2, 1.0)
+        few = Score(score.model, blocks).chi2
+        scale = score.chi2 / max(few, 1.0)
         own = self._by_ways(score, place)
         trials = [] if score.chi2 < PLAIN * score.dof else self._alike(score.model, place, blocks)
         found = []
@@ -87,7 +88,9 @@ class BaseCompliance(Effect):
             begin = score.model.with_effect(ActiveEffect(self, place, self.parameters(score.model, place), values))
             if (made := _short_fit(begin, blocks)) is not None:
                 reached = cast(TableModel, made.model).effects[-1].values
-                found.append(Seed(reached, score.chi2 - scale * made.chi2, len(values)))
+                # On few lines the rig's parameters take their part of the noise, too.
+                found.append(Seed(reached, score.chi2 - scale * made.chi2, len(made.model.names),
+                                  len(own) + len(TRIAL_Hz), few - made.chi2))
         found = [one for one in found if one.chi2 > 0] or own
         return sorted(found, key=lambda seed: -seed.chi2)
 

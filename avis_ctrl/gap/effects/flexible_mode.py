@@ -133,7 +133,8 @@ def _modes_one_by_one(score: Score, grid: Sequence[float]) -> list[tuple[int, Se
             break
         chosen.append(best)
         for taken, k, residues in sorted(tries, key=lambda one: -one[0])[:4]:
-            if seed := _seed(score.model, [frequencies[j] for j in (*chosen[:-1], k)], residues, taken):
+            if seed := _seed(score.model, [frequencies[j] for j in (*chosen[:-1], k)], residues, taken,
+                                 len(frequencies) ** count):
                 found.append((count, seed))
         before = chi2
     score.kept["modes"] = sorted(found, key=lambda one: (one[0], -one[1].chi2))
@@ -147,7 +148,8 @@ def _joint(chosen: Sequence[int], kept: Sequence[np.ndarray], own: Sequence[tupl
     return G, np.concatenate([own[i][1] for i in chosen])
 
 
-def _seed(model: TableModel, at: Sequence[tuple[float, float]], residues: np.ndarray, chi2: float) -> Seed | None:
+def _seed(model: TableModel, at: Sequence[tuple[float, float]], residues: np.ndarray, chi2: float,
+          looks: int) -> Seed | None:
     """Shapes from residues (modes n_y n_u,); None where some mode's would be negative."""
     at_actuators, at_sensors = shape_rows(model.rig, model.actuators, model.sensors.names)
     values: list[float] = []
@@ -162,4 +164,4 @@ def _seed(model: TableModel, at: Sequence[tuple[float, float]], residues: np.nda
             return None
         values += [f, zeta, *(shape * np.sqrt(sigma[0] * sign / size))]
         share, total = share + sigma[0] ** 2, total + float(np.sum(sigma ** 2))
-    return Seed(tuple(float(v) for v in values), chi2 * float(share / total), len(residues))
+    return Seed(tuple(float(v) for v in values), chi2 * float(share / total), len(residues), looks)

@@ -126,11 +126,12 @@ class MountSurge(_OfMounts):
         """Over frequency and damping, by what the change of the response takes of the residual when it may be of any
         positive size: where the rig's parameters have given way, its size at full strength is wrong, not its shape."""
         parameters, found = self.parameters(score.model, place), []
-        for point in self.starts(score.model, place):
+        starts = self.starts(score.model, place)
+        for point in starts:
             values = tuple(float(v) for v in point)
             took = score.reduction(score.of_effect(ActiveEffect(self, place, parameters, values)))
             if took.coefficients[0] > 0:
-                found.append(Seed(values, took.chi2, len(parameters)))
+                found.append(Seed(values, took.chi2, len(parameters), len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:

@@ -32,10 +32,11 @@ class FirstOrder(Beyond):
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         found = []
-        for point in self.starts(score.model, place):
+        starts = self.starts(score.model, place)
+        for point in starts:
             took = score.reduction(score.directions([self.first_order(part, place, point) for part in score.parts]))
             values = self._begin(score.model, place, point, took.coefficients)
-            found.append(Seed(tuple(float(v) for v in values), took.chi2, took.rank))
+            found.append(Seed(tuple(float(v) for v in values), took.chi2, took.rank, len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def _begin(self, model: TableModel, place: str, point: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
