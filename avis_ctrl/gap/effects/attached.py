@@ -196,7 +196,8 @@ def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> li
                 break
             before = chi2
             own = [frequencies[j] for j in triple]
-            found.append(Seed((min(mass, 0.5 * parameters[0].high), *own, zeta, *points[k]), chi2, 8, len(frequencies) ** 3))
+            values = (min(mass, 0.5 * parameters[0].high), *own, zeta, *points[k])
+            found.append(Seed(values, chi2, 8, len(frequencies) ** 3))
             k = _best_point(kept, e, axes, triple)
     return found
 
