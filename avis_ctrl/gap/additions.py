@@ -19,8 +19,9 @@ from scipy.optimize import nnls
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.attached import elements
+from avis_ctrl.gap.effects.chassis import of_chassis
 from avis_ctrl.gap.effects.flexible_mode import modes, shape_rows
-from avis_ctrl.gap.effects.mounts import LEVELED, REFERENCE_Hz, surge_omega
+from avis_ctrl.gap.effects.mounts import LEVELED, REFERENCE_Hz, drifted, surge_omega
 from avis_ctrl.gap.effects.payload import place_of, tie
 from avis_ctrl.gap.operators import MountGeometry, mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
@@ -240,7 +241,13 @@ def _friction(table: Table, place: str, values: Mapping[str, float]) -> StateSpa
 
 def _drift(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
     G, k = table.G, table.mounts.stiffness
-    return _static(table, values["relative_change"] * table.when * G.T @ (k[:, None] * G))
+    return _static(table, values["relative_change"] * drift_at(table.model, values, table.when) * G.T @ (k[:, None] * G))
+
+
+def drift_at(model: TableModel, values: Mapping[str, float], when: float) -> float:
+    """Share of a drift's change, -0.5 .. 0.5, at a moment -0.5 .. 0.5 of the campaign: the same for the linear law."""
+    begin, end = next((one.campaign_s for one in model.motion.values()), (0.0, 1.0))
+    return float(drifted(np.array(when + 0.5), values.get("time_constant_s", 0.0) / (end - begin)))
 
 
 def _cable(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
@@ -296,9 +303,8 @@ def chassis(table: Table, values: Mapping[str, float], floor: list[str], acceler
             ) -> StateSpace:
     """Velocity of a chassis on a soft base, from that of the floor and the acceleration of the payload.
 
-    v_c = H v_f - s B M a, with B = inv(s^2 m + s c + k) along each axis (about it with rocking), M the payload's. The
-    heights of a rocking chassis' mass and springs, which couple sliding and rocking, are left out: the error of the
-    realisation shows what that costs.
+    M_c v_c' = -K_b x - C_b (v_c - v_f) - M a,  x' = v_c - v_f, with M the payload's: of the coordinates that are kept
+    and in which the chassis moves. In the others it goes with the floor.
 
     Raises
     ------
@@ -306,26 +312,15 @@ def chassis(table: Table, values: Mapping[str, float], floor: list[str], acceler
     """
     if values["mass_kg"] <= 0:
         raise InputError("expected a chassis with a mass", field="base_compliance.mass_kg", value=values["mass_kg"])
-    n, parts = table.n, []
-    read = np.zeros((0, 2 * n))
-    for a, name in enumerate(table.keep):
-        own = np.zeros((2, 2 * n))
-        own[0, a], own[1, n:] = 1.0, table.inertia[a]
-        read = np.vstack([read, own])
-        parts.append(_chassis_axis(name, table.scale[a], values).renamed([f"f{a}", f"a{a}"], [f"c{a}"]))
-    total = append(*parts).scaled(1.0, read)
-    return StateSpace(total.A, total.B, total.C, total.D, 0.0, (*floor, *accelerations), tuple(moves))
-
-
-def _chassis_axis(name: str, scale: float, values: Mapping[str, float]) -> StateSpace:
-    """(floor velocity, inertia force of the payload) -> velocity of the chassis in one coordinate."""
-    turns = name.startswith("phi")
-    key = f"r{name[-1]}_Hz" if turns else f"{name}_Hz"
-    if key not in values:
-        return gain([[1.0, 0.0]])
-    m = values["mass_kg"] * (values[f"gyration_{name[-1]}_m"] ** 2 if turns else 1.0) * scale ** 2
-    w, zeta = 2 * np.pi * values[key], values["damping"]
-    # x = (deflection of the base, velocity of the chassis): x1' = x2 - v_f, m x2' = -k x1 - c (x2 - v_f) - M a
-    A = np.array([[0.0, 1.0], [-w ** 2, -2 * zeta * w]])
-    B = np.array([[-1.0, 0.0], [2 * zeta * w, -1 / m]])
-    return StateSpace(A, B, np.array([[0.0, 1.0]]), np.zeros((1, 2)))
+    n = table.n
+    mass, damping, stiffness = (table.rows(table.rows(of_q).T) for of_q in of_chassis(values))
+    free = [a for a, name in enumerate(table.keep) if (f"r{name[-1]}_Hz" if name.startswith("phi") else f"{name}_Hz")
+            in values]
+    own = np.ix_(free, free)
+    by_mass = np.linalg.inv(mass[own]) if free else np.zeros((0, 0))
+    m, follow = len(free), np.eye(n)[free]
+    A = np.block([[np.zeros((m, m)), np.eye(m)], [-by_mass @ stiffness[own], -by_mass @ damping[own]]])
+    B = np.block([[-follow, np.zeros((m, n))], [by_mass @ damping[own] @ follow, -by_mass @ table.inertia[free]]])
+    C = np.hstack([np.zeros((n, m)), follow.T])
+    D = np.hstack([np.eye(n) - follow.T @ follow, np.zeros((n, n))])
+    return StateSpace(A, B, C, D, 0.0, (*floor, *accelerations), tuple(moves))

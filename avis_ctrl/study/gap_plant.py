@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.gap.additions import drift_at
 from avis_ctrl.gap.realise import loop_lag, realise, sufficient_order, with_effects
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.lti.connect import connect, lft_lower
@@ -202,7 +203,7 @@ def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
         elif name == "stiffness_drift":
             for key in known:
                 if key.rpartition(".")[2].startswith("k_"):
-                    add(key, values["relative_change"] * when * known[key].value)
+                    add(key, values["relative_change"] * drift_at(model, values, when) * known[key].value)
         elif name == "contact_friction":
             for motor in model.rig.motors:  # type: ignore[attr-defined]
                 add(f"isolator{motor.isolator}.k_{motor.axis}", values["stiffness_N_per_m"])

@@ -143,30 +143,39 @@ class BaseCompliance(Effect):
         return [Seed(tuple(float(v) for v in values), took.chi2, 2 * len(best))]
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        m, zeta = values["mass_kg"], values["damping"]
-        ways = [way for way in WAYS if f"{way}_Hz" in values]
-        radii = [1.0, 1.0, 1.0, *(values[f"gyration_{axis}_m"] for axis in "xyz")] if len(ways) > 3 else [1.0] * 3
-        inertia = m * np.square(radii)
-        w = 2 * np.pi * np.array([values[f"{way}_Hz"] for way in ways])
-        k, c = inertia * w ** 2, 2 * zeta * inertia * w
+        mass, damping, stiffness = of_chassis(values)
         s = ops.s[:, None, None]
-        if len(ways) == 3:
-            D = inertia * s[:, :, 0] ** 2 + s[:, :, 0] * c + k
-            B, H = np.zeros((len(s), 6, 6), complex), np.zeros((len(s), 6, 3), complex)
-            B[:, range(3), range(3)], H[:, range(3), range(3)] = 1 / D, (s[:, :, 0] * c + k) / D
-        else:
-            centre = np.array([0.0, 0.0, values["centre_z_m"]])
-            mass, spring = np.zeros((6, 6)), np.zeros((2, 6, 6))
-            G, below = point_map(centre), point_map(centre + np.array([0.0, 0.0, values["base_z_m"]]))
-            mass[3:, 3:] = np.diag(inertia[3:])
-            mass += G.T @ np.diag(inertia[:3]) @ G
-            for which, one in zip(spring, (k, c), strict=True):
-                which += below.T @ np.diag(one[:3]) @ below
-                which[3:, 3:] += np.diag(one[3:])
-            tied = spring[0] + s * spring[1]
+        tied = stiffness + s * damping
+        if "rx_Hz" in values:
             B = np.linalg.inv(s ** 2 * mass + tied)
             H = B @ tied[:, :, :3]
+        else:
+            B, H, along = np.zeros((len(s), 6, 6), complex), np.zeros((len(s), 6, 3), complex), range(3)
+            held = tied[:, along, along]
+            D = s[:, :, 0] ** 2 * mass[along, along] + held
+            B[:, along, along], H[:, along, along] = 1 / D, held / D
         ops.recoil, ops.follow = B, H
+
+
+def of_chassis(values: Mapping[str, float]) -> np.ndarray:
+    """(3, 6, 6) mass, damping and stiffness of a chassis on its base, in the payload's coordinates about the table's
+    centre; nothing in those in which it does not move."""
+    ways = [way for way in WAYS if f"{way}_Hz" in values]
+    n = len(ways)
+    radii = [1.0 if len(way) == 1 else values[f"gyration_{way[1]}_m"] for way in ways]
+    inertia = values["mass_kg"] * np.square(radii)
+    w = 2 * np.pi * np.array([values[f"{way}_Hz"] for way in ways])
+    found = np.zeros((3, 6, 6))
+    if n == 3:
+        found[:, range(3), range(3)] = inertia, 2 * values["damping"] * inertia * w, inertia * w ** 2
+        return found
+    centre = np.array([0.0, 0.0, values["centre_z_m"]])
+    G, below = point_map(centre), point_map(centre + np.array([0.0, 0.0, values["base_z_m"]]))
+    each = (inertia, 2 * values["damping"] * inertia * w, inertia * w ** 2)
+    for which, place, one in zip(found, (G, below, below), each, strict=True):
+        which += place.T @ np.diag(one[:3]) @ place
+        which[3:, 3:] += np.diag(one[3:])
+    return found
 
 
 def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock]) -> LikelihoodFit | None:
