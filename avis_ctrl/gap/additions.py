@@ -241,7 +241,8 @@ def _friction(table: Table, place: str, values: Mapping[str, float]) -> StateSpa
 
 def _drift(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
     G, k = table.G, table.mounts.stiffness
-    return _static(table, values["relative_change"] * drift_at(table.model, values, table.when) * G.T @ (k[:, None] * G))
+    change = values["relative_change"] * drift_at(table.model, values, table.when)
+    return _static(table, change * G.T @ (k[:, None] * G))
 
 
 def drift_at(model: TableModel, values: Mapping[str, float], when: float) -> float:

@@ -131,7 +131,8 @@ def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, p
     best = _without_spare(refit(found.best.model, prepared.thin, prepared.thin_held), prepared)
     if len(effects_of(best.model)) < len(found.chain) - 1:
         found = replace(found, chain=(found.chain[0], best))
-    chain = (prepared.base, *found.chain[1:-1], best)
+    between = [judged(one.fit, prepared.thin_held) for one in found.chain[1:-1]]
+    chain = (prepared.base, *between, best)
     longer = replace(found, chain=chain, reached_noise=best.held_per_dof <= CLOSED)
     if found.best.held_per_dof > CLOSED or len(chain) > LONGEST or (longer.reached_noise and not definite(best)):
         return longer

@@ -1,8 +1,9 @@
-"""How large an effect would have had to be to be seen: what a verdict of none is worth.
+"""How large an effect would have to be to differ from none by three deviations: what a verdict of none is worth.
 
 Of an effect that is linear in its parameters near none, the directions A of the score test (whitened, with everything
 that re-identification absorbs projected out) are also what a fit would know them by: the covariance of the parameters
-is inv(A A^T), and a parameter is seen where it exceeds three of its standard deviations.
+is inv(A A^T). The search itself asks for more: its score must stand out of all candidates, and the criterion must
+fall by `search.LEAST_FALL`, which one parameter reaches at between four and five of its deviations.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ DEVIATIONS = 3.0
 
 def detectable(model: TableModel, blocks: Sequence[SpectralBlock], effects: Sequence[Effect] | None = None
                ) -> tuple[Detectable, ...]:
-    """For every effect, place and parameter the smallest departure from none that these data would show.
+    """For every effect, place and parameter the departure from none of three standard deviations.
 
     Of effects whose parameters are all linear, each parameter with the others of its effect free; of two laws of one
     effect the larger value. One effect at a time. Infinite where re-identification absorbs a parameter.

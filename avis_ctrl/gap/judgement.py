@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy import stats
@@ -257,15 +258,16 @@ def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect]) -> lis
         ties = tuple(sorted({name for (name, _), share in by_name.items() if share >= RIVAL and name != key[0]}))
         made.append(NamedEffect(*key, one.effect.title, updated.reported(one, misfit),
                                 min(by_name.get(key, 1.0) * unnamed, MOST_SURE), ties,
-                                _gain(found, updated), one.label))
+                                _gain(found, one.label), one.label))
     return made
 
 
-def _gain(found: Found, updated: Refit) -> float:
-    """Rise of the held-out log-likelihood by the last step of the chain, on the compared lines."""
-    if len(found.chain) < 2:
-        return 0.0
-    return float(found.chain[-2].chi2_held - found.chain[-1].chi2_held) / 2
+def _gain(found: Found, label: str) -> float:
+    """Rise of the held-out log-likelihood by the step of the chain that brought an effect, on the compared lines."""
+    for before, after in pairwise(found.chain):
+        if label in after.labels and label not in before.labels:
+            return (before.chi2_held - after.chi2_held) / 2
+    return 0.0
 
 
 def _considered(found: Found, updated: Refit) -> tuple[Considered, ...]:
@@ -281,7 +283,7 @@ def _considered(found: Found, updated: Refit) -> tuple[Considered, ...]:
             if set(rival.labels) == chosen or not own:
                 continue
             reason = rival.implausible() or (f"leaves {rival.held_per_dof:.3g} times the noise's power of the held-out "
-                                             f"records, the chosen model {found.best.held_per_dof:.3g}")
+                                             f"records, the best model {found.best.held_per_dof:.3g}")
             rows.append(Considered(" and ".join(one.effect.name for one in own),
                                    " and ".join(location(one.place) for one in own), rival.held_per_dof, float(share),
                                    reason, rival.reported(own[-1])))

@@ -21,8 +21,9 @@ class NamedEffect:
     """An effect that the data call for.
 
     name, location : of the contract. title : in words. parameters : with standard deviations.
-    probability : of this effect among the library's, given the data. indistinguishable_from : names that this data
-    cannot tell from it. confirmed : by how much the held-out log-likelihood rises with it.
+    probability : of this effect among the candidates that were refitted in its place, given the data, equal beforehand;
+    of one that acts on the signals alone, what its finder states. indistinguishable_from : names that this data cannot
+    tell from it. confirmed : by how much the held-out log-likelihood rises with it, beside those named before it.
     label : of the active effect in the updated model; empty for one that acts on the signals alone (hum, converter,
     ground motion). confirmation : in words, how it was found.
     """
@@ -77,8 +78,8 @@ class Considered:
 
 @dataclass(frozen=True)
 class Detectable:
-    """A parameter of an absent effect, and the smallest departure from none that the data would have shown: three
-    standard deviations on the fitted records. Infinite where re-identification would absorb it."""
+    """A parameter of an absent effect, and the departure from none that is three standard deviations of a fit to the
+    fitted records. The search asks for more before it names. Infinite where re-identification would absorb it."""
 
     name: str
     location: str
@@ -154,7 +155,7 @@ class Gap:
     considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.
     pictures : plain data for plots. held_out : how the records were divided. seed, seconds.
     covariance : (n_p, n_p) of the updated model's parameters.
-    detectable : where the verdict is none, how large effects would have had to be to be seen; else empty.
+    detectable : where the verdict is none, sizes of three standard deviations of absent effects; else empty.
     shares : what accounts for the outputs' power, by level, the lowest first. records : what each record leaves.
     """
 

@@ -163,8 +163,9 @@ def candidates(score: Score, effects: Sequence[Effect]) -> list[Candidate]:
 
 
 def known_noise(blocks: Sequence[SpectralBlock]) -> float:
-    """How much larger chi-square is on average because the noise is known from some degrees of freedom only: that of n
-    channels weighted by a covariance of nu complex ones has the mean n nu/(nu - n) (H. Hotelling 1931)."""
+    """How much more a score, and a difference of chi-square, scatters because its weights are estimated: nu/(nu - n) of
+    n channels and a covariance of nu complex degrees of freedom (to 1/nu^2 `maximum_likelihood.weight_cost`). The mean
+    of chi-square itself (H. Hotelling 1931) has been corrected for in the weights."""
     channels = blocks[0].Y.shape[1]
     dof = min(block.dof for block in blocks)
     return 1.0 if np.isinf(dof) else float(dof / max(dof - channels, 0.5 * dof))

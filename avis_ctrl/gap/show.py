@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 # Residual over noise that is shown as a place of the gap: significant at this level over all places together.
 PLACE_ALARM = 0.01
 MOST_PLACES = 10
+# Error over that of noise alone up to which a sentence may call it the noise.
+IS_NOISE = 1.05
 BANDS_PER_OCTAVE = 2
 # Lines of each record from which its place in level and time, and the shares of power, are told.
 SHOWN_LINES = 1200
@@ -77,7 +79,8 @@ def shown(prepared: Prepared, found: Found, base: Refit, updated: Refit, judgeme
               Stage("re-identified", *_figures(Left.of(base.model, unmasked)))]
     ladder += _steps(found, base, judgement, before, after)
     where = places(before)
-    remaining = places(after) if judgement.verdict in ("partly explained", "unexplained") else ()
+    # Of a gap that counts as closed, too: some band may stand out by itself.
+    remaining = places(after)
     sentences = (opening(judgement, ladder, after), *judgement.reasons, prepared.noise)
     sensors = None if noise is None else {name: one.value for name, one in noise.sensors.items()}
     records, shares = _every(prepared, base.model, judgement.updated.model, sensors)
@@ -111,15 +114,17 @@ def opening(judgement: Judgement, ladder: Sequence[Stage], after: Left) -> str:
     """The one sentence."""
     first, last = ladder[1], ladder[-1]
     if judgement.verdict == "none":
-        return (f"No effect is missing: after re-identification the model leaves {_percent(first.nrmse)} of the "
+        return (f"No missing effect shows: after re-identification the model leaves {_percent(first.nrmse)} of the "
                 f"held-out records, noise alone {_percent(after.noise_nrmse)}.")
     if judgement.verdict == "unexplained":
         return (f"Something is missing that the library has no name for: after re-identification the model leaves "
                 f"{_percent(first.nrmse)} of the held-out records, noise alone {_percent(after.noise_nrmse)}.")
     named = " and ".join(in_words(one) for one in judgement.effects)
-    end = "the noise" if judgement.verdict == "explained" else f"{_percent(last.nrmse)}, and something else remains"
+    end = "and something else remains" if judgement.verdict != "explained" else (
+        "which is the noise" if last.nrmse <= IS_NOISE * after.noise_nrmse else
+        f"beside {_percent(after.noise_nrmse)} of noise")
     return (f"Missing from the model: {named}; with that in it the gap falls from {_percent(first.nrmse)} to "
-            f"{end if judgement.verdict != 'explained' else f'{_percent(last.nrmse)}, which is {end}'}.")
+            f"{_percent(last.nrmse)}, {end}.")
 
 
 def in_words(one: NamedEffect) -> str:
@@ -187,7 +192,9 @@ def places(left: Left) -> tuple[Where, ...]:
     made = []
     for low, high, output, power, lines, found, dof in rows:
         ratio = power / lines
-        p = float(stats.f.sf(ratio, 2 * lines, 2 * dof * max(lines / 60, 1)) if np.isfinite(dof)
+        # At most a third of the records is held out: the noise of a band is known from twice as many lines or more.
+        known = min(dof * max(lines / 60, 1), max(dof, 2 * lines))
+        p = float(stats.f.sf(ratio, 2 * lines, 2 * known) if np.isfinite(dof)
                   else stats.chi2.sf(2 * power, 2 * lines))
         if min(p * count, 1.0) < PLACE_ALARM:
             best = int(np.argmax(found))

@@ -105,6 +105,17 @@ def test_none_says_what_would_not_have_been_seen(found):
     assert "An actuator lag below 3.1e-05 s would not have been seen." in Reader(gap_html(one).encode()).text
 
 
+def test_a_band_that_stands_out_of_a_closed_gap_is_not_denied(found):
+    left = stand_in.with_verdict(found.gap, "unexplained").remaining
+    for verdict in ("none", "explained"):
+        gap = stand_in.with_verdict(found.gap, verdict)
+        one = replace(found, gap=replace(gap, remaining=left))
+        assert "No band of any channel" not in prose(section(one, "where")) + prose(section(one, "remaining"))
+        assert tables(section(one, "remaining"))
+        quiet = replace(found, gap=replace(gap, remaining=()))
+        assert "No band of any channel" in prose(section(quiet, "remaining"))
+
+
 def test_a_group_is_said_to_be_one(found):
     effect = replace(found.gap.effects[0], indistinguishable_from=("product_of_inertia",))
     one = replace(found, gap=replace(found.gap, effects=(effect,), next_experiment="Shake the floor."))
@@ -272,7 +283,7 @@ def test_none_says_from_which_size_on_an_effect_would_show(found):
     assert tables(section(one, "remaining"))[0].rows == (
         ("actuator lag", "actuators", "time constant", "3.1e−5 s"), ("sensor gain", "Sz1", "gain", "at no size"),
         ("actuator gain", "Az1 (best) to Ax2", "gain", "1.0e−4 to 3.0e−4"))
-    assert "would have been seen" in prose(section(one, "result"))
+    assert "could be told from none" in prose(section(one, "result"))
 
 
 def test_terms_that_every_model_holds_are_no_effect(found):

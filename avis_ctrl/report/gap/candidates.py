@@ -13,7 +13,7 @@ MOST = 4
 
 
 def candidates(found: Found) -> Section:
-    """Every candidate that was refitted, the most probable first."""
+    """Candidates that were refitted, the most probable first (`judgement` hands on a dozen at most)."""
     ranked = sorted(found.gap.considered, key=lambda one: (-one.probability, one.chi2_per_dof))
     if not ranked:
         return Section("Runners-up", "considered", (Paragraph(_none(found)),))

@@ -48,8 +48,14 @@ def method(gap: Gap) -> Section:
                 "the probability of candidate i is its share of the exponentials of minus half the criterion"),
         Paragraph("An effect is named only if the held-out data confirm it. Effects are added one by one until the "
                   "held-out residual is noise or nothing in the library helps. Error and noise in per cent:"),
-        Formula("op(\"n.r.m.s.\") = (sum_k norm(e_k)^2 slash sum_k norm(Y_k)^2)^(1 slash 2)",
-                "the normalised error is the root of the residual's power over the output's"),
+        Formula("op(\"n.r.m.s.\") = (1 / n_y sum_i sum_k abs(e_(k i))^2 slash sum_k abs(Y_(k i))^2)^(1 slash 2)",
+                "the normalised error is the root of the mean over outputs of the residual's power over the output's"),
+        Paragraph("What held out means. No parameter is fitted to the held-out records, but they have their say in "
+                  "which candidate is chosen and when to stop, so that their figures after naming are no independent "
+                  "test. Hum is found in all records. Forces that depend on amplitude or time, the second-order terms "
+                  "of large rotations among them, act on the motion of the mounts as the model has it, corrected by "
+                  "each record's own sensors, of the held-out records too; avis predict goes from drives and floor "
+                  "alone."),
         Paragraph(f"Held out: {gap.held_out.rstrip('.')}." if gap.held_out else
                   "How the records were divided is not stated."),
         Heading("Sources"), Bullets(SOURCES)]

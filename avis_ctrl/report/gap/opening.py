@@ -23,8 +23,7 @@ def opening(found: Found) -> Section:
         pieces.append(_effects(gap))
     pieces += [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from]
     if gap.detectable:
-        pieces.append(Paragraph("From which size on an effect would have been seen stands in the section on what "
-                                "remains."))
+        pieces.append(Paragraph("How large an effect could be told from none stands in the section on what remains."))
     if gap.sentences[1:]:
         pieces.append(Bullets(tuple(map(wording.said, gap.sentences[1:]))))
     warned = list(dict.fromkeys(f.gate for f in found.findings if f.severity in ("warning", "stop")))
@@ -84,6 +83,7 @@ def _effects(gap: Gap) -> Table:
              wording.probability(one.probability),
              ", ".join(map(wording.titled, one.indistinguishable_from)) or "none")
             for one in gap.effects]
-    return table("What is named. The probability is that of this effect among the effects of the library, given the "
-                 "data; it does not count effects that nobody put into the library. Sizes with one standard "
+    return table("What is named. The probability of an effect of the table is that among the candidates that were "
+                 "refitted in its place, given the data; it does not count what nobody thought of. That of an effect "
+                 "on signals alone is one less the chance of such a signal without it. Sizes with one standard "
                  "deviation.", ("effect", "place", "size", "probability", "cannot be told from"), rows, "lllrl")

@@ -36,7 +36,8 @@ def places(found: Found) -> Section:
 
 def _nowhere(gap: Gap) -> str:
     if gap.verdict == "none":
-        return "No band of any channel stands out of the noise."
+        return ("The residual counts as noise as a whole. Bands that stand out of it by themselves are in the section "
+                "on what remains." if gap.remaining else "No band of any channel stands out of the noise.")
     return "The places of the gap were not stated."
 
 

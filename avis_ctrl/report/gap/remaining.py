@@ -19,14 +19,13 @@ def remaining(found: Found) -> Section:
     if gap.remaining:
         pieces.append(table_of(gap.remaining, "Places of what the updated model leaves on held-out data. "))
     if gap.detectable:
-        pieces += [Heading("What would have been seen"), detectable(gap)]
+        pieces += [Heading("How large an effect could be told from none"), detectable(gap)]
     pieces += [Heading("What to measure next"), Paragraph(gap.next_experiment or _nothing(gap))]
     return Section("What remains, and what to measure next", "remaining", tuple(pieces))
 
 
 def detectable(gap: Gap) -> Table:
-    """From which size on each effect of the library would have been seen; over its places, from the best to the worst.
-    """
+    """The size at which each effect would differ from none by three deviations; over its places, best to worst."""
     groups: dict[tuple[str, str, str], list[Detectable]] = {}
     for one in gap.detectable:
         groups.setdefault((one.name, one.parameter, one.unit), []).append(one)
@@ -37,10 +36,11 @@ def detectable(gap: Gap) -> Table:
         ends = [ordered[0]] if len(ordered) == 1 else [ordered[0], ordered[-1]]
         size = " to ".join(_seen(one) for one in ends)
         rows.append((wording.titled(name), where, wording.parameter(parameter), size))
-    return table("An effect that is absent, by itself at its place, would have been seen from this size on: three "
-                 "standard deviations of the fit, at the best and at the worst of its places. What is smaller may be "
-                 "there. \"At no size\": re-identification of the rig's own parameters would take it up.",
-                 ("effect", "place", "parameter", "seen from"), rows, "lllr")
+    return table("An effect that is absent, by itself at its place, would differ from none by three standard "
+                 "deviations of the fit at this size, at the best and at the worst of its places. What is smaller may "
+                 "be there, and so may what is somewhat larger: before the search names an effect it asks for more, "
+                 "because it tries so many. \"At no size\": re-identification of the rig's own parameters would take "
+                 "it up.", ("effect", "place", "parameter", "three deviations"), rows, "lllr")
 
 
 def _seen(one: Detectable) -> str:
@@ -51,7 +51,7 @@ def _seen(one: Detectable) -> str:
 def _left(gap: Gap) -> str:
     if gap.verdict in ("none", "explained"):
         after = " with the named effects" if gap.effects else ""
-        return (f"Nothing beyond the measured noise was found{after}." if not gap.remaining else
+        return (f"No band of any channel stands out of the measured noise{after}." if not gap.remaining else
                 f"The held-out residual{after} counts as noise as a whole; the places below stand out by themselves.")
     what = "What the named effects leave" if gap.effects else "The whole gap"
     return (f"{what} is significant, and nothing in the library accounts for it."

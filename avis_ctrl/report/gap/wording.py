@@ -7,16 +7,20 @@ from collections.abc import Mapping
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Effect, Reported, library
+from avis_ctrl.gap.judgement import UNEXPLAINED
 from avis_ctrl.gap.result import Considered, NamedEffect, Where
+from avis_ctrl.gap.search import CLOSED
 from avis_ctrl.report import words
 
 # What each verdict claims, and what it does not.
 CLAIMS = {
-    "none": "Verdict: none. After re-identification of its own parameters the rig's model agrees with the held-out "
-            "data to within the measured noise. Nothing was added. An effect that is too weak for this campaign, or "
-            "that these records do not excite, would not show.",
-    "explained": "Verdict: explained. With what is named above the model agrees with the held-out data to within "
-                 "the measured noise. What hides below that noise this campaign cannot show.",
+    "none": "Verdict: none. After re-identification of its own parameters what the rig's model leaves of the held-out "
+            f"data is, as a whole, within {UNEXPLAINED ** 0.5:.3g} times the r.m.s. of the measured noise, and no "
+            "effect is named. Nothing was added. An effect that is too weak for this campaign, or that these records "
+            "do not excite, would not show.",
+    "explained": "Verdict: explained. With what is named above what the model leaves of the held-out data is, as a "
+                 f"whole, within {CLOSED ** 0.5:.3g} times the r.m.s. of the measured noise, which counts as closed. "
+                 "What hides below that this campaign cannot show.",
     "partly explained": "Verdict: partly explained. What is named above is confirmed by the held-out data, but a "
                         "significant part of the gap remains and nothing in the library accounts for it. The updated "
                         "model is better, not complete.",

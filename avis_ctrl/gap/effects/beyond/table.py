@@ -43,7 +43,7 @@ class QuadraticStiffness(Beyond):
 
 
 class QuadraticDrag(Beyond):
-    """Force -c |v| v at every mount along each axis: air, or oil that is pressed through an orifice."""
+    """Force -c |v| v on the payload at the table's centre, v its velocity against the chassis: air."""
 
     name = "quadratic_drag"
     title = "drag in proportion to the square of velocity"
