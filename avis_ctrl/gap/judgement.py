@@ -280,7 +280,7 @@ def _considered(found: Found, updated: Refit) -> tuple[Considered, ...]:
         p = probabilities(stage)
         for rival, share in sorted(zip(stage, p, strict=True), key=lambda pair: pair[0].criterion):
             own = effects_of(rival.model)
-            if set(rival.labels) == chosen or not own:
+            if set(rival.labels) <= chosen or not own:  # a step on the way to what was chosen lost to nothing
                 continue
             reason = rival.implausible() or (f"leaves {rival.held_per_dof:.3g} times the noise's power of the held-out "
                                              f"records, the best model {found.best.held_per_dof:.3g}")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from avis_ctrl.gap.judgement import _gain
+from avis_ctrl.gap.judgement import _considered, _gain
 from avis_ctrl.gap.result import NamedEffect, Stage
 from avis_ctrl.gap.show import opening, places
 
@@ -19,6 +19,17 @@ def test_each_of_two_effects_is_confirmed_by_its_own_step():
         (("large_motion@payload", "first@a", "second@b"), 1000.0))]
     found = SimpleNamespace(chain=chain)
     assert (_gain(found, "first@a"), _gain(found, "second@b"), _gain(found, "third@c")) == (2500.0, 1500.0, 0.0)
+
+
+def test_a_step_on_the_way_to_a_pair_is_no_runner_up():
+    def refit(chi2, *names):
+        effects = [SimpleNamespace(effect=SimpleNamespace(name=name), place=f"at {name}") for name in names]
+        return SimpleNamespace(labels=names, model=SimpleNamespace(effects=effects), criterion=1e4 * chi2,
+                               held_per_dof=chi2, fit=SimpleNamespace(chi2_per_dof=chi2), implausible=lambda: "",
+                               reported=lambda effect: {})
+    pair = refit(1.0, "first", "second")
+    found = SimpleNamespace(pool=((refit(1.6, "first"), refit(5.0, "other")), (pair,)), best=pair, passed_over=())
+    assert [one.name for one in _considered(found, pair)] == ["other"]
 
 
 @pytest.mark.parametrize(("left", "said"), [(0.0101, "1.01 %, which is the noise."),

@@ -84,6 +84,7 @@ def _effects(gap: Gap) -> Table:
              ", ".join(map(wording.titled, one.indistinguishable_from)) or "none")
             for one in gap.effects]
     return table("What is named. The probability of an effect of the table is that among the candidates that were "
-                 "refitted in its place, given the data; it does not count what nobody thought of. That of an effect "
-                 "on signals alone is one less the chance of such a signal without it. Sizes with one standard "
-                 "deviation.", ("effect", "place", "size", "probability", "cannot be told from"), rows, "lllrl")
+                 "refitted in its place, given the data; it does not count what nobody thought of. That of hum "
+                 "and of a converter is one less the chance of such a signal without them; that of ground motion is "
+                 "set, not computed. Sizes with one standard deviation.",
+                 ("effect", "place", "size", "probability", "cannot be told from"), rows, "lllrl")
