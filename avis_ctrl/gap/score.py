@@ -23,7 +23,7 @@ from avis_ctrl.gap.score_algebra import SYMMETRIC, Reduction, reduction
 from avis_ctrl.gap.table_model import Acting, ActiveEffect, TableModel, _Answer, _Side
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
 from avis_ctrl.identification.response import N_Q, ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, transient_columns
+from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns
 
 # Step of a linear parameter, in units of its size, at which its direction is taken.
 STEP = 1e-3
@@ -47,9 +47,9 @@ class Part:
         if block.transient:
             columns, norms = transient_columns(block, cast(ResponseModel, model))
             T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
-            self.transient, R = np.linalg.qr(T.T)
+            self.transient, X = span(T.T)
             left = as_real(whitened(self.L, block.Y - self.answer.Y)[None])[0]
-            x = np.linalg.lstsq(R, self.transient.T @ left, rcond=1e-12)[0][:2 * N_Q] / norms[:2 * N_Q]
+            x = (X @ (self.transient.T @ left))[:2 * N_Q] / norms[:2 * N_Q]
             self.body = np.broadcast_to(x[:, None], (len(block.omega), 2 * N_Q, 1))
             self.answer = _Answer(self.made, self._acting(model))
 

@@ -29,7 +29,7 @@ import numpy as np
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import N_Q, ResponseModel, positive
-from avis_ctrl.identification.spectra import SpectralBlock, transient_columns
+from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns
 
 Prior = tuple[float, float]
 # Lines of all blocks together below which threads cost more than they bring.
@@ -279,9 +279,9 @@ def _block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, *
     columns, norms = transient_columns(block, model)
     plain = block.Y - model.answer(block, None, False).Y
     T = as_real(np.moveaxis(whitened(L, columns), -1, 0))
-    Q, R = np.linalg.qr(T.T)
+    Q, X = span(T.T)
     e = as_real(whitened(L, plain)[None])[0]
-    x = np.linalg.lstsq(R, Q.T @ e, rcond=1e-12)[0]
+    x = X @ (Q.T @ e)
     transient = (columns @ x)[:, :, None]
     white = whitened(L, plain - transient)
     e = as_real(white[None])[0]

@@ -15,7 +15,7 @@ from scipy import stats
 
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, transient_columns
+from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ def prediction_error(model: ResponseModel, block: SpectralBlock, derivative: boo
     lost, rank = np.zeros(n_y), 0
     if block.transient:
         columns, _ = transient_columns(block, model)
-        basis = _orthonormal(as_real(np.moveaxis(whitened(L, columns), -1, 0)).T)
+        basis, _ = span(as_real(np.moveaxis(whitened(L, columns), -1, 0)).T)
         rank = basis.shape[1]
         e, J = e - basis @ (basis.T @ e), J - (J @ basis) @ basis.T
         lost = _lost(L, basis, block)
@@ -94,12 +94,6 @@ def prediction_error(model: ResponseModel, block: SpectralBlock, derivative: boo
         else np.linalg.solve(L[:, 0], _complex(e, (n, n_y, m)))
     return PredictionError(block, plain, error, _complex(e, (n, n_y, m)) / np.sqrt(2),
                            _complex(J, (n, n_y, m)) / np.sqrt(2), 2 * n * n_y * m - rank, 2 * n * m - lost)
-
-
-def _orthonormal(columns: np.ndarray) -> np.ndarray:
-    """Basis of the span, without directions that are round-off."""
-    U, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return U[:, s > 1e-12 * s[0]]
 
 
 def _lost(L: np.ndarray, basis: np.ndarray, block: SpectralBlock) -> np.ndarray:

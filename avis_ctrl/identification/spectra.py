@@ -165,3 +165,19 @@ def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.nd
     columns = np.concatenate([body, chains.reshape(n, n_y, -1), model.inner_transients(block.omega)], axis=2)
     norms = np.linalg.norm(columns, axis=(0, 1))
     return columns / norms, norms
+
+
+# Singular values of unit columns below this share of the largest: two states whose columns agree within it are one.
+DEPENDENT = 1e-7
+
+
+def span(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Q (N, r) orthonormal and X (n_t, r) with columns (N, n_t) X = Q, directions that depend on others left out.
+
+    Of dependent columns (an integrator inside a mount beside impulse and step on the body) the unknowns would be huge,
+    of opposite sign, and of no meaning one by one.
+    """
+    Q, R = np.linalg.qr(columns)
+    U, s, Vt = np.linalg.svd(R)
+    kept = s > DEPENDENT * s[0]
+    return Q @ U[:, kept], Vt[kept].T / s[kept]
