@@ -18,7 +18,7 @@ from avis_ctrl.gap.data import SAME_LEVEL
 from avis_ctrl.gap.refit import Refit, probabilities, try_refit
 from avis_ctrl.gap.result import Considered, NamedEffect, Verdict
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.search import CLOSED, FALSE_ALARM, LEAST_FALL, Found, Rival, known_noise, location
+from avis_ctrl.gap.search import CLOSED, FALSE_ALARM, LEAST_FALL, MOST_OF_IT, Found, Rival, known_noise, location
 from avis_ctrl.gap.signal_effects import SignalFaults, named
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.spectra import SpectralBlock
@@ -30,8 +30,6 @@ RIVAL = 0.05
 # Without a named effect: chi-square per degree of freedom from which a residual counts as a gap although no score is
 # significant: a tenth in r.m.s. above the noise, twice what its own uncertainty leaves open.
 UNEXPLAINED = 1.21
-# With something left: share of the excess that the named effects must take.
-MOST_OF_IT = 0.97
 # With nothing left: share that they must take at least, or what else closed the gap was the noise, better known.
 EARNED = 0.5
 # Halves agree within so many standard deviations (of parameters, widened by the misfit), or within this share.

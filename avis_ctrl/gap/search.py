@@ -22,6 +22,7 @@ from avis_ctrl.gap.effects.beyond import beyond
 from avis_ctrl.gap.refit import Refit, try_refit
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
+from avis_ctrl.identification.maximum_likelihood import weight_cost
 from avis_ctrl.identification.spectra import SpectralBlock
 
 Progress = Callable[[str], None]
@@ -44,10 +45,16 @@ COARSE_LINES, COARSE_ITERATIONS, PROMOTED = 140, 8, 3
 GIVE_WAY = 4
 # Iterations on more lines, of the first stage and later.
 ITERATIONS = (20, 10)
+# And for the best ones if they are not at their end yet.
+MORE_ITERATIONS = 30
 # Share of what the chain before it leaves over the noise that a second or third effect must take.
 TAKES = 0.8
+# Share of the gap with which an effect counts as its cause although something is left.
+MOST_OF_IT = 0.97
 # One whose coarse refit leaves so many times the power that the best one leaves is not carried on.
 HOPELESS = 6.0
+# And where the best one closes the gap, one whose criterion is so much worse: odds of e^50.
+BEHIND = 100.0
 # A name is refitted, at its best place, where its score is at least this share of the best one's.
 SHARE_OF_BEST = 0.02
 # Competitors from beyond the library: coarse refits, and refits to more lines, in the place of each effect.
@@ -163,12 +170,9 @@ def candidates(score: Score, effects: Sequence[Effect]) -> list[Candidate]:
 
 
 def known_noise(blocks: Sequence[SpectralBlock]) -> float:
-    """How much more a score, and a difference of chi-square, scatters because its weights are estimated: nu/(nu - n) of
-    n channels and a covariance of nu complex degrees of freedom (to 1/nu^2 `maximum_likelihood.weight_cost`). The mean
-    of chi-square itself (H. Hotelling 1931) has been corrected for in the weights."""
-    channels = blocks[0].Y.shape[1]
-    dof = min(block.dof for block in blocks)
-    return 1.0 if np.isinf(dof) else float(dof / max(dof - channels, 0.5 * dof))
+    """How much more than the stated one the variance of a score is because the noise is known from some degrees of
+    freedom only (`weight_cost`)."""
+    return max(weight_cost(block) for block in blocks)
 
 
 def shortlist(found: Sequence[Candidate], most: int) -> list[Candidate]:
@@ -211,7 +215,7 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
         passed_over += left
         pool.append(tuple(chain[-1] for chain in made))
         plausible = [chain for chain in made if not chain[-1].implausible()]
-        if plausible and _better(plausible[0][-1], best[-1], depth, known_noise(fitted)):
+        if plausible and _better(plausible[0], best, known_noise(fitted)):
             best = plausible[0]
         elif depth > 1 or not plausible:
             break
@@ -314,14 +318,33 @@ def _promoted(rough: list[tuple[Refit, ...]], depth: int, fitted: Sequence[Spect
     made: list[tuple[Refit, ...]] = []
     left = [chain[-1] for chain in rough[PROMOTED:]]
     for chain in rough[:PROMOTED]:
-        far = made and chain[-1].held_per_dof > HOPELESS * made[0][-1].held_per_dof
-        if far or (depth > 1 and not definite(chain[-2]) and _share(chain[-1], chain[-2]) < TAKES / 2):
+        if _hopeless(chain, rough[0][-1], made[0][-1] if made else None):
             left.append(chain[-1])
             continue
         progress(f"refit with {_words(chain[-2], chain[-1].model.effects[-1])}")
         if (found := try_refit(chain[-1].model, fitted, held_out, ITERATIONS[min(depth, 2) - 1])) is not None:
             made.append((*chain[:-1], found))
-    return _distinct(made), left
+    best, *others = _distinct(made) or [()]
+    return _distinct([_to_the_end(best, fitted, held_out), *others]) if best else [], left
+
+
+def _hopeless(chain: tuple[Refit, ...], first: Refit, made: Refit | None) -> bool:
+    """Whether a coarse refit is too far behind the best coarse one, or the first that was refitted to more lines."""
+    one = chain[-1]
+    far = made is not None and one.held_per_dof > HOPELESS * made.held_per_dof
+    behind = first.held_per_dof <= CLOSED and one.criterion > first.criterion + BEHIND
+    little = len(chain) > 2 and not definite(chain[-2]) and _share(one, chain[-2]) < TAKES / 2
+    return far or behind or little
+
+
+def _to_the_end(chain: tuple[Refit, ...], fitted: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock]
+                ) -> tuple[Refit, ...]:
+    """A chain of which the last fit goes on where it had not come to its end and leaves more than noise: nothing is to
+    be added to a model that is not yet fitted."""
+    last = chain[-1]
+    if last.fit.converged or last.held_per_dof <= CLOSED:
+        return chain
+    return (*chain[:-1], try_refit(last.model, fitted, held_out, MORE_ITERATIONS) or last)
 
 
 def _share(found: Refit, before: Refit) -> float:
@@ -335,17 +358,28 @@ def definite(closed: Refit) -> bool:
     return closed.held_per_dof <= CLOSED and not any(one.effect.idealised for one in closed.model.effects)
 
 
-def _better(found: Refit, best: Refit, depth: int, stretch: float) -> bool:
+def _better(longer: tuple[Refit, ...], chain: tuple[Refit, ...], stretch: float) -> bool:
     """Whether a longer chain is worth its length: on the criterion, on the held-out data by themselves, and, of a
     second effect on, because it takes most of what the chain before it leaves.
 
     The last keeps out what only mends the first effect's law where that is not quite the table's; beside an effect of
     which the law is certain a faint second one may be small.
     """
+    found, best = longer[-1], chain[-1]
     misfit = max(1.0, found.held_per_dof) * stretch
     fall, held = best.criterion - found.criterion, best.chi2_held - found.chi2_held
-    worth = fall / misfit > LEAST_FALL and held / misfit > LEAST_FALL / 2
-    return worth and (depth == 1 or definite(best) or _share(found, best) > TAKES)
+    if fall / misfit <= LEAST_FALL or held / misfit <= LEAST_FALL / 2:
+        return False
+    return len(chain) == 1 or definite(best) or (_share(found, best) > TAKES and not _mends(longer, chain))
+
+
+def _mends(longer: tuple[Refit, ...], chain: tuple[Refit, ...]) -> bool:
+    """Whether a further effect only mends the law of an idealised one: they are known to look alike, and the first
+    takes all but a few per cent of the gap by itself."""
+    new = longer[-1].model.effects[-1].effect
+    alike = any(one.effect.idealised and (new.name in one.effect.confusable or one.effect.name in new.confusable)
+                for one in chain[-1].model.effects)
+    return alike and _share(chain[-1], chain[0]) > MOST_OF_IT
 
 
 def _ordinal(depth: int) -> str:

@@ -142,6 +142,10 @@ class BaseCompliance(Effect):
             values += [*(at[way] for way in ways[3:]), *np.clip(radii, 0.1, 3.0).tolist(), -0.3, 0.0]
         return [Seed(tuple(float(v) for v in values), took.chi2, 2 * len(best))]
 
+    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+        told = values["mass_kg"] > 3 * std["mass_kg"]
+        return "" if told else "a chassis so heavy that the data do not tell it from one that stands still"
+
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         mass, damping, stiffness = of_chassis(values)
         s = ops.s[:, None, None]

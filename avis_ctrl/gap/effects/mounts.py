@@ -134,6 +134,10 @@ class MountSurge(_OfMounts):
                 found.append(Seed(values, took.chi2, len(parameters), len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
 
+    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+        told = values["frequency_Hz"] > 3 * std["frequency_Hz"]
+        return "" if told else "a resonance of which the data do not tell the frequency"
+
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         up = vertical(ops)
         ops.internal_omega[up] = surge_omega(values)
