@@ -1,9 +1,9 @@
-"""How large an effect would have to be to differ from none by three deviations: what a verdict of none is worth.
+"""How large an effect would have to be to be seen: what a verdict of none is worth.
 
 Of an effect that is linear in its parameters near none, the directions A of the score test (whitened, with everything
 that re-identification absorbs projected out) are also what a fit would know them by: the covariance of the parameters
-is inv(A A^T). The search itself asks for more: its score must stand out of all candidates, and the criterion must
-fall by `search.LEAST_FALL`, which one parameter reaches at between four and five of its deviations.
+is inv(A A^T). The search asks that a score stand out of all candidates and that the criterion fall by
+`search.LEAST_FALL`, which one parameter reaches at between four and five of its deviations: five are given.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from avis_ctrl.gap.search import location
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.spectra import SpectralBlock
 
-DEVIATIONS = 3.0
+DEVIATIONS = 5.0
 
 
 def detectable(model: TableModel, blocks: Sequence[SpectralBlock], effects: Sequence[Effect] | None = None
                ) -> tuple[Detectable, ...]:
-    """For every effect, place and parameter the departure from none of three standard deviations.
+    """For every effect, place and parameter the departure from none of five standard deviations.
 
     Of effects whose parameters are all linear, each parameter with the others of its effect free; of two laws of one
     effect the larger value. One effect at a time. Infinite where re-identification absorbs a parameter.

@@ -19,12 +19,10 @@ from avis_ctrl.gap.refit import Refit, probabilities, try_refit
 from avis_ctrl.gap.result import Considered, NamedEffect, Verdict
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.search import CLOSED, FALSE_ALARM, LEAST_FALL, MOST_OF_IT, Found, Rival, known_noise, location
-from avis_ctrl.gap.signal_effects import SignalFaults, named
+from avis_ctrl.gap.signal_effects import MOST_SURE, SignalFaults, named
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.spectra import SpectralBlock
 
-# No probability is reported above this: what the library does not hold, and the noise's own uncertainty, leave so much.
-MOST_SURE = 0.99
 # A rival as probable as this cannot be told apart.
 RIVAL = 0.05
 # Without a named effect: chi-square per degree of freedom from which a residual counts as a gap although no score is
@@ -79,13 +77,13 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
     reasons += _beyond(found, updated, own)
     most = CLOSED if own or signal else UNEXPLAINED
     residual_left = updated.held_per_dof > most or bool(raised) or refused_by_level or found.beaten is not None
-    effects = [*_table_effects(found, updated, own), *signal]
+    effects = [*_table_effects(found, updated, own, known_noise(thin)), *signal]
     if effects:
         verdict: Verdict = "partly explained" if residual_left else "explained"
     else:
         verdict = "unexplained" if residual_left else "none"
     ties = [(one.name, other) for one in effects for other in one.indistinguishable_from]
-    return Judgement(verdict, tuple(effects), updated, _considered(found, updated), tuple(reasons),
+    return Judgement(verdict, tuple(effects), updated, _considered(found, updated, known_noise(thin)), tuple(reasons),
                      _next(ties, found, verdict))
 
 
@@ -237,7 +235,7 @@ def _size(first: ActiveEffect, second: ActiveEffect, k: int) -> float:
                for e in (first, second) for j in rows)
 
 
-def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect]) -> list[NamedEffect]:
+def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect], stretch: float) -> list[NamedEffect]:
     """Effects that act on the table, with probabilities among what was refitted in their place."""
     made = []
     misfit = max(updated.fit.chi2_per_dof, updated.held_per_dof, 1.0)
@@ -245,7 +243,7 @@ def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect]) -> lis
         others = {label for label in updated.labels if label != one.label}
         rivals = [r for stage in found.pool for r in stage
                   if others <= set(r.labels) and len(r.labels) == len(updated.labels) and not r.implausible()]
-        p = probabilities(rivals) if rivals else np.ones(0)
+        p = probabilities(rivals, stretch) if rivals else np.ones(0)
         unnamed = min((r.left for r in _equal(found, updated)), default=1.0)
         by_name: dict[tuple[str, str], float] = {}
         for rival, share in zip(rivals, p, strict=True):
@@ -268,14 +266,14 @@ def _gain(found: Found, label: str) -> float:
     return 0.0
 
 
-def _considered(found: Found, updated: Refit) -> tuple[Considered, ...]:
+def _considered(found: Found, updated: Refit, stretch: float) -> tuple[Considered, ...]:
     """What was refitted and not taken, best first, and why."""
     rows = []
     chosen = set(updated.labels)
     for stage in found.pool:
         if not stage:
             continue
-        p = probabilities(stage)
+        p = probabilities(stage, stretch)
         for rival, share in sorted(zip(stage, p, strict=True), key=lambda pair: pair[0].criterion):
             own = effects_of(rival.model)
             if set(rival.labels) <= chosen or not own:  # a step on the way to what was chosen lost to nothing

@@ -148,14 +148,14 @@ def try_refit(model: TableModel, fitted: Sequence[SpectralBlock], held_out: Sequ
         return None
 
 
-def probabilities(refits: Sequence[Refit]) -> np.ndarray:
+def probabilities(refits: Sequence[Refit], stretch: float = 1.0) -> np.ndarray:
     """(n,) posterior probabilities of models, equal beforehand.
 
     Where even the best model leaves more than noise, its own misfit is the measure of how far a difference can be
-    trusted: all criteria are divided by it.
+    trusted: all criteria are divided by it, and by `stretch`, what the noise's own uncertainty adds to a difference.
     """
     criteria = np.array([one.criterion for one in refits])
     best = refits[int(np.argmin(criteria))]
-    misfit = max(1.0, best.held_per_dof, best.fit.chi2_per_dof)
+    misfit = max(1.0, best.held_per_dof, best.fit.chi2_per_dof) * stretch
     weight = np.exp(-(criteria - criteria.min()) / (2 * misfit))
     return weight / weight.sum()

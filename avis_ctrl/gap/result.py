@@ -78,7 +78,7 @@ class Considered:
 
 @dataclass(frozen=True)
 class Detectable:
-    """A parameter of an absent effect, and the departure from none that is three standard deviations of a fit to the
+    """A parameter of an absent effect, and the departure from none that is five standard deviations of a fit to the
     fitted records. The search asks for more before it names. Infinite where re-identification would absorb it."""
 
     name: str
@@ -155,7 +155,7 @@ class Gap:
     considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.
     pictures : plain data for plots. held_out : how the records were divided. seed, seconds.
     covariance : (n_p, n_p) of the updated model's parameters.
-    detectable : where the verdict is none, sizes of three standard deviations of absent effects; else empty.
+    detectable : where the verdict is none, sizes of five standard deviations of absent effects; else empty.
     shares : what accounts for the outputs' power, by level, the lowest first. records : what each record leaves.
     """
 

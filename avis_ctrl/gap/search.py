@@ -74,12 +74,14 @@ HOLDS_STD, HOLDS = 4.0, 0.15
 class Rival:
     """A competitor from beyond the library.
 
-    refit : with it in the place of what `against` has. words : what it is.
+    refit : with it in the place of what `against` has. words : what it is. stretch : of differences of
+    chi-square by the noise's own uncertainty (`known_noise`).
     """
 
     refit: Refit
     against: Refit
     words: str
+    stretch: float = 1.0
 
     @property
     def odds(self) -> float:
@@ -89,7 +91,7 @@ class Rival:
         lose its name to one that fits no better because it has a parameter that this table makes no use of.
         """
         new, old = self.refit, self.against
-        misfit = max(1.0, min(new.held_per_dof, old.held_per_dof))
+        misfit = max(1.0, min(new.held_per_dof, old.held_per_dof)) * self.stretch
         fall = min(old.criterion - new.criterion, old.chi2_fit + old.chi2_held - new.chi2_fit - new.chi2_held)
         return 2 * math.log(PRIOR) - fall / misfit
 
@@ -269,7 +271,7 @@ def _rivals(parent: Refit, against: Refit, data: _Data, least: float) -> list[Ri
             continue
         if (found := try_refit(coarse.model, data.fitted, data.held_out, ITERATIONS[0])) is not None:
             last = found.model.effects[-1]
-            made.append(Rival(found, against, last.effect.said(last.place, last.by_name)))
+            made.append(Rival(found, against, last.effect.said(last.place, last.by_name), known_noise(data.fitted)))
     return made
 
 

@@ -23,6 +23,9 @@ from avis_ctrl.identification.prediction import model_inputs
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.rigs.rig import Rig
 
+# No probability is reported above this: what the library does not hold, and the noise's own uncertainty, leave so much.
+MOST_SURE = 0.99
+
 
 @dataclass(frozen=True, eq=False)
 class SignalFaults:
@@ -98,15 +101,15 @@ def named(faults: SignalFaults) -> list[NamedEffect]:
                                  f"the converter of {one.channel} is coarser than the rig file says"
                                  if one.kind == "resolution" else
                                  f"the converter of {one.channel} clips below its nominal range",
-                                 _reported(one.parameters), one.confidence, confirmation=one.sentence))
+                                 _reported(one.parameters), min(one.confidence, MOST_SURE), confirmation=one.sentence))
     if faults.hum is not None:
         found.append(NamedEffect("mains_hum", "geophones", f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics "
                                  f"in {', '.join(faults.hum.channels)}", _reported(faults.hum.parameters),
-                                 faults.hum.confidence, confirmation=faults.hum.sentence))
+                                 min(faults.hum.confidence, MOST_SURE), confirmation=faults.hum.sentence))
     motion = faults.noise.ground_motion if faults.noise is not None else None
     if motion is not None:
         found.append(NamedEffect("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured",
-                                 _reported(motion.parameters), 0.99, confirmation=motion.sentence))
+                                 _reported(motion.parameters), MOST_SURE, confirmation=motion.sentence))
     return found
 
 

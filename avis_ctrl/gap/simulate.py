@@ -71,7 +71,7 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
         record.deflection[:] = lines.in_time(lines.deflection(x, floor))
         for one in effects:
             volts = one.effect.volts(record, one.place, one.by_name)
-            acting = acting if volts is None else volts
+            acting = acting if volts is None else acting + (volts - record.volts)
         if acting is not u:
             x = lines.motion(lines.drive(acting, floor))
             record.deflection[:] = lines.in_time(lines.deflection(x, floor))

@@ -253,8 +253,9 @@ class TableModel:
         for one in self.effects:
             volts = one.effect.volts_spectrum(record, one.place, one.by_name, block.omega)
             if volts is not None:
+                # Several may change the volts: each adds what it changes.
                 U = U.copy()
-                U[:, :len(self.actuators), 0] = volts
+                U[:, :len(self.actuators), 0] += volts - record.kept("volts", block.omega, lambda: record.volts)
             force = one.effect.force_spectrum(record, one.place, one.by_name, block.omega)
             if force is not None:
                 total = force[:, :, None] if total is None else total + force[:, :, None]

@@ -29,7 +29,7 @@ def test_a_step_on_the_way_to_a_pair_is_no_runner_up():
                                reported=lambda effect: {})
     pair = refit(1.0, "first", "second")
     found = SimpleNamespace(pool=((refit(1.6, "first"), refit(5.0, "other")), (pair,)), best=pair, passed_over=())
-    assert [one.name for one in _considered(found, pair)] == ["other"]
+    assert [one.name for one in _considered(found, pair, 1.0)] == ["other"]
 
 
 @pytest.mark.parametrize(("left", "said"), [(0.0101, "1.01 %, which is the noise."),

@@ -181,7 +181,9 @@ class LevelingLoop(_OfMounts):
         return ("isolators 1-3 z/plain", "isolators 1-3 z/lag") if has_mounts(model) else ()
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        rate = EffectParameter("rate_Hz", "Hz", "of the integrator, over 2 pi", 0.0, 0.0, 100.0, 0.02)
+        # Faster than the best damped mode dies away, the loop is unstable: no table that was measured has it.
+        fastest = max(2 * fastest_decay(model) / (2 * np.pi), 0.1)
+        rate = EffectParameter("rate_Hz", "Hz", "of the integrator, over 2 pi", 0.0, 0.0, fastest, 0.02)
         if place.endswith("plain"):
             return (rate,)
         return (rate, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, 0.01, 100.0, 1.0,
@@ -357,3 +359,12 @@ def drifted(when: np.ndarray, time_constant: float) -> np.ndarray:
     if time_constant <= 0:
         return np.asarray(when - 0.5)
     return np.expm1(-when / time_constant) / np.expm1(-1 / time_constant) - 0.5
+
+
+def fastest_decay(model: TableModel) -> float:
+    """Largest zeta omega [1/s] of the table's own modes."""
+    mat = model.base.matrices
+    inverse = np.linalg.inv(mat.M)
+    n = len(inverse)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ mat.K, -inverse @ mat.C]])
+    return float(np.max(-np.linalg.eigvals(A).real))

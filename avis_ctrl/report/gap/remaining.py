@@ -36,11 +36,11 @@ def detectable(gap: Gap) -> Table:
         ends = [ordered[0]] if len(ordered) == 1 else [ordered[0], ordered[-1]]
         size = " to ".join(_seen(one) for one in ends)
         rows.append((wording.titled(name), where, wording.parameter(parameter), size))
-    return table("An effect that is absent, by itself at its place, would differ from none by three standard "
-                 "deviations of the fit at this size, at the best and at the worst of its places. What is smaller may "
-                 "be there, and so may what is somewhat larger: before the search names an effect it asks for more, "
-                 "because it tries so many. \"At no size\": re-identification of the rig's own parameters would take "
-                 "it up.", ("effect", "place", "parameter", "three deviations"), rows, "lllr")
+    return table("An effect that is absent, by itself at its place, would differ from none by five standard "
+                 "deviations of the fit at this size, at the best and at the worst of its places: about what the "
+                 "search asks for before it names one of so many. What is smaller may be there. \"At no size\": "
+                 "re-identification of the rig's own parameters would take it up.",
+                 ("effect", "place", "parameter", "seen from about"), rows, "lllr")
 
 
 def _seen(one: Detectable) -> str:
