@@ -18,7 +18,7 @@ from avis_ctrl.gap.judgement import effects_of, judge
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
 from avis_ctrl.gap.refit import Refit, judged, likelihood, refit, scattered, try_refit
 from avis_ctrl.gap.result import Detectable, Gap
-from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, definite, search
+from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Each, Found, definite, one_by_one, search
 from avis_ctrl.gap.show import shown
 from avis_ctrl.gap.signal_effects import (
     SignalFaults,
@@ -90,13 +90,14 @@ class Prepared:
 
 def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, float] | None = None,
             amplifier_corner_Hz: float | None = None, effects: Sequence[Effect] | None = None,
-            progress: Progress = lambda text: None) -> Gap:
+            progress: Progress = lambda text: None, each: Each = one_by_one) -> Gap:
     """Find, name and close the gap.
 
     Parameters
     ----------
     campaign : records in the rig's own words, driven ones among them. rig : as its file has it.
     band_Hz : of the comparison; the excited one where None. effects : candidates; the library where None.
+    each : how independent refits are done; one after the other by default.
 
     Raises
     ------
@@ -105,11 +106,11 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     """
     began = time.monotonic()
     prepared = prepare(campaign, rig, band_Hz, amplifier_corner_Hz, progress)
-    found = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects)
+    found = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each)
     progress("noise of floor and sensors, with what was found")
     left = left_by(prepared.campaign, found.best.model)
     prepared = prepared.measured_with(found.best.model, left)
-    found = _again(prepared, found, effects, progress)
+    found = _again(prepared, found, effects, progress, each)
     progress("fits to all lines, and what they leave of the held-out records")
     base, updated = _final(prepared, found)
     faults = replace(prepared.faults, noise=levels(left, updated.model, prepared.faults.hum, prepared.faults.converter))
@@ -122,11 +123,12 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     return replace(gap, detectable=limits)
 
 
-def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, progress: Progress) -> Found:
+def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, progress: Progress, each: Each
+           ) -> Found:
     """What was found, against the noise that is known now; searched on where only that shows that more is left."""
     if len(found.chain) == 1:
         if found.reached_noise and prepared.base.held_per_dof > NOISE:
-            return search(prepared.base, prepared.thin, prepared.thin_held, progress, effects)
+            return search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each)
         return replace(found, chain=(prepared.base,), reached_noise=prepared.base.held_per_dof <= NOISE)
     best = _without_spare(refit(found.best.model, prepared.thin, prepared.thin_held), prepared)
     if len(effects_of(best.model)) < len(found.chain) - 1:
@@ -136,7 +138,7 @@ def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, p
     longer = replace(found, chain=chain, reached_noise=best.held_per_dof <= CLOSED)
     if found.best.held_per_dof > CLOSED or len(chain) > LONGEST or (longer.reached_noise and not definite(best)):
         return longer
-    on = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, chain)
+    on = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, chain, each)
     return replace(on, pool=(*found.pool, *on.pool), passed_over=(*found.passed_over, *on.passed_over),
                    rivals=(*found.rivals, *on.rivals))
 

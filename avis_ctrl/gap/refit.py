@@ -101,6 +101,28 @@ class Refit:
         return ""
 
 
+@dataclass(frozen=True, eq=False)
+class Reached:
+    """A refit without its model, small enough to come back from another process; theta are its free parameters."""
+
+    theta: np.ndarray
+    fit: LikelihoodFit
+    chi2_held: float
+    dof_held: int
+
+    @staticmethod
+    def by(found: Refit | None) -> Reached | None:
+        if found is None:
+            return None
+        bare = replace(found.fit, model=cast(ResponseModel, None), residuals=())
+        return Reached(found.model.values, bare, found.chi2_held, found.dof_held)
+
+    def refit(self, begin: TableModel) -> Refit:
+        """With the model that was fitted, as it was before."""
+        model = begin.at(self.theta)
+        return Refit(model, replace(self.fit, model=cast(ResponseModel, model)), self.chi2_held, self.dof_held)
+
+
 def at_the_edge(effect: ActiveEffect) -> str:
     """A shape parameter that ran to the end of what physics allows: the effect has turned into something else."""
     for parameter, value in zip(effect.parameters, effect.values, strict=True):

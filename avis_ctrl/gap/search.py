@@ -13,19 +13,35 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from avis_ctrl.gap.data import thinned
 from avis_ctrl.gap.effects.base import Effect, Seed, library
 from avis_ctrl.gap.effects.beyond import beyond
-from avis_ctrl.gap.refit import Refit, try_refit
+from avis_ctrl.gap.refit import Reached, Refit, try_refit
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
 from avis_ctrl.identification.maximum_likelihood import weight_cost
 from avis_ctrl.identification.spectra import SpectralBlock
 
 Progress = Callable[[str], None]
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+
+class Each(Protocol):
+    """Answers to independent questions, in their order; where there are processors, several at a time."""
+
+    def __call__(self, function: Callable[[Item], Answer], items: Sequence[Item]) -> list[Answer]: ...
+
+
+def one_by_one(function: Callable[[Item], Answer], items: Sequence[Item]) -> list[Answer]:
+    """The same, one after the other."""
+    return [function(item) for item in items]
+
+
 # Held-out chi-square per degree of freedom up to which a residual counts as noise: an r.m.s. within 5 % of the noise,
 # which is what the noise's own estimate of some hundred degrees of freedom and its bias near resonances leave open.
 NOISE = 1.10
@@ -151,24 +167,23 @@ def location(place: str) -> str:
     return place.partition("/")[0]
 
 
-def candidates(score: Score, effects: Sequence[Effect]) -> list[Candidate]:
+def candidates(score: Score, effects: Sequence[Effect], each: Each = one_by_one) -> list[Candidate]:
     """Every effect at every place that the score finds something in, best first; significance over all of them."""
-    model, found = score.model, []
+    model = score.model
     taken = {(one.effect.name, location(one.place)) for one in model.effects}
-    tried = 0
     # Where the model is far off, so is the noise that a score is held against.
     stretch = max(1.0, score.chi2 / score.dof) * known_noise([part.block for part in score.parts])
-    for effect in effects:
+
+    def seeds(effect: Effect) -> list[tuple[str, list[Seed]]]:
         if effect.nonlinear and not model.motion:
-            continue
-        for place in effect.places(model):
-            if (effect.name, location(place)) in taken:
-                continue
-            tried += 1
-            seeds = effect.seeds(score, place)
-            found += [(active(effect, model, place, seed.values), seed) for seed in seeds[:1]]
-    return sorted((Candidate(one, seed, min(1.0, tried * seed.chance(stretch))) for one, seed in found),
-                  key=lambda c: -c.worth)
+            return []
+        places = [place for place in effect.places(model) if (effect.name, location(place)) not in taken]
+        return [(place, effect.seeds(score, place)[:1]) for place in places]
+    by_effect = each(seeds, effects)
+    tried = sum(len(found) for found in by_effect)
+    made = [Candidate(active(effect, model, place, seed.values), seed, min(1.0, tried * seed.chance(stretch)))
+            for effect, found in zip(effects, by_effect, strict=True) for place, own in found for seed in own]
+    return sorted(made, key=lambda c: -c.worth)
 
 
 def known_noise(blocks: Sequence[SpectralBlock]) -> float:
@@ -194,13 +209,13 @@ def shortlist(found: Sequence[Candidate], most: int) -> list[Candidate]:
 
 def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock],
            progress: Progress = lambda text: None, effects: Sequence[Effect] | None = None,
-           begin: tuple[Refit, ...] = ()) -> Found:
+           begin: tuple[Refit, ...] = (), each: Each = one_by_one) -> Found:
     """The shortest chain of effects that explains the gap of a re-identified model, or the best there is.
 
     fitted, held_out : thinned blocks with noise. begin : a chain from base that is to be extended only.
     """
     known = list(library().values()) if effects is None else list(effects)
-    data = _Data(fitted, held_out, [thinned(block, COARSE_LINES, seed=1) for block in fitted], progress)
+    data = _Data(fitted, held_out, [thinned(block, COARSE_LINES, seed=1) for block in fitted], progress, each)
     best = begin or (base,)
     parents = [best]
     pool: list[tuple[Refit, ...]] = []
@@ -210,10 +225,10 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
         rough: list[tuple[Refit, ...]] = []
         worth = 0.0
         for chain in parents:
-            scored = candidates(Score(chain[-1].model, fitted), known)
+            scored = candidates(Score(chain[-1].model, fitted), known, each)
             worth = max([worth, *(one.worth for one in scored[:1])])
             rough += _rough(chain, shortlist(scored, REFITS if depth == 1 else REFITS_LATER), data, depth)
-        made, left = _promoted(_distinct(rough), depth, fitted, held_out, progress)
+        made, left = _promoted(_distinct(rough), depth, data)
         passed_over += left
         pool.append(tuple(chain[-1] for chain in made))
         plausible = [chain for chain in made if not chain[-1].implausible()]
@@ -243,30 +258,25 @@ class _Data:
     held_out: Sequence[SpectralBlock]
     few: Sequence[SpectralBlock]
     progress: Progress
+    each: Each
 
 
 def _rough(chain: tuple[Refit, ...], chosen: Sequence[Candidate], data: _Data, depth: int) -> list[tuple[Refit, ...]]:
     """Coarse refits of what a shortlist holds."""
-    made = []
-    for one in chosen:
-        data.progress(f"{_ordinal(depth)} effect: {_words(chain[-1], one.effect)}?")
-        found = _coarse(chain[-1].model.with_effect(one.effect), one.effect, data.few, data.held_out)
-        if found is not None:
-            made.append((*chain, found))
-    return made
+    effects = [one.effect for one in chosen]
+    if effects:
+        data.progress(f"{_ordinal(depth)} effect: {', '.join(_words(chain[-1], one) for one in effects)}?")
+    return [(*chain, found) for found in _coarse(chain[-1].model, effects, data)]
 
 
 def _rivals(parent: Refit, against: Refit, data: _Data, least: float) -> list[Rival]:
     """The best competitor from beyond the library in the place of the effects that `against` has beyond `parent`."""
-    scored = [one for one in candidates(Score(parent.model, data.fitted), list(beyond().values())) if one.worth > least]
-    rough: list[Refit] = []
-    for one in shortlist(scored, OUTSIDE_REFITS):
-        data.progress(f"beyond the library: {one.effect.effect.title}?")
-        found = _coarse(parent.model.with_effect(one.effect), one.effect, data.few, data.held_out)
-        if found is not None:
-            rough.append(found)
+    scored = candidates(Score(parent.model, data.fitted), list(beyond().values()), data.each)
+    effects = [one.effect for one in shortlist([one for one in scored if one.worth > least], OUTSIDE_REFITS)]
+    if effects:
+        data.progress(f"beyond the library: {', '.join(one.effect.title for one in effects)}?")
     made = []
-    for coarse in sorted(rough, key=lambda r: r.criterion)[:OUTSIDE_PROMOTED]:
+    for coarse in sorted(_coarse(parent.model, effects, data), key=lambda r: r.criterion)[:OUTSIDE_PROMOTED]:
         if coarse.held_per_dof > HOPELESS * against.held_per_dof:
             continue
         if (found := try_refit(coarse.model, data.fitted, data.held_out, ITERATIONS[0])) is not None:
@@ -306,34 +316,40 @@ def _same(one: Refit, other: Refit, label: str) -> bool:
                for x, y, s, p in zip(a.values, b.values, std, a.parameters, strict=True) if p.linear)
 
 
-def _coarse(model: TableModel, effect: ActiveEffect, few: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock]
-            ) -> Refit | None:
-    """First the rig alone, for the seed took for granted that it gives way to the effect; then all together."""
-    held = try_refit(replace(model, fixed=model.fixed | set(effect.names)), few, held_out[:1], GIVE_WAY)
-    begin = model if held is None else replace(held.model, fixed=model.fixed)
-    return try_refit(begin, few, held_out, COARSE_ITERATIONS)
+def _coarse(model: TableModel, effects: Sequence[ActiveEffect], data: _Data) -> list[Refit]:
+    """Refits on few lines with one more effect each; those that came to no end are left out.
+
+    First the rig alone, for the seed took for granted that it gives way to the effect; then all together.
+    """
+    def reached(one: ActiveEffect) -> Reached | None:
+        begin = model.with_effect(one)
+        held = try_refit(replace(begin, fixed=begin.fixed | set(one.names)), data.few, data.held_out[:1], GIVE_WAY)
+        begin = begin if held is None else replace(held.model, fixed=begin.fixed)
+        return Reached.by(try_refit(begin, data.few, data.held_out, COARSE_ITERATIONS))
+    return [found.refit(model.with_effect(one)) for one, found in zip(effects, data.each(reached, effects), strict=True)
+            if found is not None]
 
 
-def _promoted(rough: list[tuple[Refit, ...]], depth: int, fitted: Sequence[SpectralBlock],
-              held_out: Sequence[SpectralBlock], progress: Progress) -> tuple[list[tuple[Refit, ...]], list[Refit]]:
+def _promoted(rough: list[tuple[Refit, ...]], depth: int, data: _Data) -> tuple[list[tuple[Refit, ...]], list[Refit]]:
     """The best of the coarse refits, refitted to more lines, best first; and those that were not."""
-    made: list[tuple[Refit, ...]] = []
-    left = [chain[-1] for chain in rough[PROMOTED:]]
-    for chain in rough[:PROMOTED]:
-        if _hopeless(chain, rough[0][-1], made[0][-1] if made else None):
-            left.append(chain[-1])
-            continue
-        progress(f"refit with {_words(chain[-2], chain[-1].model.effects[-1])}")
-        if (found := try_refit(chain[-1].model, fitted, held_out, ITERATIONS[min(depth, 2) - 1])) is not None:
-            made.append((*chain[:-1], found))
+    chosen = [chain for chain in rough[:PROMOTED] if not _hopeless(chain, rough[0][-1])]
+    left = [chain[-1] for chain in rough if chain not in chosen]
+    for chain in chosen:
+        data.progress(f"refit with {_words(chain[-2], chain[-1].model.effects[-1])}")
+
+    def reached(chain: tuple[Refit, ...]) -> Reached | None:
+        iterations = ITERATIONS[min(depth, 2) - 1]
+        return Reached.by(try_refit(chain[-1].model, data.fitted, data.held_out, iterations))
+    made = [(*chain[:-1], found.refit(chain[-1].model))
+            for chain, found in zip(chosen, data.each(reached, chosen), strict=True) if found is not None]
     best, *others = _distinct(made) or [()]
-    return _distinct([_to_the_end(best, fitted, held_out), *others]) if best else [], left
+    return _distinct([_to_the_end(best, data.fitted, data.held_out), *others]) if best else [], left
 
 
-def _hopeless(chain: tuple[Refit, ...], first: Refit, made: Refit | None) -> bool:
-    """Whether a coarse refit is too far behind the best coarse one, or the first that was refitted to more lines."""
+def _hopeless(chain: tuple[Refit, ...], first: Refit) -> bool:
+    """Whether a coarse refit is too far behind the best one."""
     one = chain[-1]
-    far = made is not None and one.held_per_dof > HOPELESS * made.held_per_dof
+    far = one.held_per_dof > HOPELESS * first.held_per_dof
     behind = first.held_per_dof <= CLOSED and one.criterion > first.criterion + BEHIND
     little = len(chain) > 2 and not definite(chain[-2]) and _share(one, chain[-2]) < TAKES / 2
     return far or behind or little

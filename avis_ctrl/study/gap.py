@@ -31,6 +31,7 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.gap_design import DesignEffect, design_effect
 from avis_ctrl.study.identification import expectation
 from avis_ctrl.study.rig_channels import in_words_of
+from avis_ctrl.study.workers import each
 
 Progress = Callable[[str], None]
 # Gates that say stop on what `gap` itself recognises and names, or mends.
@@ -99,7 +100,7 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
                                                                  measured.u_names)))
     with threadpool_limits(1):
         findings = _gates(measured, rig, options, progress) if options.gates else ()
-        gap = analyse(measured, rig, options.seed, options.band_Hz, options.amplifier_corner_Hz, None, progress)
+        gap = analyse(measured, rig, options.seed, options.band_Hz, options.amplifier_corner_Hz, None, progress, each)
         seconds = time.monotonic() - began
         stops = tuple(f"gate {one.gate}: {one.sentence}" for one in findings if one.severity == "stop")
         gap = replace(gap, seconds=seconds, sentences=(*gap.sentences, *stops))
