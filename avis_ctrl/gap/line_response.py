@@ -162,7 +162,7 @@ def _lines(made: Assembled) -> dict[str, np.ndarray]:
              "alias": made.folded[:, None] * ops.drive, "floor": made.floor_force(w), "chassis": made.follow(w)}
     if ops.recoil is not None:
         found["recoil"] = np.zeros((n, N_Q, made.n_q), complex)
-        found["recoil"][:, :, :N_Q] = s ** 2 * (ops.recoil @ made.M)
+        found["recoil"][:, :, :N_Q] = ops.recoil @ ops.borne(made.M)
     return found
 
 

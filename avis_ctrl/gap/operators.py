@@ -141,6 +141,12 @@ class Operators:
     def actuator(self, name: str) -> int:
         return self.base.actuators.index(name)
 
+    def borne(self, M: np.ndarray) -> np.ndarray:
+        """(n, 6, 6) force per displacement of the payload that mounts and motors bear, and their reaction a chassis:
+        its inertia, and what hangs on it or holds it beside them."""
+        inertia = self.s[:, None, None] ** 2 * M
+        return inertia if self.extra is None else inertia + self.extra
+
     def add_impedance(self, dynamic_stiffness: np.ndarray, rows: np.ndarray,
                       grounded: np.ndarray | None = None) -> None:
         """Elements along rows (m, 6) of dynamic stiffness (n, m) [N/m]; grounded (n, m): the part tied to the floor."""
@@ -271,14 +277,17 @@ class Assembled:
     def follow(self, w: np.ndarray) -> np.ndarray:
         """(n, 6, m) chassis displacement by the floor alone."""
         if self.ops.follow is not None:
-            return self.ops.follow @ w
+            moved = self.ops.follow @ w
+            if self.ops.recoil is not None and self.ops.extra_floor is not None:
+                moved = moved + self.ops.recoil @ (self.ops.extra_floor @ w)
+            return moved
         return np.concatenate([w, np.zeros_like(w)], axis=1)
 
     def chassis(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """(n, 6, m) chassis displacement, its recoil included."""
         moved = self.follow(w)
         if self.ops.recoil is not None:
-            moved = moved - self.ops.s[:, None, None] ** 2 * (self.ops.recoil @ (self.M @ x[:, :N_Q]))
+            moved = moved - self.ops.recoil @ (self.ops.borne(self.M) @ x[:, :N_Q])
         return moved
 
 
@@ -308,7 +317,7 @@ def assemble(ops: Operators, invert: bool = True) -> Assembled:
     for k, one in enumerate(ops.added):
         D[:, N_Q + k, N_Q + k] += one.stiffness
     if ops.recoil is not None:
-        D[:, :, :N_Q] += (G.T @ (z_pf[:, :, None] * (mounts.chassis @ ops.recoil))) @ (S ** 2 * M)
+        D[:, :, :N_Q] += (G.T @ (z_pf[:, :, None] * (mounts.chassis @ ops.recoil))) @ ops.borne(M)
     volts, folded = ops.volts()
     inverse = np.linalg.inv(D) if invert else np.empty(0)
     return Assembled(ops, D, inverse, M, G, z_pp, z_pf, slope_pp, slope_pf, T, rows, volts, folded)

@@ -13,6 +13,7 @@ from avis_ctrl.gap.search import CLOSED, search
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.rigs.rigid_body import point_map
 
 OMEGA = 2 * np.pi * np.geomspace(0.5, 80.0, 40)
 
@@ -57,6 +58,36 @@ def test_a_push_on_the_chassis(place, values):
     found, true = made.inverse @ made.forces_of_states(), np.linalg.inv(full)[:, :6, 6:]
     np.testing.assert_allclose(found, true, atol=1e-9 * np.abs(true).max())
     assert model.inner_transients(OMEGA).shape == (len(OMEGA), 6, 2 * len(ways))
+
+
+def test_a_chassis_bears_what_hangs_on_the_payload_and_what_holds_it():
+    """Payload, chassis and a sprung mass as bodies of their own, with a cable to ground: all momentum goes to ground."""
+    values = [900.0, 0.05, 9.0, 11.0, 14.0, 10.0, 12.0, 13.0, 0.4, 0.5, 0.6, -0.45, -0.2]
+    model = with_effect("base_compliance", "chassis/rocking", values)
+    m, f, zeta, at = 20.0, 12.0, 0.05, [0.3, 0.2, 0.1]
+    oscillator = active(library()["attached_oscillator"], model, "payload/z", [m, f, zeta, *at[:2]])
+    cable = active(library()["cable_stiffness"], model, "payload/axes", [2e4, 1e4, 3e4, 1e-3, *at])
+    alone = assemble(model.operators(OMEGA))
+    made = assemble(model.with_effect(oscillator).with_effect(cable).operators(OMEGA))
+    s, w = 1j * OMEGA[:, None, None], 2 * np.pi * f
+    g = point_map(np.array(at))
+    k = m * (w ** 2 + 2 * zeta * w * s)
+    K = (g.T @ np.diag([2e4, 1e4, 3e4]) @ g) * (1 + 1e-3 * s)
+    z, under = alone.z_pp[:, :, None], alone.ops.mounts.chassis
+    up = point_map(np.array([*at[:2], 0.0]))[2:3]
+    springs, stands = alone.G.T @ (z * alone.G), np.linalg.inv(alone.ops.recoil)
+    full = np.zeros((len(OMEGA), 13, 13), complex)
+    full[:, 6:12, :6] = s ** 2 * alone.M + K + up.T * k * up        # of both bodies together: motors cancel
+    full[:, :6, :6] = full[:, 6:12, :6] + springs
+    full[:, :6, 6:12], full[:, 6:12, 6:12] = -alone.G.T @ (z * under), stands
+    full[:, :6, 12:] = full[:, 6:12, 12:] = -up.T * k
+    full[:, 12:, :6], full[:, 12:, 12:] = -k * up, k + m * s ** 2
+    motors = np.broadcast_to(np.vstack([made.T, np.zeros((7, made.T.shape[1]))]), (len(OMEGA), 13, made.T.shape[1]))
+    floor = np.concatenate([K[:, :, :3], K[:, :, :3] + stands @ alone.ops.follow, np.zeros((len(OMEGA), 1, 3))], axis=1)
+    w = np.broadcast_to(np.eye(3, dtype=complex), (len(OMEGA), 3, 3))
+    for found, push in ((made.T, motors), (made.floor_force(w), floor)):
+        true = np.linalg.solve(full, push)[:, :6]
+        np.testing.assert_allclose(made.inverse @ found, true, atol=1e-9 * np.abs(true).max())
 
 
 def test_what_holds_no_states_leaves_none():
