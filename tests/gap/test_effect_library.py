@@ -351,13 +351,13 @@ VALUES = {"geophone_corner": [4.8, 0.5], "sensor_gain": [1.05], "sensor_misalign
           "product_of_inertia": [2.0], "payload_flexible_mode": [
               x for f in (30.0, 42.0, 55.0) for x in (f, 0.02, *np.linspace(-0.02, f / 1000, 12))],
           "attached_oscillator": [2.0, 1.0, -2.0, 12.0, 0.05, 0.3, 0.2, 0.1],
-          "cable_stiffness": [500.0, 400.0, 300.0, 50.0, 40.0, 30.0, 1e-3, 0.3, 0.2, 0.1]}
+          "cable_stiffness": [500.0, 400.0, 300.0, 1e-3, 0.3, 0.2, 0.1]}
 
 
 def values_at(name, place):
     values, parameters = VALUES[name], OWN[name].parameters(MOVING, place)
-    if name == "cable_stiffness" and place.endswith("axes"):
-        values = [*values[:3], *values[6:]]
+    if name == "cable_stiffness" and place.endswith("oblique"):
+        values = [20.0, -15.0, 10.0, *values[3:]]
     if name == "attached_oscillator" and place.endswith("axes"):
         values = [10.0, 12.0, 9.0, 15.0, *values[4:]]
     return values[:len(parameters)]

@@ -153,11 +153,11 @@ def test_a_refit_gains_what_the_score_predicts(name, place, values, held):
 
 
 @pytest.mark.parametrize("variant", ["axes", "oblique"])
-def test_a_refit_moves_stiffnesses_that_are_zero_or_negative(variant):
-    """A cable along one direction: along some axis it has none, between axes less than none."""
+def test_a_refit_moves_a_cable_with_stiffnesses_that_are_zero(variant):
+    """A cable along one direction: along some axis it has none."""
     along = np.array([0.0, 0.4525, -0.89]) if variant == "oblique" else np.array([0.0, 0.0, 1.0])
     K, place, near = 2e4 * np.outer(along, along), [-0.1, -0.18, 0.2], [0.0, -0.3, 0.3]
-    own = [K[0, 0], K[1, 1], K[2, 2], *([K[0, 1], K[0, 2], K[1, 2]] if variant == "oblique" else [])]
+    own = [K[0, 0], K[1, 1], K[2, 2]] if variant == "axes" else list(np.sqrt(2e4) * along)
     where = f"payload/{variant}"
     truth = MODEL.with_effect(effect("cable_stiffness", where, [*own, 2e-3, *place]))
     blocks = [block(truth, np.random.default_rng(8), name=one) for one in ("00", "01")]
@@ -167,7 +167,7 @@ def test_a_refit_moves_stiffnesses_that_are_zero_or_negative(variant):
     assert found.chi2_per_dof < 1.1
     values = np.array(found.model.effects[0].values)
     if variant == "oblique":
-        assert values[5] < -5e3
+        assert values[1] * values[2] < -5e3
     # A place along the cable's own line makes no difference.
     np.testing.assert_allclose(np.cross(values[-3:] - place, along), 0, atol=0.05)  # 0.13 at the start
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register
 from avis_ctrl.gap.effects.impedance import at_points, peaks, positions, project, unit_matrices
+from avis_ctrl.gap.effects.line_of_action import best_direction, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
 from avis_ctrl.gap.effects.sensors import second_order
 from avis_ctrl.rigs.rigid_body import point_map
@@ -22,12 +23,6 @@ if TYPE_CHECKING:
 
 # Damping ratios at which seeds are looked for, and how often the step between frequencies is halved about the best.
 DAMPINGS, HALVINGS = (0.03, 0.15), 3
-# Half-sphere of directions, about 16 degrees apart.
-_POLAR, _AROUND = np.meshgrid(np.linspace(0, np.pi / 2, 6), np.linspace(0, 2 * np.pi, 18, endpoint=False),
-                              indexing="ij")
-DIRECTIONS = np.unique(np.round(np.stack([np.sin(_POLAR) * np.cos(_AROUND), np.sin(_POLAR) * np.sin(_AROUND),
-                                          np.cos(_POLAR)], -1).reshape(-1, 3), 12), axis=0)
-
 
 @register
 class AttachedOscillator(AtPoint):
@@ -80,8 +75,8 @@ class AttachedOscillator(AtPoint):
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         names = [name for name in values if name.startswith("along_")] or ["mass_kg"]
-        told = any(abs(values[name]) > 3 * std[name] for name in names)
-        return "" if told else "a sprung mass that the data do not tell from none"
+        seen = any(abs(values[name]) > 3 * std[name] for name in names)
+        return "" if seen else "a sprung mass that the data do not tell from none"
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
@@ -91,29 +86,9 @@ class AttachedOscillator(AtPoint):
         a = np.array([values.get(f"along_{axis}", 0.0) for axis in "xyz"])
         if not np.any(a):
             return found
-        names = list(values)
-        first, last = names.index("along_x"), names.index("x_m")
-        C = np.zeros((6, 6))
-        rows = [first, first + 1, first + 2, last, last + 1, last + 2]
-        C[:] = covariance[np.ix_(rows, rows)]
-        x = np.concatenate([a, place_of(values)])
-        told = _of_line(x)
-        slope = np.array([(_of_line(x + step) - _of_line(x - step)) / (2 * np.abs(step).max())
-                          for step in np.eye(6) * 1e-6 * max(float(np.abs(a).max()), 1e-3)]).T
-        std = np.sqrt(np.maximum(np.diag(slope @ C @ slope.T), 0.0))
-        labels = [("mass_kg", "kg"), *((f"direction_{axis}", "1") for axis in "xyz"),
-                  *((f"{axis}_m", "m") for axis in "xyz")]
-        line = {name: Reported(float(v), float(s), unit) for (name, unit), v, s in zip(labels, told, std, strict=True)}
+        line = told(values, covariance, "mass_kg", "kg")
         return {"mass_kg": line.pop("mass_kg"), "frequency_Hz": found["frequency_Hz"], "damping": found["damping"],
                 **line}
-
-
-def _of_line(x: np.ndarray) -> np.ndarray:
-    """(7,) mass, direction with its largest component positive, foot of the line, from d sqrt(m) and a point (6,)."""
-    a, point = x[:3], x[3:]
-    mass = float(a @ a)
-    d = a / np.sqrt(mass) * np.sign(a[np.argmax(np.abs(a))])
-    return np.concatenate([[mass], d, point - (point @ d) * d])
 
 
 def elements(place: str, values: Mapping[str, float]) -> list[tuple[np.ndarray, float, float]]:
@@ -146,7 +121,7 @@ def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed
 
     def at(f: float, zeta: float) -> Seed | None:
         G, b = project(score, partial(sprung, frequency_Hz=f, damping=zeta), ("sprung", f, zeta))
-        chi2, k, d, mass = _best_direction(G, b, points)
+        chi2, k, d, mass = best_direction(G, b, points)
         a = min(np.sqrt(mass), 0.7 * most) * d
         return Seed((*a, f, zeta, *points[k]), chi2, 7, len(parameters[3].grid) * len(DAMPINGS)) if mass > 0 else None
 
@@ -163,20 +138,6 @@ def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed
         found += near
         best, step = max([best, *near], key=lambda seed: seed.chi2), np.sqrt(step)
     return found
-
-
-def _best_direction(G: np.ndarray, b: np.ndarray, points: np.ndarray) -> tuple[float, int, np.ndarray, float]:
-    """(chi2, point, direction (3,), mass) of the mass along one direction that takes most."""
-    basis = at_points(points, "xyz", oblique=True)
-    d = basis @ b
-    A = basis @ G @ np.swapaxes(basis, 1, 2)
-    V = np.column_stack([DIRECTIONS ** 2, *(DIRECTIONS[:, i] * DIRECTIONS[:, j] for i, j in ((0, 1), (0, 2), (1, 2)))])
-    along = d @ V.T
-    size = A.reshape(len(A), -1) @ (V[:, :, None] * V[:, None, :]).reshape(len(V), -1).T
-    mass = np.where(size > 0, along / np.where(size > 0, size, 1.0), 0.0)
-    chi2 = np.where(mass > 0, mass * along, 0.0)
-    k, v = np.unravel_index(int(np.argmax(chi2)), chi2.shape)
-    return float(chi2[k, v]), int(k), DIRECTIONS[v], float(mass[k, v])
 
 
 def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:

@@ -1,0 +1,97 @@
+"""A cable or hose between the payload and ground."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register
+from avis_ctrl.gap.effects.impedance import at_points, positions, project
+from avis_ctrl.gap.effects.line_of_action import best_direction, told
+from avis_ctrl.gap.effects.payload import AtPoint, place_of
+from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.rigs.rigid_body import point_map
+
+if TYPE_CHECKING:
+    from avis_ctrl.gap.operators import Operators
+    from avis_ctrl.gap.score import Score
+    from avis_ctrl.gap.table_model import TableModel
+
+
+@register
+class CableStiffness(AtPoint):
+    """A spring, with a little damping, from a point of the payload to ground.
+
+    axes : a stiffness along each of x, y and z. oblique : one direction d; the parameters are d sqrt(k).
+    """
+
+    name = "cable_stiffness"
+    title = "a cable or hose ties the payload to ground"
+    looks_like = "stiffness at a place and height where no mount is: it shifts and couples the lowest resonances"
+    confusable = ("com_offset", "leveling_loop")
+
+    def places(self, model: TableModel) -> tuple[str, ...]:
+        return ("payload/axes", "payload/oblique")
+
+    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+        size = 0.02 * float(np.mean(np.diag(model.base.matrices.K)[:3])) / 4  # of one mount of four, on any rig
+        most = 200 * size
+        if place.endswith("oblique"):
+            own = [EffectParameter(f"along_{axis}", "sqrt(N/m)", f"root of the stiffness times its direction's {axis}",
+                                   0.0, -float(np.sqrt(most)), float(np.sqrt(most)), float(np.sqrt(size)),
+                                   group="along") for axis in "xyz"]
+        else:
+            own = [EffectParameter(f"k_{axis}_N_per_m", "N/m", f"stiffness along {axis}", 0.0, 0.0, most, size)
+                   for axis in "xyz"]
+        return (*own, EffectParameter("damping_s", "s", "damping over stiffness", 0.0, 0.0, 0.1, 1e-3, False, (0.0,),
+                                      True),
+                *(replace(one, optional=True) for one in self.position()))
+
+    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+        k, V = np.linalg.eigh(tie(values))
+        rows = V.T @ point_map(place_of(values))
+        Z = k * (1 + ops.s * values["damping_s"])[:, None]
+        ops.add_impedance(Z, rows, Z)
+
+    def seeds(self, score: Score, place: str) -> list[Seed]:
+        """Over a grid of places: the direction and stiffness that take most, or those along the axes, none negative."""
+        parameters = self.parameters(score.model, place)
+        points = positions(parameters)
+        G, b = project(score, lambda s: np.ones_like(s))
+        if place.endswith("oblique"):
+            chi2, at, d, k = best_direction(G, b, points)
+            a = min(np.sqrt(max(k, 0.0)), 0.7 * parameters[0].high) * d
+            return [Seed((*(float(x) for x in a), 0.0, *points[at]), chi2, 6)] if k > 0 else []
+        found = []
+        for point, rows in zip(points, at_points(points, "xyz"), strict=True):
+            A, d = rows @ G @ rows.T, rows @ b
+            own = np.clip(reduction(A, d).coefficients, 0.0, parameters[0].high)
+            if np.any(own > 0):
+                found.append(Seed((*own.tolist(), 0.0, *point), float(2 * own @ d - own @ A @ own), 6))
+        return sorted(found, key=lambda seed: -seed.chi2)
+
+    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+        names = [name for name in values if name.startswith(("along_", "k_"))]
+        seen = any(abs(values[name]) > 3 * std[name] for name in names)
+        return "" if seen else "a cable that the data do not tell from none"
+
+    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+                 ) -> dict[str, Reported]:
+        """Of one direction: stiffness, direction, and the foot of the line of action; else the largest stiffness before
+        all others."""
+        found = super().reported(model, place, values, covariance)
+        if "along_x" in values:
+            return {**told(values, covariance, "stiffness_N_per_m", "N/m"), "damping_s": found["damping_s"]}
+        largest = max((found[f"k_{axis}_N_per_m"] for axis in "xyz"), key=lambda one: one.value)
+        return {"stiffness_N_per_m": largest, **found}
+
+
+def tie(values: Mapping[str, float]) -> np.ndarray:
+    """(3, 3) N/m: stiffness of a cable from its values by name."""
+    if "along_x" in values:
+        a = np.array([values[f"along_{axis}"] for axis in "xyz"])
+        return np.outer(a, a)
+    return np.diag([values[f"k_{axis}_N_per_m"] for axis in "xyz"])

@@ -1,0 +1,57 @@
+"""What acts along one direction at a point of the payload: the best direction, and how it is told.
+
+The parameters are a = d sqrt(size), d the direction and size a mass or a stiffness, so that no size is negative; and a
+point. Along the line of action a place makes no difference: the foot of the line is told, its point nearest to the
+geometric centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.effects.impedance import at_points
+
+# Half-sphere of directions, about 16 degrees apart.
+_POLAR, _AROUND = np.meshgrid(np.linspace(0, np.pi / 2, 6), np.linspace(0, 2 * np.pi, 18, endpoint=False),
+                              indexing="ij")
+DIRECTIONS = np.unique(np.round(np.stack([np.sin(_POLAR) * np.cos(_AROUND), np.sin(_POLAR) * np.sin(_AROUND),
+                                          np.cos(_POLAR)], -1).reshape(-1, 3), 12), axis=0)
+
+
+def best_direction(G: np.ndarray, b: np.ndarray, points: np.ndarray) -> tuple[float, int, np.ndarray, float]:
+    """(chi2, point, direction (3,), size) of what takes most, along one direction; points (n, 3)."""
+    basis = at_points(points, "xyz", oblique=True)
+    d = basis @ b
+    A = basis @ G @ np.swapaxes(basis, 1, 2)
+    V = np.column_stack([DIRECTIONS ** 2, *(DIRECTIONS[:, i] * DIRECTIONS[:, j] for i, j in ((0, 1), (0, 2), (1, 2)))])
+    along = d @ V.T
+    size = A.reshape(len(A), -1) @ (V[:, :, None] * V[:, None, :]).reshape(len(V), -1).T
+    mass = np.where(size > 0, along / np.where(size > 0, size, 1.0), 0.0)
+    chi2 = np.where(mass > 0, mass * along, 0.0)
+    k, v = np.unravel_index(int(np.argmax(chi2)), chi2.shape)
+    return float(chi2[k, v]), int(k), DIRECTIONS[v], float(mass[k, v])
+
+
+def told(values: Mapping[str, float], covariance: np.ndarray, size: str, unit: str) -> dict[str, Reported]:
+    """Size, direction and foot of the line of action by the values along_x .. and x_m .., to first order."""
+    names = list(values)
+    first, last = names.index("along_x"), names.index("x_m")
+    rows = [*range(first, first + 3), *range(last, last + 3)]
+    x = np.array([values[names[row]] for row in rows])
+    line = of_line(x)
+    slope = np.array([(of_line(x + step) - of_line(x - step)) / (2 * np.abs(step).max())
+                      for step in np.eye(6) * 1e-6 * max(float(np.abs(x[:3]).max()), 1e-3)]).T
+    std = np.sqrt(np.maximum(np.diag(slope @ covariance[np.ix_(rows, rows)] @ slope.T), 0.0))
+    labels = [(size, unit), *((f"direction_{axis}", "1") for axis in "xyz"), *((f"{axis}_m", "m") for axis in "xyz")]
+    return {name: Reported(float(v), float(s), u) for (name, u), v, s in zip(labels, line, std, strict=True)}
+
+
+def of_line(x: np.ndarray) -> np.ndarray:
+    """(7,) size, direction with its largest component positive, foot of the line; x d sqrt(size) and a point (6,)."""
+    a, point = x[:3], x[3:]
+    mass = float(a @ a)
+    d = a / np.sqrt(mass) * np.sign(a[np.argmax(np.abs(a))])
+    return np.concatenate([[mass], d, point - (point @ d) * d])
