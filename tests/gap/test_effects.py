@@ -250,10 +250,10 @@ def test_flexible_mode_is_a_coordinate_of_unit_mass():
 
 
 def test_cable_along_the_axes_and_oblique():
-    place = np.array([0.3, 0.2, -0.1])
+    place, d = np.array([0.3, 0.2, -0.1]), np.array([0.6, 0.0, 0.8])
     for along, K, values in (
             ("axes", np.diag([800.0, 300.0, 1500.0]), [800.0, 300.0, 1500.0]),
-            ("oblique", 2000.0 * np.outer([0.6, 0.0, 0.8], [0.6, 0.0, 0.8]), list(np.sqrt(2000.0) * np.array([0.6, 0.0, 0.8])))):
+            ("oblique", 2000.0 * np.outer(d, d), list(np.sqrt(2000.0) * d))):
         table, k = Assembly(RIG).mounts(), np.zeros((6, 6))
         G = mount_map(place)
         k[:6, :6] = G.T @ K @ G
