@@ -146,15 +146,25 @@ class MountSurge(_OfMounts):
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
-        """The standard deviation of the mass is of frequency and share only; the stiffness is taken as it is."""
+        """Means over the mounts; how these scatter goes into their standard deviations, for it is what one number for
+        all mounts leaves open. Of the mass that is of frequency, share and scatter; the mean stiffness is taken as it
+        is."""
         found = super().reported(model, place, values, covariance)
-        k = float(np.mean(mount_geometry(model.rig).stiffness[vertical(model)]))
-        f, a = values["frequency_Hz"], values["payload_share"]
-        m = k / (a * (1 - a) * (2 * np.pi * f) ** 2)
+        k = mount_geometry(model.effective.rig).stiffness[vertical(model)]
+        f, a, w = values["frequency_Hz"], values["payload_share"], surge_omega(values)
+        m = k / (a * (1 - a) * w ** 2)
         slope = np.zeros(len(values))
-        slope[:2] = -2 * m / f, -m * (1 - 2 * a) / (a * (1 - a))
-        mass = Reported(m, float(np.sqrt(max(slope @ covariance @ slope, 0.0))), "kg")
-        return {"frequency_Hz": found.pop("frequency_Hz"), "mass_kg": mass, **found}
+        slope[:2] = -2 * np.mean(m) / f, -np.mean(m) * (1 - 2 * a) / (a * (1 - a))
+        variance = float(slope @ covariance @ slope) + _of_mean(m)
+        mass = Reported(float(np.mean(m)), float(np.sqrt(max(variance, 0.0))), "kg")
+        own = found.pop("frequency_Hz")
+        frequency = Reported(own.value, float(np.sqrt(own.std ** 2 + _of_mean(w / (2 * np.pi)))), "Hz")
+        return {"frequency_Hz": frequency, "mass_kg": mass, **found}
+
+
+def _of_mean(values: np.ndarray) -> float:
+    """Variance of the mean of what scatters."""
+    return float(np.var(values, ddof=1) / len(values)) if len(values) > 1 else 0.0
 
 
 def surge_omega(values: Mapping[str, float]) -> np.ndarray:
