@@ -151,6 +151,35 @@ def test_interrupt_leaves_nothing_half_written(tmp_path):
     assert list(out.iterdir()) == []
 
 
+SWALLOWS = """
+import time
+import avis_ctrl.cli as cli
+
+def app(**options):
+    print("ready", flush=True)
+    try:
+        time.sleep(30)
+    except KeyboardInterrupt:  # as a callback of a compiled library does
+        time.sleep(30)
+
+cli.app, cli.AGAIN_S = app, 0.5
+cli.main()
+"""
+
+
+def test_an_interrupt_that_is_lost_comes_again():
+    child = subprocess.Popen([sys.executable, "-c", SWALLOWS], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                             text=True)
+    try:
+        assert child.stdout.readline() == "ready\n"
+        child.send_signal(signal.SIGINT)
+        _, complained = child.communicate(timeout=20)
+    finally:
+        child.kill()
+    assert child.returncode == 130
+    assert complained == "avis: stopped; nothing half-written is left\n"
+
+
 def test_public_names_load_on_first_use():
     assert set(avis_ctrl.__all__) >= {"hinfsyn", "musyn", "mu", "mu_peak", "worst_case_gain", "RealScalar",
                                       "ComplexScalar", "ComplexFull", "StateSpace"}

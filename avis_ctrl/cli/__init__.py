@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from types import FrameType
 from typing import Annotated
 
 import typer
@@ -21,6 +22,7 @@ from avis_ctrl.measurement.layouts import FORMATS
 # A line a paragraph: the terminal breaks them.
 LAYOUTS = "\n\n".join(" ".join(part.split()) for part in FORMATS.split("\n\n"))
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+AGAIN_S = 3.0  # time to clean up after an interrupt that was heard
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False,
                   help="Workbench for active vibration isolation tables.")
@@ -65,11 +67,20 @@ for command, name in ((design, "design"), (identify, "identify"), (gap, "gap"), 
     app.command(name, epilog=LAYOUTS if name in ("identify", "gap", "convert") else None)(command)
 
 
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """KeyboardInterrupt, and again after a while: one that falls into a callback of a compiled library is lost."""
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, _interrupt)
+        signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
+    raise KeyboardInterrupt
+
+
 def main() -> None:
     """Entry point: errors of ours end in one line and their exit code."""
     # Before numpy is loaded: several BLAS threads round differently from one, and are slower on small matrices.
     os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", MKL_NUM_THREADS="1")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
     try:
         # The parser hands back the code of typer.Exit, and 130 after Ctrl-C.
         code = app(standalone_mode=False)
@@ -84,6 +95,8 @@ def main() -> None:
         if message := error.format_message():  # without a command the help has said it
             print(f"avis: {message}", file=sys.stderr)
         sys.exit(error.exit_code)
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0)
     if code == INTERRUPTED:
         print("avis: stopped; nothing half-written is left", file=sys.stderr)
     sys.exit(code)

@@ -163,6 +163,10 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     band = band_Hz or excited_band(halves.fitted)
     if not 0 <= band[0] < band[1]:
         raise InputError("expected the lower end first, the upper one after it", field="band_Hz", value=band)
+    low, high = excited_band(halves.fitted)
+    if band[1] <= low or band[0] >= high:
+        raise InputError(f"expected a band in which the records are excited, {low:.3g} to {high:.3g} Hz",
+                         field="band_Hz", value=band)
     base = ResponseModel.of(rig, default_parameters(rig), campaign.y_unit, campaign.y_names, campaign.u_names, True,
                             amplifier_corner_Hz)
     nominal = TableModel(base, nominal=base)

@@ -206,7 +206,7 @@ def known_effects() -> dict[str, Effect]:
 def _effect(model: TableModel, one: EffectFile, field: str) -> ActiveEffect:
     known = known_effects()
     if one.name not in known:
-        raise InputError(f"expected one of {', '.join(known)}; effects of your own must be registered before",
+        raise InputError(f"expected one of {', '.join(known)}; an effect of your own by --effects FILE.py",
                          field=f"{field}.name", value=one.name)
     effect = known[one.name]
     places = effect.places(model)

@@ -118,7 +118,14 @@ class Rival:
 
     @property
     def wins(self) -> bool:
-        """Hardly anything is left of the probability of the others, and the held-out data by themselves say so."""
+        """Hardly anything is left of the probability of the others, and the held-out data by themselves say so.
+
+        What a user's own effect explains to the noise is that effect's: he knows his table, and ours may only be a
+        more pliable description of the same.
+        """
+        own = any(not one.effect.shipped for one in self.against.model.effects)
+        if own and self.against.held_per_dof <= CLOSED:
+            return False
         return self.left < GIVEN_UP and self.refit.chi2_held < self.against.chi2_held
 
     @property
@@ -321,13 +328,29 @@ def _coarse(model: TableModel, effects: Sequence[ActiveEffect], data: _Data) -> 
 
     First the rig alone, for the seed took for granted that it gives way to the effect; then all together.
     """
-    def reached(one: ActiveEffect) -> Reached | None:
+    before = try_refit(model, data.few, data.held_out[:1], 0)
+    least = np.inf if before is None else before.chi2_fit
+
+    def fitted(one: ActiveEffect) -> Refit | None:
         begin = model.with_effect(one)
         held = try_refit(replace(begin, fixed=begin.fixed | set(one.names)), data.few, data.held_out[:1], GIVE_WAY)
         begin = begin if held is None else replace(held.model, fixed=begin.fixed)
-        return Reached.by(try_refit(begin, data.few, data.held_out, COARSE_ITERATIONS))
+        return try_refit(begin, data.few, data.held_out, COARSE_ITERATIONS)
+
+    def reached(one: ActiveEffect) -> Reached | None:
+        found = fitted(one)
+        if found is None or found.chi2_fit > least:  # worse than without it: from a tenth of its strength
+            second = fitted(weaker(one))
+            found = min((r for r in (found, second) if r is not None), key=lambda r: r.chi2_fit, default=None)
+        return Reached.by(found)
     return [found.refit(model.with_effect(one)) for one, found in zip(effects, data.each(reached, effects), strict=True)
             if found is not None]
+
+
+def weaker(one: ActiveEffect) -> ActiveEffect:
+    """The same at a tenth of its strength, where it has parameters that tell this."""
+    return one.at([p.none + 0.1 * (value - p.none) if p.linear else value
+                   for p, value in zip(one.parameters, one.values, strict=True)])
 
 
 def _promoted(rough: list[tuple[Refit, ...]], depth: int, data: _Data) -> tuple[list[tuple[Refit, ...]], list[Refit]]:

@@ -126,7 +126,8 @@ def read_identified(folder: Path) -> tuple[Rig, float | None]:
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"expected the folder of an identification ({error.strerror or error})", file=path) from None
+        raise InputError(f"expected the folder of avis identify or avis gap ({error.strerror or error})",
+                         file=path) from None
     except ValueError as error:
         raise InputError(f"expected JSON; {error}", file=path) from None
     if not isinstance(result, dict) or result.get("format") != "avis-identification":

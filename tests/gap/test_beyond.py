@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, library
 from avis_ctrl.gap.effects.beyond import beyond
 from avis_ctrl.gap.effects.beyond.base import FirstOrder
 from avis_ctrl.gap.judgement import unequal_levels
@@ -15,7 +15,7 @@ from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.record_motion import mount_rows
 from avis_ctrl.gap.refit import refit
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.search import search
+from avis_ctrl.gap.search import GIVEN_UP, search, weaker
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
@@ -108,3 +108,42 @@ def test_a_force_constant_is_the_same_at_every_level():
     blocks = [block(truth, "00"), block(truth, "01")]
     gain = refit(MODEL.with_effect(active(library()["actuator_gain"], MODEL, "Az2")), blocks, blocks)
     assert unequal_levels(blocks, gain) == ""
+
+
+class LateSensor(Effect):
+    """A user's own: what a competitor describes, too, with one parameter more."""
+
+    name = "late_sensor"
+    title = "a sensor is late"
+    looks_like = "one output lags"
+
+    def places(self, model):
+        return model.sensors.names
+
+    def parameters(self, model, place):
+        return (EffectParameter("tau_s", "s", "time constant", 0.0, 0.0, 0.1, 1e-3),)
+
+    def change(self, ops, place, values):
+        ops.sense[:, ops.sensor(place)] /= 1 + ops.s * values["tau_s"]
+
+
+def test_a_user_s_own_effect_that_closes_the_gap_is_not_taken_away():
+    """A low pass with a little delay: the competitor that has both fits better, but both leave noise."""
+    truth = MODEL.with_effect(active(beyond()["sensor_late"], MODEL, "Sz1", (2e-5, 2e-3)))
+    blocks = {name: block(truth, name) for name in MOTION}
+    fitted, held = [blocks["00"], blocks["01"]], [blocks["02"], blocks["03"]]
+    found = search(refit(MODEL, fitted, held), fitted, held, effects=[LateSensor()])
+    assert found.best.labels == ("late_sensor@Sz1",)
+    rival = found.rivals[0]
+    assert rival.refit.chi2_held < rival.against.chi2_held and not rival.wins
+    # The same odds against an effect of the library would have counted.
+    shipped = replace(rival, against=replace(rival.against, model=MODEL.with_effect(
+        active(library()["sensor_gain"], MODEL, "Sz1"))))
+    assert shipped.left == rival.left and shipped.wins == (rival.left < GIVEN_UP)
+
+
+def test_a_weaker_start_goes_to_a_tenth_of_the_way():
+    one = active(library()["sensor_gain"], MODEL, "Sz1", (1.5,))
+    assert weaker(one).values == pytest.approx((1.05,))
+    drift = active(library()["stiffness_drift"], MODEL, "isolators/settling", (0.4, 20.0))
+    assert weaker(drift).values == pytest.approx((0.04, 20.0))

@@ -200,6 +200,13 @@ def test_hostile_input_is_one_line(case, gates):
     assert said in str(error.value)
 
 
+def test_a_band_without_excitation():
+    """There noise agrees with any model."""
+    case = draw_case(duration_s=6.0, seed=3, kind="none")
+    with pytest.raises(InputError, match=r"band_Hz .*expected a band in which the records are excited"):
+        find_gap(simulate_case(case), rig(), GapOptions(gates=False, band_Hz=(200.0, 300.0)))
+
+
 @pytest.mark.parametrize("band", [(60.0, 1.0), (-1.0, 20.0), (3.0, 3.0), (600.0, 700.0), (np.nan, 3.0)])
 def test_bands_that_are_none(band):
     with pytest.raises(InputError, match="band_Hz"):

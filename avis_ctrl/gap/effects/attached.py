@@ -122,7 +122,7 @@ def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed
     def at(f: float, zeta: float) -> Seed | None:
         G, b = project(score, partial(sprung, frequency_Hz=f, damping=zeta), ("sprung", f, zeta))
         chi2, k, d, mass = best_direction(G, b, points)
-        a = min(np.sqrt(mass), 0.7 * most) * d
+        a = min(np.sqrt(max(mass, 0.0)), 0.7 * most) * d
         return Seed((*a, f, zeta, *points[k]), chi2, 7, len(parameters[3].grid) * len(DAMPINGS)) if mass > 0 else None
 
     grid = parameters[3].grid

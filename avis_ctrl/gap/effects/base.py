@@ -109,6 +109,11 @@ class Effect(ABC):
     outside: ClassVar[bool] = False
     idealised: ClassVar[bool] = True
 
+    @property
+    def shipped(self) -> bool:
+        """Whether it comes with the product; not so of a user's own file."""
+        return type(self).__module__.startswith(__package__ or "avis_ctrl")
+
     def places(self, model: TableModel) -> tuple[str, ...]:
         """Where it can act on this table; empty where it cannot."""
         raise NotImplementedError

@@ -77,7 +77,7 @@ def at(every: np.ndarray, names: tuple[str, ...], place: str) -> np.ndarray:
 
 
 def timing(what: str) -> tuple[EffectParameter, ...]:
-    return (EffectParameter("delay_s", "s", f"delay of this {what} beside the others", 0.0, -0.05, 0.1, 1e-3),
+    return (EffectParameter("delay_s", "s", f"delay of this {what} beside the others", 0.0, 0.0, 0.1, 1e-3),
             EffectParameter("time_constant_s", "s", f"first-order lag of this {what} alone", 0.0, 0.0, 0.3, 1e-3))
 
 
