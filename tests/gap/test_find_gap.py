@@ -75,8 +75,6 @@ def test_one_effect_is_named_at_its_place_with_its_size(name):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=False, reason="what the second leaves lies within 1.2 of the noise of 20 s records, where "
-                   "none is looked for")
 def test_two_effects_are_both_named():
     case, found = found_in(seed=16, kind="two", strength="clear")
     assert {(one.name, one.location) for one in found.gap.effects} == {(one.name, one.location) for one in case.effects}
