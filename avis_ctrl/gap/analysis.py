@@ -160,10 +160,10 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     mended = repair(campaign, rig, None, converter) if campaign.y_unit == "V" and rig.acquisition else None
     campaign = mended.campaign if mended else campaign
     halves = divide(campaign)
-    band = band_Hz or excited_band(halves.fitted)
+    low, high = excited_band(halves.fitted)
+    band = band_Hz or (low, high)
     if not 0 <= band[0] < band[1]:
         raise InputError("expected the lower end first, the upper one after it", field="band_Hz", value=band)
-    low, high = excited_band(halves.fitted)
     if band[1] <= low or band[0] >= high:
         raise InputError(f"expected a band in which the records are excited, {low:.3g} to {high:.3g} Hz",
                          field="band_Hz", value=band)

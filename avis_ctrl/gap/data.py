@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 
+Item = TypeVar("Item")
 # Records at levels within this factor are of one level.
 SAME_LEVEL = 1.25
 # Lines of a record on which candidates are compared; the models that are reported are fitted to all.
@@ -37,6 +38,22 @@ class Halves:
     how: str
 
 
+def of_one_level(items: Sequence[Item], told: Callable[[Item], tuple[str, float]]) -> list[list[Item]]:
+    """Items of one kind and level, within SAME_LEVEL of the lowest of a group, together; sorted by kind, then level.
+
+    told : kind and level of an item.
+    """
+    groups: list[list[Item]] = []
+    for item in sorted(items, key=told):
+        kind, level = told(item)
+        first = told(groups[-1][0]) if groups else None
+        if first and kind == first[0] and level <= SAME_LEVEL * first[1]:
+            groups[-1].append(item)
+        else:
+            groups.append([item])
+    return groups
+
+
 def divide(campaign: Campaign) -> Halves:
     """Hold out records of which another one of the same level and kind is fitted; else the last third of each.
 
@@ -49,14 +66,7 @@ def divide(campaign: Campaign) -> Halves:
     driven = [record for record in campaign.records if driven_inputs(record)]
     if not driven:
         raise InputError("expected records that drive the actuators", field="records")
-    groups: list[list[RecordSource]] = []
-    for record in sorted(driven, key=lambda one: (one.header.excitation, one.header.level_V)):
-        last = groups[-1][0].header if groups else None
-        h = record.header
-        if last and h.excitation == last.excitation and h.level_V <= SAME_LEVEL * last.level_V:
-            groups[-1].append(record)
-        else:
-            groups.append([record])
+    groups = of_one_level(driven, lambda record: (record.header.excitation, record.header.level_V))
     groups.sort(key=lambda group: -group[0].header.level_V)
     several = [group for group in groups if len(group) > 1]
     order = several[:1] + several[:0:-1]

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.data import SAME_LEVEL
+from avis_ctrl.gap.data import of_one_level
 from avis_ctrl.gap.refit import Refit, probabilities, try_refit
 from avis_ctrl.gap.result import Considered, NamedEffect, Verdict
 from avis_ctrl.gap.score import Score
@@ -136,12 +136,11 @@ def undetermined(updated: Refit) -> str:
     if why := updated.implausible():
         names = " and ".join(one.effect.name for one in effects_of(updated.model))
         return f"{names} comes nearest, but that is not possible ({why}): not named"
-    misfit = max(updated.fit.chi2_per_dof, updated.held_per_dof, 1.0)
     for one in effects_of(updated.model):
         linear = [j for j, p in enumerate(one.parameters) if p.linear]
         size = np.array([one.parameters[j].size for j in linear])
         away = np.array([one.values[j] - one.parameters[j].none for j in linear]) / size
-        C = updated.covariance_of(one, misfit)[np.ix_(linear, linear)] / np.outer(size, size)
+        C = updated.covariance_of(one, updated.misfit)[np.ix_(linear, linear)] / np.outer(size, size)
         known = np.linalg.matrix_rank(C, hermitian=True) if linear else 0
         if known and float(stats.chi2.sf(away @ np.linalg.pinv(C, hermitian=True) @ away, known)) > FALSE_ALARM:
             return f"{one.effect.name} comes nearest, but these records do not tell its strength from none: not named"
@@ -171,7 +170,7 @@ def unequal_levels(thin: Sequence[SpectralBlock], updated: Refit) -> str:
     """
     model = updated.model
     levels = {block.name: model.motion[block.name].level_V for block in thin if block.name in model.motion}
-    groups = _levels(list(levels.values()))
+    groups = of_one_level(sorted(set(levels.values())), lambda level: ("", level))
     if len(groups) < 2 or len(levels) < len(thin):
         return ""
     score = Score(model, thin)
@@ -194,17 +193,6 @@ def unequal_levels(thin: Sequence[SpectralBlock], updated: Refit) -> str:
             return (f"its {one.parameters[strength[0]].name} differs by {np.ptp(of_level) / size:.0%} of its strength "
                     f"between the records' levels (by chance {p:.0e})")
     return ""
-
-
-def _levels(levels: Sequence[float]) -> list[list[float]]:
-    """Levels that are the same within SAME_LEVEL, together."""
-    groups: list[list[float]] = []
-    for level in sorted(set(levels)):
-        if groups and level <= SAME_LEVEL * groups[-1][0]:
-            groups[-1].append(level)
-        else:
-            groups.append([level])
-    return groups
 
 
 def _disagree(updated: Refit, halves: tuple[list[SpectralBlock], list[SpectralBlock]], what: str) -> str:
@@ -238,7 +226,6 @@ def _size(first: ActiveEffect, second: ActiveEffect, k: int) -> float:
 def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect], stretch: float) -> list[NamedEffect]:
     """Effects that act on the table, with probabilities among what was refitted in their place."""
     made = []
-    misfit = max(updated.fit.chi2_per_dof, updated.held_per_dof, 1.0)
     for one in own:
         others = {label for label in updated.labels if label != one.label}
         rivals = [r for stage in found.pool for r in stage
@@ -252,7 +239,7 @@ def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect], stretc
             by_name[key] = by_name.get(key, 0.0) + float(share)
         key = (one.effect.name, location(one.place))
         ties = tuple(sorted({name for (name, _), share in by_name.items() if share >= RIVAL and name != key[0]}))
-        made.append(NamedEffect(*key, one.effect.title, updated.reported(one, misfit),
+        made.append(NamedEffect(*key, one.effect.title, updated.reported(one, updated.misfit),
                                 min(by_name.get(key, 1.0) * unnamed, MOST_SURE), ties,
                                 _gain(found, one.label), one.label))
     return made

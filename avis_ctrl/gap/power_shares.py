@@ -26,7 +26,7 @@ from typing import Literal
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.data import SAME_LEVEL
+from avis_ctrl.gap.data import of_one_level
 from avis_ctrl.gap.result import PowerShares
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction_error import PredictionError
@@ -133,16 +133,9 @@ def attributed(one: Split, noise: np.ndarray, sensors: np.ndarray | None) -> dic
 
 def _levels(errors: Sequence[PredictionError], headers: Mapping[str, RecordHeader]) -> list[list[PredictionError]]:
     """Driven records of one level and excitation; the lowest level first."""
-    driven = sorted((e for e in errors if headers[e.block.name].excitation not in ("rest", "floor")),
-                    key=lambda e: (headers[e.block.name].excitation, headers[e.block.name].level_V))
-    groups: list[list[PredictionError]] = []
-    for e in driven:
-        h = headers[e.block.name]
-        first = headers[groups[-1][0].block.name] if groups else None
-        if first and h.excitation == first.excitation and h.level_V <= SAME_LEVEL * first.level_V:
-            groups[-1].append(e)
-        else:
-            groups.append([e])
+    def told(e: PredictionError) -> tuple[str, float]:
+        return headers[e.block.name].excitation, headers[e.block.name].level_V
+    groups = of_one_level([e for e in errors if told(e)[0] not in ("rest", "floor")], told)
     return sorted(groups, key=lambda group: headers[group[0].block.name].level_V)
 
 

@@ -48,6 +48,11 @@ class Refit:
         return self.chi2_held / self.dof_held
 
     @property
+    def misfit(self) -> float:
+        """How many times the noise's power the model leaves, of fitted or of held-out data; one at least."""
+        return max(1.0, self.fit.chi2_per_dof, self.held_per_dof)
+
+    @property
     def criterion(self) -> float:
         """-2 log of the evidence, up to a constant: Bayesian information criterion of the fit (G. Schwarz 1978), and
         the held-out data, which need no penalty."""
@@ -178,6 +183,5 @@ def probabilities(refits: Sequence[Refit], stretch: float = 1.0) -> np.ndarray:
     """
     criteria = np.array([one.criterion for one in refits])
     best = refits[int(np.argmin(criteria))]
-    misfit = max(1.0, best.held_per_dof, best.fit.chi2_per_dof) * stretch
-    weight = np.exp(-(criteria - criteria.min()) / (2 * misfit))
+    weight = np.exp(-(criteria - criteria.min()) / (2 * best.misfit * stretch))
     return weight / weight.sum()

@@ -25,7 +25,7 @@ def test_a_step_on_the_way_to_a_pair_is_no_runner_up():
     def refit(chi2, *names):
         effects = [SimpleNamespace(effect=SimpleNamespace(name=name), place=f"at {name}") for name in names]
         return SimpleNamespace(labels=names, model=SimpleNamespace(effects=effects), criterion=1e4 * chi2,
-                               held_per_dof=chi2, fit=SimpleNamespace(chi2_per_dof=chi2), implausible=lambda: "",
+                               held_per_dof=chi2, misfit=max(chi2, 1.0), implausible=lambda: "",
                                reported=lambda effect: {})
     pair = refit(1.0, "first", "second")
     found = SimpleNamespace(pool=((refit(1.6, "first"), refit(5.0, "other")), (pair,)), best=pair, passed_over=())

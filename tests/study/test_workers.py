@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import time
 
+import numpy as np
 import pytest
 
-from avis_ctrl.errors import ComputationError
-from avis_ctrl.study.workers import Workers
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.study.workers import Workers, each
 
 
 def double(value: int) -> int:
@@ -60,3 +61,24 @@ def test_ctrl_c_is_not_kept_for_later():
         raise KeyboardInterrupt
     with pytest.raises(KeyboardInterrupt), Workers(1) as workers:
         workers.submit(interrupt)
+
+
+def test_answers_are_those_of_a_loop_in_their_order():
+    A = np.random.default_rng(1).standard_normal((6, 6))
+    expected = [np.linalg.matrix_power(A, k) for k in range(7)]
+    # A function that no pickle could carry, as refits are.
+    found = each(lambda k: np.linalg.matrix_power(A, k), range(7))
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert each(lambda k: k, []) == [] and each(lambda k: k + 1, [1]) == [2]
+
+
+def test_an_error_is_the_one_of_the_function_and_nothing_is_left_over():
+    def fails(k):
+        if k == 3:
+            raise InputError("expected another", field="k", value=k)
+        return os.getpid()
+    with pytest.raises(InputError, match="k = 3: expected another"):
+        each(fails, range(5))
+    if len(os.sched_getaffinity(0)) > 1:
+        assert os.getpid() not in each(fails, range(3))

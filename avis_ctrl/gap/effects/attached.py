@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register, told_from_none
 from avis_ctrl.gap.effects.impedance import at_points, peaks, positions, project, unit_matrices
 from avis_ctrl.gap.effects.line_of_action import best_direction, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 # Damping ratios at which seeds are looked for, and how often the step between frequencies is halved about the best.
 DAMPINGS, HALVINGS = (0.03, 0.15), 3
+
 
 @register
 class AttachedOscillator(AtPoint):
@@ -75,8 +76,7 @@ class AttachedOscillator(AtPoint):
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         names = [name for name in values if name.startswith("along_")] or ["mass_kg"]
-        seen = any(abs(values[name]) > 3 * std[name] for name in names)
-        return "" if seen else "a sprung mass that the data do not tell from none"
+        return "" if told_from_none(values, std, names) else "a sprung mass that the data do not tell from none"
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:

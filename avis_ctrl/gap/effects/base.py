@@ -15,7 +15,7 @@ in them there, which the score test and the starting values use; the others shap
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -82,6 +82,11 @@ class Reported:
     value: float
     std: float
     unit: str
+
+
+def told_from_none(values: Mapping[str, float], std: Mapping[str, float], names: Iterable[str]) -> bool:
+    """Whether one of some parameters is more than three of its standard deviations from zero."""
+    return any(abs(values[name]) > 3 * std[name] for name in names)
 
 
 class Effect(ABC):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register, told_from_none
 from avis_ctrl.gap.effects.impedance import at_points, positions, project
 from avis_ctrl.gap.effects.line_of_action import best_direction, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
@@ -75,8 +75,7 @@ class CableStiffness(AtPoint):
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         names = [name for name in values if name.startswith(("along_", "k_"))]
-        seen = any(abs(values[name]) > 3 * std[name] for name in names)
-        return "" if seen else "a cable that the data do not tell from none"
+        return "" if told_from_none(values, std, names) else "a cable that the data do not tell from none"
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.data import thinned
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register, told_from_none
 from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.mounts import has_mounts
 from avis_ctrl.gap.effects.sensors import receptance
@@ -143,8 +143,8 @@ class BaseCompliance(Effect):
         return [Seed(tuple(float(v) for v in values), took.chi2, 2 * len(best))]
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
-        told = values["mass_kg"] > 3 * std["mass_kg"]
-        return "" if told else "a chassis so heavy that the data do not tell it from one that stands still"
+        return "" if told_from_none(values, std, ["mass_kg"]) else (
+            "a chassis so heavy that the data do not tell it from one that stands still")
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         mass, damping, stiffness = of_chassis(values)

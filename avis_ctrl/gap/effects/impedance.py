@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter
-from avis_ctrl.gap.score_algebra import Reduction, reduction, symmetric_coordinates
+from avis_ctrl.gap.score_algebra import symmetric_coordinates
 from avis_ctrl.rigs.rigid_body import point_map
 
 if TYPE_CHECKING:
@@ -108,14 +108,6 @@ def recoils(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.
         seen = answer.left[:, :, :6] @ through
         columns.append(-np.moveaxis(seen[:, :, :, None] * amount[:, None], 2, 0))
     return score.directions(columns)
-
-
-def residues(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> tuple[Reduction, np.ndarray]:
-    """Best residues (n_y, n_u) of a mode of that receptance over all paths, displacement per newton, without any tie
-    between them."""
-    A = paths(score, receptance)
-    took = reduction(A @ A.T, A @ score.e)
-    return took, took.coefficients.reshape(len(score.model.sensors.names), -1)
 
 
 def paths(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Seed, register
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Seed, register, told_from_none
 from avis_ctrl.gap.operators import mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect
 
@@ -135,8 +135,8 @@ class MountSurge(_OfMounts):
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
-        told = values["frequency_Hz"] > 3 * std["frequency_Hz"]
-        return "" if told else "a resonance of which the data do not tell the frequency"
+        return "" if told_from_none(values, std, ["frequency_Hz"]) else (
+            "a resonance of which the data do not tell the frequency")
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         up = vertical(ops)

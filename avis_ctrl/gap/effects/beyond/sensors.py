@@ -19,6 +19,16 @@ if TYPE_CHECKING:
     from avis_ctrl.gap.table_model import TableModel
 
 
+def mix(ops: Operators, into: str, shares: Mapping[str, float]) -> None:
+    """Shares of other sensors' signals in one."""
+    j, gain = ops.sensor(into), ops.base.sensors.sensitivity * ops.sensor_gain
+    rows = np.array(ops.rows)
+    for name, share in shares.items():
+        i = ops.sensor(name)
+        rows[:, j] = rows[:, j] + share * gain[i] / gain[j] * ops.rows[:, i]
+    ops.rows = rows
+
+
 class SensorCrosstalk(FirstOrder):
     """One output holds a share of another output's signal."""
 
@@ -32,11 +42,8 @@ class SensorCrosstalk(FirstOrder):
         return (EffectParameter("share", "1", "share of the other's signal", 0.0, -2.0, 2.0, 0.01),)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        j, i = (ops.sensor(name) for name in place.split("/"))
-        gain = ops.base.sensors.sensitivity * ops.sensor_gain
-        rows = np.array(np.broadcast_to(ops.rows, np.broadcast_shapes(ops.rows.shape, (1, 1, 1))))
-        rows[:, j] = rows[:, j] + values["share"] * gain[i] / gain[j] * ops.rows[:, i]
-        ops.rows = rows
+        into, source = place.split("/")
+        mix(ops, into, {source: values["share"]})
 
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
         names = part.model.sensors.names
@@ -62,12 +69,7 @@ class SensorCrosstalkOfAll(FirstOrder):
                                      group="share") for name in model.sensors.names if name != place)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        j, gain = ops.sensor(place), ops.base.sensors.sensitivity * ops.sensor_gain
-        rows = np.array(ops.rows)
-        for name, share in values.items():
-            i = ops.sensor(name.removeprefix("share_of_"))
-            rows[:, j] = rows[:, j] + share * gain[i] / gain[j] * ops.rows[:, i]
-        ops.rows = rows
+        mix(ops, place, {name.removeprefix("share_of_"): share for name, share in values.items()})
 
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
         names, Y = part.model.sensors.names, part.answer.Y
@@ -159,7 +161,10 @@ class _Output(FirstOrder):
 
 
 class _OfOneOutput(_Output):
+    """One sensor whose reading holds a power of itself, `words`."""
+
     law: Callable[[np.ndarray], np.ndarray]
+    words: str
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         known = [one for one in model.motion.values() if one.y.size]
@@ -167,6 +172,9 @@ class _OfOneOutput(_Output):
 
     def signals(self, record: RecordMotion) -> np.ndarray:
         return type(self).law(record.y - record.y.mean(0))
+
+    def said(self, place: str, values: Mapping[str, float]) -> str:
+        return f"{place} not linear, with a term in the {self.words} of its reading"
 
 
 class SensorQuadratic(_OfOneOutput):
@@ -176,9 +184,7 @@ class SensorQuadratic(_OfOneOutput):
     title = "a sensor that is not linear (quadratic)"
     parameter = EffectParameter("per_unit", "1/[y]", "quadratic share", 0.0, -1e6, 1e6, 1e-2)
     law = staticmethod(lambda y: y ** 2)
-
-    def said(self, place: str, values: Mapping[str, float]) -> str:
-        return f"{place} not linear, with a term in the square of its reading"
+    words = "square"
 
 
 class SensorCubic(_OfOneOutput):
@@ -188,9 +194,7 @@ class SensorCubic(_OfOneOutput):
     title = "a sensor that is not linear (cubic)"
     parameter = EffectParameter("per_unit_2", "1/[y]^2", "cubic share", 0.0, -1e9, 1e9, 1e-2)
     law = staticmethod(lambda y: y ** 3)
-
-    def said(self, place: str, values: Mapping[str, float]) -> str:
-        return f"{place} not linear, with a term in the cube of its reading"
+    words = "cube"
 
 
 class ClockRate(_Output):
