@@ -86,8 +86,10 @@ def late(s: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
 
 
 class Late(FirstOrder):
-    """exp(-s T)/(1 + s tau). To first order both are one."""
+    """exp(-s T)/(1 + s tau). To first order both are one; nothing is earlier than it was sent."""
+
+    def seeds(self, score: Score, place: str) -> list[Seed]:
+        return [seed for seed in super().seeds(score, place) if any(seed.values)]
 
     def _begin(self, model: TableModel, place: str, point: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-        late = float(np.sum(coefficients))
-        return np.array([late / 2, late / 2]) if late > 0 else np.array([late, 0.0])
+        return np.full(2, max(float(np.sum(coefficients)), 0.0) / 2)
