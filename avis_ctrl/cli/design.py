@@ -22,12 +22,12 @@ def design(
     from rich.console import Console
 
     from avis_ctrl.study.design_file import read_study
-    from avis_ctrl.study.output import open_folder
+    from avis_ctrl.study.files import output_folder
+    from avis_ctrl.study.output import FILES, FOLDERS
 
     console = Console(highlight=False)
     design, rig = read_study(file)  # before anything is imported or written that takes time
-    folder = open_folder(out)
-    with Progress(console) as progress:
+    with output_folder(out, FILES, FOLDERS) as folder, Progress(console) as progress:
         from avis_ctrl.report import render_html, render_pdf
         from avis_ctrl.study.output import write_study
         from avis_ctrl.study.runner import run_design

@@ -46,7 +46,7 @@ def gap(
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.rigs import load_rig
-    from avis_ctrl.study.files import open_folder, write_whole
+    from avis_ctrl.study.files import open_folder, output_folder, write_whole
     from avis_ctrl.study.gap_names import GAP_FILES
     from avis_ctrl.study.rig_channels import in_words_of
 
@@ -68,15 +68,17 @@ def gap(
         raise error.in_file(campaign) from None
     for note in in_short(measured.notes):
         console.print(f"[dim]{note}[/]")
-    folder = open_folder(out, GAP_FILES)
-    with Progress(console) as progress:
+    with output_folder(out, GAP_FILES) as folder, Progress(console) as progress:
         from avis_ctrl.report import gap_html, gap_pdf
         from avis_ctrl.study.gap import GapOptions, find_gap
         from avis_ctrl.study.gap_files import write_gap
 
         options = GapOptions(seed, band_Hz, True, despite_gates, amplifier_Hz, design or design_file is not None,
                              design_file, own)
-        found = find_gap(named, start, options, progress)
+        try:
+            found = find_gap(named, start, options, progress)
+        except InputError as error:
+            raise error if error.file else error.in_file(campaign) from None
         progress("report")
         files = write_gap(folder, found.gap, gap_html(found), gap_pdf(found))
         if found.design is not None and found.design.files:
@@ -102,6 +104,9 @@ def _summary(console, found) -> None:
         console.print(f"- {sentence}")
     if gap.next_experiment:
         console.print(f"- next: {gap.next_experiment}")
+    elif gap.effects and found.design is None and not found.design_note:
+        console.print("- next: --design shows what this does to the controller; avis predict tries the updated model "
+                      "on another campaign")
     if found.design is not None:
         for sentence in found.design.sentences:
             console.print(f"- {sentence}")

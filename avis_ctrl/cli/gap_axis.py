@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,23 +29,28 @@ def gap_axis(
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="folder for gap.json")] = None,
     seed: Annotated[int, typer.Option("--seed")] = 1,
 ) -> None:
-    """What a model of one axis lacks: its name, its size, how sure that is, and the gap before and after."""
+    """What a model of one axis lacks: its name, its size, how sure that is, and the gap before and after.
+
+    For example: avis gap-axis drive drive.mat --columns force=vir,position=qm,reference=qg,t=t --scale force=35.15
+    """
     from rich.console import Console
 
     from avis_ctrl.cli.console import Progress
     from avis_ctrl.gap.single_axis import find_axis_gap_in
-    from avis_ctrl.study.files import open_folder, write_whole
+    from avis_ctrl.study.files import output_folder, write_whole
 
     roles = dict(_pair(part, "--columns") for part in columns.split(",")) if columns else None
     factors = {role: _number(text) for role, text in (_pair(part, "--scale") for part in scale.split(","))} \
         if scale else None
     options: dict[str, Any] = {} if band_Hz is None else {"band_Hz": band_Hz}
     options |= {} if cutoff_Hz is None else {"cutoff_Hz": cutoff_Hz}
-    folder = open_folder(out, ("gap.json",)) if out else None
     console = Console(highlight=False)
-    with Progress(console) as progress:
-        found = find_axis_gap_in(kind, path, roles, scale=factors, sample_rate_Hz=sample_rate_Hz, seed=seed,
-                                 progress=progress, **options)
+    with output_folder(out, ("gap.json",)) if out else nullcontext() as folder:
+        with Progress(console) as progress:
+            found = find_axis_gap_in(kind, path, roles, scale=factors, sample_rate_Hz=sample_rate_Hz, seed=seed,
+                                     progress=progress, **options)
+        if folder:
+            write_whole(folder / "gap.json", json.dumps(found.to_json(), indent=2, allow_nan=False).encode())
     console.print(f"verdict: {found.verdict}")
     for sentence in found.sentences:
         console.print(sentence, soft_wrap=True, markup=False)
@@ -52,7 +58,6 @@ def gap_axis(
         noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
         console.print(f"- {stage.stage}: {100 * stage.nrmse:.3g} % on unseen data{noise}", soft_wrap=True, markup=False)
     if folder:
-        write_whole(folder / "gap.json", json.dumps(found.to_json(), indent=2, allow_nan=False).encode())
         console.print(f"{folder / 'gap.json'}")
 
 

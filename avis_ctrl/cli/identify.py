@@ -54,7 +54,7 @@ def identify(
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.rigs import load_rig
-    from avis_ctrl.study.files import open_folder
+    from avis_ctrl.study.files import output_folder
     from avis_ctrl.study.identification_files import FILES
     from avis_ctrl.study.rig_channels import in_words_of
 
@@ -68,8 +68,7 @@ def identify(
         raise error.in_file(measurement) from None
     for note in in_short(measured.notes) if isinstance(measured, Campaign) else ():
         console.print(f"[dim]{note}[/]")
-    folder = open_folder(out, FILES)
-    with Progress(console) as progress:
+    with output_folder(out, FILES) as folder, Progress(console) as progress:
         from avis_ctrl.report import identification_html, identification_pdf
         from avis_ctrl.study.identification import IdentifyOptions, identify
         from avis_ctrl.study.identification_design import design_start

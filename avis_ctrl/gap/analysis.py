@@ -14,7 +14,7 @@ from avis_ctrl.gap.data import Halves, blocks_of, divide, thinned, with_noise
 from avis_ctrl.gap.detectable import detectable
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.judgement import effects_of, judge
+from avis_ctrl.gap.judgement import effects_of, judge, undetermined
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
 from avis_ctrl.gap.refit import Refit, judged, likelihood, refit, scattered, try_refit
 from avis_ctrl.gap.result import Detectable, Gap
@@ -28,6 +28,7 @@ from avis_ctrl.gap.signal_effects import (
     predicted,
     without_hum,
 )
+from avis_ctrl.gap.signals.converter import ConverterFinding
 from avis_ctrl.gap.signals.hum import HumFinding, find_hum, polluted
 from avis_ctrl.gap.signals.leftover import Leftover
 from avis_ctrl.gap.signals.repair import repair
@@ -44,8 +45,8 @@ from avis_ctrl.rigs.rig import Rig
 Progress = Callable[[str], None]
 # Share of a channel's samples beyond its limits from which repaired samples are predicted anew.
 REPAIRED = 1e-5
-# How often, each time with the better model that the last repair allowed.
-REPAIRS = 3
+# How often, each time with the better model that the last repair allowed, and iterations of its fit in between.
+REPAIRS, ITERATIONS = 3, 10
 # Second-order terms as Newton and Euler have them, with sensors fixed to the payload and forces along earth axes.
 BY_PHYSICS = (1.0, 0.0, 1.0)
 
@@ -59,6 +60,7 @@ class Prepared:
     """A campaign made ready: halves, blocks with noise on all lines, and the re-identified model.
 
     unmasked : held-out blocks as they came, hum and all. nominal : the rig as its file has it. faults : of the signals.
+    clipped : the campaign with its clipped samples, where more than a few are repaired in `campaign`; else None.
     """
 
     campaign: Campaign
@@ -71,6 +73,7 @@ class Prepared:
     nominal: TableModel
     base: Refit
     faults: SignalFaults
+    clipped: Campaign | None = None
 
     @cached_property
     def thin(self) -> list[SpectralBlock]:
@@ -86,6 +89,17 @@ class Prepared:
         (fitted, held_out, unmasked), how = _noise(groups, self.halves, left, model, self.band_Hz)
         made = replace(self, fitted=fitted, held_out=held_out, unmasked=unmasked, noise=how)
         return replace(made, base=refit(self.base.model, made.thin, made.thin_held))
+
+    def repaired_with(self, model: TableModel) -> Prepared:
+        """The same with clipped samples as a model expects them, which has more than the re-identified one."""
+        made = self
+        for _ in range(REPAIRS):
+            assert made.clipped is not None
+            mended = repair(made.clipped, model.rig, predicted(made.clipped, model), self.faults.converter).campaign
+            made = _ready(mended, made.nominal, replace(made.base.model, effects=()), made.band_Hz,
+                          self.faults.converter, made.clipped, lambda text: None)
+            model = refit(replace(model, motion=made.nominal.motion), made.thin, made.thin_held, ITERATIONS).model
+        return made
 
 
 def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, float] | None = None,
@@ -106,21 +120,36 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     """
     began = time.monotonic()
     prepared = prepare(campaign, rig, band_Hz, amplifier_corner_Hz, progress)
-    found = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each)
+    # What stands in the place of clipped samples lacks whatever the model lacks: the first search is a rough one then.
+    found = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each,
+                   longest=LONGEST if prepared.clipped is None else 1)
+    if prepared.clipped is not None and (nearest := _nearest(found)) is not None:
+        progress("clipped samples: what the model expects behind the limits with "
+                 + " and ".join(one.effect.name for one in effects_of(nearest)))
+        prepared = prepared.repaired_with(nearest)
+        found = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each)
     progress("noise of floor and sensors, with what was found")
     left = left_by(prepared.campaign, found.best.model)
     prepared = prepared.measured_with(found.best.model, left)
     found = _again(prepared, found, effects, progress, each)
     progress("fits to all lines, and what they leave of the held-out records")
-    base, updated = _final(prepared, found)
+    base, updated, left_out = _final(prepared, found)
     faults = replace(prepared.faults, noise=levels(left, updated.model, prepared.faults.hum, prepared.faults.converter))
-    judgement = judge(prepared.thin, found, base, updated, faults)
+    judgement = judge(prepared.thin, found, base, updated, faults, left_out)
     limits: tuple[Detectable, ...] = ()
     if judgement.verdict == "none":
         progress("how large an effect would have had to be to be seen")
         limits = detectable(base.model, prepared.thin, effects)
     gap = shown(prepared, found, base, updated, judgement, seed, time.monotonic() - began, faults.noise)
     return replace(gap, detectable=limits)
+
+
+def _nearest(found: Found) -> TableModel | None:
+    """The best model with effects that a search has refitted, where the re-identified one leaves more than noise."""
+    tried = [one for stage in found.pool for one in stage if one.held_per_dof < found.chain[0].held_per_dof]
+    if found.chain[0].held_per_dof <= NOISE or not tried:
+        return None
+    return min(tried, key=lambda one: one.criterion).model
 
 
 def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, progress: Progress, each: Each
@@ -172,13 +201,20 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     nominal = TableModel(base, nominal=base)
     progress(f"re-identification of {len(nominal.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz; {halves.how}")
     rough = _rough(nominal, halves, band)
-    if mended and max(mended.clipped.values()) > REPAIRED:
+    original = campaign if mended and max(mended.clipped.values()) > REPAIRED else None
+    if original is not None:
         progress("clipped samples: what the model expects behind the limits")
-        original = campaign
         for _ in range(REPAIRS):
             campaign = repair(original, rig, predicted(original, rough), converter).campaign
             halves = divide(campaign)
             rough = _rough(rough, halves, band)
+    return _ready(campaign, nominal, rough, band, converter, original, progress)
+
+
+def _ready(campaign: Campaign, nominal: TableModel, rough: TableModel, band: tuple[float, float],
+           converter: tuple[ConverterFinding, ...], clipped: Campaign | None, progress: Progress) -> Prepared:
+    """Hum taken out, blocks with noise, second-order terms, and the re-identified model, from a rough one."""
+    halves = divide(campaign)
     left = left_by(campaign, rough)
     raw_held = blocks_of(halves.held_out, rough, band)
     hum = find_hum(left)
@@ -198,7 +234,7 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     again = refit(model.with_effect(active(LargeMotion(), model, "payload", BY_PHYSICS)),
                   [thinned(block) for block in fitted], [thinned(block) for block in held_out])
     return Prepared(campaign, halves, band, fitted, held_out, unmasked, how, replace(nominal, motion=motion), again,
-                    SignalFaults(converter, hum))
+                    SignalFaults(converter, hum), clipped)
 
 
 def _noise(groups: Sequence[list[SpectralBlock]], halves: Halves, left: tuple[Leftover, ...], model: TableModel,
@@ -241,8 +277,18 @@ def _masked(blocks: Sequence[SpectralBlock], campaign: Campaign, hum: HumFinding
     return found
 
 
-def _final(prepared: Prepared, found: Found) -> tuple[Refit, Refit]:
-    """Re-identified and updated model with what they leave of all held-out lines; the last one fitted to many lines."""
+def _final(prepared: Prepared, found: Found) -> tuple[Refit, Refit, list[str]]:
+    """Re-identified and updated model with what they leave of all held-out lines, the last one fitted to many lines;
+    and why effects were left out that these many lines do not tell from none beside others."""
     many = [thinned(block, FINAL_LINES) for block in prepared.fitted]
-    best = scattered(judged(likelihood(found.best.model, many, FINAL_ITERATIONS), prepared.held_out), many)
-    return (judged(found.chain[0].fit, prepared.held_out), best) if len(found.chain) > 1 else (best, best)
+
+    def fitted(model: TableModel) -> Refit:
+        return scattered(judged(likelihood(model, many, FINAL_ITERATIONS), prepared.held_out), many)
+    best, left_out = fitted(found.best.model), []
+    while len(effects_of(best.model)) > 1:
+        label, why = undetermined(best)
+        if not label:
+            break
+        left_out.append(why)
+        best = fitted(best.model.without(label))
+    return (judged(found.chain[0].fit, prepared.held_out) if len(found.chain) > 1 else best), best, left_out

@@ -15,6 +15,8 @@ import numpy as np
 from scipy import stats
 
 from avis_ctrl.gap.data import of_one_level
+from avis_ctrl.gap.in_words import sized, spoken
+from avis_ctrl.gap.next_measurement import between
 from avis_ctrl.gap.refit import Refit, probabilities, try_refit
 from avis_ctrl.gap.result import Considered, NamedEffect, Verdict
 from avis_ctrl.gap.score import Score
@@ -39,7 +41,10 @@ UNEQUAL_SHARE, UNEQUAL = 0.25, 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """Verdict, effects and model; rivals that were refitted, and sentences on how it was decided."""
+    """Verdict, effects and model; rivals that were refitted, and sentences on how it was decided.
+
+    like : what a gap without a name behaves most like.
+    """
 
     verdict: Verdict
     effects: tuple[NamedEffect, ...]
@@ -47,14 +52,16 @@ class Judgement:
     considered: tuple[Considered, ...]
     reasons: tuple[str, ...]
     next_experiment: str | None
+    like: str = ""
 
 
-def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Refit, faults: SignalFaults) -> Judgement:
-    """Weigh what a search and the signals brought."""
+def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Refit, faults: SignalFaults,
+          left_out: Sequence[str] = ()) -> Judgement:
+    """Weigh what a search and the signals brought. left_out : why some of what was found is not in `updated`."""
     own = effects_of(updated.model)
     if own and not earned(base, updated, known_noise(thin)):
         own, updated = [], base
-    faint = undetermined(updated)
+    _, faint = undetermined(updated)
     if own and faint:
         own, updated = [], base
     if updated.held_per_dof > CLOSED or found.beaten is not None:
@@ -64,7 +71,7 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
     raised = faults.raised
     reasons = [f"the noise of {', '.join(raised)} is above the rig file's ambient level; the library has no name for "
                "that"] if raised else []
-    reasons += [faint] if faint else []
+    reasons += [*left_out, faint] if faint else left_out
     refused_by_level = False
     if own and updated.held_per_dof > CLOSED:
         refusal = refused(thin, base, updated)
@@ -84,7 +91,8 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
         verdict = "unexplained" if residual_left else "none"
     ties = [(one.name, other) for one in effects for other in one.indistinguishable_from]
     return Judgement(verdict, tuple(effects), updated, _considered(found, updated, known_noise(thin)), tuple(reasons),
-                     _next(ties, found, verdict))
+                     _next(ties, found),
+                     found.beaten.words if found.beaten is not None and not own else "")
 
 
 def _beyond(found: Found, updated: Refit, own: Sequence[ActiveEffect]) -> list[str]:
@@ -109,8 +117,8 @@ def _amount(rival: Rival) -> str:
     """Parameters of a competitor in words."""
     last = rival.refit.model.effects[-1]
     reported = rival.refit.reported(last, max(rival.refit.fit.chi2_per_dof, 1.0))
-    return ", ".join(f"{name} {one.value:.3g} +- {one.std:.1g} {one.unit}".rstrip(" 1") for name, one in
-                     sorted(reported.items(), key=lambda item: -abs(item[1].value) / max(item[1].std, 1e-300))[:2])
+    surest = sorted(reported.items(), key=lambda item: -abs(item[1].value) / max(item[1].std, 1e-300))
+    return ", ".join(f"{spoken(name, one.unit)} {sized(one)}" for name, one in surest[:2])
 
 
 def effects_of(model: TableModel) -> list[ActiveEffect]:
@@ -129,22 +137,23 @@ def earned(base: Refit, updated: Refit, stretch: float = 1.0) -> bool:
     return base.held_per_dof - updated.held_per_dof > EARNED * excess
 
 
-def undetermined(updated: Refit) -> str:
-    """Why an effect is not told from none: its strength is within its own uncertainty (A. Wald's test, with the
-    covariance that the scatter over bands and records gives), or beyond what physics allows. Empty where it is told.
+def undetermined(updated: Refit) -> tuple[str, str]:
+    """(label, why) of an effect that is not told from none: its strength is within its own uncertainty (A. Wald's test,
+    with the covariance that the scatter over bands and records gives), or beyond what physics allows. Empty where all
+    are told.
     """
-    if why := updated.implausible():
-        names = " and ".join(one.effect.name for one in effects_of(updated.model))
-        return f"{names} comes nearest, but that is not possible ({why}): not named"
     for one in effects_of(updated.model):
+        if why := updated.forbidden(one):
+            return one.label, f"{one.effect.name} comes nearest, but that is not possible ({why}): not named"
         linear = [j for j, p in enumerate(one.parameters) if p.linear]
         size = np.array([one.parameters[j].size for j in linear])
         away = np.array([one.values[j] - one.parameters[j].none for j in linear]) / size
         C = updated.covariance_of(one, updated.misfit)[np.ix_(linear, linear)] / np.outer(size, size)
         known = np.linalg.matrix_rank(C, hermitian=True) if linear else 0
         if known and float(stats.chi2.sf(away @ np.linalg.pinv(C, hermitian=True) @ away, known)) > FALSE_ALARM:
-            return f"{one.effect.name} comes nearest, but these records do not tell its strength from none: not named"
-    return ""
+            why = "these records do not tell its strength from none"
+            return one.label, f"{one.effect.name} comes nearest, but {why}: not named"
+    return "", ""
 
 
 def refused(thin: Sequence[SpectralBlock], base: Refit, updated: Refit) -> str:
@@ -279,31 +288,14 @@ def _considered(found: Found, updated: Refit, stretch: float) -> tuple[Considere
     return tuple(rows[:12])
 
 
-def _next(ties: Sequence[tuple[str, str]], found: Found, verdict: Verdict) -> str | None:
-    """Which measurement would tell rivals apart, from where their predictions differ most."""
+def _next(ties: Sequence[tuple[str, str]], found: Found) -> str | None:
+    """Which measurement would tell rivals apart."""
     if ties:
+        models = {one.model.effects[-1].effect.name: one.model for stage in found.pool for one in stage}
         name, other = ties[0]
-        return _between(name, other, found)
-    if verdict in ("unexplained", "partly explained"):
-        return ("Repeat the records at half and at twice the level, and one record at rest with the floor measured: a "
-                "residual that keeps its size relative to the drive is linear and missing from the library, one that "
-                "grows faster is not linear, one that stays is noise.")
+        return between(name, other, models.get(name), models.get(other))
+    if (rival := found.beaten) is not None:
+        nearest = effects_of(rival.against.model)
+        if nearest:
+            return between(rival.words, nearest[-1].effect.name, rival.refit.model, rival.against.model)
     return None
-
-
-def _between(name: str, other: str, found: Found) -> str:
-    models = {one.model.effects[-1].effect.name: one.model for stage in found.pool for one in stage}
-    a, b = models.get(name), models.get(other)
-    if a is None or b is None or a.effects[-1].effect.nonlinear != b.effects[-1].effect.nonlinear:
-        return (f"To tell {name} from {other}, record the same signals at half and at twice the level: only one of "
-                "them depends on amplitude.")
-    frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), 300)
-    omega = 2 * np.pi * frequency
-    n_u = len(a.actuators)
-    Ga, Gb = a.response(omega)[:, :, :n_u], b.response(omega)[:, :, :n_u]
-    difference = np.abs(Ga - Gb)
-    k, i, j = np.unravel_index(int(np.argmax(difference)), difference.shape)
-    near = frequency[difference[:, i, j] > 0.5 * difference[k, i, j]]
-    return (f"To tell {name} from {other}, drive {a.actuators[j]} from {near.min():.3g} to {near.max():.3g} Hz and "
-            f"look at {a.sensors.names[i]}: there their predictions differ most, by {difference[k, i, j]:.2g} "
-            f"{a.sensors.unit}/V.")

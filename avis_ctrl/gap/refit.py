@@ -96,14 +96,13 @@ class Refit:
 
     def implausible(self) -> str:
         """Why physics forbids the values of some effect; empty where it does not."""
-        for one in self.model.effects:
-            std = dict(zip((p.name for p in one.parameters), np.sqrt(np.maximum(np.diag(self.covariance_of(one)), 0)),
-                           strict=True))
-            if reason := one.effect.implausible(one.by_name, std):
-                return reason
-            if reason := at_the_edge(one):
-                return reason
-        return ""
+        return next((reason for one in self.model.effects if (reason := self.forbidden(one))), "")
+
+    def forbidden(self, one: ActiveEffect) -> str:
+        """Why physics forbids the values of an effect; empty where it does not."""
+        std = np.sqrt(np.maximum(np.diag(self.covariance_of(one)), 0))
+        return one.effect.implausible(one.by_name, dict(zip((p.name for p in one.parameters), std, strict=True))) or \
+            at_the_edge(one)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ import numpy as np
 
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.measurement.gates.finding import Picture
 
 Verdict = Literal["none", "explained", "partly explained", "unexplained"]
 VERDICTS: tuple[str, ...] = ("none", "explained", "partly explained", "unexplained")
@@ -153,7 +152,7 @@ class Gap:
     noise_nrmse : what noise alone would leave of the held-out records. next_experiment : None or a sentence.
     baseline, updated : models (updated is the baseline where nothing was named).
     considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.
-    pictures : plain data for plots. held_out : how the records were divided. seed, seconds.
+    held_out : how the records were divided. seed, seconds.
     covariance : (n_p, n_p) of the updated model's parameters.
     detectable : where the verdict is none, sizes of five standard deviations of absent effects; else empty.
     shares : what accounts for the outputs' power, by level, the lowest first. records : what each record leaves.
@@ -171,7 +170,6 @@ class Gap:
     considered: tuple[Considered, ...]
     heat: HeatMap | None
     sentences: tuple[str, ...]
-    pictures: tuple[Picture, ...]
     held_out: str
     seed: int
     seconds: float

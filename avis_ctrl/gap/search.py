@@ -18,7 +18,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from avis_ctrl.gap.data import thinned
-from avis_ctrl.gap.effects.base import Effect, Seed, library
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, library
 from avis_ctrl.gap.effects.beyond import beyond
 from avis_ctrl.gap.refit import Reached, Refit, try_refit
 from avis_ctrl.gap.score import Score
@@ -73,6 +73,9 @@ HOPELESS = 6.0
 BEHIND = 100.0
 # A name is refitted, at its best place, where its score is at least this share of the best one's.
 SHARE_OF_BEST = 0.02
+# Another summit of an effect's score over what shapes it is tried, too, from this share of the highest on, and where
+# it is that many times another frequency.
+SUMMIT, APART = 0.5, 1.4
 # Competitors from beyond the library: coarse refits, and refits to more lines, in the place of each effect.
 OUTSIDE_REFITS, OUTSIDE_PROMOTED = 3, 1
 # One is tried where its score is at least this share of the best one's of the library.
@@ -185,12 +188,26 @@ def candidates(score: Score, effects: Sequence[Effect], each: Each = one_by_one)
         if effect.nonlinear and not model.motion:
             return []
         places = [place for place in effect.places(model) if (effect.name, location(place)) not in taken]
-        return [(place, effect.seeds(score, place)[:1]) for place in places]
+        return [(place, summits(effect.seeds(score, place), effect.parameters(model, place))) for place in places]
     by_effect = each(seeds, effects)
     tried = sum(len(found) for found in by_effect)
     made = [Candidate(active(effect, model, place, seed.values), seed, min(1.0, tried * seed.chance(stretch)))
             for effect, found in zip(effects, by_effect, strict=True) for place, own in found for seed in own]
     return sorted(made, key=lambda c: -c.worth)
+
+
+def summits(found: Sequence[Seed], parameters: Sequence[EffectParameter]) -> list[Seed]:
+    """The best of seeds that are sorted, and the next one that is a summit of its own, if it is not far lower: to first
+    order the wrong one of two frequencies may look better."""
+    shape = [k for k, one in enumerate(parameters) if len(one.grid) > 3]
+    if not shape or not found:
+        return list(found[:1])
+    at = np.array([[one.values[k] for k in shape] for one in found])
+    high = sum(one.chi2 > SUMMIT * found[0].chi2 for one in found)
+    for k in range(1, high if np.all(at > 0) else 0):
+        if np.all(np.any(np.abs(np.log(at[:k] / at[k])) > np.log(APART), axis=1)):
+            return [found[0], found[k]]
+    return [found[0]]
 
 
 def known_noise(blocks: Sequence[SpectralBlock]) -> float:
@@ -207,19 +224,21 @@ def shortlist(found: Sequence[Candidate], most: int) -> list[Candidate]:
     top = significant[0].worth
     chosen: list[Candidate] = []
     for one in significant:
-        same = [c for c in chosen if c.effect.effect.name == one.effect.effect.name]
+        same = [c.effect.place for c in chosen if c.effect.effect.name == one.effect.effect.name]
         places = 2 if one.worth > 0.3 * top else 1
-        if len(same) < places and one.worth > SHARE_OF_BEST * top:
+        room = len(set(same)) < places or one.effect.place in same
+        if room and len(same) <= places and one.worth > SHARE_OF_BEST * top:
             chosen.append(one)
     return chosen[:most]
 
 
 def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock],
            progress: Progress = lambda text: None, effects: Sequence[Effect] | None = None,
-           begin: tuple[Refit, ...] = (), each: Each = one_by_one) -> Found:
+           begin: tuple[Refit, ...] = (), each: Each = one_by_one, longest: int = LONGEST) -> Found:
     """The shortest chain of effects that explains the gap of a re-identified model, or the best there is.
 
     fitted, held_out : thinned blocks with noise. begin : a chain from base that is to be extended only.
+    longest : most effects of a chain.
     """
     known = list(library().values()) if effects is None else list(effects)
     data = _Data(fitted, held_out, [thinned(block, COARSE_LINES, seed=1) for block in fitted], progress, each)
@@ -228,7 +247,7 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
     pool: list[tuple[Refit, ...]] = []
     passed_over: list[Refit] = []
     rivals: list[Rival] = []
-    for depth in range(len(best), LONGEST + 1):
+    for depth in range(len(best), longest + 1):
         rough: list[tuple[Refit, ...]] = []
         worth = 0.0
         for chain in parents:
@@ -301,9 +320,9 @@ def _contested(found: Found, data: _Data) -> Found:
             return replace(found, chain=chain[:1], reached_noise=False, beaten=alone)
     if len(chain) < 3 or chain[-1].held_per_dof > CLOSED:
         return found
-    # A pair: each of its effects may stand for something else.
+    # A pair: each of its effects may stand for something else; the first has been contested if it closed the gap alone.
     first, second = (one.label for one in chain[-1].model.effects[-2:])
-    for kept, dropped in ((first, second), (second, first)):
+    for kept, dropped in ((first, second), (second, first))[:1 if chain[1].held_per_dof <= CLOSED else 2]:
         parent = (chain[1] if kept == first else
                   try_refit(chain[-1].model.without(dropped), data.fitted, data.held_out, ITERATIONS[1]))
         for one in _rivals(parent, chain[-1], data, 0.0) if parent is not None else ():
@@ -339,8 +358,9 @@ def _coarse(model: TableModel, effects: Sequence[ActiveEffect], data: _Data) -> 
 
     def reached(one: ActiveEffect) -> Reached | None:
         found = fitted(one)
-        if found is None or found.chi2_fit > least:  # worse than without it: from a tenth of its strength
-            second = fitted(weaker(one))
+        faint = weaker(one)
+        if (found is None or found.chi2_fit > least) and faint.values != one.values:  # worse than without it
+            second = fitted(faint)
             found = min((r for r in (found, second) if r is not None), key=lambda r: r.chi2_fit, default=None)
         return Reached.by(found)
     return [found.refit(model.with_effect(one)) for one, found in zip(effects, data.each(reached, effects), strict=True)

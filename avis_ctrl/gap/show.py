@@ -11,11 +11,12 @@ import numpy as np
 from scipy import stats
 
 from avis_ctrl.gap.data import all_silent, thinned
-from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.in_words import in_words
 from avis_ctrl.gap.judgement import Judgement, effects_of
+from avis_ctrl.gap.next_measurement import of_unexplained
 from avis_ctrl.gap.power_shares import power_shares
 from avis_ctrl.gap.refit import Refit
-from avis_ctrl.gap.result import Gap, HeatMap, NamedEffect, PowerShares, RecordGap, Stage, Where
+from avis_ctrl.gap.result import Gap, HeatMap, PowerShares, RecordGap, Stage, Where
 from avis_ctrl.gap.search import Found
 from avis_ctrl.gap.signals.noise_level import NoiseLevels
 from avis_ctrl.gap.table_model import TableModel
@@ -84,10 +85,13 @@ def shown(prepared: Prepared, found: Found, base: Refit, updated: Refit, judgeme
     sentences = (opening(judgement, ladder, after), *judgement.reasons, prepared.noise)
     sensors = None if noise is None else {name: one.value for name, one in noise.sensors.items()}
     records, shares = _every(prepared, base.model, judgement.updated.model, sensors)
+    onward = judgement.next_experiment
+    if onward is None and judgement.verdict in ("unexplained", "partly explained"):
+        onward = of_unexplained(remaining, records)
     return Gap(judgement.verdict, judgement.effects, tuple(ladder), where if judgement.verdict != "none" else (),
-               remaining, after.noise_nrmse, judgement.next_experiment, base.model, judgement.updated.model,
+               remaining, after.noise_nrmse, onward, base.model, judgement.updated.model,
                judgement.considered, heat_map(before, after), sentences,
-               (), prepared.halves.how, seed, seconds, judgement.updated.covariance,
+               prepared.halves.how, seed, seconds, judgement.updated.covariance,
                shares=shares, records=records)
 
 
@@ -105,7 +109,7 @@ def _steps(found: Found, base: Refit, judgement: Judgement, before: Left, after:
         label = table[depth - 1].effect.name
         if depth == len(table):
             steps.append(Stage(label, *_figures(after)))
-        else:
+        elif {one.label for one in effects_of(found.chain[depth].model)} == {one.label for one in table[:depth]}:
             steps.append(Stage(label, *_figures(Left.of(found.chain[depth].model, blocks))))
     return steps
 
@@ -117,39 +121,15 @@ def opening(judgement: Judgement, ladder: Sequence[Stage], after: Left) -> str:
         return (f"No missing effect shows: after re-identification the model leaves {_percent(first.nrmse)} of the "
                 f"held-out records, noise alone {_percent(after.noise_nrmse)}.")
     if judgement.verdict == "unexplained":
-        return (f"Something is missing that the library has no name for: after re-identification the model leaves "
-                f"{_percent(first.nrmse)} of the held-out records, noise alone {_percent(after.noise_nrmse)}.")
+        like = f"; it behaves most like {judgement.like}" if judgement.like else ""
+        return (f"Something is missing that the library has no name for{like}: after re-identification the model "
+                f"leaves {_percent(first.nrmse)} of the held-out records, noise alone {_percent(after.noise_nrmse)}.")
     named = " and ".join(in_words(one) for one in judgement.effects)
     end = "and something else remains" if judgement.verdict != "explained" else (
         "which is the noise" if last.nrmse <= IS_NOISE * after.noise_nrmse else
         f"beside {_percent(after.noise_nrmse)} of noise")
     return (f"Missing from the model: {named}; with that in it the gap falls from {_percent(first.nrmse)} to "
             f"{_percent(last.nrmse)}, {end}.")
-
-
-def in_words(one: NamedEffect) -> str:
-    """An effect with its place, first parameters and probability."""
-    sizes = ", ".join(f"{spoken(name, p.unit)} {_sized(p)}" for name, p in list(one.parameters.items())[:3])
-    ties = f", or {' or '.join(one.indistinguishable_from)}, which this data cannot tell from it" \
-        if one.indistinguishable_from else ""
-    return f"{one.title} ({one.name}, {one.location}: {sizes}; probability {one.probability:.2f}{ties})"
-
-
-def spoken(name: str, unit: str) -> str:
-    """A parameter's name without its unit, which stands behind the number."""
-    tail = unit.replace(" ", "").replace("^", "").replace("/", "_per_")
-    return name.removesuffix(f"_{tail}").replace("_", " ")
-
-
-def _sized(p: Reported) -> str:
-    """value +- standard deviation unit, both to the second digit of the latter."""
-    unit = "" if p.unit == "1" else f" {p.unit}"
-    if not (np.isfinite(p.std) and p.std > 0 and np.isfinite(p.value)):
-        return f"{p.value:.5g}{unit}"
-    places = 1 - int(np.floor(np.log10(float(f"{p.std:.1e}"))))
-    power = int(np.floor(np.log10(max(abs(p.value), p.std)))) if places > 6 else 0
-    value, std = (f"{v / 10.0 ** power:.{max(places + power, 0)}f}" for v in (p.value, p.std))
-    return f"({value} +- {std})e{power}{unit}" if power else f"{value} +- {std}{unit}"
 
 
 def _percent(share: float) -> str:

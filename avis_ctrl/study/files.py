@@ -6,7 +6,7 @@ import contextlib
 import json
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,20 @@ def open_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence
             raise InputError(f"expected a {'folder' if is_folder else 'file'} at {path / name}, or nothing",
                              field="--out", value=str(path))
     return path
+
+
+@contextlib.contextmanager
+def output_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Iterator[Path]:
+    """`open_folder`; what it created goes again where an error leaves it empty. Raises as it does."""
+    path = Path(folder)
+    made = [one for one in (path, *path.parents) if not one.exists()]
+    try:
+        yield open_folder(path, files, folders)
+    except BaseException:
+        with contextlib.suppress(OSError):  # not empty
+            for one in made:
+                one.rmdir()
+        raise
 
 
 def write_whole(path: Path, content: bytes) -> None:

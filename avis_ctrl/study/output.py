@@ -8,16 +8,10 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.study import files
 from avis_ctrl.study.files import not_written, write_json, write_whole
 from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
 
-FILES = ("plant.json", "report.html", "report.pdf", "result.json")
-
-
-def open_folder(folder: str | Path) -> Path:
-    """The output folder of a design study; raises as `files.open_folder`."""
-    return files.open_folder(folder, FILES, ("controllers",))
+FILES, FOLDERS = ("plant.json", "report.html", "report.pdf", "result.json"), ("controllers",)
 
 
 def controller_dict(result: ControllerResult, units_in: str = "m/s", units_out: str = "N") -> dict[str, Any]:

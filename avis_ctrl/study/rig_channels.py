@@ -68,11 +68,13 @@ def _refusal(rig: Rig, had: Mapping[str, Sequence[str]], known: Mapping[str, Seq
     """What is wrong with the channels of one or both roles, and what to do."""
     strange = {role: [name for name in names if name not in known[role]] for role, names in had.items()}
     said = "; ".join(f"the {WHAT[role]} of the rig {rig.name} are {', '.join(of_rig[role])}" for role in had)
+    field = " and ".join(f"{role} names" for role in had)
+    value = next(iter(strange.values())) if len(had) == 1 else strange
     if stated not in (UNNAMED, rig.name):
-        said += f"; the file says it is a campaign of {stated}"
+        return InputError(f"the file says it is a campaign of {stated}, not of {rig.name}, of which {said}",
+                          field=field, value=value)
     example = ",".join(f"{role}_names={'+'.join(of_rig[role][:2])}+..." for role in had)
     counts = " and ".join(f"{len(names)} of {role}" for role, names in had.items())
     said += (f"; where the file's channels ({counts}) are some of these, name them in the file's order: "
              f"--columns {example} (of identify and convert)")
-    return InputError(said, field=" and ".join(f"{role} names" for role in had),
-                      value=next(iter(strange.values())) if len(had) == 1 else strange)
+    return InputError(said, field=field, value=value)

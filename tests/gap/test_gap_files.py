@@ -160,7 +160,7 @@ def updated_model():
 def gap_of(updated=None, effects=()):
     updated = updated or updated_model()
     return Gap("explained", tuple(effects), (Stage("nominal", 0.3, 900.0), Stage("re-identified", 0.1, float("inf"))),
-               (Where(2.0, 6.0, "Az1", "Sz2", 0.8),), (), 0.01, None, BASE, updated, (), None, ("found",), (),
+               (Where(2.0, 6.0, "Az1", "Sz2", 0.8),), (), 0.01, None, BASE, updated, (), None, ("found",),
                "record 05 held out", 1, 2.5, np.diag(np.arange(1.0, 1 + len(updated.names))))
 
 

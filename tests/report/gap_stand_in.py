@@ -14,7 +14,7 @@ from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series
+from avis_ctrl.measurement.gates.finding import Finding
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.study.campaign_plan import plan_from_table
@@ -64,15 +64,6 @@ def heat() -> HeatMap:
     return HeatMap(edges, columns, before, scatter)
 
 
-def pictures() -> tuple[Picture, ...]:
-    """What a finder may draw beside the rest."""
-    other = Picture("Score of every effect", "effect", "score over its 99.9 % quantile [-]",
-                    (Series("score", np.arange(3.0), np.array([80.0, 12.0, 0.4]), "bars"),),
-                    (Limit("significant above", 1.0),), y_scale="log",
-                    x_names=("com_offset", "product_of_inertia", "loop_delay"))
-    return (other,)
-
-
 def shares() -> tuple[PowerShares, ...]:
     """Two levels; noise falls and nonlinearity rises with the level."""
     edges = np.geomspace(0.8, 60.0, 13)
@@ -114,7 +105,7 @@ def explained(campaign: Campaign) -> Gap:
                ("The centre of mass is not where the model has it: com offset at the payload, (20.1 ± 0.2) mm along x "
                 "and (−11.9 ± 0.2) mm along y; probability above 99.9 %.",
                 "The held-out records confirm it at both levels."),
-               pictures(), "records 04, 05 held out, each beside a fitted one of its level", 1, 41.5,
+               "records 04, 05 held out, each beside a fitted one of its level", 1, 41.5,
                np.diag((1e-3 * np.maximum(np.abs(updated.values), 1e-3)) ** 2) if n else None,
                shares=shares(), records=by_record())
 
@@ -122,8 +113,8 @@ def explained(campaign: Campaign) -> Gap:
 def minimal(gap: Gap, verdict: str = "none") -> Gap:
     """Nothing but what the class asks for."""
     return replace(gap, verdict=verdict, effects=(), stages=(), where=(), remaining=(), noise_nrmse=float("nan"),
-                   next_experiment=None, updated=gap.baseline, considered=(), heat=None, sentences=(), pictures=(),
-                   held_out="", covariance=None, shares=(), records=())
+                   next_experiment=None, updated=gap.baseline, considered=(), heat=None, sentences=(), held_out="",
+                   covariance=None, shares=(), records=())
 
 
 def with_verdict(gap: Gap, verdict: str) -> Gap:

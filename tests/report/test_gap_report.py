@@ -28,7 +28,7 @@ from avis_ctrl.report.plotly_backend import graph
 from avis_ctrl.study.gap_overlay import GapOverlay, gap_overlay, selections
 
 NAMED = {"gap_spectrum", "ladder", "gap_responses", "heat_map", "gap_records", "gap_coherence", "gap_coherence_lowest",
-         "gap_other_0", "gap_mu"}
+"gap_mu"}
 
 
 @pytest.fixture(scope="module")

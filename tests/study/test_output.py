@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.study import files
 from avis_ctrl.study.files import write_json, write_whole
-from avis_ctrl.study.output import open_folder
+from avis_ctrl.study.output import FILES, FOLDERS
 
 SIZE = 300_000
 
@@ -122,6 +122,22 @@ def test_without_nameless_files_the_renamed_way_is_taken(tmp_path, monkeypatch):
 def test_files_can_be_read_by_others(tmp_path):
     write_whole(tmp_path / "a.json", b"{}")
     assert (tmp_path / "a.json").stat().st_mode & 0o444 == 0o444
+
+
+def open_folder(folder):
+    return files.open_folder(folder, FILES, FOLDERS)
+
+
+def test_what_was_made_goes_again_where_an_error_leaves_it_empty(tmp_path):
+    (tmp_path / "mine").mkdir()
+    for folder in ("a/b", "mine"):
+        with pytest.raises(KeyError), files.output_folder(tmp_path / folder):
+            raise KeyError
+    with pytest.raises(KeyError), files.output_folder(tmp_path / "written" / "b") as path:
+        (path / "result.json").write_text("{}")
+        raise KeyError
+    assert sorted(one.relative_to(tmp_path).as_posix() for one in tmp_path.rglob("*")) == [
+        "mine", "written", "written/b", "written/b/result.json"]
 
 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register, told_from_none
-from avis_ctrl.gap.effects.impedance import at_points, peaks, positions, project, unit_matrices
+from avis_ctrl.gap.effects.impedance import about, at_points, peaks, positions, project, unit_matrices
 from avis_ctrl.gap.effects.line_of_action import best_direction, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
 from avis_ctrl.gap.effects.sensors import second_order
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from avis_ctrl.gap.score import Score
     from avis_ctrl.gap.table_model import TableModel
 
-# Damping ratios at which seeds are looked for, and how often the step between frequencies is halved about the best.
-DAMPINGS, HALVINGS = (0.03, 0.15), 3
+# Damping ratios at which seeds are looked for, how often the step between frequencies or places is halved about the
+# best, and places from which that begins.
+DAMPINGS, HALVINGS, STARTS = (0.03, 0.15), 3, 6
 
 
 @register
@@ -115,11 +116,11 @@ def sprung(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
 
 
 def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:
-    """Best place and direction at each frequency of the grid and of the residual's peaks; refined about the best."""
-    points = positions(parameters)
+    """Best place and direction at each frequency of the grid and of the residual's peaks; finer about the best."""
+    every = positions(parameters)
     most = parameters[0].high
 
-    def at(f: float, zeta: float) -> Seed | None:
+    def at(f: float, zeta: float, points: np.ndarray = every) -> Seed | None:
         G, b = project(score, partial(sprung, frequency_Hz=f, damping=zeta), ("sprung", f, zeta))
         chi2, k, d, mass = best_direction(G, b, points)
         a = min(np.sqrt(max(mass, 0.0)), 0.7 * most) * d
@@ -130,71 +131,56 @@ def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed
     found += [seed for f in peaks(score) for zeta in (0.01, 0.05) if (seed := at(f, zeta))]
     if not found:
         return []
-    best, step = max(found, key=lambda seed: seed.chi2), np.sqrt(grid[1] / grid[0])
+    best, step, step_m = max(found, key=lambda seed: seed.chi2), np.sqrt(grid[1] / grid[0]), 0.5
     for _ in range(HALVINGS):
-        f, zeta = best.values[3:5]
-        near = [seed for one, other in ((f * step, zeta), (f / step, zeta), (f, zeta / 2))
-                if (seed := at(one, other))]
+        f, zeta, point = *best.values[3:5], np.array(best.values[5:])
+        near = [seed for one, other in ((f, zeta), (f * step, zeta), (f / step, zeta), (f, zeta / 2))
+                if (seed := at(one, other, about(point, step_m)))]
         found += near
-        best, step = max([best, *near], key=lambda seed: seed.chi2), np.sqrt(step)
+        best, step, step_m = max([best, *near], key=lambda seed: seed.chi2), np.sqrt(step), step_m / 2
     return found
 
 
 def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:
-    """Three frequencies at once: all triples at a place, then all places at the best triple, and again."""
+    """Three frequencies at once: all triples at every place of the grid, then finer about the best places."""
     points, zeta = positions(parameters), 0.05
-    frequencies = sorted({*parameters[1].grid, *peaks(score)})
-    frequencies = [f for f in frequencies if f > 2.0]
-    kept = [unit_matrices(score, partial(sprung, frequency_Hz=f, damping=zeta)).astype(np.float32)
-            for f in frequencies]
-    axes = at_points(points, "xyz")
-    e, found = score.e.astype(np.float32), []
-    for begin in _first_points(kept, e, axes):
-        k, before = begin, -1.0
-        for _ in range(3):
-            chi2, mass, triple = _best_triple(kept, e, axes[k])
-            if mass <= 0 or chi2 <= before * (1 + 1e-6):
-                break
-            before = chi2
-            own = [frequencies[j] for j in triple]
-            values = (min(mass, 0.5 * parameters[0].high), *own, zeta, *points[k])
-            found.append(Seed(values, chi2, 8, len(frequencies) ** 3))
-            k = _best_point(kept, e, axes, triple)
+    frequencies = np.array([f for f in sorted({*parameters[1].grid, *peaks(score)}) if f > 2.0])
+    kept = np.concatenate([unit_matrices(score, partial(sprung, frequency_Hz=f, damping=zeta)).astype(np.float32)
+                           for f in frequencies])
+    n = len(frequencies)
+    G, b = (kept @ kept.T).astype(float).reshape(n, 21, n, 21), (kept @ score.e.astype(np.float32)).reshape(n, 21)
+
+    def at(point: np.ndarray) -> tuple[float, float, list[int], np.ndarray]:
+        rows = at_points(point[None], "xyz")[0]
+        return *_best_triple(np.einsum("ap,fpgq,bq->fagb", rows, G, rows, optimize=True), b @ rows.T), point
+    starts = sorted((at(point) for point in points), key=lambda one: -one[0])[:STARTS]
+    found = []
+    for chi2, mass, triple, point in starts:
+        best = chi2, mass, triple, point
+        for halving in range(1, HALVINGS + 1):
+            near = about(best[3], 0.5 ** halving)
+            best = max(best, at(near[_best_point(G, b, at_points(near, "xyz"), best[2])]), key=lambda one: one[0])
+        chi2, mass, triple, point = best
+        if mass > 0:
+            values = (min(mass, 0.5 * parameters[0].high), *frequencies[triple], zeta, *point)
+            found.append(Seed(tuple(map(float, values)), chi2, 8, n ** 3))
     return found
 
 
-def _first_points(kept: list[np.ndarray], e: np.ndarray, axes: np.ndarray) -> list[int]:
-    """Places at which equal frequencies take most, and at which the axes by themselves do in sum."""
-    together, alone = np.zeros(len(axes)), np.zeros((len(axes), 3))
-    for A in kept:
-        G, b = (A @ A.T).astype(float), (A @ e).astype(float)
-        sum_of = axes.sum(1)
-        own, size = sum_of @ b, np.einsum("ni,ij,nj->n", sum_of, G, sum_of)
-        together = np.maximum(together, np.maximum(own, 0) ** 2 / size)
-        own, size = axes @ b, np.einsum("nai,ij,naj->na", axes, G, axes)
-        alone = np.maximum(alone, np.maximum(own, 0) ** 2 / size)
-    return list(dict.fromkeys((int(np.argmax(together)), int(np.argmax(alone.sum(1))))))
-
-
-def _best_triple(kept: list[np.ndarray], e: np.ndarray, rows: np.ndarray) -> tuple[float, float, tuple[int, int, int]]:
-    """(chi2, mass, index of the frequency along x, y, z) at one place; rows (3, 21)."""
-    A = np.array([rows.astype(np.float32) @ one for one in kept])  # (n, 3, N)
-    n = len(A)
-    flat = np.swapaxes(A, 0, 1).reshape(3 * n, -1)
-    G, b = (flat @ flat.T).astype(float).reshape(3, n, 3, n), (flat @ e).astype(float).reshape(3, n)
-    own = np.einsum("anan->an", G)
-    x, y, z = np.ix_(range(n), range(n), range(n))
-    along = b[0, x] + b[1, y] + b[2, z]
-    size = own[0, x] + own[1, y] + own[2, z] + 2 * (G[0, x, 1, y] + G[0, x, 2, z] + G[1, y, 2, z])
+def _best_triple(G: np.ndarray, b: np.ndarray) -> tuple[float, float, list[int]]:
+    """(chi2, mass, index of the frequency along x, y, z) at one place; G (n, 3, n, 3), b (n, 3)."""
+    own = np.einsum("fafa->af", G)
+    x, y, z = np.ix_(*(range(len(b)),) * 3)
+    along = b[x, 0] + b[y, 1] + b[z, 2]
+    size = own[0, x] + own[1, y] + own[2, z] + 2 * (G[x, 0, y, 1] + G[x, 0, z, 2] + G[y, 1, z, 2])
     chi2 = np.maximum(along, 0) ** 2 / size
     best = np.unravel_index(int(np.argmax(chi2)), chi2.shape)
-    return float(chi2[best]), float(along[best] / size[best]), (int(best[0]), int(best[1]), int(best[2]))
+    return float(chi2[best]), float(along[best] / size[best]), [int(k) for k in best]
 
 
-def _best_point(kept: list[np.ndarray], e: np.ndarray, axes: np.ndarray, triple: tuple[int, int, int]) -> int:
-    """Place at which three frequencies take most."""
-    A = np.concatenate([kept[j] for j in triple])
-    G, b = (A @ A.T).astype(float), (A @ e).astype(float)
-    rows = axes.reshape(len(axes), -1)
-    along = rows @ b
-    return int(np.argmax(np.maximum(along, 0) ** 2 / np.einsum("ni,ij,nj->n", rows, G, rows)))
+def _best_point(G: np.ndarray, b: np.ndarray, axes: np.ndarray, triple: Sequence[int]) -> int:
+    """Place at which three frequencies take most; axes (places, 3, 21)."""
+    rows, own = axes.reshape(len(axes), -1), list(triple)
+    A = G[own][:, :, own].reshape(63, 63)
+    along = rows @ b[own].reshape(63)
+    return int(np.argmax(np.maximum(along, 0) ** 2 / np.einsum("ni,ij,nj->n", rows, A, rows)))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register, told_from_none
-from avis_ctrl.gap.effects.impedance import at_points, positions, project
+from avis_ctrl.gap.effects.impedance import about, at_points, positions, project
 from avis_ctrl.gap.effects.line_of_action import best_direction, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
 from avis_ctrl.gap.score_algebra import reduction
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from avis_ctrl.gap.operators import Operators
     from avis_ctrl.gap.score import Score
     from avis_ctrl.gap.table_model import TableModel
+
+
+# How often the step between places is halved about the best.
+HALVINGS = 3
 
 
 @register
@@ -57,21 +61,16 @@ class CableStiffness(AtPoint):
         ops.add_impedance(Z, rows, Z)
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Over a grid of places: the direction and stiffness that take most, or those along the axes, none negative."""
+        """Over a grid of places, finer about the best: the direction and stiffness that take most, or those along the
+        axes, none negative."""
         parameters = self.parameters(score.model, place)
-        points = positions(parameters)
         G, b = project(score, lambda s: np.ones_like(s))
-        if place.endswith("oblique"):
-            chi2, at, d, k = best_direction(G, b, points)
-            a = min(np.sqrt(max(k, 0.0)), 0.7 * parameters[0].high) * d
-            return [Seed((*(float(x) for x in a), 0.0, *points[at]), chi2, 6)] if k > 0 else []
-        found = []
-        for point, rows in zip(points, at_points(points, "xyz"), strict=True):
-            A, d = rows @ G @ rows.T, rows @ b
-            own = np.clip(reduction(A, d).coefficients, 0.0, parameters[0].high)
-            if np.any(own > 0):
-                found.append(Seed((*own.tolist(), 0.0, *point), float(2 * own @ d - own @ A @ own), 6))
-        return sorted(found, key=lambda seed: -seed.chi2)
+        of = _along_one if place.endswith("oblique") else _along_axes
+        found = of(G, b, positions(parameters), parameters[0].high)
+        for halving in range(1, HALVINGS + 1) if found else ():
+            near = about(np.array(found[0].values[-3:]), 0.5 ** halving)
+            found = sorted(found + of(G, b, near, parameters[0].high), key=lambda seed: -seed.chi2)
+        return found
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         names = [name for name in values if name.startswith(("along_", "k_"))]
@@ -86,6 +85,22 @@ class CableStiffness(AtPoint):
             return {**told(values, covariance, "stiffness_N_per_m", "N/m"), "damping_s": found["damping_s"]}
         largest = max((found[f"k_{axis}_N_per_m"] for axis in "xyz"), key=lambda one: one.value)
         return {"stiffness_N_per_m": largest, **found}
+
+
+def _along_one(G: np.ndarray, b: np.ndarray, points: np.ndarray, most: float) -> list[Seed]:
+    chi2, at, d, k = best_direction(G, b, points)
+    a = min(np.sqrt(max(k, 0.0)), 0.7 * most) * d
+    return [Seed((*(float(x) for x in a), 0.0, *points[at]), chi2, 6)] if k > 0 else []
+
+
+def _along_axes(G: np.ndarray, b: np.ndarray, points: np.ndarray, most: float) -> list[Seed]:
+    found = []
+    for point, rows in zip(points, at_points(points, "xyz"), strict=True):
+        A, d = rows @ G @ rows.T, rows @ b
+        own = np.clip(reduction(A, d).coefficients, 0.0, most)
+        if np.any(own > 0):
+            found.append(Seed((*own.tolist(), 0.0, *point), float(2 * own @ d - own @ A @ own), 6))
+    return sorted(found, key=lambda seed: -seed.chi2)
 
 
 def tie(values: Mapping[str, float]) -> np.ndarray:

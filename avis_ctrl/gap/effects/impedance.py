@@ -31,6 +31,13 @@ def positions(parameters: Sequence[EffectParameter]) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
+def about(point: np.ndarray, share: float) -> np.ndarray:
+    """(27, 3) m: places about one, that share of the grid's step away along each axis, within the grid."""
+    steps = [share * (grid[1] - grid[0]) * np.array([-1.0, 0.0, 1.0]) for grid in GRID_m]
+    near = point + np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(-1, 3)
+    return np.clip(near, [grid[0] for grid in GRID_m], [grid[-1] for grid in GRID_m])
+
+
 def at_points(points: np.ndarray, axes: str, oblique: bool = False) -> np.ndarray:
     """(n, len(axes) or 6, 21): unit springs at each place along each axis, with oblique between the axes too."""
     return _at_points(points.tobytes(), axes, oblique)

@@ -1,4 +1,4 @@
-"""Dependence on level and time, coherence, and whatever else the finder drew."""
+"""Dependence on level and time, and coherence."""
 
 from __future__ import annotations
 
@@ -7,20 +7,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from avis_ctrl.gap.result import Gap, RecordGap
-from avis_ctrl.measurement.gates.finding import Picture
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, level
 from avis_ctrl.report.gap.before_after import AFTER, BEFORE, NOISE
 from avis_ctrl.report.gap.coherence import coherence
 from avis_ctrl.report.gap.finding import Found
-from avis_ctrl.report.identification.pictures import figure_of
 from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Section
-
-# Panels of one figure.
-TOGETHER = 6
 
 
 def dependence(found: Found) -> Section:
-    """What each record leaves by level and by time, shares of power, and pictures of the finder."""
+    """What each record leaves by level and by time, and shares of power."""
     gap = found.gap
     pieces: list[Piece] = []
     if gap.records:
@@ -30,9 +25,6 @@ def dependence(found: Found) -> Section:
     pieces.append(Heading("Coherence: what noise, nonlinearity and unmeasured inputs account for"))
     pieces += coherence(gap.shares) if gap.shares else [
         Paragraph("No shares of power were computed: the driven records have too few lines for their inputs.", "note")]
-    own = [p for p in gap.pictures if any(len(s.x) for s in p.series)]
-    if own:
-        pieces += [Heading("Further pictures"), *_figures(own)]
     return Section("Level, time and coherence", "dependence", tuple(pieces))
 
 
@@ -71,10 +63,3 @@ def _limits(values: Sequence[float]) -> tuple[float, float]:
     room = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     return low - room, high + room
 
-
-def _figures(pictures: Sequence[Picture]) -> list[Piece]:
-    parts = [pictures[k:k + TOGETHER] for k in range(0, len(pictures), TOGETHER)]
-    return [figure_of(f"gap_other_{k}", "What else was looked at." + (f" Part {k + 1} of {len(parts)}."
-                                                                      if len(parts) > 1 else ""), part, 2,
-                      0.85 if len(part) > 1 else 0.75)
-            for k, part in enumerate(parts)]

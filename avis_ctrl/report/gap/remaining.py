@@ -20,12 +20,12 @@ def remaining(found: Found) -> Section:
         pieces.append(table_of(gap.remaining, "Places of what the updated model leaves on held-out data. "))
     if gap.detectable:
         pieces += [Heading("How large an effect could be told from none"), detectable(gap)]
-    pieces += [Heading("What to measure next"), Paragraph(gap.next_experiment or _nothing(gap))]
+    pieces += [Heading("What to measure next"), Paragraph(gap.next_experiment or _nothing(found))]
     return Section("What remains, and what to measure next", "remaining", tuple(pieces))
 
 
 def detectable(gap: Gap) -> Table:
-    """The size at which each effect would differ from none by three deviations; over its places, best to worst."""
+    """The size at which each effect would differ from none by five standard deviations; its best and worst place."""
     groups: dict[tuple[str, str, str], list[Detectable]] = {}
     for one in gap.detectable:
         groups.setdefault((one.name, one.parameter, one.unit), []).append(one)
@@ -58,9 +58,13 @@ def _left(gap: Gap) -> str:
             + (" The places below hold it." if gap.remaining else " Its places were not stated."))
 
 
-def _nothing(gap: Gap) -> str:
+def _nothing(found: Found) -> str:
+    gap = found.gap
     if gap.effects and any(one.indistinguishable_from for one in gap.effects):
         return "No experiment was found that would tell the inseparable effects apart."
     if gap.verdict in ("partly explained", "unexplained"):
         return "No experiment was found that would tell more."
+    if gap.effects and found.design is None:
+        return ("Nothing is needed to decide what is missing. What it does to the controller avis gap shows with "
+                "--design; avis predict tries the updated model on a campaign that it was not found from.")
     return "Nothing is needed to decide what is asked here."

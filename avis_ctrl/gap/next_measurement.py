@@ -1,0 +1,87 @@
+"""What to measure next: what tells two explanations apart, or, without any, what tells most of what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from avis_ctrl.gap.result import RecordGap, Where
+from avis_ctrl.gap.table_model import TableModel
+
+# Residual power over that of the noise from which a record tells how the residual grows; levels are two by this ratio.
+TELLING, ANOTHER_LEVEL = 2.0, 1.2
+# Power of the level with which a linear residual grows, and within which deviation that is told.
+LINEAR, WITHIN = 1.0, 0.2
+# Share of the largest difference of two predictions, and of the gap, that belongs to the band to look at.
+NEAR, PART = 0.5, 0.1
+
+
+def between(name: str, other: str, a: TableModel | None, b: TableModel | None) -> str:
+    """What tells two explanations apart: where the predictions of their refitted models differ most."""
+    bent = {model.effects[-1].effect.nonlinear for model in (a, b) if model is not None}
+    if a is None or b is None or True in bent:
+        why = ("only one of them depends on amplitude" if bent == {True, False} else
+               "they depend on amplitude in different ways")
+        return f"To tell {name} from {other}, record the same signals at half and at twice the level: {why}."
+    frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), 300)
+    omega = 2 * np.pi * frequency
+    n_u = len(a.actuators)
+    Ga, Gb = a.response(omega)[:, :, :n_u], b.response(omega)[:, :, :n_u]
+    difference = np.abs(Ga - Gb)
+    k, i, j = np.unravel_index(int(np.argmax(difference)), difference.shape)
+    near = frequency[difference[:, i, j] > NEAR * difference[k, i, j]]
+    return (f"To tell {name} from {other}, drive {a.actuators[j]} from {near.min():.3g} to {near.max():.3g} Hz and "
+            f"look at {a.sensors.names[i]}: there their predictions differ most, by {difference[k, i, j]:.2g} "
+            f"{a.sensors.unit}/V.")
+
+
+def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str:
+    """Where to look at what no effect accounts for, and what the levels of these records already say of it."""
+    where = _where(places)
+    growth = grows(records)
+    if growth is None:
+        return (f"Repeat the records at half and at twice the level{where and ', with'}{where}, and one record at rest "
+                "with the floor measured: what keeps its size relative to the drive is linear, what grows faster is "
+                "not, what stays is noise or comes through the floor.")
+    power, std = growth
+    told = f"What remains grows as the level of the drive to the power {power:.2f} +- {std:.2g}"
+    if abs(power) <= max(WITHIN, 2 * std) and abs(power) < abs(power - LINEAR):
+        return (f"{told}: it hardly depends on the drives. Take a record at rest with the floor measured, and look for "
+                f"other sources{where and ' in'}{where}.")
+    if abs(power - LINEAR) <= max(WITHIN, 2 * std):
+        return (f"{told}: it is linear. Drive one actuator at a time{where and ', with'}{where}: by which drives and "
+                "at which sensors it appears shows where it acts.")
+    law = ("more slowly than the drive, as friction, play or a limit would have it" if power < LINEAR else
+           "faster than the drive, as stiffening, a limit or clipping would have it")
+    return (f"{told}: {law}. Repeat one record at three or more levels with a multisine of odd lines"
+            f"{where and ', with'}{where}: the size of the lines in between, over the level, shows its law.")
+
+
+def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
+    """(power, std) of the level with which the residual beyond noise grows; None where one level or noise tells none.
+
+    Least squares of log residual on log level over the records, noise taken off in power.
+    """
+    telling = [r for r in records if r.level_V > 0 and r.after ** 2 > TELLING]
+    level = np.log([r.level_V for r in telling])
+    if len(telling) < 3 or np.ptp(level) < np.log(ANOTHER_LEVEL):
+        return None
+    left = np.log([np.sqrt(r.after ** 2 - 1) for r in telling])
+    A = np.column_stack([np.ones(len(level)), level])
+    x = np.linalg.lstsq(A, left, rcond=None)[0]
+    scatter = np.sum((left - A @ x) ** 2) / (len(left) - 2)
+    return float(x[1]), float(np.sqrt(scatter * np.linalg.inv(A.T @ A)[1, 1]))
+
+
+def _where(places: Sequence[Where]) -> str:
+    """Output and band that hold most of the gap, in words; empty where none stands out."""
+    if not places:
+        return ""
+    outputs = {one.output for one in places}
+    most = max(outputs, key=lambda name: sum(one.share for one in places if one.output == name))
+    band = [one for one in places if one.output == most]
+    held = sum(one.share for one in band)
+    band = [one for one in band if one.share > PART * held]
+    return (f" lines from {min(one.from_Hz for one in band):.3g} to {max(one.to_Hz for one in band):.3g} Hz at {most} "
+            f"({held:.0%} of it)")
