@@ -100,15 +100,17 @@ def predict(
     effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="file of own effects that the "
                                                  "models of avis gap hold")] = None,
 ) -> None:
-    """What a found model would have measured, from the campaign's u and floor alone.
+    """What a found model would have measured, from the campaign's u and floor alone, and how far that is from its y.
 
     Of the identified rig /records/NN/y; of the models of avis gap /records/NN/y_baseline and /records/NN/y_updated.
     """
     from rich.console import Console
+    from rich.table import Table
 
     from avis_ctrl.measurement.campaign import Campaign
     from avis_ctrl.measurement.formats import read_measurements
     from avis_ctrl.study.gap_names import GAP_FILE
+    from avis_ctrl.study.prediction_errors import prediction_errors
     from avis_ctrl.study.rig_channels import in_words_of
 
     console = Console(highlight=False)
@@ -134,6 +136,14 @@ def predict(
     assert isinstance(measured, Campaign)  # as it was
     with Progress(console) as progress:
         write(folder, measured, out, progress)
+        progress("errors")
+        errors = list(prediction_errors(out, measured))
+    if errors:
+        names = list(errors[0].relative)
+        table = Table("record", *names, title="error over measured y, r.m.s.; records are predicted from rest")
+        for one in errors:
+            table.add_row(one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names))
+        console.print(table)
     console.print(f"{out}: {len(measured.records)} records")
 
 

@@ -276,6 +276,8 @@ def _considered(found: Found, updated: Refit, stretch: float) -> tuple[Considere
                 continue
             reason = rival.implausible() or (f"leaves {rival.held_per_dof:.3g} times the noise's power of the held-out "
                                              f"records, the best model {found.best.held_per_dof:.3g}")
+            if rival.held_per_dof > found.chain[0].held_per_dof:
+                reason += ": more than without it; its fit stopped short, or does not hold beyond its records"
             rows.append(Considered(" and ".join(one.effect.name for one in own),
                                    " and ".join(location(one.place) for one in own), rival.held_per_dof, float(share),
                                    reason, rival.reported(own[-1])))

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from assembled_table import Assembly, mount_map
 
-from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.effects.base import Seed, library
 from avis_ctrl.gap.effects.impedance import peaks
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.realise import realise
 from avis_ctrl.gap.score import Score
+from avis_ctrl.gap.search import summits
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
@@ -228,6 +229,31 @@ def test_seed_of_a_sprung_mass_with_three_frequencies():
     assert np.linalg.norm(np.array(found[0].values[5:]) - PLACE) < 0.25
     _, one = seeds_of(truth, "attached_oscillator", "payload/oblique")
     assert found[0].chi2 > 1.2 * one[0].chi2
+
+
+@pytest.mark.parametrize("place", [(-0.076, -0.12, 0.024), (0.31, 0.4, -0.18), (-0.5, 0.1, 0.28)])
+def test_a_place_between_those_of_the_grid_is_found(place):
+    """The grid's steps are 0.2 m and more."""
+    truth = with_effect("attached_oscillator", "payload/axes", [1.4, 17.5, 15.5, 12.3, 0.06, *place], FREE)
+    _, found = seeds_of(truth, "attached_oscillator", "payload/axes")
+    np.testing.assert_allclose(found[0].values[1:4], [17.5, 15.5, 12.3], rtol=0.1)
+    assert np.linalg.norm(np.array(found[0].values[5:]) - place) < 0.08
+    tied = with_effect("cable_stiffness", "payload/axes", [150.0, 220.0, 300.0, 1e-3, *place], FREE)
+    _, found = seeds_of(tied, "cable_stiffness", "payload/axes")
+    assert np.linalg.norm(np.array(found[0].values[-3:]) - place) < 0.08
+
+
+def test_another_summit_of_the_score_is_kept():
+    parameters = library()["mount_surge"].parameters(FREE, "isolators z")
+
+    def seeds(*of):
+        return [Seed((f, 0.5, zeta, 0.0, 0.0, 0.0), chi2, 6) for f, zeta, chi2 in of]
+    far = seeds((150.0, 0.015, 9.0), (134.0, 0.015, 8.5), (56.0, 0.015, 8.0), (120.0, 0.015, 7.0), (150.0, 0.05, 6.0))
+    assert summits(far, parameters) == [far[0], far[2]]
+    # A slope, not a summit: each beside a better one. And one that is far lower.
+    for one in (seeds((150.0, 0.015, 9.0), (120.0, 0.015, 8.0), (90.0, 0.015, 7.0)),
+                seeds((150.0, 0.015, 9.0), (30.0, 0.015, 4.0)), seeds((150.0, 0.015, 9.0)), []):
+        assert summits(one, parameters) == one[:1]
 
 
 def test_seeds_of_as_many_modes_as_there_are():

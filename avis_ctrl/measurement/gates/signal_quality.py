@@ -94,7 +94,7 @@ class SignalToNoise(Gate):
                     )
                 )
             elif dB[weakest, j] < LOW_DB:
-                low = ", ".join(f"{middle[b]:.3g} Hz {dB[b, j]:.0f} dB" for b in np.flatnonzero(dB[:, j] < LOW_DB))
+                low = ", ".join(f"{middle[b]:.3g} Hz {round(float(dB[b, j]))} dB" for b in np.flatnonzero(dB[:, j] < LOW_DB))
                 found.append(
                     Finding(
                         self.name,

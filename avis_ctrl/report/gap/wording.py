@@ -29,6 +29,8 @@ CLAIMS = {
                    "re-identified one.",
 }
 PERCENT = 100.0
+# Shares below this are told as that.
+LEAST = 1e-5
 # What names of parameters end in, the longer before what it ends in itself.
 UNITS = ("_N_per_ms", "_m_per_s2", "_N_per_m3", "_Ns_per_m", "_N_per_m",
          "_kgm2", "_per_s", "_Hz", "_deg", "_rad", "_kg", "_s", "_m", "_V", "_N")
@@ -61,7 +63,9 @@ def probability(value: float) -> str:
 
 def percent(share: float, digits: int = 3) -> str:
     """A share in per cent."""
-    return f"{words.number(PERCENT * share, digits)} %" if np.isfinite(share) else "not computed"
+    if not np.isfinite(share):
+        return "not computed"
+    return "< 0.001 %" if 0 < share < LEAST else f"{words.number(PERCENT * share, digits)} %"
 
 
 def quantity(one: Reported) -> str:

@@ -24,7 +24,7 @@ def gates_of(findings: Sequence[Finding]) -> Section:
     if not findings:
         return Section("Gates", "gates", (Paragraph("The gates look at records in time; there were none."),))
     ordered = sorted(findings, key=lambda f: -SEVERITIES.index(f.severity))
-    rows = [(f.gate, MARKS[f.severity], f.sentence) for f in ordered]
+    rows = [(gate, MARKS[severity], text) for gate, severity, text in _together(ordered)]
     counts = ", ".join(f"{sum(f.severity == s for f in ordered)} {s}" for s in reversed(SEVERITIES)
                        if any(f.severity == s for f in ordered))
     pieces: list[Piece] = [
@@ -40,6 +40,16 @@ def gates_of(findings: Sequence[Finding]) -> Section:
     if small:
         pieces.append(Fold(f"The {len(well)} pictures of gates that found nothing", tuple(small)))
     return Section("Gates", "gates", tuple(pieces))
+
+
+def _together(findings: Sequence[Finding]) -> list[tuple[str, str, str]]:
+    """(gate, severity, text): what differs by channel only in its first sentence shares the rest."""
+    grouped: dict[tuple[str, str, str], list[str]] = {}
+    for f in findings:
+        first, _, rest = f.sentence.partition(". ")
+        grouped.setdefault((f.gate, f.severity, rest), []).append(first.rstrip("."))
+    return [(gate, severity, f"{'; '.join(firsts)}. {rest}".rstrip()) for (gate, severity, rest), firsts
+            in grouped.items()]
 
 
 def _pictures(findings: list[Finding]) -> list[tuple[Picture, list[str]]]:
