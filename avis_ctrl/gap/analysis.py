@@ -12,13 +12,14 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.data import Halves, blocks_of, divide, thinned, with_noise
 from avis_ctrl.gap.detectable import detectable
+from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.judgement import effects_of, judge, undetermined
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
 from avis_ctrl.gap.refit import Refit, judged, likelihood, refit, scattered, try_refit
 from avis_ctrl.gap.result import Detectable, Gap
-from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Each, Found, definite, one_by_one, search
+from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, definite, search
 from avis_ctrl.gap.show import shown
 from avis_ctrl.gap.signal_effects import (
     SignalFaults,
@@ -90,14 +91,15 @@ class Prepared:
         made = replace(self, fitted=fitted, held_out=held_out, unmasked=unmasked, noise=how)
         return replace(made, base=refit(self.base.model, made.thin, made.thin_held))
 
-    def repaired_with(self, model: TableModel) -> Prepared:
+    def repaired_with(self, model: TableModel, each: Each = one_by_one) -> Prepared:
         """The same with clipped samples as a model expects them, which has more than the re-identified one."""
         made = self
         for _ in range(REPAIRS):
             assert made.clipped is not None
-            mended = repair(made.clipped, model.rig, predicted(made.clipped, model), self.faults.converter).campaign
+            behind = predicted(made.clipped, model, each)
+            mended = repair(made.clipped, model.rig, behind, self.faults.converter).campaign
             made = _ready(mended, made.nominal, replace(made.base.model, effects=()), made.band_Hz,
-                          self.faults.converter, made.clipped, lambda text: None)
+                          self.faults.converter, made.clipped, lambda text: None, each)
             model = refit(replace(model, motion=made.nominal.motion), made.thin, made.thin_held, ITERATIONS).model
         return made
 
@@ -119,17 +121,17 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     ComputationError : a fit that does not come to an end.
     """
     began = time.monotonic()
-    prepared = prepare(campaign, rig, band_Hz, amplifier_corner_Hz, progress)
+    prepared = prepare(campaign, rig, band_Hz, amplifier_corner_Hz, progress, each)
     # What stands in the place of clipped samples lacks whatever the model lacks: the first search is a rough one then.
     found = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each,
                    longest=LONGEST if prepared.clipped is None else 1)
     if prepared.clipped is not None and (nearest := _nearest(found)) is not None:
         progress("clipped samples: what the model expects behind the limits with "
                  + " and ".join(one.effect.name for one in effects_of(nearest)))
-        prepared = prepared.repaired_with(nearest)
+        prepared = prepared.repaired_with(nearest, each)
         found = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each)
     progress("noise of floor and sensors, with what was found")
-    left = left_by(prepared.campaign, found.best.model)
+    left = left_by(prepared.campaign, found.best.model, each)
     prepared = prepared.measured_with(found.best.model, left)
     found = _again(prepared, found, effects, progress, each)
     progress("fits to all lines, and what they leave of the held-out records")
@@ -182,7 +184,8 @@ def _without_spare(best: Refit, prepared: Prepared) -> Refit:
 
 
 def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = None,
-            amplifier_corner_Hz: float | None = None, progress: Progress = lambda text: None) -> Prepared:
+            amplifier_corner_Hz: float | None = None, progress: Progress = lambda text: None,
+            each: Each = one_by_one) -> Prepared:
     """From records to blocks with noise and the re-identified model."""
     progress("converters, and what is held out")
     converter = converter_faults(campaign, rig)
@@ -205,17 +208,18 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     if original is not None:
         progress("clipped samples: what the model expects behind the limits")
         for _ in range(REPAIRS):
-            campaign = repair(original, rig, predicted(original, rough), converter).campaign
+            campaign = repair(original, rig, predicted(original, rough, each), converter).campaign
             halves = divide(campaign)
             rough = _rough(rough, halves, band)
-    return _ready(campaign, nominal, rough, band, converter, original, progress)
+    return _ready(campaign, nominal, rough, band, converter, original, progress, each)
 
 
 def _ready(campaign: Campaign, nominal: TableModel, rough: TableModel, band: tuple[float, float],
-           converter: tuple[ConverterFinding, ...], clipped: Campaign | None, progress: Progress) -> Prepared:
+           converter: tuple[ConverterFinding, ...], clipped: Campaign | None, progress: Progress,
+           each: Each) -> Prepared:
     """Hum taken out, blocks with noise, second-order terms, and the re-identified model, from a rough one."""
     halves = divide(campaign)
-    left = left_by(campaign, rough)
+    left = left_by(campaign, rough, each)
     raw_held = blocks_of(halves.held_out, rough, band)
     hum = find_hum(left)
     if hum is not None:
@@ -223,12 +227,12 @@ def _ready(campaign: Campaign, nominal: TableModel, rough: TableModel, band: tup
         campaign = without_hum(campaign, hum, left)
         halves = divide(campaign)
         rough = _rough(rough, halves, band)
-        left = left_by(campaign, rough)
+        left = left_by(campaign, rough, each)
     fitted = _masked(blocks_of(halves.fitted, rough, band), halves.fitted, hum)
     held_out = _masked(blocks_of(halves.held_out, rough, band), halves.held_out, hum)
     progress("noise, and second-order terms of large rotations")
     (fitted, held_out, unmasked), how = _noise((fitted, held_out, raw_held), halves, left, rough, band)
-    motion = with_large_motion(motion_of(_parts(halves), rough, campaign), rough)
+    motion = with_large_motion(motion_of(_parts(halves), rough, campaign, each), rough)
     model = replace(rough, motion=motion)
     # The large motion's own coefficients are physics; they are free because the source leaves open what turns.
     again = refit(model.with_effect(active(LargeMotion(), model, "payload", BY_PHYSICS)),

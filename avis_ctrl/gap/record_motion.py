@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import scipy.fft
 
+from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.large_motion import second_order
 from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
 from avis_ctrl.gap.motion import RecordMotion
@@ -33,14 +34,15 @@ NOISE_FROM = 0.6
 MARGIN_s, PASSES, RELAXATION = 5.0, 6, 1.8
 
 
-def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = None) -> dict[str, RecordMotion]:
+def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = None, each: Each = one_by_one
+              ) -> dict[str, RecordMotion]:
     """Motion of every record of a campaign by its name, from its measured y.
 
     Parameters
     ----------
     campaign : its records may be portions of others: these are taken whole, so that the portion starts in motion.
     model : effects that depend on amplitude or time do not act in the simulation; the sensors say what they did.
-    whole : the campaign that sets the clock, where `campaign` is a part of it.
+    whole : the campaign that sets the clock, where `campaign` is a part of it. each : how records are worked through.
 
     Raises
     ------
@@ -50,12 +52,11 @@ def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = No
     ends = [(one.header.start_s, one.header.start_s + one.header.duration_s) for one in clock]
     campaign_s = (min(start for start, _ in ends), max(end for _, end in ends))
     linear = linear_part(model)
-    known: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+    sources = list({id(source): source for source, _, _ in map(origin, campaign.records)}.values())
+    known = dict(zip(map(id, sources), each(lambda source: _in_time(source.load(), linear), sources), strict=True))
     found = {}
     for record in campaign.records:
         source, begin, stop = origin(record)
-        if id(source) not in known:
-            known[id(source)] = _in_time(source.load(), linear)
         volts, deflection, y = known[id(source)]
         h = record.header
         found[h.name] = RecordMotion(h.name, h.sample_rate_Hz, h.start_s, campaign_s, volts[:stop], deflection[:stop],

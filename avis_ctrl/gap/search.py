@@ -13,11 +13,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
 
 import numpy as np
 
 from avis_ctrl.gap.data import thinned
+from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, library
 from avis_ctrl.gap.effects.beyond import beyond
 from avis_ctrl.gap.refit import Reached, Refit, try_refit
@@ -27,21 +27,6 @@ from avis_ctrl.identification.maximum_likelihood import weight_cost
 from avis_ctrl.identification.spectra import SpectralBlock
 
 Progress = Callable[[str], None]
-Item = TypeVar("Item")
-Answer = TypeVar("Answer")
-
-
-class Each(Protocol):
-    """Answers to independent questions, in their order; where there are processors, several at a time."""
-
-    def __call__(self, function: Callable[[Item], Answer], items: Sequence[Item]) -> list[Answer]: ...
-
-
-def one_by_one(function: Callable[[Item], Answer], items: Sequence[Item]) -> list[Answer]:
-    """The same, one after the other."""
-    return [function(item) for item in items]
-
-
 # Held-out chi-square per degree of freedom up to which a residual counts as noise: an r.m.s. within 5 % of the noise,
 # which is what the noise's own estimate of some hundred degrees of freedom and its bias near resonances leave open.
 NOISE = 1.10

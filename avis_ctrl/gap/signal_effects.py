@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import AvisError
+from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.result import NamedEffect
 from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
@@ -20,7 +21,7 @@ from avis_ctrl.gap.signals.noise_level import NoiseLevels, noise_levels
 from avis_ctrl.gap.simulate import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction import model_inputs
-from avis_ctrl.measurement.campaign import Campaign, Record
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.rigs.rig import Rig
 
 # No probability is reported above this: what the library does not hold, and the noise's own uncertainty, leave so much.
@@ -54,22 +55,21 @@ def converter_faults(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, ..
     return inspect_converter(campaign, rig) if campaign.y_unit == "V" and rig.acquisition is not None else ()
 
 
-def predicted(campaign: Campaign, model: TableModel) -> dict[str, np.ndarray]:
+def predicted(campaign: Campaign, model: TableModel, each: Each = one_by_one) -> dict[str, np.ndarray]:
     """(samples, n_y) that the model reads in every record, from rest."""
-    found = {}
     starts = [r.header.start_s for r in campaign.records]
     clock = (min(starts), max(r.header.start_s + r.header.duration_s for r in campaign.records))
-    for record in campaign.records:
-        loaded = record.load()
-        u, floor = model_inputs(model.base, loaded)
-        found[record.header.name] = simulate(model, u, floor, record.header.sample_rate_Hz,
-                                             start_s=record.header.start_s, campaign_s=clock).y
-    return found
+
+    def read(record: RecordSource) -> np.ndarray:
+        h = record.header
+        return simulate(model, *model_inputs(model.base, record.load()), h.sample_rate_Hz, start_s=h.start_s,
+                        campaign_s=clock).y
+    return dict(zip((record.header.name for record in campaign.records), each(read, campaign.records), strict=True))
 
 
-def left_by(campaign: Campaign, model: TableModel) -> tuple[Leftover, ...]:
+def left_by(campaign: Campaign, model: TableModel, each: Each = one_by_one) -> tuple[Leftover, ...]:
     """What the model leaves of every record in time."""
-    return leftovers(campaign, predicted(campaign, model))
+    return leftovers(campaign, predicted(campaign, model, each))
 
 
 def levels(left: tuple[Leftover, ...], model: TableModel, hum: HumFinding | None,

@@ -50,7 +50,7 @@ def test_what_growth_says(power, said):
 
 
 def test_the_channel_and_band_that_hold_most_are_named():
-    places = (Where(3.0, 4.2, "Az1", "Sz2", 0.5), Where(4.2, 6.0, "Az1", "Sz2", 0.2), Where(40.0, 56.0, "", "Sz2", 0.01),
-              Where(10.0, 14.0, "", "Sx2", 0.29))
+    places = (Where(3.0, 4.2, "Az1", "Sz2", 0.5), Where(4.2, 6.0, "Az1", "Sz2", 0.2),
+              Where(40.0, 56.0, "", "Sz2", 0.01), Where(10.0, 14.0, "", "Sx2", 0.29))
     text = of_unexplained(places, records(1.0, 1e3))
     assert "from 3 to 6 Hz at Sz2 (71% of it)" in text and "one actuator at a time" in text

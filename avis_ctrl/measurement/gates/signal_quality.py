@@ -94,7 +94,8 @@ class SignalToNoise(Gate):
                     )
                 )
             elif dB[weakest, j] < LOW_DB:
-                low = ", ".join(f"{middle[b]:.3g} Hz {round(float(dB[b, j]))} dB" for b in np.flatnonzero(dB[:, j] < LOW_DB))
+                weak = np.flatnonzero(dB[:, j] < LOW_DB)
+                low = ", ".join(f"{middle[b]:.3g} Hz {round(float(dB[b, j]))} dB" for b in weak)
                 found.append(
                     Finding(
                         self.name,
