@@ -41,21 +41,22 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
     where = _where(places)
     growth = grows(records)
     if growth is None:
-        return (f"Repeat the records at half and at twice the level{where and ', with'}{where}, and one record at rest "
-                "with the floor measured: what keeps its size relative to the drive is linear, what grows faster is "
-                "not, what stays is noise or comes through the floor.")
+        return (f"{where and f'What remains lies to {where}. '}Repeat the records at half and at twice the level, and "
+                "one record at rest with the floor measured: what keeps its size relative to the drive is linear, what "
+                "grows faster is not, what stays is noise or comes through the floor.")
     power, std = growth
-    told = f"What remains grows as the level of the drive to the power {power:.2f} +- {std:.2g}"
+    told = (f"What remains{where and f', to {where},'} grows as the level of the drive to the power {power:.2f} +- "
+            f"{std:.2g}")
     if abs(power) <= max(WITHIN, 2 * std) and abs(power) < abs(power - LINEAR):
         return (f"{told}: it hardly depends on the drives. Take a record at rest with the floor measured, and look for "
-                f"other sources{where and ' in'}{where}.")
+                "other sources.")
     if abs(power - LINEAR) <= max(WITHIN, 2 * std):
-        return (f"{told}: it is linear. Drive one actuator at a time{where and ', with'}{where}: by which drives and "
-                "at which sensors it appears shows where it acts.")
+        return (f"{told}: it is linear. Drive one actuator at a time: by which drives and at which sensors it appears "
+                "shows where it acts.")
     law = ("more slowly than the drive, as friction, play or a limit would have it" if power < LINEAR else
            "faster than the drive, as stiffening, a limit or clipping would have it")
-    return (f"{told}: {law}. Repeat one record at three or more levels with a multisine of odd lines"
-            f"{where and ', with'}{where}: the size of the lines in between, over the level, shows its law.")
+    return (f"{told}: {law}. Repeat one record at three or more levels with a multisine of odd lines: the size of the "
+            "lines in between, over the level, shows its law.")
 
 
 def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
@@ -83,5 +84,5 @@ def _where(places: Sequence[Where]) -> str:
     band = [one for one in places if one.output == most]
     held = sum(one.share for one in band)
     band = [one for one in band if one.share > PART * held]
-    return (f" lines from {min(one.from_Hz for one in band):.3g} to {max(one.to_Hz for one in band):.3g} Hz at {most} "
-            f"({held:.0%} of it)")
+    return (f"{held:.0%} at {most} from {min(one.from_Hz for one in band):.3g} to "
+            f"{max(one.to_Hz for one in band):.3g} Hz")

@@ -41,6 +41,8 @@ def test_its_deviation_is_that_of_least_squares():
 def test_what_tells_nothing_of_growth(some):
     assert grows(some) is None
     assert "half and at twice the level" in of_unexplained((), some)
+    place = Where(3.0, 4.0, "", "Sz2", 0.5)
+    assert of_unexplained((place,), some).startswith("What remains lies to 50% at Sz2 from 3 to 4 Hz. Repeat")
 
 
 @pytest.mark.parametrize(("power", "said"), [(1.0, "it is linear"), (0.0, "hardly depends on the drives"),
@@ -53,4 +55,4 @@ def test_the_channel_and_band_that_hold_most_are_named():
     places = (Where(3.0, 4.2, "Az1", "Sz2", 0.5), Where(4.2, 6.0, "Az1", "Sz2", 0.2),
               Where(40.0, 56.0, "", "Sz2", 0.01), Where(10.0, 14.0, "", "Sx2", 0.29))
     text = of_unexplained(places, records(1.0, 1e3))
-    assert "from 3 to 6 Hz at Sz2 (71% of it)" in text and "one actuator at a time" in text
+    assert "What remains, to 71% at Sz2 from 3 to 6 Hz, grows" in text and "one actuator at a time" in text
