@@ -24,8 +24,8 @@ def opening(found: Found) -> Section:
     pieces += [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from]
     if gap.detectable:
         pieces.append(Paragraph("How large an effect could be told from none stands in the section on what remains."))
-    onward = (gap.next_experiment,) if gap.next_experiment and gap.verdict in ("unexplained", "partly explained") else ()
-    if told := (*gap.sentences[1:], *onward):
+    open_still = gap.verdict in ("unexplained", "partly explained")
+    if told := (*gap.sentences[1:], *([gap.next_experiment] if open_still and gap.next_experiment else [])):
         pieces.append(Bullets(tuple(map(wording.said, told))))
     warned = list(dict.fromkeys(f.gate for f in found.findings if f.severity in ("warning", "stop")))
     if warned:
