@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from avis_ctrl.errors import InputError
+from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.data import Halves, blocks_of, divide, thinned, with_noise
 from avis_ctrl.gap.detectable import detectable
 from avis_ctrl.gap.each import Each, one_by_one
@@ -94,13 +94,17 @@ class Prepared:
     def repaired_with(self, model: TableModel, each: Each = one_by_one) -> Prepared:
         """The same with clipped samples as a model expects them, which has more than the re-identified one."""
         made = self
-        for _ in range(REPAIRS):
+        for k in range(REPAIRS):
             assert made.clipped is not None
             behind = predicted(made.clipped, model, each)
             mended = repair(made.clipped, model.rig, behind, self.faults.converter).campaign
             made = _ready(mended, made.nominal, replace(made.base.model, effects=()), made.band_Hz,
                           self.faults.converter, made.clipped, lambda text: None, each)
-            model = refit(replace(model, motion=made.nominal.motion), made.thin, made.thin_held, ITERATIONS).model
+            better = (try_refit(replace(model, motion=made.nominal.motion), made.thin, made.thin_held, ITERATIONS)
+                      if k < REPAIRS - 1 else None)
+            if better is None:
+                break
+            model = better.model
         return made
 
 
@@ -128,7 +132,10 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     if prepared.clipped is not None and (nearest := _nearest(found)) is not None:
         progress("clipped samples: what the model expects behind the limits with "
                  + " and ".join(one.effect.name for one in effects_of(nearest)))
-        prepared = prepared.repaired_with(nearest, each)
+        try:
+            prepared = prepared.repaired_with(nearest, each)
+        except ComputationError:  # it was fitted on lines, and in time leaves every bound
+            progress("clipped samples: left as the re-identified model expects them")
         found = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each)
     progress("noise of floor and sensors, with what was found")
     left = left_by(prepared.campaign, found.best.model, each)

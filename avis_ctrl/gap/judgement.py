@@ -89,9 +89,8 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
         verdict: Verdict = "partly explained" if residual_left else "explained"
     else:
         verdict = "unexplained" if residual_left else "none"
-    ties = [(one.name, other) for one in effects for other in one.indistinguishable_from]
     return Judgement(verdict, tuple(effects), updated, _considered(found, updated, known_noise(thin)), tuple(reasons),
-                     _next(ties, found),
+                     _next(effects, found, updated),
                      found.beaten.words if found.beaten is not None and not own else "")
 
 
@@ -103,7 +102,8 @@ def _beyond(found: Found, updated: Refit, own: Sequence[ActiveEffect]) -> list[s
                 f"{nearest}, which comes nearest, leaves {rival.against.held_per_dof:.3g} times the noise's power, "
                 f"this {rival.refit.held_per_dof:.3g}"]
     if own:
-        return [f"{rival.words}, {_amount(rival)}, for which the library has no name, explains the data as well"
+        return [f"{rival.words}, {_amount(rival)}, for which the library has no name, is not ruled out: probability "
+                f"{1 - rival.left:.2g} beside what is named"
                 for rival in _equal(found, updated)]
     return []
 
@@ -236,9 +236,7 @@ def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect], stretc
     """Effects that act on the table, with probabilities among what was refitted in their place."""
     made = []
     for one in own:
-        others = {label for label in updated.labels if label != one.label}
-        rivals = [r for stage in found.pool for r in stage
-                  if others <= set(r.labels) and len(r.labels) == len(updated.labels) and not r.implausible()]
+        rivals, others = _in_place_of(one.label, found, updated)
         p = probabilities(rivals, stretch) if rivals else np.ones(0)
         unnamed = min((r.left for r in _equal(found, updated)), default=1.0)
         by_name: dict[tuple[str, str], float] = {}
@@ -252,6 +250,13 @@ def _table_effects(found: Found, updated: Refit, own: list[ActiveEffect], stretc
                                 min(by_name.get(key, 1.0) * unnamed, MOST_SURE), ties,
                                 _gain(found, one.label), one.label))
     return made
+
+
+def _in_place_of(label: str, found: Found, updated: Refit) -> tuple[list[Refit], set[str]]:
+    """Refits that have some effect in the place of one of the updated model's, and the labels of the others."""
+    others = {other for other in updated.labels if other != label}
+    return [r for stage in found.pool for r in stage if others <= set(r.labels)
+            and len(r.labels) == len(updated.labels) and not r.implausible()], others
 
 
 def _gain(found: Found, label: str) -> float:
@@ -290,12 +295,17 @@ def _considered(found: Found, updated: Refit, stretch: float) -> tuple[Considere
     return tuple(rows[:12])
 
 
-def _next(ties: Sequence[tuple[str, str]], found: Found) -> str | None:
-    """Which measurement would tell rivals apart."""
-    if ties:
-        models = {one.model.effects[-1].effect.name: one.model for stage in found.pool for one in stage}
-        name, other = ties[0]
-        return between(name, other, models.get(name), models.get(other))
+def _next(effects: Sequence[NamedEffect], found: Found, updated: Refit) -> str | None:
+    """Which measurement would tell rivals apart: of each name the best refit in the place of the other."""
+    for one in effects:
+        if not one.indistinguishable_from:
+            continue
+        rivals, others = _in_place_of(one.label, found, updated)
+        models: dict[str, TableModel] = {}
+        for tried in sorted(rivals, key=lambda r: r.criterion):
+            models.setdefault(next(e for e in tried.model.effects if e.label not in others).effect.name, tried.model)
+        other = one.indistinguishable_from[0]
+        return between(one.name, other, models.get(one.name, updated.model), models[other])
     if (rival := found.beaten) is not None:
         nearest = effects_of(rival.against.model)
         if nearest:

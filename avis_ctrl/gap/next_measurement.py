@@ -11,29 +11,51 @@ from avis_ctrl.gap.table_model import TableModel
 
 # Residual power over that of the noise from which a record tells how the residual grows; levels are two by this ratio.
 TELLING, ANOTHER_LEVEL = 2.0, 1.2
-# Power of the level with which a linear residual grows, and within which deviation that is told.
-LINEAR, WITHIN = 1.0, 0.2
+# Power of the level with which a linear residual grows, and within which deviation that is told; standard deviation
+# from which a power is not told: two of them reach from what grows with the drives to what does not.
+LINEAR, WITHIN, UNSURE = 1.0, 0.2, 0.5
+# Points at which predictions are compared, all over the band and again about where they differ most.
+POINTS = 300
 # Share of the largest difference of two predictions, and of the gap, that belongs to the band to look at.
 NEAR, PART = 0.5, 0.1
 
 
-def between(name: str, other: str, a: TableModel | None, b: TableModel | None) -> str:
+def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
     """What tells two explanations apart: where the predictions of their refitted models differ most."""
-    bent = {model.effects[-1].effect.nonlinear for model in (a, b) if model is not None}
-    if a is None or b is None or True in bent:
+    bent = {_bent_beside(a, b), _bent_beside(b, a)}
+    if True in bent:
         why = ("only one of them depends on amplitude" if bent == {True, False} else
                "they depend on amplitude in different ways")
         return f"To tell {name} from {other}, record the same signals at half and at twice the level: {why}."
-    frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), 300)
-    omega = 2 * np.pi * frequency
-    n_u = len(a.actuators)
-    Ga, Gb = a.response(omega)[:, :, :n_u], b.response(omega)[:, :, :n_u]
-    difference = np.abs(Ga - Gb)
+    frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), POINTS)
+    difference = _difference(a, b, frequency)
     k, i, j = np.unravel_index(int(np.argmax(difference)), difference.shape)
-    near = frequency[difference[:, i, j] > NEAR * difference[k, i, j]]
-    return (f"To tell {name} from {other}, drive {a.actuators[j]} from {near.min():.3g} to {near.max():.3g} Hz and "
-            f"look at {a.sensors.names[i]}: there their predictions differ most, by {difference[k, i, j]:.2g} "
-            f"{a.sensors.unit}/V.")
+    low, high = _about(difference[:, i, j], int(k))
+    # A lightly damped peak is narrower than the first points are apart.
+    frequency = np.geomspace(frequency[low], frequency[high], POINTS)
+    finer = _difference(a, b, frequency)[:, i, j]
+    low, high = _about(finer, int(np.argmax(finer)))
+    band = f"{frequency[low]:.3g} to {frequency[high]:.3g} Hz"
+    return (f"To tell {name} from {other}, drive {a.actuators[j]} from {band} and look at {a.sensors.names[i]}: there "
+            f"their predictions differ most, by {finer.max():.2g} {a.sensors.unit}/V.")
+
+
+def _bent_beside(model: TableModel, other: TableModel) -> bool:
+    """Whether what a model has beside another one depends on amplitude."""
+    common = {one.label for one in other.effects}
+    return any(one.effect.nonlinear for one in model.effects if one.label not in common)
+
+
+def _difference(a: TableModel, b: TableModel, frequency: np.ndarray) -> np.ndarray:
+    """(n, n_y, n_u) size of the difference of two responses to the drives."""
+    omega, n_u = 2 * np.pi * frequency, len(a.actuators)
+    return np.abs(a.response(omega)[:, :, :n_u] - b.response(omega)[:, :, :n_u])
+
+
+def _about(size: np.ndarray, k: int) -> tuple[int, int]:
+    """First points on either side of k, or the last there are, that are no larger than NEAR of what is at k."""
+    far = np.flatnonzero(size <= NEAR * size[k])
+    return int(far[far < k].max(initial=0)), int(far[far > k].min(initial=len(size) - 1))
 
 
 def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str:
@@ -62,17 +84,23 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
 def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
     """(power, std) of the level with which the residual beyond noise grows; None where one level or noise tells none.
 
-    Least squares of log residual on log level over the records, noise taken off in power.
+    Least squares of log residual on log level over the records, noise taken off in power. The residual is told over the
+    noise, which is another one where the floor is measured, and other signals meet another part of the gap: records of
+    each kind have a size of their own, all the same power. None, too, where its deviation is UNSURE or more.
     """
     telling = [r for r in records if r.level_V > 0 and r.after ** 2 > TELLING]
-    level = np.log([r.level_V for r in telling])
-    if len(telling) < 3 or np.ptp(level) < np.log(ANOTHER_LEVEL):
+    kinds = sorted({r.kind for r in telling})
+    if len(telling) < len(kinds) + 2:
         return None
-    left = np.log([np.sqrt(r.after ** 2 - 1) for r in telling])
-    A = np.column_stack([np.ones(len(level)), level])
+    own = np.array([[r.kind == kind for kind in kinds] for r in telling], float)
+    level, left = np.log([r.level_V for r in telling]), np.log([np.sqrt(r.after ** 2 - 1) for r in telling])
+    if max(np.ptp(level[of > 0]) for of in own.T) < np.log(ANOTHER_LEVEL):
+        return None
+    A = np.column_stack([own, level])
     x = np.linalg.lstsq(A, left, rcond=None)[0]
-    scatter = np.sum((left - A @ x) ** 2) / (len(left) - 2)
-    return float(x[1]), float(np.sqrt(scatter * np.linalg.inv(A.T @ A)[1, 1]))
+    scatter = np.sum((left - A @ x) ** 2) / (len(left) - A.shape[1])
+    std = float(np.sqrt(scatter * np.linalg.inv(A.T @ A)[-1, -1]))
+    return (float(x[-1]), std) if std < UNSURE else None
 
 
 def _where(places: Sequence[Where]) -> str:
@@ -84,5 +112,5 @@ def _where(places: Sequence[Where]) -> str:
     band = [one for one in places if one.output == most]
     held = sum(one.share for one in band)
     band = [one for one in band if one.share > PART * held]
-    return (f"{held:.0%} at {most} from {min(one.from_Hz for one in band):.3g} to "
+    return (f"{sum(one.share for one in band):.0%} at {most} from {min(one.from_Hz for one in band):.3g} to "
             f"{max(one.to_Hz for one in band):.3g} Hz")

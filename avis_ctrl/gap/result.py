@@ -130,7 +130,8 @@ class PowerShares:
 class RecordGap:
     """What the models leave of one record, r.m.s. over that of the noise, on lines drawn for all records alike.
 
-    start_s : on the campaign's clock. held_out : no fit has seen it.
+    start_s : on the campaign's clock. held_out : no fit has seen it. kind : how it was driven, whether its floor was
+    measured; residual over noise compares among records of one kind.
     """
 
     name: str
@@ -139,6 +140,7 @@ class RecordGap:
     held_out: bool
     before: float
     after: float
+    kind: str = ""
 
 
 @dataclass(frozen=True, eq=False)

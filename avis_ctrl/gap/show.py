@@ -222,7 +222,8 @@ def _every(prepared: Prepared, before: TableModel, after: TableModel, sensors_rm
 
     def ratio(e: PredictionError) -> float:
         return float(np.sqrt(e.chi2 / e.dof))
-    records = [RecordGap(name, headers[name].level_V, headers[name].start_s, name in held, ratio(a), ratio(b))
+    records = [RecordGap(name, headers[name].level_V, headers[name].start_s, name in held, ratio(a), ratio(b),
+                         f"{headers[name].excitation}, {b.block.kind}")
                for name, a, b in ((a.block.name, a, b) for a, b in zip(first, last, strict=True))]
     shares = power_shares(last, headers, after, all_silent(prepared.halves.fitted, blocks), sensors_rms)
     return tuple(sorted(records, key=lambda one: one.name)), shares

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.gap import analysis, judgement
 from avis_ctrl.gap.judgement import _considered, _gain
 from avis_ctrl.gap.result import NamedEffect, Stage
 from avis_ctrl.gap.show import opening, places
@@ -28,7 +30,8 @@ def test_a_step_on_the_way_to_a_pair_is_no_runner_up():
                                held_per_dof=chi2, misfit=max(chi2, 1.0), implausible=lambda: "",
                                reported=lambda effect: {})
     pair = refit(1.0, "first", "second")
-    found = SimpleNamespace(pool=((refit(1.6, "first"), refit(5.0, "other")), (pair,)), best=pair, passed_over=())
+    found = SimpleNamespace(pool=((refit(1.6, "first"), refit(5.0, "other")), (pair,)), best=pair, passed_over=(),
+                            chain=(refit(9.0),))
     assert [one.name for one in _considered(found, pair, 1.0)] == ["other"]
 
 
@@ -57,3 +60,39 @@ def test_chance_of_a_place_does_not_count_noise_that_was_not_measured(dof):
     least = stats.f.sf(1.15 ** 2, 1600, 2 * max(dof, 1600))
     assert not told or told[0].p_value >= least * (1 - 1e-9)
     assert (dof < 60) or told
+
+
+def test_the_next_measurement_compares_the_best_refits_in_one_place(monkeypatch):
+    """A pair; for its first effect another one is as good. A worse refit of that one came later, and at the first stage
+    it was refitted by itself."""
+    def refit(criterion, *names):
+        effects = [SimpleNamespace(effect=SimpleNamespace(name=name), label=f"{name}@x", place="x") for name in names]
+        return SimpleNamespace(model=SimpleNamespace(effects=effects), labels=tuple(one.label for one in effects),
+                               criterion=criterion, implausible=lambda: "")
+    pair, tied, worse, alone = (refit(100.0, "first", "second"), refit(101.0, "other", "second"),
+                                refit(900.0, "other", "second"), refit(5000.0, "other"))
+    found = SimpleNamespace(pool=((alone,), (pair, tied, worse)), beaten=None)
+    effects = [NamedEffect("second", "x", "", {}, 0.99, (), label="second@x"),
+               NamedEffect("first", "x", "", {}, 0.6, ("other",), label="first@x")]
+    monkeypatch.setattr(judgement, "between", lambda *told: told)
+    assert judgement._next(effects, found, pair) == ("first", "other", pair.model, tied.model)
+
+
+def test_a_model_that_cannot_be_simulated_does_not_end_the_analysis(monkeypatch):
+    """Clipped samples stay as the re-identified model expects them, and the search is done in full."""
+    class SearchedInFullError(Exception):
+        pass
+
+    def repaired_with(model, each):
+        raise ComputationError("the table leaves every bound")
+
+    def search(*_, longest=None, **__):
+        if longest is None:
+            raise SearchedInFullError
+        return None
+    prepared = SimpleNamespace(clipped=object(), base=None, thin=[], thin_held=[], repaired_with=repaired_with)
+    monkeypatch.setattr(analysis, "prepare", lambda *_: prepared)
+    monkeypatch.setattr(analysis, "search", search)
+    monkeypatch.setattr(analysis, "_nearest", lambda found: SimpleNamespace(effects=()))
+    with pytest.raises(SearchedInFullError):
+        analysis.analyse(None, None)

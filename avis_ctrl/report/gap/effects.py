@@ -34,8 +34,9 @@ def _sizes(gap: Gap) -> Table:
             known = np.isfinite(p.std) and p.std > 0
             rows.append((one.name, one.location, name, value, f"± {sigma}" if known else "none",
                          "" if p.unit == "1" else words.unit(p.unit)))
-    return table("Parameters of the named effects, fitted together with all parameters of the rig; one standard "
-                 "deviation, from the covariance of that fit.",
+    return table("Parameters of the named effects. Those of the table are fitted together with all parameters of the "
+                 "rig, with one standard deviation from that fit, by noise or by how what the model leaves scatters, "
+                 "whichever is larger; those of hum, converters and floor are from the records themselves.",
                  ("effect", "place", "parameter", "value", "± 1 σ", "unit"), rows, "lllrrl")
 
 

@@ -41,18 +41,24 @@ def method(gap: Gap) -> Section:
         Paragraph("Selection. Significant candidates are refitted together with all parameters of the rig, and "
                   "compared by the Bayesian information criterion of the fit, with p combinations of parameters that n "
                   "data determine, and by the likelihood of data that no fit has seen. Probabilities follow from the "
-                  "sum, over the candidates that were refitted, all equal beforehand; where even the best one leaves "
-                  "more than noise, its chi-square per degree of freedom m (at least 1) divides the criteria:"),
+                  "sum, over the candidates that were refitted, all equal beforehand. A factor m divides the criteria: "
+                  "the chi-square per degree of freedom of the best one, at least 1, for where that leaves more than "
+                  "noise, times what the noise's own uncertainty adds to a difference. What explains the data and has "
+                  "no name in the library takes its share, and none is stated above 99 %:"),
         Formula("kappa = chi_\"fit\"^2 + p ln n + chi_\"held out\"^2, quad P_i = e^(-kappa_i slash 2 m) "
                 "slash sum_j e^(-kappa_j slash 2 m)",
                 "the probability of candidate i is its share of the exponentials of minus half the criterion"),
-        Paragraph("An effect is named only if the held-out data confirm it. Effects are added one by one until the "
+        Paragraph("An effect of the table is named only if the held-out data confirm it; hum, converters and the "
+                  "floor's motion are judged in all records together. Effects are added one by one until the "
                   "held-out residual is noise or nothing in the library helps. Error and noise in per cent:"),
         Formula("op(\"n.r.m.s.\") = (1 / n_y sum_i sum_k abs(e_(k i))^2 slash sum_k abs(Y_(k i))^2)^(1 slash 2)",
                 "the normalised error is the root of the mean over outputs of the residual's power over the output's"),
         Paragraph("What held out means. No parameter is fitted to the held-out records, but they have their say in "
                   "which candidate is chosen and when to stop, so that their figures after naming are no independent "
-                  "test. Hum is found in all records. Forces that depend on amplitude or time, the second-order terms "
+                  "test. The noise is that of the fitted records; hum, what is wrong with a converter, and the levels "
+                  "of floor and sensors are found in all records, and hum is taken out of all. Where a channel clips, "
+                  "what the model expects behind the limit stands in place of the clipped samples, of held-out records "
+                  "too: these samples test nothing. Forces that depend on amplitude or time, the second-order terms "
                   "of large rotations among them, act on the motion of the mounts as the model has it, corrected by "
                   "each record's own sensors, of the held-out records too; avis predict goes from drives and floor "
                   "alone."),

@@ -39,7 +39,8 @@ def detectable(gap: Gap) -> Table:
     return table("An effect that is absent, by itself at its place, would differ from none by five standard "
                  "deviations of the fit at this size, at the best and at the worst of its places: about what the "
                  "search asks for before it names one of so many. What is smaller may be there. \"At no size\": "
-                 "re-identification of the rig's own parameters would take it up.",
+                 "re-identification of the rig's own parameters would take it up. Effects that have a frequency or "
+                 "another shape of their own are not in this table.",
                  ("effect", "place", "parameter", "seen from about"), rows, "lllr")
 
 
