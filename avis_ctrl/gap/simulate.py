@@ -77,7 +77,7 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
             record.deflection[:] = lines.in_time(lines.deflection(x, floor))
     still = with_large_motion({"": record}, model)[""] if _has_large_motion(effects) else record
     pushing = [one for one in effects if one.effect.force(still, one.place, one.by_name) is not None]
-    if not pushing:
+    if not pushing or not len(lines.G):  # a rig without mounts of its own has no motion by which forces could act
         return Simulated(lines.in_time(lines.sensed(x, acting)), lines.in_time(lines.deflection(x, floor)))
     return _with_forces(model, lines, replace(record, volts=acting), x, floor, pushing)
 

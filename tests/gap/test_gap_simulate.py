@@ -351,6 +351,9 @@ def test_a_rig_without_mounts_by_name():
     u = 0.1 * np.random.default_rng(3).standard_normal((2000, len(model.actuators)))
     found = simulate(model, u, None, rate)
     assert found.deflection.shape == (2000, 0)
+    # Its second-order terms are those of mounts that are not known: the table stays linear.
+    large = model.with_effect(active(LargeMotion(), model, "payload", (1.0, 0.0, 1.0)))
+    np.testing.assert_array_equal(simulate(large, u, None, rate).y, found.y)
     header = RecordHeader("00", rate, 2000, model.actuators, model.sensors.names, "noise")
     motion = motion_of(Campaign(rig.name, (Record(header, u, found.y),)), model)["00"]
     assert motion.deflection.shape == (2000, 0)
