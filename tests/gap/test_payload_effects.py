@@ -12,6 +12,7 @@ from avis_ctrl.gap.effects.base import Seed, library
 from avis_ctrl.gap.effects.impedance import peaks
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.realise import realise
+from avis_ctrl.gap.refit import at_the_edge
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.search import summits
 from avis_ctrl.gap.table_model import TableModel, active
@@ -241,6 +242,15 @@ def test_a_place_between_those_of_the_grid_is_found(place):
     tied = with_effect("cable_stiffness", "payload/axes", [150.0, 220.0, 300.0, 1e-3, *place], FREE)
     _, found = seeds_of(tied, "cable_stiffness", "payload/axes")
     assert np.linalg.norm(np.array(found[0].values[-3:]) - place) < 0.08
+
+
+def test_along_its_line_of_action_a_place_may_end_anywhere():
+    def of(point):
+        model = with_effect("attached_oscillator", "payload/oblique", [0.0, 1.9, 0.0, 21.0, 0.02, *point], FREE)
+        one = model.effects[-1]
+        return one.effect.implausible(one.by_name, dict.fromkeys(one.by_name, 1e-3)) or at_the_edge(one)
+    assert of((0.1, 2.0, 0.1)) == ""
+    assert "line of action" in of((2.0, 0.0, 0.1))
 
 
 def test_another_summit_of_the_score_is_kept():

@@ -11,8 +11,8 @@ import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register, told_from_none
 from avis_ctrl.gap.effects.impedance import about, at_points, peaks, positions, project, unit_matrices
-from avis_ctrl.gap.effects.line_of_action import best_direction, told
-from avis_ctrl.gap.effects.payload import AtPoint, place_of
+from avis_ctrl.gap.effects.line_of_action import best_direction, foot, told
+from avis_ctrl.gap.effects.payload import AtPoint, REACH_m, place_of
 from avis_ctrl.gap.effects.sensors import second_order
 from avis_ctrl.rigs.rigid_body import point_map
 
@@ -54,7 +54,8 @@ class AttachedOscillator(AtPoint):
             most = float(np.sqrt(mass))
             along = [EffectParameter(f"along_{axis}", "sqrt(kg)", f"root of the mass times its direction's {axis}", 0.0,
                                      -most, most, 0.1 * most, group="along") for axis in "xyz"]
-            return (*along, frequency, damping, *self.position())
+            # Along the line of action a place makes no difference and may end anywhere.
+            return (*along, frequency, damping, *(replace(one, optional=True) for one in self.position()))
         if variant == "axes":
             each = [replace(frequency, name=f"frequency_{axis}_Hz", description=f"of the mass along {axis}")
                     for axis in "xyz"]
@@ -77,7 +78,11 @@ class AttachedOscillator(AtPoint):
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         names = [name for name in values if name.startswith("along_")] or ["mass_kg"]
-        return "" if told_from_none(values, std, names) else "a sprung mass that the data do not tell from none"
+        if not told_from_none(values, std, names):
+            return "a sprung mass that the data do not tell from none"
+        if "along_x" in values and np.abs(foot(values)).max() > 0.999 * REACH_m:
+            return f"a line of action that passes {REACH_m:g} m from the table"
+        return ""
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:

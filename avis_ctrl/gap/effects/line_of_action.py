@@ -49,6 +49,12 @@ def told(values: Mapping[str, float], covariance: np.ndarray, size: str, unit: s
     return {name: Reported(float(v), float(s), u) for (name, u), v, s in zip(labels, line, std, strict=True)}
 
 
+def foot(values: Mapping[str, float]) -> np.ndarray:
+    """(3,) m: the point of the line of action nearest to the geometric centre, by the values along_x .. and x_m .."""
+    names = (*(f"along_{axis}" for axis in "xyz"), *(f"{axis}_m" for axis in "xyz"))
+    return of_line(np.array([values[name] for name in names]))[4:]
+
+
 def of_line(x: np.ndarray) -> np.ndarray:
     """(7,) size, direction with its largest component positive, foot of the line; x d sqrt(size) and a point (6,)."""
     a, point = x[:3], x[3:]
