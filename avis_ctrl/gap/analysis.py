@@ -17,7 +17,7 @@ from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.judgement import effects_of, judge, undetermined
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
-from avis_ctrl.gap.refit import Refit, judged, likelihood, refit, scattered, try_refit
+from avis_ctrl.gap.refit import Refit, anew, judged, likelihood, refit, scattered, try_refit
 from avis_ctrl.gap.result import Detectable, Gap
 from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, definite, search
 from avis_ctrl.gap.show import shown
@@ -155,7 +155,8 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
 
 def _nearest(found: Found) -> TableModel | None:
     """The best model with effects that a search has refitted, where the re-identified one leaves more than noise."""
-    tried = [one for stage in found.pool for one in stage if one.held_per_dof < found.chain[0].held_per_dof]
+    tried = [one for stage in found.pool for one in stage
+             if one.held_per_dof < found.chain[0].held_per_dof and not one.implausible()]
     if found.chain[0].held_per_dof <= NOISE or not tried:
         return None
     return min(tried, key=lambda one: one.criterion).model
@@ -169,8 +170,13 @@ def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, p
             return search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each)
         return replace(found, chain=(prepared.base,), reached_noise=prepared.base.held_per_dof <= NOISE)
     best = _without_spare(refit(found.best.model, prepared.thin, prepared.thin_held), prepared)
+    # Names are compared, and told, by the noise as it is known in the end.
+    pool = tuple(tuple(anew(one, prepared.thin, prepared.thin_held) for one in stage) for stage in found.pool)
+    found = replace(found, pool=pool, passed_over=tuple(judged(one.fit, prepared.thin_held)
+                                                        for one in found.passed_over))
     if len(effects_of(best.model)) < len(found.chain) - 1:
-        found = replace(found, chain=(found.chain[0], best))
+        # A stage of its own where the search had no refit with it alone.
+        found = replace(found, chain=(found.chain[0], best), pool=(*found.pool, (best,)))
     between = [judged(one.fit, prepared.thin_held) for one in found.chain[1:-1]]
     chain = (prepared.base, *between, best)
     longer = replace(found, chain=chain, reached_noise=best.held_per_dof <= CLOSED)

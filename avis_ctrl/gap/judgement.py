@@ -146,7 +146,11 @@ def undetermined(updated: Refit) -> tuple[str, str]:
         if why := updated.forbidden(one):
             return one.label, f"{one.effect.name} comes nearest, but that is not possible ({why}): not named"
         linear = [j for j, p in enumerate(one.parameters) if p.linear]
-        size = np.array([one.parameters[j].size for j in linear])
+        # In units of what the data know of each alone, so that what they do not know together falls out.
+        rows = [updated.model.names.index(one.names[j]) if one.names[j] in updated.model.names else -1 for j in linear]
+        known_by = updated.fit.information
+        size = np.array([known_by.scale[k] / np.sqrt(max(known_by.relative[k, k], 1e-300)) if k >= 0
+                         else one.parameters[j].size for k, j in zip(rows, linear, strict=True)])
         away = np.array([one.values[j] - one.parameters[j].none for j in linear]) / size
         C = updated.covariance_of(one, updated.misfit)[np.ix_(linear, linear)] / np.outer(size, size)
         known = np.linalg.matrix_rank(C, hermitian=True) if linear else 0

@@ -160,6 +160,12 @@ def judged(found: LikelihoodFit, held_out: Sequence[SpectralBlock]) -> Refit:
     return Refit(cast(TableModel, found.model), found, sum(e.chi2 for e in errors), sum(e.dof for e in errors))
 
 
+def anew(found: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[SpectralBlock]) -> Refit:
+    """A refit weighed by blocks of which the noise is better known, its parameters as they are."""
+    chi2 = sum(prediction_error(found.fit.model, block, derivative=False).chi2 for block in fitted)
+    return judged(replace(found.fit, chi2=chi2), held_out)
+
+
 def scattered(found: Refit, fitted: Sequence[SpectralBlock]) -> Refit:
     """The same with the covariance that the scatter of the score over the fitted blocks gives."""
     return replace(found, robust=clustered(found.model, fitted, found.fit.information))
