@@ -22,7 +22,7 @@ from avis_ctrl.gap.effects.attached import elements
 from avis_ctrl.gap.effects.cable import tie
 from avis_ctrl.gap.effects.chassis import of_chassis
 from avis_ctrl.gap.effects.flexible_mode import modes, shape_rows
-from avis_ctrl.gap.effects.mounts import LEVELED, REFERENCE_Hz, drifted, surge_omega
+from avis_ctrl.gap.effects.mounts import LEVELED, REFERENCE_Hz, contacts, drifted, surge_omega
 from avis_ctrl.gap.effects.payload import place_of
 from avis_ctrl.gap.operators import MountGeometry, mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
@@ -237,7 +237,7 @@ def _friction(table: Table, place: str, values: Mapping[str, float]) -> StateSpa
     """Far below the slip: a spring at every motor."""
     at_actuators, _ = shape_rows(table.model.rig, table.model.actuators, table.model.sensors.names)
     G = at_actuators @ table.G
-    return _static(table, values["stiffness_N_per_m"] * G.T @ G)
+    return _static(table, G.T @ (contacts(values)[:, None] * G))
 
 
 def _drift(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:

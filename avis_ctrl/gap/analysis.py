@@ -300,7 +300,7 @@ def _final(prepared: Prepared, found: Found) -> tuple[Refit, Refit, list[str]]:
     many = [thinned(block, FINAL_LINES) for block in prepared.fitted]
 
     def fitted(model: TableModel) -> Refit:
-        return scattered(judged(likelihood(model, many, FINAL_ITERATIONS), prepared.held_out), many)
+        return scattered(judged(likelihood(model.with_late_free(), many, FINAL_ITERATIONS), prepared.held_out), many)
     best, left_out = fitted(found.best.model), []
     while len(effects_of(best.model)) > 1:
         label, why = undetermined(best)

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.gap.effects.mounts import ContactFriction, dahl
+from avis_ctrl.gap.effects.mounts import ContactFriction, contacts, dahl
 from avis_ctrl.gap.line_response import LineResponse
 from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect
@@ -145,7 +145,7 @@ class FrictionForce(WindowForce):
 
     def __call__(self, start: int, stop: int) -> np.ndarray:
         f = self._friction(start, stop)
-        return -self.one.by_name["stiffness_N_per_m"] * f @ self.record.rows[self.record.driven_rows]
+        return -f @ (contacts(self.one.by_name)[:, None] * self.record.rows[self.record.driven_rows])
 
     def accept(self, start: int, stop: int) -> None:
         self.state = self._friction(start, stop)[-1]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -176,9 +177,10 @@ def _made(file: ModelFile) -> TableModel:
                             sensors.sensitivity_unit, sensors.transient_poles)
     base = ResponseModel(rig, tuple(file.free), sensors, tuple(file.actuators), file.period_s, file.delay_s,
                          file.amplifier_corner_Hz)
-    model = TableModel(base, fixed=frozenset(file.fixed))
+    model = TableModel(base)
     for k, one in enumerate(file.effects):
         model = model.with_effect(_effect(model, one, f"effects[{k}]"))
+    model = replace(model, fixed=frozenset(file.fixed))
     known = {name for one in model.effects for name in one.names}
     if unknown := sorted(model.fixed - known):
         raise InputError("expected names of parameters of the effects", field="fixed", value=unknown)

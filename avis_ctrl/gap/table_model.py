@@ -59,9 +59,10 @@ class Acting:
 
 
 def active(effect: Effect, model: TableModel, place: str, values: Sequence[float] | None = None) -> ActiveEffect:
-    """An effect at a place of a model, without strength where no values are given."""
+    """An effect at a place of a model, without strength where no values are given; late parameters may be left out."""
     parameters = effect.parameters(model, place)
     values = effect.starts(model, place)[0].tolist() if values is None else list(values)
+    values += [one.none for one in parameters[len(values):] if one.late]
     if len(values) != len(parameters):
         raise InputError(f"expected {len(parameters)} values", field=effect.name, value=list(values))
     return ActiveEffect(effect, place, parameters, tuple(float(v) for v in values))
@@ -166,10 +167,19 @@ class TableModel:
         return replace(self, effects=(*self.effects[:k], self.effects[k].at(values), *self.effects[k + 1:]))
 
     def with_effect(self, effect: ActiveEffect) -> TableModel:
-        return replace(self, effects=(*self.effects, effect))
+        """The model with one effect more, its late parameters held where they are."""
+        late = {name for name, one in zip(effect.names, effect.parameters, strict=True) if one.late}
+        return replace(self, effects=(*self.effects, effect), fixed=self.fixed | late)
+
+    def with_late_free(self) -> TableModel:
+        """The same with the late parameters of its effects free, too."""
+        late = {name for effect in self.effects
+                for name, one in zip(effect.names, effect.parameters, strict=True) if one.late}
+        return replace(self, fixed=self.fixed - late) if late & self.fixed else self
 
     def without(self, label: str) -> TableModel:
-        return replace(self, effects=tuple(one for one in self.effects if one.label != label))
+        gone = {name for one in self.effects if one.label == label for name in one.names}
+        return replace(self, effects=tuple(one for one in self.effects if one.label != label), fixed=self.fixed - gone)
 
     @cached_property
     def effective(self) -> ResponseModel:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.gap.additions import drift_at
+from avis_ctrl.gap.effects.mounts import contacts
 from avis_ctrl.gap.realise import loop_lag, realise, sufficient_order, with_effects
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.lti.connect import connect, lft_lower
@@ -205,8 +206,9 @@ def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
                 if key.rpartition(".")[2].startswith("k_"):
                     add(key, values["relative_change"] * drift_at(model, values, when) * known[key].value)
         elif name == "contact_friction":
+            each = dict(zip(model.actuators, contacts(values), strict=True))
             for motor in model.rig.motors:  # type: ignore[attr-defined]
-                add(f"isolator{motor.isolator}.k_{motor.axis}", values["stiffness_N_per_m"])
+                add(f"isolator{motor.isolator}.k_{motor.axis}", float(each[motor.name]))
     return Carried(_with_sensitivity(rig.with_parameters(changes), model, factors), asked, tuple(inside),
                    tuple(outside))
 

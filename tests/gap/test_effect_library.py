@@ -119,6 +119,20 @@ def test_a_surge_of_no_mass_is_none():
     np.testing.assert_allclose(model.response(OMEGA), BARE.response(OMEGA), rtol=1e-6)
 
 
+def test_what_contacts_share_is_held_until_the_last_fit():
+    """Forces of unequal contacts are those of each alone; only `with_late_free` frees their shares."""
+    values = values_at("contact_friction", "actuators")
+    model = with_effect("contact_friction", "actuators", values, MOVING)
+    late = {name for name in model.with_late_free().names if "uneven_" in name}
+    assert len(late) == 7 and not late & set(model.names)
+    record, own = MOVING.motion["00"], OWN["contact_friction"]
+    equal = dict(zip(("stiffness_N_per_m", "slip_m"), values[:2], strict=True))
+    shares = np.array([*values[2:], -sum(values[2:])])
+    alone = [own.force(replace(record, driven_rows=record.driven_rows[k:k + 1]), "actuators", equal) for k in range(8)]
+    np.testing.assert_allclose(own.force(record, "actuators", model.effects[-1].by_name),
+                               sum((1 + s) * one for s, one in zip(shares, alone, strict=True)), rtol=1e-12, atol=1e-15)
+
+
 @pytest.mark.parametrize(("name", "place"), EVERYWHERE)
 def test_what_is_reported_is_finite_at_every_bound(name, place):
     """A refit may end there, also one that is only told among the runners-up."""
@@ -345,7 +359,8 @@ VALUES = {"geophone_corner": [4.8, 0.5], "sensor_gain": [1.05], "sensor_misalign
           "tilt_coupling": [9.8], "actuator_gain": [0.95], "actuator_lag": [2e-3], "loop_delay": [0.7e-3],
           "actuator_saturation": [1.0], "mount_relaxation": [0.3, 3.0], "structural_damping": [0.06],
           "mount_surge": [30.0, 0.45, 0.02, 0.01, -0.02, 0.03], "leveling_loop": [0.04, 0.5],
-          "cubic_stiffness": [1e13], "contact_friction": [3e3, 1e-5], "stiffness_drift": [0.03, 3.0],
+          "cubic_stiffness": [1e13], "stiffness_drift": [0.03, 3.0],
+          "contact_friction": [3e3, 1e-5, 0.1, -0.2, 0.05, 0.12, -0.1, 0.15, -0.07],
           "base_compliance": [1000.0, 0.05, 9.0, 10.0, 14.0, 20.0, 25.0, 30.0, 0.4, 0.5, 0.6, -0.4, -0.1],
           "com_offset": [0.01, -0.02, 0.03],
           "product_of_inertia": [2.0], "payload_flexible_mode": [
@@ -367,7 +382,7 @@ def values_at(name, place):
     pair for k, pair in enumerate(EVERYWHERE) if k == 0 or EVERYWHERE[k - 1][0] != pair[0] or "/" in pair[1]])
 def test_derivatives_by_central_differences(name, place):
     """By all parameters of rig and effect: differences of the answer as a whole, of two steps (Richardson)."""
-    model = with_effect(name, place, values_at(name, place), MOVING)
+    model = with_effect(name, place, values_at(name, place), MOVING).with_late_free()
     theta, found = model.values, model.answer(BLOCK)
     free = [*range(0, len(BARE.names), 3), *range(len(BARE.names), len(theta))]
     for row in free:

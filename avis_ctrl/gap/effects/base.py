@@ -38,7 +38,8 @@ class EffectParameter:
     none : value without the effect. low, high : what physics allows. size : one unit of it in a fit.
     linear : the effect vanishes as this goes to `none`, at first in proportion.
     grid : for one that is not linear, where to look for it. optional : one that may end at its bounds.
-    group : parameters of one group are judged by the size of the largest of them.
+    group : parameters of one group are judged by the size of the largest of them. late : one that the search leaves at
+        `none` and only the last fit frees: what an effect takes for equal.
     """
 
     name: str
@@ -52,6 +53,7 @@ class EffectParameter:
     grid: tuple[float, ...] = ()
     optional: bool = False
     group: str = ""
+    late: bool = False
 
 
 @dataclass(frozen=True)

@@ -265,6 +265,7 @@ class ContactFriction(Effect):
     """Dahl friction at every motor, along its axis: f' = sigma v (1 - sign(v) f/F_c), F_c = sigma times the slip.
 
     P. R. Dahl, A solid friction model (1968): stiff and lossless for motion far below the slip, Coulomb far above.
+    Contacts slip at the same displacement; how their stiffness is shared among them the last fit finds.
     """
 
     name = "contact_friction"
@@ -281,19 +282,37 @@ class ContactFriction(Effect):
         rms, k = median_rms(model), float(np.mean(mount_geometry(model.rig).stiffness))
         return (EffectParameter("stiffness_N_per_m", "N/m", "of a contact before it slips", 0.0, 0.0, 20 * k, 0.05 * k),
                 EffectParameter("slip_m", "m", "displacement at which a contact slips", 0.0, 1e-3 * rms, 1e3 * rms, rms,
-                                False, tuple(rms * x for x in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0))))
+                                False, tuple(rms * x for x in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0))),
+                *(EffectParameter(f"uneven_{name}", "1", f"stiffness of the contact of {name} over the mean, less one",
+                                  0.0, -0.9, 0.9, 0.1, False, (0.0,), True, late=True)
+                  for name in model.actuators[:-1]))
 
     def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
         own = record.driven_rows
         f = dahl(np.ascontiguousarray(record.deflection[:, own]), values["slip_m"])
-        return -values["stiffness_N_per_m"] * f @ record.rows[own]
+        return -f @ (contacts(values)[:, None] * record.rows[own])
+
+    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
+                       ) -> np.ndarray | None:
+        """As `force`; of a slip the contacts' own forces are kept."""
+        own, slip = record.driven_rows, values["slip_m"]
+        f = record.kept(f"{self.name} {slip}", omega,
+                        lambda: dahl(np.ascontiguousarray(record.deflection[:, own]), slip))
+        return -f @ (contacts(values)[:, None] * record.rows[own])
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         k, slip = values["stiffness_N_per_m"], values["slip_m"]
         slope = np.array([slip, k])
-        return {"force_N": Reported(k * slip, float(np.sqrt(max(slope @ covariance @ slope, 0.0))), "N"),
+        variance = float(slope @ covariance[:2, :2] @ slope)
+        return {"force_N": Reported(k * slip, float(np.sqrt(max(variance, 0.0))), "N"),
                 **super().reported(model, place, values, covariance)}
+
+
+def contacts(values: Mapping[str, float]) -> np.ndarray:
+    """(m,) N/m: stiffness of each contact, in the order of the actuators."""
+    uneven = [value for name, value in values.items() if name.startswith("uneven_")]
+    return values["stiffness_N_per_m"] * (1 + np.array([*uneven, -sum(uneven)]))
 
 
 @njit(cache=True)

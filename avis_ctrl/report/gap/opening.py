@@ -10,6 +10,9 @@ from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, table
 
+# Parameters of an effect that a row has room for; all of them stand in the section on parameters.
+MOST = 5
+
 
 def opening(found: Found) -> Section:
     """Verdict, the gap in numbers, named effects."""
@@ -80,7 +83,7 @@ def _stage(name: str) -> str:
 
 
 def _effects(gap: Gap) -> Table:
-    rows = [(wording.titled(one.name), one.location, wording.quantities(one.parameters),
+    rows = [(wording.titled(one.name), one.location, wording.quantities(one.parameters, MOST),
              wording.probability(one.probability),
              ", ".join(map(wording.titled, one.indistinguishable_from)) or "none")
             for one in gap.effects]
