@@ -27,6 +27,8 @@ test-slow: lint
 
 demo: $(BIN)/.installed
 	$(BIN)/avis design designs/avis_z_phix.toml --out reports/avis_z_phix
+	$(BIN)/avis simulate-campaign --rig avis --plan designs/plans/lagging_amplifiers.toml --out reports/lagging_amplifiers.h5
+	$(BIN)/avis gap reports/lagging_amplifiers.h5 --rig avis --out reports/lagging_amplifiers
 
 # The peers that we measure ourselves against are no dependency of the product.
 bench: $(BIN)/.installed

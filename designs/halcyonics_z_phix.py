@@ -20,7 +20,8 @@ from avis_ctrl.study.design_file import (
     TransmissibilitySection,
     UncertaintySection,
 )
-from avis_ctrl.study.output import open_folder, write_study
+from avis_ctrl.study.files import open_folder
+from avis_ctrl.study.output import write_study
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.runner import compare, conclude, synthesise
 
