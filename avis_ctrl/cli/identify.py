@@ -109,10 +109,12 @@ def predict(
 
     from avis_ctrl.measurement.campaign import Campaign
     from avis_ctrl.measurement.formats import read_measurements
+    from avis_ctrl.study.files import require_other
     from avis_ctrl.study.gap_names import GAP_FILE
-    from avis_ctrl.study.prediction_errors import prediction_errors
+    from avis_ctrl.study.prediction_errors import compared, prediction_errors
     from avis_ctrl.study.rig_channels import in_words_of
 
+    require_other(out, campaign)
     console = Console(highlight=False)
     measured = read_measurements(campaign)
     if not isinstance(measured, Campaign):
@@ -144,6 +146,8 @@ def predict(
         for one in errors:
             table.add_row(one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names))
         console.print(table)
+        if note := compared(errors):
+            console.print(note)
     console.print(f"{out}: {len(measured.records)} records")
 
 

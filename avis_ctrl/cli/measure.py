@@ -91,8 +91,11 @@ def simulate_campaign(
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.simulation import rehearse
     from avis_ctrl.study.campaign_plan import default_plan, plan_toml, read_plan
-    from avis_ctrl.study.files import write_whole
+    from avis_ctrl.study.files import require_other, write_whole
 
+    for written in (out, write_plan, truth):
+        if written is not None:
+            require_other(written, plan, rig)
     console = Console(highlight=False)
     table = load_rig(rig)
     chosen = read_plan(plan) if plan else default_plan(table, "orthogonal" if orthogonal else "zippered",
@@ -128,7 +131,9 @@ def convert(
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.measurement.formats.hdf5 import write_campaign
     from avis_ctrl.measurement.formats.stored_response import write_frequency_response
+    from avis_ctrl.study.files import require_other
 
+    require_other(out, source)
     console = Console(highlight=False)
     measured = read_measurements(source, parse_columns(columns) if columns else None, rig,
                                  **known_hints(period_s, excitation, sample_rate_Hz, unit_y))

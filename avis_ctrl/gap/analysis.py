@@ -19,7 +19,7 @@ from avis_ctrl.gap.judgement import effects_of, judge, undetermined
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
 from avis_ctrl.gap.refit import Refit, anew, judged, likelihood, refit, scattered, try_refit
 from avis_ctrl.gap.result import Detectable, Gap
-from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, definite, search
+from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, Rival, definite, search
 from avis_ctrl.gap.show import shown
 from avis_ctrl.gap.signal_effects import (
     SignalFaults,
@@ -46,6 +46,8 @@ from avis_ctrl.rigs.rig import Rig
 Progress = Callable[[str], None]
 # Share of a channel's samples beyond its limits from which repaired samples are predicted anew.
 REPAIRED = 1e-5
+# Lines of a record in the band below which a fit with its transient tells nothing.
+FEWEST_LINES = 60
 # How often, each time with the better model that the last repair allowed, and iterations of its fit in between.
 REPAIRS, ITERATIONS = 3, 10
 # Second-order terms as Newton and Euler have them, with sensors fixed to the payload and forces along earth axes.
@@ -162,18 +164,27 @@ def _nearest(found: Found) -> TableModel | None:
     return min(tried, key=lambda one: one.criterion).model
 
 
+def _weighed(found: Found, prepared: Prepared) -> Found:
+    """What was found, compared and told by the noise as it is known in the end."""
+    def of(one: Refit) -> Refit:
+        return anew(one, prepared.thin, prepared.thin_held)
+
+    def told(rival: Rival) -> Rival:
+        return replace(rival, refit=of(rival.refit), against=of(rival.against))
+    return replace(found, pool=tuple(tuple(map(of, stage)) for stage in found.pool),
+                   passed_over=tuple(judged(one.fit, prepared.thin_held) for one in found.passed_over),
+                   rivals=tuple(map(told, found.rivals)), beaten=found.beaten and told(found.beaten))
+
+
 def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, progress: Progress, each: Each
            ) -> Found:
     """What was found, against the noise that is known now; searched on where only that shows that more is left."""
+    found = _weighed(found, prepared)
     if len(found.chain) == 1:
         if found.reached_noise and prepared.base.held_per_dof > NOISE:
             return search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each)
         return replace(found, chain=(prepared.base,), reached_noise=prepared.base.held_per_dof <= NOISE)
     best = _without_spare(refit(found.best.model, prepared.thin, prepared.thin_held), prepared)
-    # Names are compared, and told, by the noise as it is known in the end.
-    pool = tuple(tuple(anew(one, prepared.thin, prepared.thin_held) for one in stage) for stage in found.pool)
-    found = replace(found, pool=pool, passed_over=tuple(judged(one.fit, prepared.thin_held)
-                                                        for one in found.passed_over))
     if len(effects_of(best.model)) < len(found.chain) - 1:
         # A stage of its own where the search had no refit with it alone.
         found = replace(found, chain=(found.chain[0], best), pool=(*found.pool, (best,)))
@@ -208,14 +219,21 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     low, high = excited_band(halves.fitted)
     band = band_Hz or (low, high)
     if not 0 <= band[0] < band[1]:
-        raise InputError("expected the lower end first, the upper one after it", field="band_Hz", value=band)
+        raise InputError("expected 0 <= LOW < HIGH", field="band_Hz", value=band)
     if band[1] <= low or band[0] >= high:
         raise InputError(f"expected a band in which the records are excited, {low:.3g} to {high:.3g} Hz",
                          field="band_Hz", value=band)
+    if amplifier_corner_Hz is not None and not 0 < amplifier_corner_Hz < np.inf:
+        raise InputError("expected a frequency above zero", field="amplifier corner", value=amplifier_corner_Hz)
     base = ResponseModel.of(rig, default_parameters(rig), campaign.y_unit, campaign.y_names, campaign.u_names, True,
                             amplifier_corner_Hz)
     nominal = TableModel(base, nominal=base)
     progress(f"re-identification of {len(nominal.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz; {halves.how}")
+    for record in halves.fitted.records:
+        lines = int((band[1] - band[0]) * record.header.duration_s)
+        if lines < FEWEST_LINES:
+            raise InputError(f"expected a wider band or longer records: {lines} lines of record {record.header.name} "
+                             f"lie in it, and a fit needs {FEWEST_LINES}", field="band_Hz", value=band)
     rough = _rough(nominal, halves, band)
     original = campaign if mended and max(mended.clipped.values()) > REPAIRED else None
     if original is not None:

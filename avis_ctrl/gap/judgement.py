@@ -274,7 +274,9 @@ def _gain(found: Found, label: str) -> float:
 def _considered(found: Found, updated: Refit, stretch: float) -> tuple[Considered, ...]:
     """What was refitted and not taken, best first, and why."""
     rows = []
-    chosen = set(updated.labels)
+    chosen, left = set(updated.labels), 1.0 if found.beaten is None else found.beaten.left
+    best, who = ((found.best, "the best model") if found.beaten is None else
+                 (found.beaten.refit, "what it behaves most like"))
     for stage in found.pool:
         if not stage:
             continue
@@ -284,18 +286,18 @@ def _considered(found: Found, updated: Refit, stretch: float) -> tuple[Considere
             if set(rival.labels) <= chosen or not own:  # a step on the way to what was chosen lost to nothing
                 continue
             reason = rival.implausible() or (f"leaves {rival.held_per_dof:.3g} times the noise's power of the held-out "
-                                             f"records, the best model {found.best.held_per_dof:.3g}")
+                                             f"records, {who} {best.held_per_dof:.3g}")
             if rival.held_per_dof > found.chain[0].held_per_dof:
                 reason += ": more than without it; its fit stopped short, or does not hold beyond its records"
             rows.append(Considered(" and ".join(one.effect.name for one in own),
-                                   " and ".join(location(one.place) for one in own), rival.held_per_dof, float(share),
-                                   reason, rival.reported(own[-1])))
+                                   " and ".join(location(one.place) for one in own), rival.held_per_dof,
+                                   float(share) * left, reason, rival.reported(own[-1])))
     for rival in sorted(found.passed_over, key=lambda one: one.held_per_dof):
         own = effects_of(rival.model)
         rows.append(Considered(" and ".join(one.effect.name for one in own),
                                " and ".join(location(one.place) for one in own), rival.held_per_dof, 0.0,
-                               rival.implausible() or "left far behind after a refit to few lines: "
-                               f"{rival.held_per_dof:.3g} times the noise's power", rival.reported(own[-1])))
+                               rival.implausible() or "behind others after a refit to few lines, not refitted to all",
+                               rival.reported(own[-1])))
     return tuple(rows[:12])
 
 

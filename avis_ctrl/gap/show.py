@@ -32,6 +32,8 @@ PLACE_ALARM = 0.01
 MOST_PLACES = 10
 # Error over that of noise alone up to which a sentence may call it the noise.
 IS_NOISE = 1.05
+# Error over that of noise below which the noise was over-estimated.
+TOO_MUCH_NOISE = 0.8
 BANDS_PER_OCTAVE = 2
 # Lines of each record from which its place in level and time, and the shares of power, are told.
 SHOWN_LINES = 1200
@@ -126,6 +128,8 @@ def opening(judgement: Judgement, ladder: Sequence[Stage], after: Left) -> str:
                 f"leaves {_percent(first.nrmse)} of the held-out records, noise alone {_percent(after.noise_nrmse)}.")
     named = " and ".join(in_words(one) for one in judgement.effects)
     end = "and something else remains" if judgement.verdict != "explained" else (
+        f"less than the noise as it was estimated ({_percent(after.noise_nrmse)}: too much where the table resonates)"
+        if last.nrmse < TOO_MUCH_NOISE * after.noise_nrmse else
         "which is the noise" if last.nrmse <= IS_NOISE * after.noise_nrmse else
         f"beside {_percent(after.noise_nrmse)} of noise")
     return (f"Missing from the model: {named}; with that in it the gap falls from {_percent(first.nrmse)} to "

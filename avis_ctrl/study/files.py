@@ -49,6 +49,14 @@ def output_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequen
         raise
 
 
+def require_other(out: Path, *inputs: Path | str | None) -> None:
+    """Raises InputError where a file to write is one that is read: a measurement is never replaced."""
+    for one in inputs:
+        with contextlib.suppress(OSError):
+            if one is not None and out.samefile(one):
+                raise InputError("expected another file than the one that is read", field="--out", value=str(out))
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that nobody ever sees half of it.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,3 +37,16 @@ def prediction_errors(predicted: Path, campaign: Campaign) -> Iterator[Predictio
 def _relative(made: np.ndarray, y: np.ndarray, size: np.ndarray) -> float:
     error = made - made.mean(axis=0) - y
     return float(np.sqrt(np.mean(np.mean(error ** 2, axis=0) / size ** 2)))
+
+
+def compared(errors: Sequence[PredictionErrors]) -> str:
+    """What the errors of two models say of them; empty where there is one model, or the updated one is better."""
+    pairs = np.array([(one.relative["y_baseline"], one.relative["y_updated"]) for one in errors
+                      if {"y_baseline", "y_updated"} <= set(one.relative)])
+    if not len(pairs):
+        return ""
+    if np.array_equal(pairs[:, 0], pairs[:, 1]):
+        return "both models are the same here: nothing that predictions show was named"
+    before, after = np.sqrt(np.mean(pairs ** 2, axis=0))
+    return (f"the updated model is further off than the baseline ({100 * after:.3g} % against {100 * before:.3g} %): "
+            "this campaign is of another table, or of one without the named effects") if after > before else ""

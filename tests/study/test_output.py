@@ -140,6 +140,16 @@ def test_what_was_made_goes_again_where_an_error_leaves_it_empty(tmp_path):
         "mine", "written", "written/b", "written/b/result.json"]
 
 
+def test_what_is_read_is_never_written(tmp_path):
+    campaign = tmp_path / "campaign.h5"
+    campaign.write_bytes(b"precious")
+    (tmp_path / "link.h5").symlink_to(campaign)
+    for out in (campaign, tmp_path / "link.h5", tmp_path / "." / "campaign.h5"):
+        with pytest.raises(InputError, match="another file"):
+            files.require_other(out, "avis", None, campaign)
+    files.require_other(tmp_path / "new.h5", campaign, None, "avis")
+
+
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
     (tmp_path / "out").write_bytes(b"precious")
     with pytest.raises(InputError, match="--out") as refused:

@@ -21,7 +21,9 @@ def candidates(found: Found) -> Section:
     rows = [(wording.candidate(one), words.number(one.chi2_per_dof, 4), wording.probability(one.probability),
              wording.quantities(one.parameters, MOST) or "not stated", one.reason) for one in ranked]
     pieces: list[Piece] = [table("Candidates that were refitted together with all parameters of the rig, with "
-                                 "chi-square on held-out data, and why each lost.", header, rows[:FIRST], "lrrll")]
+                                 "chi-square on lines of the held-out records, and why each lost. The lines are drawn "
+                                 "densely at the resonances: the figures differ from those of all lines in the ladder.",
+                                 header, rows[:FIRST], "lrrll")]
     if rows[FIRST:]:
         pieces.append(Fold(f"{len(rows) - FIRST} more candidates",
                            (table("The others.", header, rows[FIRST:], "lrrll"),)))

@@ -1,0 +1,45 @@
+"""Errors of predictions against what was measured, by hand."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
+from avis_ctrl.study.prediction_errors import compared, prediction_errors
+
+
+@pytest.fixture
+def predicted(tmp_path):
+    """A campaign of two records, and a file of predictions of it, off by known shares."""
+    rng, records, path = np.random.default_rng(1), [], tmp_path / "p.h5"
+    with h5py.File(path, "w") as file:
+        for k, (a, b) in enumerate(((0.3, 0.01), (0.5, 0.02))):
+            y = rng.standard_normal((400, 2))
+            y = (y - y.mean(axis=0)) * [1.0, 1e-3]
+            header = RecordHeader(f"{k:02d}", 1000.0, 400, ("u1",), ("Sy1", "Sz1"), "noise", 0.1)
+            records.append(Record(header, np.zeros((400, 1)), y, None))
+            file[f"records/{k:02d}/y_baseline"] = (1 + a) * y + 7.0
+            file[f"records/{k:02d}/y_updated"] = (1 - b) * y
+    return path, Campaign("avis", tuple(records))
+
+
+def test_each_channel_counts_alike_and_means_do_not(predicted):
+    found = list(prediction_errors(*predicted))
+    assert [one.record for one in found] == ["00", "01"]
+    for one, (a, b) in zip(found, ((0.3, 0.01), (0.5, 0.02)), strict=True):
+        assert one.relative == pytest.approx({"y_baseline": a, "y_updated": b})
+    assert compared(found) == ""
+
+
+def test_a_worse_model_and_the_same_model_are_called_so(predicted):
+    path, campaign = predicted
+    with h5py.File(path, "r+") as file:
+        for group in file["records"].values():
+            group["y_updated"][...] = 3 * group["y_baseline"][()]
+    assert "further off" in compared(list(prediction_errors(path, campaign)))
+    with h5py.File(path, "r+") as file:
+        for group in file["records"].values():
+            group["y_updated"][...] = group["y_baseline"][()]
+    assert "the same" in compared(list(prediction_errors(path, campaign)))
