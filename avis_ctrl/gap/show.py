@@ -128,7 +128,7 @@ def opening(judgement: Judgement, ladder: Sequence[Stage], after: Left) -> str:
                 f"leaves {_percent(first.nrmse)} of the held-out records, noise alone {_percent(after.noise_nrmse)}.")
     named = " and ".join(in_words(one) for one in judgement.effects)
     end = "and something else remains" if judgement.verdict != "explained" else (
-        f"less than the noise as it was estimated ({_percent(after.noise_nrmse)}: too much where the table resonates)"
+        f"less than the noise as it was estimated ({_percent(after.noise_nrmse)}), which is too much then"
         if last.nrmse < TOO_MUCH_NOISE * after.noise_nrmse else
         "which is the noise" if last.nrmse <= IS_NOISE * after.noise_nrmse else
         f"beside {_percent(after.noise_nrmse)} of noise")

@@ -31,12 +31,14 @@ def test_a_step_on_the_way_to_a_pair_is_no_runner_up():
                                reported=lambda effect: {})
     pair = refit(1.0, "first", "second")
     found = SimpleNamespace(pool=((refit(1.6, "first"), refit(5.0, "other")), (pair,)), best=pair, passed_over=(),
-                            chain=(refit(9.0),))
+                            chain=(refit(9.0),), beaten=None)
     assert [one.name for one in _considered(found, pair, 1.0)] == ["other"]
 
 
 @pytest.mark.parametrize(("left", "said"), [(0.0101, "1.01 %, which is the noise."),
-                                            (0.0119, "1.19 %, beside 1 % of noise.")])
+                                            (0.0119, "1.19 %, beside 1 % of noise."),
+                                            (0.0006, "less than the noise as it was estimated (1 %), which is too "
+                                                     "much then.")])
 def test_a_gap_is_called_the_noise_only_where_it_is(left, said):
     one = NamedEffect("actuator_lag", "actuators", "the amplifiers lag", {}, 0.9)
     ladder = [Stage("nominal", 0.3, 900.0), Stage("re-identified", 0.1, 100.0), Stage("actuator_lag", left, 1.3)]
