@@ -23,13 +23,12 @@ def design(
 
     from avis_ctrl.study.design_file import read_study
     from avis_ctrl.study.files import output_folder
-    from avis_ctrl.study.output import FILES, FOLDERS
+    from avis_ctrl.study.output import FILES, FOLDERS, write_study
 
     console = Console(highlight=False)
     design, rig = read_study(file)  # before anything is imported or written that takes time
     with output_folder(out, FILES, FOLDERS) as folder, Progress(console) as progress:
         from avis_ctrl.report import render_html, render_pdf
-        from avis_ctrl.study.output import write_study
         from avis_ctrl.study.runner import run_design
 
         result = run_design(design, rig, progress, source=file)

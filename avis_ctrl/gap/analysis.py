@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -46,10 +46,10 @@ from avis_ctrl.rigs.rig import Rig
 Progress = Callable[[str], None]
 # Share of a channel's samples beyond its limits from which repaired samples are predicted anew.
 REPAIRED = 1e-5
-# Lines of a record in the band below which a fit with its transient tells nothing.
-FEWEST_LINES = 60
 # How often, each time with the better model that the last repair allowed, and iterations of its fit in between.
 REPAIRS, ITERATIONS = 3, 10
+# Lines of a record in the band below which a fit with its transient tells nothing.
+FEWEST_LINES = 60
 # Second-order terms as Newton and Euler have them, with sensors fixed to the payload and forces along earth axes.
 BY_PHYSICS = (1.0, 0.0, 1.0)
 
@@ -95,13 +95,12 @@ class Prepared:
 
     def repaired_with(self, model: TableModel, each: Each = one_by_one) -> Prepared:
         """The same with clipped samples as a model expects them, which has more than the re-identified one."""
-        made = self
+        made, clipped, converter = self, self.clipped, self.faults.converter
+        assert clipped is not None
         for k in range(REPAIRS):
-            assert made.clipped is not None
-            behind = predicted(made.clipped, model, each)
-            mended = repair(made.clipped, model.rig, behind, self.faults.converter).campaign
-            made = _ready(mended, made.nominal, replace(made.base.model, effects=()), made.band_Hz,
-                          self.faults.converter, made.clipped, lambda text: None, each)
+            mended = repair(clipped, model.rig, predicted(clipped, model, each), converter).campaign
+            made = _ready(mended, made.nominal, replace(made.base.model, effects=()), made.band_Hz, converter, clipped,
+                          lambda text: None, each)
             better = (try_refit(replace(model, motion=made.nominal.motion), made.thin, made.thin_held, ITERATIONS)
                       if k < REPAIRS - 1 else None)
             if better is None:
@@ -166,6 +165,7 @@ def _nearest(found: Found) -> TableModel | None:
 
 def _weighed(found: Found, prepared: Prepared) -> Found:
     """What was found, compared and told by the noise as it is known in the end."""
+    @cache  # a rival stands against one of the pool, and the one that beat it is one of the rivals
     def of(one: Refit) -> Refit:
         return anew(one, prepared.thin, prepared.thin_held)
 
@@ -179,10 +179,10 @@ def _weighed(found: Found, prepared: Prepared) -> Found:
 def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, progress: Progress, each: Each
            ) -> Found:
     """What was found, against the noise that is known now; searched on where only that shows that more is left."""
+    if len(found.chain) == 1 and found.reached_noise and prepared.base.held_per_dof > NOISE:
+        return search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each)
     found = _weighed(found, prepared)
     if len(found.chain) == 1:
-        if found.reached_noise and prepared.base.held_per_dof > NOISE:
-            return search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, each=each)
         return replace(found, chain=(prepared.base,), reached_noise=prepared.base.held_per_dof <= NOISE)
     best = _without_spare(refit(found.best.model, prepared.thin, prepared.thin_held), prepared)
     if len(effects_of(best.model)) < len(found.chain) - 1:

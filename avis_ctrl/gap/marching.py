@@ -16,7 +16,7 @@ import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.gap.effects.mounts import ContactFriction, contacts, dahl
+from avis_ctrl.gap.effects.mounts import ContactFriction, dahl, pushed
 from avis_ctrl.gap.line_response import LineResponse
 from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect
@@ -144,8 +144,7 @@ class FrictionForce(WindowForce):
         return dahl(np.ascontiguousarray(np.vstack([origin, moved])), slip)[1:]
 
     def __call__(self, start: int, stop: int) -> np.ndarray:
-        f = self._friction(start, stop)
-        return -f @ (contacts(self.one.by_name)[:, None] * self.record.rows[self.record.driven_rows])
+        return pushed(self._friction(start, stop), self.record, self.one.by_name)
 
     def accept(self, start: int, stop: int) -> None:
         self.state = self._friction(start, stop)[-1]

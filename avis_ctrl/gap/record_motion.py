@@ -48,9 +48,7 @@ def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = No
     ------
     InputError : channels or rates that are not the model's, a record too long for one piece.
     """
-    clock = (whole or campaign).records
-    ends = [(one.header.start_s, one.header.start_s + one.header.duration_s) for one in clock]
-    campaign_s = (min(start for start, _ in ends), max(end for _, end in ends))
+    campaign_s = clock_of(whole or campaign)
     linear = linear_part(model)
     sources = list({id(source): source for source, _, _ in map(origin, campaign.records)}.values())
     known = dict(zip(map(id, sources), each(lambda source: _in_time(source.load(), linear), sources), strict=True))
@@ -63,6 +61,12 @@ def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = No
                                      *mount_rows(model), h.level_V, begin, actuators=model.actuators,
                                      sensors=model.sensors.names, y=y[:stop])
     return found
+
+
+def clock_of(campaign: Campaign) -> tuple[float, float]:
+    """Begin of the first record and end of the last one, s."""
+    headers = [one.header for one in campaign.records]
+    return min(h.start_s for h in headers), max(h.start_s + h.duration_s for h in headers)
 
 
 def origin(record: RecordSource) -> tuple[RecordSource, int, int]:

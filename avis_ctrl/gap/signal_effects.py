@@ -13,6 +13,7 @@ import numpy as np
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.record_motion import clock_of
 from avis_ctrl.gap.result import NamedEffect
 from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
 from avis_ctrl.gap.signals.hum import HumFinding, subtract
@@ -57,8 +58,7 @@ def converter_faults(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, ..
 
 def predicted(campaign: Campaign, model: TableModel, each: Each = one_by_one) -> dict[str, np.ndarray]:
     """(samples, n_y) that the model reads in every record, from rest."""
-    starts = [r.header.start_s for r in campaign.records]
-    clock = (min(starts), max(r.header.start_s + r.header.duration_s for r in campaign.records))
+    clock = clock_of(campaign)
 
     def read(record: RecordSource) -> np.ndarray:
         h = record.header

@@ -43,6 +43,11 @@ class ActiveEffect:
     def by_name(self) -> dict[str, float]:
         return dict(zip((one.name for one in self.parameters), self.values, strict=True))
 
+    @property
+    def late(self) -> frozenset[str]:
+        """Names of the parameters that only the last fit frees."""
+        return frozenset(name for name, one in zip(self.names, self.parameters, strict=True) if one.late)
+
     def at(self, values: Sequence[float]) -> ActiveEffect:
         return replace(self, values=tuple(float(v) for v in values))
 
@@ -168,14 +173,11 @@ class TableModel:
 
     def with_effect(self, effect: ActiveEffect) -> TableModel:
         """The model with one effect more, its late parameters held where they are."""
-        late = {name for name, one in zip(effect.names, effect.parameters, strict=True) if one.late}
-        return replace(self, effects=(*self.effects, effect), fixed=self.fixed | late)
+        return replace(self, effects=(*self.effects, effect), fixed=self.fixed | effect.late)
 
     def with_late_free(self) -> TableModel:
         """The same with the late parameters of its effects free, too."""
-        late = {name for effect in self.effects
-                for name, one in zip(effect.names, effect.parameters, strict=True) if one.late}
-        return replace(self, fixed=self.fixed - late) if late & self.fixed else self
+        return replace(self, fixed=self.fixed.difference(*(effect.late for effect in self.effects)))
 
     def without(self, label: str) -> TableModel:
         gone = {name for one in self.effects if one.label == label for name in one.names}

@@ -20,9 +20,8 @@ from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.gap.analysis import analyse
 from avis_ctrl.gap.effects.own import OwnEffects, try_out
 from avis_ctrl.gap.result import Gap
-from avis_ctrl.gap.simulate import simulate
+from avis_ctrl.gap.signal_effects import predicted
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.identification.prediction import model_inputs
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -146,15 +145,8 @@ def _design(gap: Gap, options: GapOptions, progress: Progress) -> tuple[DesignEf
 
 def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.ndarray]]:
     """(y_baseline, y_updated), each (samples, n_y), of every record of another campaign, from u and floor."""
-    clock = (min(r.header.start_s for r in campaign.records),
-             max(r.header.start_s + r.header.duration_s for r in campaign.records))
-
-    def read(model: TableModel, record) -> np.ndarray:
-        u, floor = model_inputs(model.base, record)
-        return simulate(model, u, floor, record.header.sample_rate_Hz, start_s=record.header.start_s,
-                        campaign_s=clock).y
-    loaded = [record.load() for record in campaign.records]
-    return [(read(found.gap.baseline, record), read(found.gap.updated, record)) for record in loaded]
+    baseline, updated = (predicted(campaign, model) for model in (found.gap.baseline, found.gap.updated))
+    return [(baseline[record.header.name], updated[record.header.name]) for record in campaign.records]
 
 
 def provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float) -> dict[str, Any]:

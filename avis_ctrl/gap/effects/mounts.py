@@ -169,8 +169,13 @@ def _of_mean(values: np.ndarray) -> float:
 
 def surge_omega(values: Mapping[str, float]) -> np.ndarray:
     """(mounts,) rad/s of the resonance inside each."""
+    return 2 * np.pi * values["frequency_Hz"] * shares(values)
+
+
+def shares(values: Mapping[str, float]) -> np.ndarray:
+    """(m,) of each mount or contact over their mean, from the values uneven_ .. of all but the last."""
     uneven = [value for name, value in values.items() if name.startswith("uneven_")]
-    return 2 * np.pi * values["frequency_Hz"] * (1 + np.array([*uneven, -sum(uneven)]))
+    return 1 + np.array([*uneven, -sum(uneven)])
 
 
 @register
@@ -288,17 +293,13 @@ class ContactFriction(Effect):
                   for name in model.actuators[:-1]))
 
     def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
-        own = record.driven_rows
-        f = dahl(np.ascontiguousarray(record.deflection[:, own]), values["slip_m"])
-        return -f @ (contacts(values)[:, None] * record.rows[own])
+        return pushed(slipping(record, values["slip_m"]), record, values)
 
     def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
                        ) -> np.ndarray | None:
         """As `force`; of a slip the contacts' own forces are kept."""
-        own, slip = record.driven_rows, values["slip_m"]
-        f = record.kept(f"{self.name} {slip}", omega,
-                        lambda: dahl(np.ascontiguousarray(record.deflection[:, own]), slip))
-        return -f @ (contacts(values)[:, None] * record.rows[own])
+        slip = values["slip_m"]
+        return pushed(record.kept(f"{self.name} {slip}", omega, lambda: slipping(record, slip)), record, values)
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
@@ -311,8 +312,17 @@ class ContactFriction(Effect):
 
 def contacts(values: Mapping[str, float]) -> np.ndarray:
     """(m,) N/m: stiffness of each contact, in the order of the actuators."""
-    uneven = [value for name, value in values.items() if name.startswith("uneven_")]
-    return values["stiffness_N_per_m"] * (1 + np.array([*uneven, -sum(uneven)]))
+    return values["stiffness_N_per_m"] * shares(values)
+
+
+def slipping(record: RecordMotion, slip: float) -> np.ndarray:
+    """(samples, m) m: friction of each contact over its stiffness."""
+    return dahl(np.ascontiguousarray(record.deflection[:, record.driven_rows]), slip)
+
+
+def pushed(f: np.ndarray, record: RecordMotion, values: Mapping[str, float]) -> np.ndarray:
+    """(n, 6) generalized force on the payload by friction over stiffness, (n, m), in time or on lines."""
+    return -f @ (contacts(values)[:, None] * record.rows[record.driven_rows])
 
 
 @njit(cache=True)
