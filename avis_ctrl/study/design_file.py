@@ -151,12 +151,17 @@ class FloorSection(_Section):
 
 
 class SynthesisSection(_Section):
+    """D-K iteration and what ends it.
+
+    polish : descend on gamma where D-K iteration stalls; by default where it stalls above target_mu.
+    """
+
     max_iterations: Annotated[int, Field(ge=1, le=50)] = 8
     time_limit_s: Positive = 20.0
     backoff_percent: Annotated[float, Field(ge=0, le=50)] = 1.0
     reduction_cost_percent: NotNegative = 1.0
     target_mu: Positive | None = None
-    polish: bool = False
+    polish: bool | None = None
 
 
 class SkyhookSection(_Section):

@@ -141,9 +141,12 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
         progress("controller for the updated model: mu synthesis")
         new_plant, new_design, new_rig = plant_of(design, updated, plant.allocation, when)
         try:
-            K_new = mu_optimal(new_design, new_plant, new_rig)[0].K
+            candidate, made = mu_optimal(new_design, new_plant, new_rig)
+            K_new = candidate.K
             assert K_new is not None
             new = figures(new_design, updated, new_plant, K_new, when)
+            if new.mu_upper >= 1:
+                notes.append(f"Its synthesis ended as follows: {made.status}.")
             progress(f"  mu {new.mu_upper:.3f} for the new controller")
         except ComputationError as error:
             notes.append(f"No controller was found for the updated model: {error}")

@@ -33,7 +33,7 @@ CARRIED: Mapping[str, str] = {
     "sensor_gain": "the sensor's sensitivity in the rig file", "loop_delay": "the rig's loop delay",
     "actuator_lag": "loop.amplifier_corner_Hz of the design", "actuator_saturation": "the rig's drive limit",
     "stiffness_drift": "the rig's stiffness at that moment",
-    "contact_friction": "the rig's stiffness far below the slip"}
+    "contact_friction": "the rig's stiffness far below the slip, and the range of that stiffness covers it too"}
 
 
 # Error of a plant's delay at the bandwidth of the drives that asks for a higher order than the design's (at most 6).

@@ -15,7 +15,8 @@ from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.lti.connect import lft_lower, lft_upper
 from avis_ctrl.rigs.rig_file import load_rig
-from avis_ctrl.study.controllers import classical_skyhook
+from avis_ctrl.robust.mu_peak import mu_peak
+from avis_ctrl.study.controllers import classical_skyhook, mu_optimal
 from avis_ctrl.study.design_file import read_study
 from avis_ctrl.study.gap_design import PARAMETERS_PERCENT, compare_designs, design_effect, figures, start_files
 from avis_ctrl.study.gap_plant import carried, plant_of, six_dof_is_stable
@@ -209,6 +210,20 @@ def test_an_amplifier_lag_costs_the_controller_and_a_new_one_wins_it_back(baseli
         assert one.peak_dB <= one.worst_peak_dB and one.band_dB <= one.worst_band_dB and one.stable_in_six
     assert "robust performance is lost" in found.sentences[0]
     assert "amplifier_corner_Hz = 40" in found.files["design.toml"]
+
+
+@pytest.mark.slow
+def test_an_iteration_that_stalls_above_its_target_goes_on(baseline, design):
+    """D-K iteration alone stalls at 1.24 on the plant of these files and reaches 0.88 on the model's own."""
+    model = with_one(with_one(baseline, "contact_friction", "actuators", (1.5e4, 5e-6, *(0.0,) * 7)),
+                     "stiffness_drift", "isolators/linear", (-0.037,))
+    found = carried(design, model, -0.5)
+    plant = build_plant(found.design, found.rig)
+    patient = found.design.model_copy(update={"synthesis": found.design.synthesis.model_copy(
+        update={"time_limit_s": 600.0})})
+    candidate, made = mu_optimal(patient, plant, found.rig)
+    assert made.status == "target 0.9 reached" and made.history[-1].kind == "descent"
+    assert mu_peak(plant.synthesis.closed(candidate.K), plant.synthesis.all_blocks).upper < 0.95
 
 
 @pytest.mark.slow
