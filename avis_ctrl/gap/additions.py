@@ -22,7 +22,7 @@ from avis_ctrl.gap.effects.attached import elements
 from avis_ctrl.gap.effects.cable import tie
 from avis_ctrl.gap.effects.chassis import of_chassis
 from avis_ctrl.gap.effects.flexible_mode import modes, shape_rows
-from avis_ctrl.gap.effects.mounts import LEVELED, REFERENCE_Hz, contacts, drifted, surge_omega
+from avis_ctrl.gap.effects.mounts import LEVELED, REFERENCE_Hz, contacts, drift_over_stiffness, drifted, surge_omega
 from avis_ctrl.gap.effects.payload import place_of
 from avis_ctrl.gap.operators import MountGeometry, mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
@@ -242,14 +242,14 @@ def _friction(table: Table, place: str, values: Mapping[str, float]) -> StateSpa
 
 def _drift(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
     G, k = table.G, table.mounts.stiffness
-    change = values["relative_change"] * drift_at(table.model, values, table.when)
-    return _static(table, change * G.T @ (k[:, None] * G))
+    return _static(table, drift_at(table.model, values, table.when) * G.T @ (k[:, None] * G))
 
 
 def drift_at(model: TableModel, values: Mapping[str, float], when: float) -> float:
-    """Share of a drift's change, -0.5 .. 0.5, at a moment -0.5 .. 0.5 of the campaign: the same for the linear law."""
+    """Change of stiffness over that of the model's rig at a moment -0.5 .. 0.5 of the campaign, by a drift's law."""
     begin, end = next((one.campaign_s for one in model.motion.values()), (0.0, 1.0))
-    return float(drifted(np.array(when + 0.5), values.get("time_constant_s", 0.0) / (end - begin)))
+    through = float(drifted(np.array(when + 0.5), values.get("time_constant_s", 0.0) / (end - begin)))
+    return values["relative_change"] * drift_over_stiffness(model) * through
 
 
 def _cable(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:

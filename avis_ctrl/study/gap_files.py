@@ -75,9 +75,19 @@ def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
     header = [f"{rig.name}, {what} by avis gap", *(["standard deviations (1 sigma) beside the values: of the fit, "
                                                      "conditional on what it took as known"] if comments else [])]
     header += [f"not in this file, for a rig file has no place for it: {one.effect.title} ({one.effect.name}, "
-               f"{one.place}: " + ", ".join(f"{key} = {value:.6g}" for key, value in one.by_name.items()) + ")"
-               for one in left]
+               f"{one.place}: " + ", ".join(_as_reported(model, one)) + ")" for one in left]
+    if any(one.effect.name == "stiffness_drift" for one in left):
+        header.append("stiffness in this file is that in the middle of its drift; the change is told over that "
+                      "at its begin")
     return rig_toml(rig, comments, "\n".join(header))
+
+
+def _as_reported(model: TableModel, one: ActiveEffect) -> list[str]:
+    """Parameters of an effect as gap.json and the report have them."""
+    n = len(one.names)
+    found = one.effect.reported(model, one.place, one.by_name, np.zeros((n, n)))
+    return [f"{name} = {value.value:.6g}{'' if value.unit in ('', '1') else ' ' + value.unit}"
+            for name, value in found.items()]
 
 
 def rig_with_effects(model: TableModel) -> tuple[Rig, list[ActiveEffect]]:

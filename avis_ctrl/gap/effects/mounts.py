@@ -380,9 +380,7 @@ class StiffnessDrift(Effect):
         found = super().reported(model, place, values, covariance)
         # The model's change is of the stiffness that the record's motion was found with; a person's is of what the
         # table's stiffness was at the beginning.
-        own = found["relative_change"]
-        known = float(np.sum(mount_geometry(model.effective.rig).stiffness))
-        ratio = next((float(np.sum(one.stiffness)) / known for one in model.motion.values()), 1.0)
+        own, ratio = found["relative_change"], drift_over_stiffness(model)
         begin = 1 - own.value * ratio / 2
         one = Reported(own.value * ratio / begin, own.std * ratio / begin ** 2, own.unit)
         found["relative_change"] = one
@@ -391,6 +389,12 @@ class StiffnessDrift(Effect):
             hours = (spans[0][1] - spans[0][0]) / 3600
             found["rate_per_hour"] = Reported(one.value / hours, one.std / hours, "1/h")
         return found
+
+
+def drift_over_stiffness(model: TableModel) -> float:
+    """Stiffness of the record's motion, whose share a drift's change is, over that of the model's rig."""
+    known = float(np.sum(mount_geometry(model.effective.rig).stiffness))
+    return next((float(np.sum(one.stiffness)) / known for one in model.motion.values()), 1.0)
 
 
 def drifted(when: np.ndarray, time_constant: float) -> np.ndarray:
