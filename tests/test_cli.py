@@ -57,7 +57,9 @@ def test_help_of_a_command():
     (("desing",), "desing"),
     (("design", "x.toml", "--out", "OUT", "--fast"), "--fast"),
     (("doctor", "now"), "now"),
-], ids=["no such file", "no file given", "no folder given", "unknown command", "unknown option", "too many words"])
+    (("gap", "missing.h5", "--rig", "avis", "--out", "OUT", "--design-file", "other.toml"), "other.toml"),
+], ids=["no such file", "no file given", "no folder given", "unknown command", "unknown option", "too many words",
+        "no such design, before the measurement is read"])
 def test_wrong_usage_is_one_line_and_code_2(arguments, words, tmp_path):
     arguments = tuple(str(tmp_path / "out") if one == "OUT" else one for one in arguments)
     done = avis(*arguments)

@@ -58,6 +58,10 @@ def gap(
         own = load_effects(effects)
         console.print(f"[dim]effects of your own: {', '.join(own.names)}[/]")
     start = load_rig(rig)
+    if design or design_file is not None:
+        from avis_ctrl.study.gap_design import design_for
+
+        design_for(start, design_file)  # what is wrong with it is said now, not after the search
     mapping = parse_columns(columns) if columns else None
     measured = read_measurements(campaign, mapping, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
     if not isinstance(measured, Campaign):
@@ -80,7 +84,7 @@ def gap(
         except InputError as error:
             raise error if error.file else error.in_file(campaign) from None
         progress("report")
-        files = write_gap(folder, found.gap, gap_html(found), gap_pdf(found))
+        files = write_gap(folder, found.gap, gap_html(found), gap_pdf(found), found.to_json())
         if found.design is not None and found.design.files:
             onward = open_folder(folder / "design", tuple(found.design.files))
             for name, text in found.design.files.items():

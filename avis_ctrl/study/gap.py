@@ -72,8 +72,10 @@ class GapFinding:
     design_note: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """gap.json of the contract, with provenance."""
-        return {**self.gap.to_json(), "provenance": dict(self.provenance)}
+        """gap.json of the contract; beside it what noise leaves, the sentences of the report, mu and provenance."""
+        return {**self.gap.to_json(), "noise_nrmse": self.gap.noise_nrmse, "sentences": list(self.gap.sentences),
+                "design": self.design.to_json() if self.design else None, "design_note": self.design_note or None,
+                "provenance": dict(self.provenance)}
 
 
 def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptions | None = None,
@@ -155,6 +157,8 @@ def provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float
     own = options.own_effects
     told = {} if own is None else {"own_effects": f"{own.path.name}: {', '.join(own.names)}",
                                    "own_effects_sha256": own.sha256}
+    if options.design_file is not None:
+        told["design_sha256"] = hashlib.sha256(options.design_file.read_bytes()).hexdigest()
     return {"avis_ctrl": avis_ctrl.__version__, "measurement": measured.source, **told,
             "measurement_sha256": digest(measured), "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
             "seed": options.seed, "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -101,6 +102,13 @@ class DesignEffect:
     def mu_new(self) -> float | None:
         return self.new.mu_upper if self.new else None
 
+    def to_json(self) -> dict[str, Any]:
+        """Figures of the three loops, infinite where a loop is unstable, and what is said of them."""
+        loops = {"before": self.before, "after": self.after, "new": self.new}
+        return {**{name: asdict(loop) if loop else None for name, loop in loops.items()},
+                "in_files": list(self.in_files), "not_in_files": list(self.not_in_files),
+                "sentences": list(self.sentences), "seconds": self.seconds}
+
 
 def design_effect(gap: Gap, design: Path | Design | None = None,
                   progress: Progress = lambda text: None) -> DesignEffect:
@@ -120,7 +128,7 @@ def design_effect(gap: Gap, design: Path | Design | None = None,
     with threadpool_limits(1):
         # The second-order terms of large rotations are nothing at rest.
         before, after = (model.without(f"{LargeMotion.name}@payload") for model in (gap.baseline, gap.updated))
-        return compare_designs(before, after, _asked(design, gap.baseline.rig), progress)
+        return compare_designs(before, after, design_for(gap.baseline.rig, design), progress)
 
 
 def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
@@ -158,7 +166,8 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
                         time.monotonic() - began)
 
 
-def _asked(design: Path | Design | None, rig: Rig) -> Design:
+def design_for(rig: Rig, design: Path | Design | None = None) -> Design:
+    """What `design_effect` designs on a rig. Raises InputError as it does, before anything is computed."""
     if design is None:
         if not isinstance(rig, AvisTable):
             raise InputError(f"there is a default for the AVIS only: give a design file for {rig.name}", field="design")

@@ -40,8 +40,11 @@ UNPREDICTABLE = {"mains_hum": "the hum's phase in another campaign is not known"
                  "ground_motion": "floor motion that is not measured cannot be predicted"}
 
 
-def write_gap(folder: Path, gap: Gap, html: str | None = None, pdf: bytes | None = None) -> list[Path]:
+def write_gap(folder: Path, gap: Gap, html: str | None = None, pdf: bytes | None = None,
+              told: Mapping[str, Any] | None = None) -> list[Path]:
     """All files; gap.json last, so that its presence says that the others are complete.
+
+    told : content of gap.json, by default the gap's own without provenance.
 
     Raises ComputationError where the disk refuses.
     """
@@ -58,7 +61,7 @@ def write_gap(folder: Path, gap: Gap, html: str | None = None, pdf: bytes | None
         if content is not None:
             write_whole(folder / name, content.encode() if isinstance(content, str) else content)
             written.append(folder / name)
-    write_json(folder / GAP_FILE, gap.to_json())
+    write_json(folder / GAP_FILE, dict(told or gap.to_json()))
     return [*written, folder / GAP_FILE]
 
 

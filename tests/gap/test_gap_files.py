@@ -26,6 +26,7 @@ from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.formats.hdf5 import write_campaign
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rig_file import load_rig as read_rig
+from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.study.gap_files import read_gap, write_gap, write_gap_predictions
 from avis_ctrl.study.gap_names import GAP_FILES
 
@@ -189,6 +190,16 @@ def test_the_folder(tmp_path):
     assert "3e+12" in text
     assert "sensor_gain" not in text
     assert "mass +- 1 kg" in text
+
+
+def test_gap_json_says_where_it_comes_from(tmp_path):
+    made_by = {"seed": 3, "measurement_sha256": "ab"}
+    found = GapFinding(gap_of(), campaign_of(1.0, samples=10), (), made_by, None, "no controller")
+    write_gap(tmp_path, found.gap, told=found.to_json())
+    told = read_gap(tmp_path)
+    assert told["provenance"] == made_by
+    assert (told["noise_nrmse"], told["sentences"], told["design"], told["design_note"]) == (
+        0.01, ["found"], None, "no controller")
 
 
 def test_without_reports_and_again(tmp_path):
