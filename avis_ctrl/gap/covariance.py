@@ -135,7 +135,7 @@ def _residuals(model: TableModel, blocks: Sequence[SpectralBlock]
     for k, block in enumerate(blocks):
         part = Part(model, block)
         es.append(part.real((block.Y - part.answer.Y)[None])[0])
-        Js.append(part.real(model.answer(block, part.body).dY))
+        Js.append(part.real(model.answer(block, part.body, inner=part.inner).dY))
         octaves = np.log2(np.maximum(block.omega, lowest) / lowest)
         lines = np.repeat(np.floor(BANDS_PER_OCTAVE * octaves).astype(int), block.Y.shape[1] * block.Y.shape[2])
         bands.append(np.tile(lines, 2))  # real parts first, imaginary ones after

@@ -195,7 +195,7 @@ def unequal_levels(thin: Sequence[SpectralBlock], updated: Refit) -> str:
         row = model.names.index(one.names[strength[0]]) if one.names[strength[0]] in model.names else None
         if row is None:
             continue
-        dY = [model.answer(part.block, part.body).dY[row:row + 1] for part in score.parts]
+        dY = [model.answer(part.block, part.body, inner=part.inner).dY[row:row + 1] for part in score.parts]
         A = np.concatenate([score.directions([d * (levels[b.name] in group) for d, b in zip(dY, thin, strict=True)])
                             for group in groups[1:]])
         took = score.reduction(A)

@@ -242,9 +242,13 @@ class Assembled:
         return self.G.shape[1]
 
     def forces_of_states(self) -> np.ndarray:
-        """(n, n_q, m) forces on the coordinates by unit impulses on what moves inside beside the payload: the modes,
-        masses inside mounts, and the chassis; and what effects say of their own (`Operators.inner`)."""
+        """(n, n_q, m) forces on the coordinates by unit initial states of what moves inside beside the payload:
+        impulses on the modes, masses inside mounts, and the chassis, and on what effects say of their own
+        (`Operators.inner`); steps on the same; and states of first order (`Operators.decays`)."""
         ops, n = self.ops, len(self.ops.s)
+
+        def of_body(force: np.ndarray) -> np.ndarray:
+            return np.concatenate([force, np.zeros((n, self.n_q - N_Q, force.shape[2]))], axis=1)
         F = [np.broadcast_to(np.eye(self.n_q)[None, :, N_Q:], (n, self.n_q, self.n_q - N_Q)).astype(complex)]
         inside = np.flatnonzero(np.isfinite(ops.internal_omega))
         if inside.size:
@@ -254,11 +258,26 @@ class Assembled:
             by_mass = g * (1 - share) / (g + (ops.s[:, None] / w) ** 2)
             F.append(self.G.T[:, inside] * by_mass[:, None, :])
         if ops.recoil is not None:
-            moves = ops.recoil[:, :, np.any(ops.recoil, axis=(0, 1))]
-            F.append(self.G.T @ (self.z_pf[:, :, None] * (ops.mounts.chassis @ moves)))
-        for one in ops.inner:
-            F.append(np.concatenate([one, np.zeros((n, self.n_q - N_Q, one.shape[2]))], axis=1))
-        return np.concatenate(F, axis=2)
+            F.append(self.G.T @ (self.z_pf[:, :, None] * (ops.mounts.chassis @ self._moves)))
+        F += [of_body(one) for one in ops.inner]
+        impulses = np.concatenate(F, axis=2)
+        return np.concatenate([impulses, ops.s[:, None, None] * impulses, *map(of_body, ops.decays)], axis=2)
+
+    @property
+    def _moves(self) -> np.ndarray:
+        """(n, 6, m) chassis displacement by unit forces in the directions in which it can move."""
+        assert self.ops.recoil is not None
+        return self.ops.recoil[:, :, np.any(self.ops.recoil, axis=(0, 1))]
+
+    def _chassis_states(self, inner: np.ndarray) -> np.ndarray:
+        """(n, 6, 1) chassis displacement by its part of the initial states of `forces_of_states`."""
+        ops, moves = self.ops, self._moves
+        n_decays = sum(one.shape[2] for one in ops.decays)
+        n_impulses = (len(inner) - n_decays) // 2
+        first = n_impulses - sum(one.shape[2] for one in ops.inner) - moves.shape[2]
+        own = slice(first, first + moves.shape[2])
+        return (moves @ inner[:n_impulses][own])[:, :, None] + ops.s[:, None, None] * (
+            moves @ inner[n_impulses:][own])[:, :, None]
 
     def floor_force(self, w: np.ndarray) -> np.ndarray:
         """(n, n_q, m) force of floor displacement w (n, 3, m)."""
@@ -283,11 +302,13 @@ class Assembled:
             return moved
         return np.concatenate([w, np.zeros_like(w)], axis=1)
 
-    def chassis(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """(n, 6, m) chassis displacement, its recoil included."""
+    def chassis(self, x: np.ndarray, w: np.ndarray, inner: np.ndarray | None = None) -> np.ndarray:
+        """(n, 6, m) chassis displacement, its recoil included, and what it starts with (`forces_of_states`)."""
         moved = self.follow(w)
         if self.ops.recoil is not None:
             moved = moved - self.ops.recoil @ (self.ops.borne(self.M) @ x[:, :N_Q])
+            if inner is not None and inner.size:
+                moved = moved + self._chassis_states(inner)
         return moved
 
 

@@ -23,7 +23,7 @@ from avis_ctrl.gap.score_algebra import SYMMETRIC, Reduction, reduction
 from avis_ctrl.gap.table_model import Acting, ActiveEffect, TableModel, _Answer, _Side
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
 from avis_ctrl.identification.response import N_Q, ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns
+from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns, transient_parts
 
 # Step of a linear parameter, in units of its size, at which its direction is taken.
 STEP = 1e-3
@@ -35,6 +35,7 @@ class Part:
     """One block at the model: response pieces, and the projection of its transient.
 
     body : (n, 12, 1) impulses and steps of the transient as the data have it; an effect changes what they do, too.
+    inner : (m,) what the states inside start with, for derivatives by the model's own parameters.
     """
 
     def __init__(self, model: TableModel, block: SpectralBlock):
@@ -43,14 +44,15 @@ class Part:
         self.made = assemble(model.operators(block.omega))
         self.transient = np.zeros((0, 0))
         self.body: np.ndarray | None = None
+        self.inner: np.ndarray | None = None
         self.answer = _Answer(self.made, self._acting(model))
         if block.transient:
             columns, norms = transient_columns(block, cast(ResponseModel, model))
             T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
             self.transient, X = span(T.T)
             left = as_real(whitened(self.L, block.Y - self.answer.Y)[None])[0]
-            x = (X @ (self.transient.T @ left))[:2 * N_Q] / norms[:2 * N_Q]
-            self.body = np.broadcast_to(x[:, None], (len(block.omega), 2 * N_Q, 1))
+            self.body, self.inner = transient_parts(X @ (self.transient.T @ left), norms, block,
+                                                    cast(ResponseModel, model))
             self.answer = _Answer(self.made, self._acting(model))
 
     def _acting(self, model: TableModel) -> Acting:
@@ -97,7 +99,8 @@ class Score:
         self.kept: dict = {}
         self.parts = [Part(model, block) for block in blocks]
         self.e = np.concatenate([part.real((part.block.Y - part.answer.Y)[None])[0] for part in self.parts])
-        J = np.concatenate([part.real(model.answer(part.block, part.body).dY) for part in self.parts], axis=1)
+        J = np.concatenate([part.real(model.answer(part.block, part.body, inner=part.inner).dY)
+                            for part in self.parts], axis=1)
         J = J * model.scales()[:, None]
         size = np.linalg.norm(J, axis=1)
         _, s, Vt = np.linalg.svd(J / np.where(size > 0, size, 1.0)[:, None], full_matrices=False)

@@ -55,12 +55,14 @@ class ActiveEffect:
 @dataclass(frozen=True, eq=False)
 class Acting:
     """What acts on the table: U (n, n_u + 3 [+ 12], m), internal force (n, 6, m), displacement (n, n_y, m) that the
-    sensors read beside the payload's own, and what their outputs hold in addition (n, n_y, m)."""
+    sensors read beside the payload's own, what their outputs hold in addition (n, n_y, m), and what the states inside
+    start with (`TableModel.inner_transients`)."""
 
     U: np.ndarray
     force: np.ndarray | None = None
     reading: np.ndarray | None = None
     output: np.ndarray | None = None
+    inner: np.ndarray | None = None
 
 
 def active(effect: Effect, model: TableModel, place: str, values: Sequence[float] | None = None) -> ActiveEffect:
@@ -225,36 +227,35 @@ class TableModel:
         if not any(one.effect.holds_states for one in self.effects):
             return np.zeros((len(omega), n_y, 0), complex)
         made = assemble(self.operators(omega))
-        ops, F = made.ops, made.forces_of_states()
-        seen = (_gain(made) * ops.sense[:, :, None]) * (made.rows @ made.inverse)
-        Y = seen @ F
-        return np.concatenate([Y, ops.s[:, None, None] * Y, *(seen[:, :, :N_Q] @ one for one in ops.decays)], axis=2)
+        seen = (_gain(made) * made.ops.sense[:, :, None]) * (made.rows @ made.inverse)
+        return seen @ made.forces_of_states()
 
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
         """As `ResponseModel.driven`: y by spectra of the inputs, and its derivative by the free parameters."""
         return self._driven(np.asarray(omega, float), U, None, derivative)
 
-    def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True) -> Driven:
-        """As `ResponseModel.answer`: of a record, with what depends on its motion in time."""
+    def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True,
+               inner: np.ndarray | None = None) -> Driven:
+        """As `ResponseModel.answer`: of a record, with what depends on its motion in time; inner (n_t,): what the
+        states of `inner_transients` start with."""
         U = block.U if body is None else np.concatenate([block.U, body], axis=1)
-        if not self.nonlinear:
-            return self._driven(block.omega, U, None, derivative)
-        return self._driven(block.omega, U, block, derivative)
+        return self._driven(block.omega, U, block if self.nonlinear else None, derivative, inner)
 
-    def _driven(self, omega: np.ndarray, U: np.ndarray, block: SpectralBlock | None, derivative: bool) -> Driven:
+    def _driven(self, omega: np.ndarray, U: np.ndarray, block: SpectralBlock | None, derivative: bool,
+                inner: np.ndarray | None = None) -> Driven:
         made = assemble(self.operators(omega))
-        answer = _Answer(made, self._acting(U, block))
+        answer = _Answer(made, self._acting(U, block, inner))
         if not derivative:
             return Driven(answer.Y, np.empty(0))
         dY = np.zeros((len(self.names), *answer.Y.shape), complex)
         answer.by_rig(self.effective, self.derivative_matrices, dY)
-        self._by_effects(omega, U, block, made, answer, dY)
+        self._by_effects(omega, U, block, made, answer, dY, inner)
         return Driven(answer.Y, dY)
 
-    def _acting(self, U: np.ndarray, block: SpectralBlock | None) -> Acting:
+    def _acting(self, U: np.ndarray, block: SpectralBlock | None, inner: np.ndarray | None = None) -> Acting:
         """Inputs with the volts that act, and what effects that depend on the record add."""
         if block is None:
-            return Acting(U)
+            return Acting(U, inner=inner)
         record = self.motion.get(block.name)
         if record is None:
             raise InputError("expected the record's motion in time for an effect that depends on it",
@@ -278,9 +279,10 @@ class TableModel:
             added = one.effect.output_spectrum(record, one.place, one.by_name, block.omega)
             if added is not None:
                 output = added[:, :, None] if output is None else output + added[:, :, None]
-        return Acting(U, total, seen, output)
+        return Acting(U, total, seen, output, inner)
 
-    def _by_effects(self, omega, U, block, made: Assembled, answer: _Answer, dY: np.ndarray) -> None:
+    def _by_effects(self, omega, U, block, made: Assembled, answer: _Answer, dY: np.ndarray,
+                    inner: np.ndarray | None) -> None:
         """Central differences of the whole response by the effects' parameters."""
         n, theta, (low, high) = len(self.base.names), self.values, self.bounds()
         scale = self.scales()
@@ -290,7 +292,7 @@ class TableModel:
             sides = []
             for end in ends:
                 other = self._with_effect_parameter(row - n, end)
-                acting = other._acting(U, block)
+                acting = other._acting(U, block, inner)
                 own = made if self.effects[self._free[row - n][0]].effect.nonlinear else assemble(
                     other.operators(omega), invert=False)
                 sides.append(_Side(own, acting, answer.x))
@@ -327,6 +329,8 @@ class _Drive:
             total[:, :N_Q] += U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
         if force is not None:
             total[:, :N_Q] += force
+        if acting.inner is not None and acting.inner.size:
+            total += (made.forces_of_states() @ acting.inner)[:, :, None]
         self.total, self.reading, self.output = total, acting.reading, acting.output
 
 
@@ -350,7 +354,7 @@ class _Answer:
 
     def __init__(self, made: Assembled, acting: Acting):
         ops, drive = made.ops, _Drive(made, acting)
-        self.made, self.s = made, ops.s[:, None, None]
+        self.made, self.s, self.inner = made, ops.s[:, None, None], acting.inner
         self.volts, self.w, self.folded = drive.volts, drive.w, drive.folded
         self.x = made.inverse @ drive.total
         self.Minv = np.linalg.inv(ops.base.matrices.M)
@@ -369,7 +373,7 @@ class _Answer:
         mat, others = model.matrices, 0
         rows = {name: k for k, name in enumerate(ops.mounts.names)}
         own = made.G @ self.x
-        chassis = ops.mounts.chassis @ made.chassis(self.x, self.w)
+        chassis = ops.mounts.chassis @ made.chassis(self.x, self.w, self.inner)
         through = left @ made.G.T
         folded_q = self.Minv @ mat.T @ self.folded
         for j, name in enumerate(model.names):

@@ -28,8 +28,8 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.response import N_Q, ResponseModel, positive
-from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns
+from avis_ctrl.identification.response import ResponseModel, positive
+from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns, transient_parts
 
 Prior = tuple[float, float]
 # Lines of all blocks together below which threads cost more than they bring.
@@ -199,7 +199,8 @@ class _Descent:
         while self.iterations < max_iterations and not self.converged:
             step, promised = self._step(damping)
             if promised < 1e-6 * max(1.0, 1e-3 * self.now.chi2 / len(self.model.names)) + 1e-12 * self.now.chi2:
-                self.converged = True
+                # Of a step that only damping makes small nothing is known.
+                self.converged = damping <= 1.0
                 break
             trial = self._try(step)
             if trial is not None and trial[1] < self.now.chi2:
@@ -287,9 +288,8 @@ def _block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, *
     e = as_real(white[None])[0]
     J = np.empty(0)
     if derivative:
-        n_b = 2 * N_Q
-        body = np.broadcast_to((x[:n_b] / norms[:n_b])[None, :, None], (len(block.omega), n_b, 1))
-        J = as_real(whitened(L, model.answer(block, body).dY))
+        body, inner = transient_parts(x, norms, block, model)
+        J = as_real(whitened(L, model.answer(block, body, inner=inner).dY))
         J = J - (J @ Q) @ Q.T
     return e, J, Residual(block, plain - transient, white / np.sqrt(2), transient)
 

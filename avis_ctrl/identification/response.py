@@ -241,8 +241,10 @@ class ResponseModel:
         n, n_in = len(omega), len(self.inputs)
         return self.driven(omega, np.broadcast_to(np.eye(n_in, dtype=complex), (n, n_in, n_in)), derivative=False).Y
 
-    def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True) -> Driven:
-        """y of a block of data; body (n, 12, m): impulses and steps of the transient beside the block's inputs."""
+    def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True,
+               inner: np.ndarray | None = None) -> Driven:
+        """y of a block of data; body (n, 12, m): impulses and steps of the transient beside the block's inputs; inner:
+        states beside those of body and sensors, of which this model has none."""
         U = block.U if body is None else np.concatenate([block.U, body], axis=1)
         return self.driven(block.omega, U, derivative)
 

@@ -167,6 +167,17 @@ def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.nd
     return columns / norms, norms
 
 
+def transient_parts(x: np.ndarray, norms: np.ndarray, block: SpectralBlock, model: ResponseModel
+                    ) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 12, 1) impulses and steps on the body, and (m,) what the states inside start with: the part of unknowns
+    x (n_t,) of the columns of `transient_columns`, norms (n_t,), that changes with the model's parameters."""
+    n_b, n_y = 2 * N_Q, block.Y.shape[1]
+    true = x / norms
+    chains = n_y * (max(len(model.sensors.transient_poles), 2) + (len(model.sensors.transient_poles) > 1))
+    body = np.broadcast_to(true[None, :n_b, None], (len(block.omega), n_b, 1))
+    return body, true[n_b + chains:]
+
+
 # Singular values of unit columns below this share of the largest: two states whose columns agree within it are one.
 DEPENDENT = 1e-7
 

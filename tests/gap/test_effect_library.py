@@ -15,6 +15,7 @@ from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.record_motion import mount_rows
 from avis_ctrl.gap.search import location
 from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.identification.maximum_likelihood import _block_residual, whitener
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block
@@ -376,6 +377,33 @@ def values_at(name, place):
     if name == "attached_oscillator" and place.endswith("axes"):
         values = [10.0, 12.0, 9.0, 15.0, *values[4:]]
     return values[:len(parameters)]
+
+
+@pytest.mark.parametrize(("name", "place"), [pair for pair in EVERYWHERE if OWN[pair[0]].holds_states])
+def test_the_gradient_of_a_fit_knows_what_the_states_inside_start_with(name, place):
+    """Where a record's ends are fitted, too: slope of its chi-square by every parameter, against differences."""
+    model = with_effect(name, place, values_at(name, place))
+    rng = np.random.default_rng(4)
+    begins = [1e-4 * rng.standard_normal(model.inner_transients(OMEGA[:1]).shape[2])]
+    U = rng.standard_normal((len(OMEGA), len(model.inputs), 1)) * np.r_[np.ones(8), np.full(3, 1e-4)][:, None]
+    block = SpectralBlock("one", OMEGA, U, np.zeros((len(OMEGA), len(model.sensors.names), 1), complex),
+                          transient=True)
+    Y = model.at(1.02 * model.values).answer(block, None, False, *begins).Y
+    Y = Y + 1e-2 * np.abs(Y) * rng.standard_normal(Y.shape)
+    noise = np.einsum("ki,ij->kij", np.mean(np.abs(Y[..., 0]) ** 2, axis=1)[:, None] * np.ones(Y.shape[1]),
+                      np.eye(Y.shape[1]))
+    block = replace(block, Y=Y, noise=noise[:, None])
+    L = whitener(block)
+
+    def chi2(theta):
+        e, _, _ = _block_residual(model.at(theta), block, L, derivative=False)
+        return e @ e
+    e, J, _ = _block_residual(model, block, L, derivative=True)
+    for row in [*range(0, len(BARE.names), 2), *range(len(BARE.names), len(model.values))]:
+        h = 1e-4 * max(abs(model.values[row]), 1e-3 * model.scales()[row]) * np.eye(len(model.values))[row]
+        slope = (chi2(model.values + h) - chi2(model.values - h)) / (2 * np.abs(h).max())
+        found, most = -2 * J[row] @ e, 2 * np.linalg.norm(J[row]) * np.linalg.norm(e)
+        assert found == pytest.approx(slope, abs=1e-5 * most), model.names[row]
 
 
 @pytest.mark.parametrize(("name", "place"), [
