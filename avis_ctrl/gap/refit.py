@@ -151,7 +151,7 @@ def refit(model: TableModel, fitted: Sequence[SpectralBlock], held_out: Sequence
 
 def likelihood(model: TableModel, fitted: Sequence[SpectralBlock], iterations: int) -> LikelihoodFit:
     """`identification.fit` of a table model, which has all that it asks of a `ResponseModel`."""
-    return fit(cast(ResponseModel, model), fitted, max_iterations=iterations)
+    return fit(cast(ResponseModel, model), fitted, model.priors, max_iterations=iterations)
 
 
 def judged(found: LikelihoodFit, held_out: Sequence[SpectralBlock]) -> Refit:

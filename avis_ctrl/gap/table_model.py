@@ -135,6 +135,13 @@ class TableModel:
         return np.concatenate([self.base.values, [self.effects[k].values[j] for k, j in self._free]])
 
     @property
+    def priors(self) -> dict[str, tuple[float, float]]:
+        """(mean, standard deviation) of free parameters that records need not determine (`Effect.priors`)."""
+        known = {f"{one.label}.{name}": prior for one in self.effects
+                 for name, prior in one.effect.priors(self, one.place, one.by_name).items()}
+        return {name: prior for name, prior in known.items() if name in self.names}
+
+    @property
     def units(self) -> tuple[str, ...]:
         return (*self.base.units, *(self.effects[k].parameters[j].unit for k, j in self._free))
 

@@ -223,6 +223,10 @@ class Effect(ABC):
         """Why physics forbids these values, empty where it does not."""
         return ""
 
+    def priors(self, model: TableModel, place: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        """(mean, standard deviation) by name of parameters that records need not determine, from values near by."""
+        return {}
+
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         """Parameters as a person reads them; by default as they are."""

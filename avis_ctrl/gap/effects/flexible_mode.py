@@ -24,6 +24,8 @@ COUNTS = {"": 1, "two": 2, "three": 3}
 # A further mode is looked for where it takes this share of what the modes before it leave over the noise, and more than
 # chance would.
 FURTHER = 0.25
+# 1/sqrt(kg) that a shape is expected to have at least, where nothing is seen of it.
+SMALLEST_SHAPE = 1e-3
 
 
 @register
@@ -58,6 +60,20 @@ class PayloadFlexibleMode(Effect):
                                   f"mass-normalised shape {of_mode} at {name}", 0.0, -1.0, 1.0, 0.01, optional=not own,
                                   group=f"shape{of}") for name, own in zip(names, driven, strict=True))]
         return tuple(found)
+
+    def priors(self, model: TableModel, place: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        """Where no motor pushes, a shape is of the size that it has elsewhere.
+
+        A mode is held by the mounts' stiffness at these points, too: what they add to w^2 and 2 z w cannot be told
+        from the mode's own, and along one combination of them no force on the payload shows them either.
+        """
+        found: dict[str, tuple[float, float]] = {}
+        parameters = [one for one in self.parameters(model, place) if one.group]
+        for group in {one.group for one in parameters}:
+            seen = [values[one.name] for one in parameters if one.group == group and not one.optional]
+            size = max(float(np.sqrt(np.mean(np.square(seen)))), SMALLEST_SHAPE)
+            found |= {one.name: (0.0, size) for one in parameters if one.group == group and one.optional}
+        return found
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         at_actuators, at_sensors = shape_rows(ops.base.rig, ops.base.actuators, ops.base.sensors.names)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import replace
 from typing import Any
 
@@ -35,6 +36,8 @@ GATES: tuple[type[Gate], ...] = (
 )
 # What rows that do not belong together spoil.
 CONSEQUENCES = ("signal to noise", "coherence", "periodicity", "repeatability", "level dependence", "spikes")
+# The same where no record is without them.
+OF_ALL = ("channel order", "polarity")
 
 
 def examine(campaign: Campaign, expectation: Expectation | None = None, longest: int = LONGEST) -> tuple[Finding, ...]:
@@ -62,7 +65,7 @@ def examine(campaign: Campaign, expectation: Expectation | None = None, longest:
         for gate, of in zip(gates, kept, strict=True):
             of.append(gate.look(seen, known))
     findings = [f for gate, of in zip(gates, kept, strict=True) for f in gate.conclude(of, campaign, known)]
-    findings = after_clipping(after_missing_samples(findings))
+    findings = after_clipping(after_missing_samples(findings, {record.header.name for record in campaign.records}))
     if shortened:
         said = (
             f" (Of record {', '.join(shortened[:4])}{' and others' if len(shortened) > 4 else ''} only pieces of"
@@ -72,10 +75,11 @@ def examine(campaign: Campaign, expectation: Expectation | None = None, longest:
     return tuple(findings)
 
 
-def after_missing_samples(findings: list[Finding]) -> list[Finding]:
+def after_missing_samples(findings: list[Finding], names: Set[str]) -> list[Finding]:
     """Findings that follow from missing samples say so and are notes: the cause stops, and they are to be judged again.
 
-    Only gates that compare rows with the commanded voltage or with each other, of the records concerned or of all.
+    Only gates that compare rows with the commanded voltage or with each other, of the records concerned or of all;
+    what all records say together of channels and signs only where samples miss in each, of `names`.
     """
     records = {r for f in findings if f.gate == MissingSamples.name and f.severity == "stop" for r in f.records}
     said = (
@@ -85,7 +89,11 @@ def after_missing_samples(findings: list[Finding]) -> list[Finding]:
 
     def follows(f: Finding) -> bool:
         of = {name.removeprefix("record ") for name in f.records}
-        return f.gate in CONSEQUENCES and f.severity in ("warning", "stop") and (not of or bool(of & records))
+        if f.severity not in ("warning", "stop"):
+            return False
+        if f.gate in OF_ALL:
+            return not of and records >= names
+        return f.gate in CONSEQUENCES and (not of or bool(of & records))
 
     if not records:
         return findings
