@@ -12,10 +12,11 @@ from avis_ctrl.gap.effects.base import Seed, library
 from avis_ctrl.gap.effects.impedance import peaks
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.realise import realise
-from avis_ctrl.gap.refit import at_the_edge
+from avis_ctrl.gap.refit import at_the_edge, refit
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.search import summits
 from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs import load_rig
@@ -193,6 +194,32 @@ def test_leveling_measures_the_payload_against_a_chassis_that_moves():
     for one in model.effects:
         both = with_effect(one.effect.name, one.place, one.values, both)
     assert realise(both).error < 1e-6
+
+
+def test_what_no_record_tells_of_a_mode_is_in_the_deviation_of_its_frequency():
+    """Points that no motor pushes add stiffness to the mode alone, along one combination of them."""
+    rng, omega = np.random.default_rng(3), 2 * np.pi * np.geomspace(1.0, 60.0, 300)
+    model = TableModel(ResponseModel.of(RIG, default_parameters(RIG), sampled=False))
+    U = np.zeros((len(omega), 11, 4), complex)
+    U[:, :8] = rng.standard_normal((len(omega), 8, 4)) + 1j * rng.standard_normal((len(omega), 8, 4))
+    seen = [17.0, 0.02, *0.015 * rng.standard_normal(12)]
+    parameters = library()["payload_flexible_mode"].parameters(model, "payload")
+    start = [0.0 if one.optional and one.group else value for one, value in zip(parameters, seen, strict=True)]
+    assert start.count(0.0) == 4
+    truth, begin = (with_effect("payload_flexible_mode", "payload", values, model) for values in (seen, start))
+    made = SpectralBlock("00", omega, U, np.zeros((len(omega), 6, 4), complex))
+    Y = truth.answer(made, None, False).Y
+    power = 1e-6 * np.mean(np.abs(Y) ** 2, axis=(0, 2))
+    noise = np.sqrt(power / 2)[:, None] * (rng.standard_normal(Y.shape) + 1j * rng.standard_normal(Y.shape))
+    block = replace(made, Y=Y + noise).with_noise(
+        np.broadcast_to(np.diag(power), (len(omega), 6, 6)).astype(complex).copy())
+    found = refit(begin, [block], [block], 40)
+    told = found.reported(found.model.effects[0])
+    assert found.held_per_dof == pytest.approx(1.0, abs=0.1)
+    for name, true in (("frequency_Hz", 17.0), ("damping", 0.02)):
+        assert abs(told[name].value - true) < 3 * told[name].std
+    # By noise alone it would be known to a few parts in a million.
+    assert told["frequency_Hz"].std > 1e-4 * 17.0
 
 
 # --- seeds

@@ -23,7 +23,9 @@ from gates_rig import (
 
 from avis_ctrl.measurement.gates import GATES, examine
 from avis_ctrl.measurement.gates.channel_map import ChannelMap
+from avis_ctrl.measurement.gates.examine import after_missing_samples
 from avis_ctrl.measurement.gates.excerpt import excerpt
+from avis_ctrl.measurement.gates.finding import Finding
 
 SEVERE = ("warning", "stop")
 
@@ -159,6 +161,15 @@ def test_a_buffer_written_twice(clean):
     y[9000:9256] = y[8744:9000]
     found = [f for f in alarms(changed(clean, 0, y=y)) if f.gate == "missing samples"]
     assert "repeats 256 rows at 9 s" in found[0].sentence
+
+
+def test_channels_are_not_called_exchanged_where_every_record_lacks_samples():
+    lost = Finding("missing samples", "stop", "36 samples were lost", (), ("00", "01"))
+    mixed, copied = (Finding("channel order", "stop", "said", ("Sy1", "Sz2"), of) for of in ((), ("00",)))
+    judged = after_missing_samples([lost, mixed, copied], {"00", "01"})
+    assert [f.severity for f in judged] == ["stop", "note", "stop"] and "consequence" in judged[1].sentence
+    judged = after_missing_samples([lost, mixed, copied], {"00", "01", "02"})
+    assert [f.severity for f in judged] == ["stop"] * 3
 
 
 def test_records_that_overlap_in_time(clean):
