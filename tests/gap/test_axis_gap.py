@@ -314,7 +314,7 @@ GOOD = {"u": np.sin(np.arange(4000.0)), "y": np.cos(np.arange(4000.0)), "sample_
 
 @pytest.mark.parametrize(("kind", "data", "said"), [
     ("table", {}, "expected one of drive, oscillator, seismometer, levels"),
-    ("oscillator", {}, "expected the data for kind oscillator"),
+    ("oscillator", {}, r"expected for kind oscillator the data u, y, sample_rate_Hz, \[band_Hz\]"),
     ("oscillator", GOOD | {"y": np.zeros(3)}, "as many of u as of y"),
     ("oscillator", GOOD | {"y": np.full(4000, np.nan)}, "finite"),
     ("oscillator", GOOD | {"sample_rate_Hz": -1.0}, "0 <= low|expected"),

@@ -12,6 +12,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -53,13 +55,14 @@ def find_axis_gap(kind: str, *, seed: int = 1, progress: Progress | None = None,
     if kind not in (*PROBLEMS, "levels"):
         raise InputError(f"expected one of {', '.join((*PROBLEMS, 'levels'))}", field="kind", value=kind)
     begun, told = time.perf_counter(), progress or (lambda stage: None)
-    try:
-        problem = level_dependence(progress=told, **data) if kind == "levels" else PROBLEMS[kind](**data)
-    except TypeError as error:
-        if "argument" not in str(error):
-            raise
-        raise InputError(f"expected the data for kind {kind}, see find_axis_gap", field="data",
-                         value=sorted(data)) from None
+    make = partial(level_dependence, progress=told) if kind == "levels" else PROBLEMS[kind]
+    known = signature(make).parameters
+    if set(data) - set(known) or any(name not in data for name, one in known.items() if one.default is one.empty):
+        said = ", ".join(name if one.default is one.empty else f"[{name}]" for name, one in known.items()
+                         if name != "progress")
+        raise InputError(f"expected for kind {kind} the data {said} (in brackets what may be left out)", field="data",
+                         value=sorted(data))
+    problem = make(**data)
     found = problem if isinstance(problem, AxisGap) else gap_of(problem, list(library(kind).values()), seed, told)
     return replace(found, seconds=time.perf_counter() - begun)
 
