@@ -121,7 +121,8 @@ def between(J: np.ndarray, e: np.ndarray, record: np.ndarray) -> np.ndarray:
     total = np.maximum(w.sum(axis=0), np.finfo(float).tiny)
     Q = np.sum(w * (x - (w * x).sum(axis=0) / total) ** 2, axis=0)
     weight = total - np.sum(w ** 2, axis=0) / total
-    found = np.divide(Q - dof, weight, out=np.zeros_like(Q), where=weight > 0)
+    # Where one record alone tells of a parameter, there is nothing to compare.
+    found = np.divide(Q - dof, weight, out=np.zeros_like(Q), where=(w.sum(axis=0) > 0) & (weight > ALONE * total))
     separate = total * np.sum(root ** 2, axis=1) > SEPARATE
     differ = stats.chi2.sf(Q, dof) < CHANCE
     return np.where(separate & differ, found, 0.0)

@@ -28,7 +28,7 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.gates import Finding, examine
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.gap_design import DesignEffect, design_effect
-from avis_ctrl.study.identification import expectation
+from avis_ctrl.study.identification import amplifier_corner, amplifier_words, expectation
 from avis_ctrl.study.rig_channels import in_words_of
 from avis_ctrl.study.workers import each
 
@@ -46,8 +46,8 @@ class GapOptions:
 
     band_Hz : of the comparison; the excited one where None. design : synthesise controllers on both models, by
     design_file or by default z and phi_x. gates : look at the signals before anything else. despite_gates : go on where
-    a gate says stop. amplifier_corner_Hz : lag that the amplifiers are known to have. own_effects : of the user's own
-    file, beside the library.
+    a gate says stop. amplifier_corner_Hz : lag that the amplifiers are known to have; see `amplifier_corner`.
+    own_effects : of the user's own file, beside the library.
     """
 
     seed: int = 1
@@ -101,10 +101,14 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
                                                                  measured.u_names)))
     with threadpool_limits(1):
         findings = _gates(measured, rig, options, progress) if options.gates else ()
-        gap = analyse(measured, rig, options.seed, options.band_Hz, options.amplifier_corner_Hz, None, progress, each)
+        corner = amplifier_corner(rig, options.amplifier_corner_Hz)
+        known = (amplifier_words(corner, options.amplifier_corner_Hz),) if corner else ()
+        for words in known:
+            progress(words)
+        gap = analyse(measured, rig, options.seed, options.band_Hz, corner, None, progress, each)
         seconds = time.monotonic() - began
         stops = tuple(f"gate {one.gate}: {one.sentence}" for one in findings if one.severity == "stop")
-        gap = replace(gap, seconds=seconds, sentences=(*gap.sentences, *stops))
+        gap = replace(gap, seconds=seconds, sentences=(*gap.sentences, *known, *stops))
         design, note = _design(gap, options, progress)
     return GapFinding(gap, measured, findings, provenance(measured, rig, options, seconds), design, note)
 

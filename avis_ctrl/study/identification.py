@@ -134,9 +134,7 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
         progress("which records to fit, which to hold out, and the band")
         split, fitted, held_out, band = _divide(measured, options)
         if model.amplifier_corner_Hz:
-            progress(f"amplifiers with a first-order lag of {model.amplifier_corner_Hz:g} Hz"
-                     + ("" if options.amplifier_corner_Hz else ", as rehearsals and designs assume; --amplifier-corner "
-                                                               "states another"))
+            progress(amplifier_words(model.amplifier_corner_Hz, options.amplifier_corner_Hz))
         progress(f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
                  + (f"; {split.how}" if split else ""))
         found = fit_campaign(fitted, model, band, options.priors, options.starts, options.seed, progress=progress)
@@ -163,11 +161,20 @@ def _check(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> 
             measured.named(name)
 
 
-def amplifier_corner(rig: Rig, options: IdentifyOptions) -> float | None:
-    """The amplifiers' corner [Hz] as stated; on tables with accelerometers what rehearsals and designs assume."""
-    if options.amplifier_corner_Hz is None and rig.geophones is None and rig.accelerometers is not None:
+def amplifier_corner(rig: Rig, stated_Hz: float | None) -> float | None:
+    """The amplifiers' corner [Hz] as stated; on tables with accelerometers what rehearsals and designs assume.
+
+    Without a lag an accelerometer would see a force that jumps at the very moment of its sample.
+    """
+    if stated_Hz is None and rig.geophones is None and rig.accelerometers is not None:
         return ACCELEROMETER_AMPLIFIER_HZ
-    return options.amplifier_corner_Hz
+    return stated_Hz
+
+
+def amplifier_words(corner_Hz: float, stated_Hz: float | None) -> str:
+    """The corner, and whether it was stated."""
+    return f"amplifiers with a first-order lag of {corner_Hz:g} Hz" + (
+        "" if stated_Hz else ", as rehearsals and designs assume; --amplifier-corner states another")
 
 
 def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions) -> ResponseModel:
@@ -184,7 +191,8 @@ def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: Ident
         unit, sensors, sampled = measured.output_unit, measured.outputs, False
         actuators = tuple(name for name in measured.inputs if name not in ("vx", "vy", "vz"))
     names = named_parameters(rig, options.parameters, unit) if options.parameters else default_parameters(rig)
-    return ResponseModel.of(rig, names, unit, sensors, actuators, sampled, amplifier_corner(rig, options))
+    corner = amplifier_corner(rig, options.amplifier_corner_Hz)
+    return ResponseModel.of(rig, names, unit, sensors, actuators, sampled, corner)
 
 
 def gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options: IdentifyOptions,

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from truth.cases import draw_case, rig, simulate_case
 
-from avis_ctrl.errors import AvisError, InputError
+from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.gap.result import VERDICTS
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
+from avis_ctrl.study import gap as gap_study
 from avis_ctrl.study.gap import GapOptions, find_gap
 
 SIGNALS = {"mains_hum", "sensor_quantisation", "ground_motion"}
@@ -93,6 +94,25 @@ def test_what_is_outside_the_library_is_not_named_as_something_else():
     assert found.gap.where
     assert found.gap.next_experiment
     require_contract(found.to_json())
+
+
+@pytest.mark.parametrize(("name", "stated", "taken"), [
+    ("avis", None, None), ("avis", 90.0, 90.0), ("halcyonics", None, 300.0), ("halcyonics", 90.0, 90.0)])
+def test_the_amplifiers_of_a_table_with_accelerometers_lag(monkeypatch, name, stated, taken):
+    """As `avis identify` and `avis simulate-campaign` have it; a rig file states no lag."""
+    rig, asked = load_rig(name), []
+
+    def stop(campaign, rig, seed, band_Hz, corner, *rest):
+        asked.append(corner)
+        raise ComputationError("enough")
+    monkeypatch.setattr(gap_study, "analyse", stop)
+    y, u = tuple(rig.sensor_rows()[0]), rig.equations_of_motion().actuators
+    header = RecordHeader("00", rig.sample_rate_Hz, 400, u, y, "noise", 1.0, 0.0, y_unit="V")
+    rng = np.random.default_rng(1)
+    record = Record(header, rng.standard_normal((400, len(u))), rng.standard_normal((400, len(y))))
+    with pytest.raises(ComputationError, match="enough"):
+        gap_study.find_gap(Campaign(name, (record,)), rig, GapOptions(gates=False, amplifier_corner_Hz=stated))
+    assert asked == [taken]
 
 
 # --- the contract
