@@ -59,8 +59,8 @@ BEHIND = 100.0
 # A name is refitted, at its best place, where its score is at least this share of the best one's.
 SHARE_OF_BEST = 0.02
 # Another summit of an effect's score over what shapes it is tried, too, from this share of the highest on, and where
-# it is that many times another frequency.
-SUMMIT, APART = 0.5, 1.4
+# it is that many times another frequency; or, without a summit, so many times that of the highest.
+SUMMIT, APART, FAR = 0.5, 1.4, 2.0
 # Competitors from beyond the library: coarse refits, and refits to more lines, in the place of each effect.
 OUTSIDE_REFITS, OUTSIDE_PROMOTED = 3, 1
 # One is tried where its score is at least this share of the best one's of the library.
@@ -182,8 +182,8 @@ def candidates(score: Score, effects: Sequence[Effect], each: Each = one_by_one)
 
 
 def summits(found: Sequence[Seed], parameters: Sequence[EffectParameter]) -> list[Seed]:
-    """The best of seeds that are sorted, and the next one that is a summit of its own, if it is not far lower: to first
-    order the wrong one of two frequencies may look better."""
+    """The best of seeds that are sorted, and the next one that is a summit of its own, or far from the best on a broad
+    one, if it is not far lower: to first order the wrong one of two frequencies may look better."""
     shape = [k for k, one in enumerate(parameters) if len(one.grid) > 3]
     if not shape or not found:
         return list(found[:1])
@@ -191,6 +191,8 @@ def summits(found: Sequence[Seed], parameters: Sequence[EffectParameter]) -> lis
     high = sum(one.chi2 > SUMMIT * found[0].chi2 for one in found)
     for k in range(1, high if np.all(at > 0) else 0):
         if np.all(np.any(np.abs(np.log(at[:k] / at[k])) > np.log(APART), axis=1)):
+            return [found[0], found[k]]
+        if np.any(np.abs(np.log(at[0] / at[k])) > np.log(FAR)):
             return [found[0], found[k]]
     return [found[0]]
 

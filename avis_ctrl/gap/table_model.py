@@ -150,6 +150,13 @@ class TableModel:
         own = [self.effects[k].parameters[j].size for k, j in self._free]
         return np.concatenate([(self.nominal or self.base).scales(), own])
 
+    def reach(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n_p,) relative units by which a parameter may go down or up in one step of a fit: half of itself, and one of
+        an effect at least half of its size, up to twice its value."""
+        known, sizes = self.base.reach()[0], np.array([self.effects[k].parameters[j].size for k, j in self._free])
+        own = np.abs([self.effects[k].values[j] for k, j in self._free]) / sizes
+        return (np.concatenate([known, np.maximum(0.5, 0.5 * own)]), np.concatenate([known, np.maximum(0.5, own)]))
+
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """(n_p,) lowest and highest values that physics allows."""
         low, high = (self.nominal or self.base).bounds()

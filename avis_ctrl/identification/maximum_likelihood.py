@@ -230,16 +230,17 @@ class _Descent:
         values, vectors = np.linalg.eigh(H / np.outer(size, size))
         along = vectors.T @ (g / size)
         known = values > 1e-11 * values[-1]
-        # No parameter by more than half of itself at once: what the data hardly know is held back first.
+        # No parameter by more than its reach at once: what the data hardly know is held back first.
+        down, up = self.model.reach()
         while True:
             y = np.where(known, -along / np.where(known, values + damping, 1.0), 0.0)
             step[free] = vectors @ y / size
-            largest = np.max(np.abs(step))
-            if largest <= 0.5 or damping >= 1.0:
+            largest = np.max(np.abs(step) / np.where(step > 0, up, down))
+            if largest <= 1 or damping >= 1.0:
                 break
             damping *= 4
-        if largest > 0.5:
-            y, step = y * (0.5 / largest), step * (0.5 / largest)
+        if largest > 1:
+            y, step = y / largest, step / largest
         return step, float(-(2 * along @ y + y @ (values * y)))
 
     def at_bound(self) -> np.ndarray:

@@ -188,6 +188,11 @@ class ResponseModel:
         low = np.where([positive(name) for name in self.names], LOWEST * self.scales(), -np.inf)
         return low, np.full(len(low), np.inf)
 
+    def reach(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n_p,) relative units by which a parameter may go down or up in one step of a fit: half of itself."""
+        half = np.full(len(self.names), 0.5)
+        return half, half
+
     @property
     def inputs(self) -> tuple[str, ...]:
         """Actuators, then the floor's velocities."""

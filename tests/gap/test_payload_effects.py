@@ -287,6 +287,9 @@ def test_another_summit_of_the_score_is_kept():
         return [Seed((f, 0.5, zeta, 0.0, 0.0, 0.0), chi2, 6) for f, zeta, chi2 in of]
     far = seeds((150.0, 0.015, 9.0), (134.0, 0.015, 8.5), (56.0, 0.015, 8.0), (120.0, 0.015, 7.0), (150.0, 0.05, 6.0))
     assert summits(far, parameters) == [far[0], far[2]]
+    # A slope that is still high an octave below.
+    broad = seeds((150.0, 0.015, 9.0), (120.0, 0.015, 8.0), (90.0, 0.015, 7.0), (70.0, 0.015, 6.0), (60.0, 0.015, 5.0))
+    assert summits(broad, parameters) == [broad[0], broad[3]]
     # A slope, not a summit: each beside a better one. And one that is far lower.
     for one in (seeds((150.0, 0.015, 9.0), (120.0, 0.015, 8.0), (90.0, 0.015, 7.0)),
                 seeds((150.0, 0.015, 9.0), (30.0, 0.015, 4.0)), seeds((150.0, 0.015, 9.0)), []):

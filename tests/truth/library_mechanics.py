@@ -154,7 +154,7 @@ def _mount_surge(d: Draw) -> Drawn:
     f, zeta = d.size(150.0, 15.0), d.between(0.01, 0.1)
     mass = 4 * float(np.mean(d.plant.k[:, 2])) / (2 * np.pi * f) ** 2
     return "isolators z", {"frequency_Hz": f, "mass_kg": mass, "damping_ratio": zeta}, {
-        "uneven": d.rng.uniform(0.97, 1.03, 4).tolist()}
+        "uneven": _about_one(d.rng.uniform(0.97, 1.03, 4)).tolist()}
 
 
 def _apply_mount_surge(plant: Plant, h: Hidden) -> None:

@@ -24,6 +24,8 @@ REFERENCE_Hz = 3.0
 SURGE_Hz = tuple(np.geomspace(8.0, 150.0, 28).tolist())
 # Mounts with a leveling valve: a fourth would be one too many to level a plane.
 LEVELED = 3
+# Damping ratio with which the fit of a resonance inside the mounts begins at least.
+BROAD = 0.05
 
 
 def has_mounts(model: TableModel) -> bool:
@@ -120,7 +122,7 @@ class MountSurge(_OfMounts):
                 EffectParameter("damping_ratio", "1", "of that resonance", 0.0, 0.0, 1.0, 0.05, False,
                                 (0.015, 0.05, 0.15), True),
                 *(EffectParameter(f"uneven_{i}", "1", f"frequency of mount {i} over the mean, less one", 0.0, -0.2, 0.2,
-                                  0.02, False, (0.0,), True) for i in range(1, count)))
+                                  0.1, False, (0.0,), True) for i in range(1, count)))
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         """Over frequency and damping, by what the change of the response takes of the residual when it may be of any
@@ -131,7 +133,10 @@ class MountSurge(_OfMounts):
             values = tuple(float(v) for v in point)
             took = score.reduction(score.of_effect(ActiveEffect(self, place, parameters, values)))
             if took.coefficients[0] > 0:
-                found.append(Seed(values, took.chi2, len(parameters), len(starts)))
+                # From a narrow resonance at the wrong frequency no fit finds the right one.
+                begin = [max(value, BROAD) if one.name == "damping_ratio" else value
+                         for one, value in zip(parameters, values, strict=True)]
+                found.append(Seed(tuple(begin), took.chi2, len(parameters), len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
