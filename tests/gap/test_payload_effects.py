@@ -222,6 +222,26 @@ def test_what_no_record_tells_of_a_mode_is_in_the_deviation_of_its_frequency():
     assert told["frequency_Hz"].std > 1e-4 * 17.0
 
 
+def test_a_fit_reaches_how_a_resonance_scatters_over_the_mounts():
+    """In few steps: none is held to a share of a unit that is small beside the way."""
+    rng, omega = np.random.default_rng(5), 2 * np.pi * np.geomspace(1.0, 60.0, 200)
+    model = TableModel(ResponseModel.of(RIG, default_parameters(RIG), sampled=False))
+    U = np.zeros((len(omega), 11, 4), complex)
+    U[:, :8] = rng.standard_normal((len(omega), 8, 4)) + 1j * rng.standard_normal((len(omega), 8, 4))
+    hidden = [54.0, 0.5, 0.1, 0.08, -0.09, 0.06]
+    truth = with_effect("mount_surge", "isolators z", hidden, model)
+    begin = with_effect("mount_surge", "isolators z", [60.0, 0.5, 0.05, 0.0, 0.0, 0.0], model)
+    made = SpectralBlock("00", omega, U, np.zeros((len(omega), 6, 4), complex))
+    Y = truth.answer(made, None, False).Y
+    power = 1e-6 * np.mean(np.abs(Y) ** 2, axis=(0, 2))
+    noise = np.sqrt(power / 2)[:, None] * (rng.standard_normal(Y.shape) + 1j * rng.standard_normal(Y.shape))
+    block = replace(made, Y=Y + noise).with_noise(
+        np.broadcast_to(np.diag(power), (len(omega), 6, 6)).astype(complex).copy())
+    found = refit(begin, [block], [block], 12)
+    assert found.held_per_dof == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_allclose(found.model.effects[0].values[3:], hidden[3:], atol=0.02)
+
+
 # --- seeds
 
 def seeds_of(truth, name, place, noise=1e-4):
