@@ -13,6 +13,7 @@ The chassis follows the floor displacement w through H_w and recoils with B: zer
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -241,6 +242,7 @@ class Assembled:
     def n_q(self) -> int:
         return self.G.shape[1]
 
+    @cached_property
     def forces_of_states(self) -> np.ndarray:
         """(n, n_q, m) forces on the coordinates by unit initial states of what moves inside beside the payload:
         impulses on the modes, masses inside mounts, and the chassis, and on what effects say of their own

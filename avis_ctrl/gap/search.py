@@ -190,9 +190,8 @@ def summits(found: Sequence[Seed], parameters: Sequence[EffectParameter]) -> lis
     at = np.array([[one.values[k] for k in shape] for one in found])
     high = sum(one.chi2 > SUMMIT * found[0].chi2 for one in found)
     for k in range(1, high if np.all(at > 0) else 0):
-        if np.all(np.any(np.abs(np.log(at[:k] / at[k])) > np.log(APART), axis=1)):
-            return [found[0], found[k]]
-        if np.any(np.abs(np.log(at[0] / at[k])) > np.log(FAR)):
+        away = np.max(np.abs(np.log(at[:k] / at[k])), axis=1)
+        if np.all(away > np.log(APART)) or away[0] > np.log(FAR):
             return [found[0], found[k]]
     return [found[0]]
 

@@ -242,7 +242,7 @@ class TableModel:
             return np.zeros((len(omega), n_y, 0), complex)
         made = assemble(self.operators(omega))
         seen = (_gain(made) * made.ops.sense[:, :, None]) * (made.rows @ made.inverse)
-        return seen @ made.forces_of_states()
+        return seen @ made.forces_of_states
 
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
         """As `ResponseModel.driven`: y by spectra of the inputs, and its derivative by the free parameters."""
@@ -263,7 +263,7 @@ class TableModel:
             return Driven(answer.Y, np.empty(0))
         dY = np.zeros((len(self.names), *answer.Y.shape), complex)
         answer.by_rig(self.effective, self.derivative_matrices, dY)
-        self._by_effects(omega, U, block, made, answer, dY, inner)
+        self._by_effects(omega, U, block, made, answer, dY)
         return Driven(answer.Y, dY)
 
     def _acting(self, U: np.ndarray, block: SpectralBlock | None, inner: np.ndarray | None = None) -> Acting:
@@ -295,8 +295,7 @@ class TableModel:
                 output = added[:, :, None] if output is None else output + added[:, :, None]
         return Acting(U, total, seen, output, inner)
 
-    def _by_effects(self, omega, U, block, made: Assembled, answer: _Answer, dY: np.ndarray,
-                    inner: np.ndarray | None) -> None:
+    def _by_effects(self, omega, U, block, made: Assembled, answer: _Answer, dY: np.ndarray) -> None:
         """Central differences of the whole response by the effects' parameters."""
         n, theta, (low, high) = len(self.base.names), self.values, self.bounds()
         scale = self.scales()
@@ -306,7 +305,7 @@ class TableModel:
             sides = []
             for end in ends:
                 other = self._with_effect_parameter(row - n, end)
-                acting = other._acting(U, block, inner)
+                acting = other._acting(U, block, answer.inner)
                 own = made if self.effects[self._free[row - n][0]].effect.nonlinear else assemble(
                     other.operators(omega), invert=False)
                 sides.append(_Side(own, acting, answer.x))
@@ -344,7 +343,7 @@ class _Drive:
         if force is not None:
             total[:, :N_Q] += force
         if acting.inner is not None and acting.inner.size:
-            total += (made.forces_of_states() @ acting.inner)[:, :, None]
+            total += (made.forces_of_states @ acting.inner)[:, :, None]
         self.total, self.reading, self.output = total, acting.reading, acting.output
 
 

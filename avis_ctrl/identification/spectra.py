@@ -158,22 +158,25 @@ def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.nd
     U = np.zeros((n, n_in + 2 * N_Q, 2 * N_Q), complex)
     U[:, n_in:] = np.eye(2 * N_Q)
     body = model.driven(block.omega, U, derivative=False).Y
-    poles = np.asarray(model.sensors.transient_poles)
-    shapes = [np.ones(n), s] if len(poles) == 1 else [
-        *(s ** k / np.polyval(poles[::-1], s) for k in range(len(poles) - 1)), np.ones(n), s]
-    chains = np.stack(shapes, -1)[:, None, :, None] * np.eye(n_y)[:, None, :]
+    chains = chain_transients(s, model)[:, None, :, None] * np.eye(n_y)[:, None, :]
     columns = np.concatenate([body, chains.reshape(n, n_y, -1), model.inner_transients(block.omega)], axis=2)
     norms = np.linalg.norm(columns, axis=(0, 1))
     return columns / norms, norms
+
+
+def chain_transients(s: np.ndarray, model: ResponseModel) -> np.ndarray:
+    """(n, k) of one sensor: the states of its chain, a constant and a slope in frequency; s (n,) j omega."""
+    poles = np.asarray(model.sensors.transient_poles)
+    states = (s ** k / np.polyval(poles[::-1], s) for k in range(len(poles) - 1))
+    return np.stack([*states, np.ones(len(s)), s], axis=-1)
 
 
 def transient_parts(x: np.ndarray, norms: np.ndarray, block: SpectralBlock, model: ResponseModel
                     ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 12, 1) impulses and steps on the body, and (m,) what the states inside start with: the part of unknowns
     x (n_t,) of the columns of `transient_columns`, norms (n_t,), that changes with the model's parameters."""
-    n_b, n_y = 2 * N_Q, block.Y.shape[1]
-    true = x / norms
-    chains = n_y * (max(len(model.sensors.transient_poles), 2) + (len(model.sensors.transient_poles) > 1))
+    n_b, true = 2 * N_Q, x / norms
+    chains = block.Y.shape[1] * chain_transients(1j * block.omega[:1], model).shape[1]
     body = np.broadcast_to(true[None, :n_b, None], (len(block.omega), n_b, 1))
     return body, true[n_b + chains:]
 

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.gap.data import SAME_LEVEL
 from avis_ctrl.gap.judgement import effects_of
+from avis_ctrl.gap.record_motion import clock_of
 from avis_ctrl.gap.simulate import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.campaign_fit import driven_inputs, excited_band
@@ -60,8 +61,7 @@ def gap_overlay(campaign: Campaign, baseline: TableModel, updated: TableModel) -
     """The overlay of the records of the level that most of them have (of all where these are too few), or a sentence
     why there is none."""
     refused = "no record drives the actuators"
-    ends = [(r.header.start_s, r.header.start_s + r.header.duration_s) for r in campaign.records]
-    clock = (min(start for start, _ in ends), max(end for _, end in ends))
+    clock = clock_of(campaign)
     with threadpool_limits(1):
         for records in selections(campaign):
             try:

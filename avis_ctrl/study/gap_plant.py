@@ -202,9 +202,10 @@ def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
         elif name == "sensor_gain":
             factors[one.place] *= values["gain"]
         elif name == "stiffness_drift":
+            change = drift_at(model, values, when)
             for key in known:
                 if key.rpartition(".")[2].startswith("k_"):
-                    add(key, drift_at(model, values, when) * known[key].value)
+                    add(key, change * known[key].value)
         elif name == "contact_friction":
             each = dict(zip(model.actuators, contacts(values), strict=True))
             for motor in model.rig.motors:  # type: ignore[attr-defined]

@@ -384,15 +384,14 @@ def test_the_gradient_of_a_fit_knows_what_the_states_inside_start_with(name, pla
     """Where a record's ends are fitted, too: slope of its chi-square by every parameter, against differences."""
     model = with_effect(name, place, values_at(name, place))
     rng = np.random.default_rng(4)
-    begins = [1e-4 * rng.standard_normal(model.inner_transients(OMEGA[:1]).shape[2])]
+    inner = 1e-4 * rng.standard_normal(model.inner_transients(OMEGA[:1]).shape[2])
     U = rng.standard_normal((len(OMEGA), len(model.inputs), 1)) * np.r_[np.ones(8), np.full(3, 1e-4)][:, None]
     block = SpectralBlock("one", OMEGA, U, np.zeros((len(OMEGA), len(model.sensors.names), 1), complex),
                           transient=True)
-    Y = model.at(1.02 * model.values).answer(block, None, False, *begins).Y
+    Y = model.at(1.02 * model.values).answer(block, None, False, inner).Y
     Y = Y + 1e-2 * np.abs(Y) * rng.standard_normal(Y.shape)
-    noise = np.einsum("ki,ij->kij", np.mean(np.abs(Y[..., 0]) ** 2, axis=1)[:, None] * np.ones(Y.shape[1]),
-                      np.eye(Y.shape[1]))
-    block = replace(block, Y=Y, noise=noise[:, None])
+    power = np.mean(np.abs(Y[..., 0]) ** 2, axis=1)
+    block = replace(block, Y=Y).with_noise((power[:, None, None] * np.eye(Y.shape[1])).astype(complex))
     L = whitener(block)
 
     def chi2(theta):

@@ -37,7 +37,7 @@ def test_a_push_on_the_mass_inside_a_mount():
     full[:, :6, 6:] = -G.T * upper[:, None]
     full[:, 6:, :6] = np.swapaxes(full[:, :6, 6:], 1, 2)
     full[:, range(6, 10), range(6, 10)] = upper + lower + s ** 2 * mass
-    impulses, steps = np.split(made.inverse @ made.forces_of_states(), 2, axis=2)
+    impulses, steps = np.split(made.inverse @ made.forces_of_states, 2, axis=2)
     np.testing.assert_allclose(impulses, np.linalg.inv(full)[:, :6, 6:], rtol=1e-9)
     np.testing.assert_allclose(steps, s[:, :, None] * impulses, rtol=1e-9)
 
@@ -57,7 +57,7 @@ def test_a_push_on_the_chassis(place, values):
     full = np.concatenate([
         np.concatenate([inertia + G.T @ (z * G), -G.T @ (z * under)], axis=2),
         np.concatenate([inertia[:, ways], np.linalg.inv(moves[:, ways][:, :, ways])], axis=2)], axis=1)
-    impulses, steps = np.split(made.inverse @ made.forces_of_states(), 2, axis=2)
+    impulses, steps = np.split(made.inverse @ made.forces_of_states, 2, axis=2)
     true = np.linalg.inv(full)[:, :6, 6:]
     np.testing.assert_allclose(impulses, true, atol=1e-9 * np.abs(true).max())
     np.testing.assert_allclose(steps, S * impulses, atol=1e-9 * np.abs(S * true).max())
