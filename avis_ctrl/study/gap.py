@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import platform
 import time
@@ -162,7 +163,8 @@ def provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float
     told = {} if own is None else {"own_effects": f"{own.path.name}: {', '.join(own.names)}",
                                    "own_effects_sha256": own.sha256}
     if options.design_file is not None:
-        told["design_sha256"] = hashlib.sha256(options.design_file.read_bytes()).hexdigest()
+        with contextlib.suppress(OSError):  # nothing was made of it then, which design_note says
+            told["design_sha256"] = hashlib.sha256(options.design_file.read_bytes()).hexdigest()
     return {"avis_ctrl": avis_ctrl.__version__, "measurement": measured.source, **told,
             "measurement_sha256": digest(measured), "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
             "seed": options.seed, "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
