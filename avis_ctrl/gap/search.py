@@ -50,6 +50,8 @@ ITERATIONS = (20, 10)
 MORE_ITERATIONS = 30
 # Share of what the chain before it leaves over the noise that a second or third effect must take.
 TAKES = 0.8
+# And the share with which an effect may be given more of what it may have several of.
+LARGER_PART = 0.5
 # Share of the gap with which an effect counts as its cause although something is left.
 MOST_OF_IT = 0.97
 # One whose coarse refit leaves so many times the power that the best one leaves is not carried on.
@@ -372,7 +374,7 @@ def _promoted(rough: list[tuple[Refit, ...]], depth: int, data: _Data) -> tuple[
     made = [(*chain[:-1], found.refit(chain[-1].model))
             for chain, found in zip(chosen, data.each(reached, chosen), strict=True) if found is not None]
     best, *others = _distinct(made) or [()]
-    return _distinct([_to_the_end(best, data.fitted, data.held_out), *others]) if best else [], left
+    return _distinct([_grown(_to_the_end(best, data.fitted, data.held_out), data), *others]) if best else [], left
 
 
 def _hopeless(chain: tuple[Refit, ...], first: Refit) -> bool:
@@ -392,6 +394,28 @@ def _to_the_end(chain: tuple[Refit, ...], fitted: Sequence[SpectralBlock], held_
     if last.fit.converged or last.held_per_dof <= CLOSED:
         return chain
     return (*chain[:-1], try_refit(last.model, fitted, held_out, MORE_ITERATIONS) or last)
+
+
+def _grown(chain: tuple[Refit, ...], data: _Data) -> tuple[Refit, ...]:
+    """A chain of which the last effect takes the larger part of what was left, with as much more of it (a further mode)
+    as takes most of the rest; as it was where none does."""
+    last = found = chain[-1]
+    if len(chain) == 1 or _share(last, chain[-2]) < LARGER_PART:
+        return chain
+    while found.held_per_dof > CLOSED:
+        one = found.model.effects[-1]
+        larger = one.effect.grown(one, found.model, data.fitted)
+        if not larger:
+            break
+        data.progress(f"more of it: {one.effect.name} ({larger[0].place.replace('/', ', ')})?")
+        coarse = min(_coarse(found.model.without(one.label), larger, data), key=lambda r: r.criterion, default=None)
+        more = coarse and try_refit(coarse.model, data.fitted, data.held_out, MORE_ITERATIONS)
+        if more is None or more.criterion >= found.criterion:
+            break
+        found = more
+    misfit = max(1.0, found.held_per_dof) * known_noise(data.fitted)
+    enough = (last.criterion - found.criterion) / misfit > LEAST_FALL and _share(found, last) > TAKES
+    return (*chain[:-1], found) if enough else chain
 
 
 def _share(found: Refit, before: Refit) -> float:

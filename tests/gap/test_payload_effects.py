@@ -245,8 +245,8 @@ def test_a_fit_reaches_how_a_resonance_scatters_over_the_mounts():
 
 # --- seeds
 
-def seeds_of(truth, name, place, noise=1e-4):
-    """What the score makes of a weak effect, without noise in the data."""
+def block_of(truth, noise=1e-4):
+    """What a table answers to eight motors, without noise in the data."""
     rng, omega = np.random.default_rng(7), 2 * np.pi * np.geomspace(1.0, 70.0, 250)
     U = np.zeros((len(omega), 11, 1), complex)
     U[:, :8, 0] = rng.standard_normal((len(omega), 8)) + 1j * rng.standard_normal((len(omega), 8))
@@ -254,8 +254,12 @@ def seeds_of(truth, name, place, noise=1e-4):
     Y = truth.answer(made, None, False).Y
     plain = FREE.answer(made, None, False).Y
     power = noise * np.mean(np.abs(plain) ** 2, axis=(0, 2))
-    block = replace(made, Y=Y).with_noise(np.broadcast_to(np.diag(power), (len(omega), 6, 6)).astype(complex).copy())
-    score = Score(FREE, [block])
+    return replace(made, Y=Y).with_noise(np.broadcast_to(np.diag(power), (len(omega), 6, 6)).astype(complex).copy())
+
+
+def seeds_of(truth, name, place, noise=1e-4):
+    """What the score makes of a weak effect."""
+    score = Score(FREE, [block_of(truth, noise)])
     return score, library()[name].seeds(score, place)
 
 
@@ -327,6 +331,26 @@ def test_seeds_of_as_many_modes_as_there_are():
     two = with_effect("payload_flexible_mode", "payload/two", [22.0, 0.01, *first, 41.0, 0.01, *second], FREE)
     _, found = seeds_of(two, "payload_flexible_mode", "payload/two", 1e-6)
     np.testing.assert_allclose([found[0].values[0], found[0].values[14]], [22.0, 41.0], rtol=0.03)
+
+
+def test_a_further_mode_is_found_beside_those_of_a_model():
+    rng = np.random.default_rng(8)
+    values = [value for f in (22.0, 41.0, 55.0) for value in (f, 0.01, *(0.02 * rng.standard_normal(12)))]
+    block = block_of(with_effect("payload_flexible_mode", "payload/three", values, FREE))
+    two = with_effect("payload_flexible_mode", "payload/two", values[:28], FREE)
+    found = two.effects[0].effect.grown(two.effects[0], two, [block])
+    assert found[0].place == "payload/three"
+    assert found[0].values[:28] == tuple(values[:28])
+    assert found[0].values[28] == pytest.approx(55.0, rel=0.03)
+    shape = np.array(found[0].values[30:])
+    driven = [not one.optional for one in found[0].parameters[30:]]
+    assert abs(shape[driven] @ np.array(values[30:])[driven]) > 0.95 * np.linalg.norm(shape[driven]) * np.linalg.norm(
+        np.array(values[30:])[driven])
+    three = two.without(two.effects[0].label).with_effect(found[0])
+    assert found[0].effect.grown(found[0], three, [block]) == []
+    # What acts once cannot have more of it.
+    once = with_effect("mount_surge", "isolators z", active(library()["mount_surge"], FREE, "isolators z").values, FREE)
+    assert once.effects[0].effect.grown(once.effects[0], once, [block]) == []
 
 
 def test_a_mass_without_strength_changes_nothing():

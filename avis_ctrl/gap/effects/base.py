@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from avis_ctrl.gap.motion import RecordMotion
     from avis_ctrl.gap.operators import Operators
     from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import TableModel
+    from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+    from avis_ctrl.identification.spectra import SpectralBlock
 
 
 @dataclass(frozen=True)
@@ -218,6 +219,11 @@ class Effect(ABC):
             if not wrong:
                 found.append(Seed(tuple(values), took.chi2, took.rank, len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
+
+    def grown(self, one: ActiveEffect, model: TableModel, blocks: Sequence[SpectralBlock]) -> list[ActiveEffect]:
+        """One of a fitted model with one more of what it may have several of (modes), the most promising first; none
+        where it may not have more."""
+        return []
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         """Why physics forbids these values, empty where it does not."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,13 +18,16 @@ from avis_ctrl.gap.score_algebra import reduction
 if TYPE_CHECKING:
     from avis_ctrl.gap.operators import Operators
     from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import TableModel
+    from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+    from avis_ctrl.identification.spectra import SpectralBlock
 
 # Variants by number of modes.
 COUNTS = {"": 1, "two": 2, "three": 3}
 # A further mode is looked for where it takes this share of what the modes before it leave over the noise, and more than
 # chance would.
 FURTHER = 0.25
+# log of the ratio of two modes' frequencies from which on they are looked for apart.
+APART = 0.08
 # 1/sqrt(kg) that a shape is expected to have at least, where nothing is seen of it.
 SMALLEST_SHAPE = 1e-3
 
@@ -89,6 +93,23 @@ class PayloadFlexibleMode(Effect):
         return [seed for n, seed in _modes_one_by_one(score, self.parameters(score.model, "payload")[0].grid)
                 if n == count]
 
+    def grown(self, one: ActiveEffect, model: TableModel, blocks: Sequence[SpectralBlock]) -> list[ActiveEffect]:
+        """With one mode more, away from those it has: a weak one shows only once the strong ones are fitted."""
+        from avis_ctrl.gap.score import Score
+
+        count = COUNTS[one.place.partition("/")[2]]
+        larger = next((place for place in self.places(model) if COUNTS[place.partition("/")[2]] == count + 1), "")
+        if not larger:
+            return []
+        known = np.log([frequency for frequency, _, _ in modes(one.by_name)])
+        score = Score(model, blocks)
+        further = [seed for n, seed in _modes_one_by_one(score, self.parameters(model, "payload")[0].grid)
+                   if n == 1 and seed.chi2 > FURTHER * (score.chi2 - score.dof)
+                   and np.min(np.abs(np.log(seed.values[0]) - known)) > APART]
+        parameters = self.parameters(model, larger)
+        return [replace(one, place=larger, parameters=parameters, values=(*one.values, *seed.values))
+                for seed in further]
+
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         """The modes in the order of their frequencies."""
@@ -137,7 +158,7 @@ def _modes_one_by_one(score: Score, grid: Sequence[float]) -> list[tuple[int, Se
     for count in COUNTS.values():
         tries = []
         for k in range(len(frequencies)):
-            if all(abs(np.log(frequencies[k][0] / frequencies[j][0])) > 0.08 for j in chosen):
+            if all(abs(np.log(frequencies[k][0] / frequencies[j][0])) > APART for j in chosen):
                 G, b = _joint([*chosen, k], kept, own)
                 took = reduction(G, b)
                 tries.append((took.chi2, k, took.coefficients))
