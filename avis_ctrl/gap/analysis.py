@@ -19,7 +19,7 @@ from avis_ctrl.gap.judgement import effects_of, judge, undetermined
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
 from avis_ctrl.gap.refit import Refit, anew, judged, likelihood, refit, scattered, try_refit
 from avis_ctrl.gap.result import Detectable, Gap
-from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, Rival, definite, search
+from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, Rival, contested, definite, search
 from avis_ctrl.gap.show import shown
 from avis_ctrl.gap.signal_effects import (
     SignalFaults,
@@ -56,6 +56,8 @@ BY_PHYSICS = (1.0, 0.0, 1.0)
 
 # Lines of each record that the reported model is fitted to, and iterations from where the search left it.
 FINAL_LINES, FINAL_ITERATIONS = 1500, 8
+# Probability of a competitor below which a better knowledge of the noise does not bring it back.
+NO_CHANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +143,7 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     progress("noise of floor and sensors, with what was found")
     left = left_by(prepared.campaign, found.best.model, each)
     prepared = prepared.measured_with(found.best.model, left)
-    found = _again(prepared, found, effects, progress, each)
+    found = _contested(_again(prepared, found, effects, progress, each), prepared)
     progress("fits to all lines, and what they leave of the held-out records")
     base, updated, left_out = _final(prepared, found)
     faults = replace(prepared.faults, noise=levels(left, updated.model, prepared.faults.hum, prepared.faults.converter))
@@ -196,6 +198,18 @@ def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, p
     on = search(prepared.base, prepared.thin, prepared.thin_held, progress, effects, chain, each)
     return replace(on, pool=(*found.pool, *on.pool), passed_over=(*found.passed_over, *on.passed_over),
                    rivals=(*found.rivals, *on.rivals))
+
+
+def _contested(found: Found, prepared: Prepared) -> Found:
+    """Competitors that came near, fitted to the noise that is known now as what was found is; what then wins, wins."""
+    def told(one: Rival) -> Rival:
+        if set(one.against.labels) != set(found.best.labels) or one.left > 1 - NO_CHANCE:
+            return one
+        again = try_refit(one.refit.model, prepared.thin, prepared.thin_held)
+        return replace(one, refit=again or one.refit, against=found.best)
+    if found.beaten is not None:
+        return found
+    return contested(replace(found, rivals=tuple(map(told, found.rivals))))
 
 
 def _without_spare(best: Refit, prepared: Prepared) -> Refit:

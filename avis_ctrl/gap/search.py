@@ -299,13 +299,19 @@ def _rivals(parent: Refit, against: Refit, data: _Data, least: float) -> list[Ri
     return made
 
 
-def _contested(found: Found, data: _Data) -> Found:
-    """The chain without names that a competitor takes away."""
-    chain = found.chain
-    for one in found.rivals if len(chain) > 1 else ():
-        alone = replace(one, against=chain[-1])
+def contested(found: Found) -> Found:
+    """The chain without names where one of the competitors known takes them away."""
+    for one in found.rivals if len(found.chain) > 1 and found.beaten is None else ():
+        alone = replace(one, against=found.best)
         if alone.wins:
-            return replace(found, chain=chain[:1], reached_noise=False, beaten=alone)
+            return replace(found, chain=found.chain[:1], reached_noise=False, beaten=alone)
+    return found
+
+
+def _contested(found: Found, data: _Data) -> Found:
+    """The chain without names that a competitor takes away, one of the pair's with new competitors in its place."""
+    found = contested(found)
+    chain = found.chain
     if len(chain) < 3 or chain[-1].held_per_dof > CLOSED:
         return found
     # A pair: each of its effects may stand for something else; the first has been contested if it closed the gap alone.

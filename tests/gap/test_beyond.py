@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.record_motion import mount_rows
 from avis_ctrl.gap.refit import refit
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.search import GIVEN_UP, search, weaker
+from avis_ctrl.gap.search import GIVEN_UP, Found, Rival, contested, search, weaker
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
@@ -140,6 +141,37 @@ def test_a_user_s_own_effect_that_closes_the_gap_is_not_taken_away():
     shipped = replace(rival, against=replace(rival.against, model=MODEL.with_effect(
         active(library()["sensor_gain"], MODEL, "Sz1"))))
     assert shipped.left == rival.left and shipped.wins == (rival.left < GIVEN_UP)
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """What a contest asks of a refit; of so many numbers that the held-out residual is noise."""
+
+    criterion: float
+    chi2_held: float = 1000.0
+    chi2_fit: float = 0.0
+    held_per_dof: float = 1.0
+    model = SimpleNamespace(effects=())
+
+
+def test_what_came_near_is_contested_anew():
+    base, named, far, near = (Weighed(c) for c in (5000.0, 1000.0, 2000.0, 1100.0))
+    # Held against what was found before it was refitted, the competitor would win; against the refit it does not.
+    rival = Rival(replace(near, chi2_fit=100.0), replace(far, chi2_fit=1000.0), "a competitor")
+    assert rival.left < GIVEN_UP
+    found = Found((base, named), (), True, (), (rival,))
+    assert contested(found) is found
+    # By what it falls short: odds of e^((1100 - 1000)/2), ten to one beforehand.
+    assert replace(rival, against=named).odds == pytest.approx(2 * np.log(10.0) + 100.0)
+    better = replace(rival, refit=Weighed(800.0, 990.0, -200.0))
+    beaten = contested(replace(found, rivals=(better,)))
+    assert beaten.chain == (base,)
+    assert not beaten.reached_noise
+    assert beaten.beaten is not None
+    assert beaten.beaten.against is named
+    # What has been decided stays.
+    kept = replace(found, rivals=(better,), beaten=rival)
+    assert contested(kept) is kept
 
 
 def test_a_weaker_start_goes_to_a_tenth_of_the_way():
