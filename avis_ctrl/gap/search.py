@@ -404,7 +404,7 @@ def _to_the_end(chain: tuple[Refit, ...], fitted: Sequence[SpectralBlock], held_
 
 def _grown(chain: tuple[Refit, ...], data: _Data) -> tuple[Refit, ...]:
     """A chain of which the last effect takes the larger part of what was left, with as much more of it (a further mode)
-    as takes most of the rest; as it was where none does."""
+    as takes the larger part of the rest; as it was where none does."""
     last = found = chain[-1]
     if len(chain) == 1 or _share(last, chain[-2]) < LARGER_PART:
         return chain
@@ -420,7 +420,7 @@ def _grown(chain: tuple[Refit, ...], data: _Data) -> tuple[Refit, ...]:
             break
         found = more
     misfit = max(1.0, found.held_per_dof) * known_noise(data.fitted)
-    enough = (last.criterion - found.criterion) / misfit > LEAST_FALL and _share(found, last) > TAKES
+    enough = (last.criterion - found.criterion) / misfit > LEAST_FALL and _share(found, last) > LARGER_PART
     return (*chain[:-1], found) if enough else chain
 
 
