@@ -98,14 +98,14 @@ class PayloadFlexibleMode(Effect):
         from avis_ctrl.gap.score import Score
 
         count = COUNTS[one.place.partition("/")[2]]
-        larger = next((place for place in self.places(model) if COUNTS[place.partition("/")[2]] == count + 1), "")
-        if not larger:
+        if count == max(COUNTS.values()):
             return []
         known = np.log([frequency for frequency, _, _ in modes(one.by_name)])
         score = Score(model, blocks)
-        further = [seed for n, seed in _modes_one_by_one(score, self.parameters(model, "payload")[0].grid)
-                   if n == 1 and seed.chi2 > FURTHER * (score.chi2 - score.dof)
+        further = [seed for _, seed in _modes_one_by_one(score, self.parameters(model, "payload")[0].grid, 1)
+                   if seed.chi2 > FURTHER * (score.chi2 - score.dof)
                    and np.min(np.abs(np.log(seed.values[0]) - known)) > APART]
+        larger = next(f"payload/{name}" for name, modes_of in COUNTS.items() if modes_of == count + 1)
         parameters = self.parameters(model, larger)
         return [replace(one, place=larger, parameters=parameters, values=(*one.values, *seed.values))
                 for seed in further]
@@ -144,10 +144,11 @@ def shape_rows(rig, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[n
             np.eye(len(order))[[order[places[name]] for name in sensors]])
 
 
-def _modes_one_by_one(score: Score, grid: Sequence[float]) -> list[tuple[int, Seed]]:
-    """(number of modes, seed), the best first: each further mode beside those before it."""
-    if "modes" in score.kept:
-        return score.kept["modes"]
+def _modes_one_by_one(score: Score, grid: Sequence[float], most: int = len(COUNTS)) -> list[tuple[int, Seed]]:
+    """(number of modes, seed), the best first: each further mode beside those before it, up to `most`."""
+    key = ("modes", most)
+    if key in score.kept:
+        return score.kept[key]
     frequencies = [(f, 0.02) for f in grid] + [(f, zeta) for f in peaks(score) if f > grid[0] for zeta in (0.005, 0.02)]
     kept = [paths(score, partial(receptance, frequency_Hz=f, damping=zeta)).astype(np.float32)
             for f, zeta in frequencies]
@@ -155,7 +156,7 @@ def _modes_one_by_one(score: Score, grid: Sequence[float]) -> list[tuple[int, Se
     own = [((A @ A.T).astype(float), (A @ e).astype(float)) for A in kept]
     chosen: list[int] = []
     before = 0.0
-    for count in COUNTS.values():
+    for count in range(1, most + 1):
         tries = []
         for k in range(len(frequencies)):
             if all(abs(np.log(frequencies[k][0] / frequencies[j][0])) > APART for j in chosen):
@@ -174,8 +175,8 @@ def _modes_one_by_one(score: Score, grid: Sequence[float]) -> list[tuple[int, Se
                                  len(frequencies) ** count):
                 found.append((count, seed))
         before = chi2
-    score.kept["modes"] = sorted(found, key=lambda one: (one[0], -one[1].chi2))
-    return score.kept["modes"]
+    score.kept[key] = sorted(found, key=lambda one: (one[0], -one[1].chi2))
+    return score.kept[key]
 
 
 def _joint(chosen: Sequence[int], kept: Sequence[np.ndarray], own: Sequence[tuple[np.ndarray, np.ndarray]]
