@@ -243,6 +243,12 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
             worth = max([worth, *(one.worth for one in scored[:1])])
             rough += _rough(chain, shortlist(scored, REFITS if depth == 1 else REFITS_LATER), data, depth)
         made, left = _promoted(_distinct(rough), depth, data)
+        if made and made[0][:-1] not in parents:  # an earlier effect has grown: what else may follow it as it is now?
+            parent = made[0][:-1]
+            scored = candidates(Score(parent[-1].model, fitted), known, each)
+            beside, behind = _promoted(_distinct(_rough(parent, shortlist(scored, REFITS_LATER), data, depth)), depth,
+                                       data)
+            made, left = _distinct([*made, *beside]), [*left, *behind]
         passed_over += left
         pool.append(tuple(chain[-1] for chain in made))
         plausible = [chain for chain in made if not chain[-1].implausible()]
@@ -336,8 +342,8 @@ def _same(one: Refit, other: Refit, label: str) -> bool:
                for x, y, s, p in zip(a.values, b.values, std, a.parameters, strict=True) if p.linear)
 
 
-def _coarse(model: TableModel, effects: Sequence[ActiveEffect], data: _Data) -> list[Refit]:
-    """Refits on few lines with one more effect each; those that came to no end are left out.
+def _coarse(model: TableModel, effects: Sequence[ActiveEffect], data: _Data, at: int | None = None) -> list[Refit]:
+    """Refits on few lines with one more effect each, as number `at`; those that came to no end are left out.
 
     First the rig alone, for the seed took for granted that it gives way to the effect; then all together.
     """
@@ -345,7 +351,7 @@ def _coarse(model: TableModel, effects: Sequence[ActiveEffect], data: _Data) -> 
     least = np.inf if before is None else before.chi2_fit
 
     def fitted(one: ActiveEffect) -> Refit | None:
-        begin = model.with_effect(one)
+        begin = model.with_effect(one, at)
         held = try_refit(replace(begin, fixed=begin.fixed | set(one.names)), data.few, data.held_out[:1], GIVE_WAY)
         begin = begin if held is None else replace(held.model, fixed=begin.fixed)
         return try_refit(begin, data.few, data.held_out, COARSE_ITERATIONS)
@@ -357,8 +363,8 @@ def _coarse(model: TableModel, effects: Sequence[ActiveEffect], data: _Data) -> 
             second = fitted(faint)
             found = min((r for r in (found, second) if r is not None), key=lambda r: r.chi2_fit, default=None)
         return Reached.by(found)
-    return [found.refit(model.with_effect(one)) for one, found in zip(effects, data.each(reached, effects), strict=True)
-            if found is not None]
+    made = zip(effects, data.each(reached, effects), strict=True)
+    return [found.refit(model.with_effect(one, at)) for one, found in made if found is not None]
 
 
 def weaker(one: ActiveEffect) -> ActiveEffect:
@@ -403,25 +409,39 @@ def _to_the_end(chain: tuple[Refit, ...], fitted: Sequence[SpectralBlock], held_
 
 
 def _grown(chain: tuple[Refit, ...], data: _Data) -> tuple[Refit, ...]:
-    """A chain of which the last effect takes the larger part of what was left, with as much more of it (a further mode)
-    as takes the larger part of the rest; as it was where none does."""
+    """A chain with as much more of one of its effects (a further mode) as takes the larger part of what the chain
+    leaves; as it was where none does. The shorter chains are refitted with that effect as it is then."""
     last = found = chain[-1]
-    if len(chain) == 1 or _share(last, chain[-2]) < LARGER_PART:
-        return chain
-    while found.held_per_dof > CLOSED:
-        one = found.model.effects[-1]
-        larger = one.effect.grown(one, found.model, data.fitted)
-        if not larger:
+    while len(chain) > 1 and found.held_per_dof > CLOSED:
+        more = [_with_more(found, k, data) for k in range(len(found.model.effects))]
+        best = min((one for one in more if one is not None), key=lambda r: r.criterion, default=found)
+        if best.criterion >= found.criterion:
             break
-        data.progress(f"more of it: {one.effect.name} ({larger[0].place.replace('/', ', ')})?")
-        coarse = min(_coarse(found.model.without(one.label), larger, data), key=lambda r: r.criterion, default=None)
-        more = coarse and try_refit(coarse.model, data.fitted, data.held_out, MORE_ITERATIONS)
-        if more is None or more.criterion >= found.criterion:
-            break
-        found = more
+        found = best
     misfit = max(1.0, found.held_per_dof) * known_noise(data.fitted)
-    enough = (last.criterion - found.criterion) / misfit > LEAST_FALL and _share(found, last) > LARGER_PART
-    return (*chain[:-1], found) if enough else chain
+    if (last.criterion - found.criterion) / misfit <= LEAST_FALL or _share(found, last) <= LARGER_PART:
+        return chain
+    return (*(_alike(one, found, data) for one in chain[:-1]), found)
+
+
+def _with_more(found: Refit, k: int, data: _Data) -> Refit | None:
+    """A refit with more of the effect number k, if there is more of it."""
+    one = found.model.effects[k]
+    larger = one.effect.grown(one, found.model, data.fitted)
+    if not larger:
+        return None
+    data.progress(f"more of it: {one.effect.name} ({larger[0].place.replace('/', ', ')})?")
+    coarse = min(_coarse(found.model.without(one.label), larger, data, k), key=lambda r: r.criterion, default=None)
+    return coarse and try_refit(coarse.model, data.fitted, data.held_out, MORE_ITERATIONS)
+
+
+def _alike(one: Refit, found: Refit, data: _Data) -> Refit:
+    """A refit with the same effects as another one's first."""
+    first = found.model.effects[:len(one.model.effects)]
+    if [effect.label for effect in first] == [effect.label for effect in one.model.effects]:
+        return one
+    return try_refit(replace(one.model, effects=first, fixed=found.model.fixed), data.fitted, data.held_out,
+                     ITERATIONS[1]) or one
 
 
 def _share(found: Refit, before: Refit) -> float:

@@ -187,9 +187,10 @@ class TableModel:
         values[j] = value
         return replace(self, effects=(*self.effects[:k], self.effects[k].at(values), *self.effects[k + 1:]))
 
-    def with_effect(self, effect: ActiveEffect) -> TableModel:
-        """The model with one effect more, its late parameters held where they are."""
-        return replace(self, effects=(*self.effects, effect), fixed=self.fixed | effect.late)
+    def with_effect(self, effect: ActiveEffect, at: int | None = None) -> TableModel:
+        """The model with one effect more, the last or as number `at`; its late parameters held where they are."""
+        at = len(self.effects) if at is None else at
+        return replace(self, effects=(*self.effects[:at], effect, *self.effects[at:]), fixed=self.fixed | effect.late)
 
     def with_late_free(self) -> TableModel:
         """The same with the late parameters of its effects free, too."""
