@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from assembled_table import Assembly, mount_map
 
+from avis_ctrl.gap.data import thinned
+from avis_ctrl.gap.each import one_by_one
 from avis_ctrl.gap.effects.base import Seed, library
 from avis_ctrl.gap.effects.impedance import peaks
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.realise import realise
 from avis_ctrl.gap.refit import at_the_edge, refit
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.search import summits
+from avis_ctrl.gap.search import _Data, _grown, summits
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
@@ -351,6 +353,25 @@ def test_a_further_mode_is_found_beside_those_of_a_model():
     # What acts once cannot have more of it.
     once = with_effect("mount_surge", "isolators z", active(library()["mount_surge"], FREE, "isolators z").values, FREE)
     assert once.effects[0].effect.grown(once.effects[0], once, [block]) == []
+
+
+def test_an_earlier_effect_of_a_chain_grows_in_its_place():
+    rng = np.random.default_rng(8)
+    values = [value for f in (22.0, 41.0, 55.0) for value in (f, 0.02, *(0.01 * rng.standard_normal(12)))]
+
+    def damped(model):
+        return model.with_effect(active(library()["structural_damping"], model, "isolators/causal", [0.08]))
+    block = measured(damped(with_effect("payload_flexible_mode", "payload/three", values, IDENTIFIED)), rng)
+    two = with_effect("payload_flexible_mode", "payload/two", values[:28], IDENTIFIED)
+    chain = tuple(refit(model, [block], [block], 4) for model in (IDENTIFIED, two, damped(two)))
+    data = _Data([block], [block], [thinned(block, 140, seed=1)], lambda text: None, one_by_one)
+    grown = _grown(chain, data)
+    mode, damping = "payload_flexible_mode@payload/three", "structural_damping@isolators/causal"
+    assert [one.labels for one in grown] == [(), (mode,), (mode, damping)]
+    assert grown[-1].held_per_dof == pytest.approx(1.0, abs=0.1)
+    assert grown[-1].model.effects[0].values[28] == pytest.approx(55.0, rel=1e-3)
+    assert grown[-1].model.effects[1].values[0] == pytest.approx(0.08, rel=0.02)
+    assert _grown(grown, data) is grown
 
 
 def test_a_mass_without_strength_changes_nothing():
