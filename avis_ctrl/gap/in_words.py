@@ -18,8 +18,8 @@ def in_words(one: NamedEffect) -> str:
 
 def spoken(name: str, unit: str) -> str:
     """A parameter's name without its unit, which stands behind the number."""
-    tail = unit.replace(" ", "").replace("^", "").replace("/", "_per_")
-    return name.removesuffix(f"_{tail}").replace("_", " ")
+    tail = "" if unit == "1" else unit.replace(" ", "").replace("^", "").replace("/", "_per_")
+    return (name.removesuffix(f"_{tail}") if tail else name).replace("_", " ")
 
 
 def sized(p: Reported) -> str:

@@ -109,7 +109,8 @@ def named(faults: SignalFaults) -> list[NamedEffect]:
     motion = faults.noise.ground_motion if faults.noise is not None else None
     if motion is not None:
         found.append(NamedEffect("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured",
-                                 _reported(motion.parameters), MOST_SURE, confirmation=motion.sentence))
+                                 _reported(motion.parameters), min(motion.confidence, MOST_SURE),
+                                 confirmation=motion.sentence))
     return found
 
 

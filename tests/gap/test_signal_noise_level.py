@@ -54,6 +54,7 @@ def test_ambient_is_ambient(kind, slope):
 def test_three_times_ambient_is_ground_motion_whatever_its_shape(kind, slope):
     found = levels(*drawn(2, kind, slope=slope, floor_rms=6e-6))
     assert found.ground_motion is not None and found.raised == ()
+    assert found.ground_motion.confidence > 0.999
     value = found.ground_motion.parameters["velocity_rms"]
     assert abs(value.value - 6e-6) < max(4 * value.std, 0.15 * 6e-6)
 

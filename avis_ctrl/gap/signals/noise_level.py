@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.stats import norm
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.signals.converter import nominal_converter
@@ -110,11 +111,13 @@ class GroundMotionFinding:
     """Unmeasured floor motion clearly above ambient.
 
     parameters : "velocity_rms" (mean over directions) and "velocity_rms_x" ... [m/s] in 0.5-60 Hz.
+    confidence : 1 - p, p a bound on the chance that estimates of a floor that is at ambient come out as high.
     """
 
     channels: tuple[str, ...]
     parameters: dict[str, Estimate]
     ratio: float
+    confidence: float
     sentence: str
     picture: Picture
 
@@ -321,10 +324,15 @@ def _level(S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarra
 
     def above(one: Estimate, factor: float) -> bool:
         return one.value > factor * ambient and one.value - SIGNIFICANT * one.std > ambient
-    significant = any(one.value - SIGNIFICANT * one.std > ambient for one in (mean, mean_seen, *seen.values()))
+    significant = _excess(ambient, mean, mean_seen, seen) > SIGNIFICANT
     clear = (any(above(one, SEEN_FACTOR) for one in (mean_seen, *seen.values()))
              or any(above(one, TOTAL_FACTOR) for one in (mean, *rms.values())))
     return FloorLevel(rms, seen, ends, mean, mean_seen, ambient, foreign, centre, S, std, significant, clear)
+
+
+def _excess(ambient: float, mean: Estimate, mean_seen: Estimate, seen: dict[str, Estimate]) -> float:
+    """Standard errors by which the highest of these five estimates is above ambient."""
+    return max((one.value - ambient) / max(one.std, 1e-30) for one in (mean, mean_seen, *seen.values()))
 
 
 def _tail(f: np.ndarray, S: np.ndarray, std: np.ndarray, end: float) -> tuple[float, float]:
@@ -375,4 +383,5 @@ def _ground_motion(floor: FloorLevel, names: tuple[str, ...]) -> GroundMotionFin
                 f" {1e6 * seen.value:.3g} +- {1e6 * seen.std:.2g} um/s of it are seen up to {end:.3g} Hz, the rest is a"
                 " power law carried on.")
     parameters = {"velocity_rms": m} | {f"velocity_rms_{axis}": one for axis, one in floor.rms.items()}
-    return GroundMotionFinding(names, parameters, ratio, sentence, picture)
+    chance = 5 * float(norm.sf(_excess(floor.ambient, m, seen, floor.seen)))
+    return GroundMotionFinding(names, parameters, ratio, 1 - min(chance, 1.0), sentence, picture)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from avis_ctrl.gap.in_words import spoken
 from avis_ctrl.gap.result import Detectable, Gap
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
@@ -30,12 +31,12 @@ def detectable(gap: Gap) -> Table:
     for one in gap.detectable:
         groups.setdefault((one.name, one.parameter, one.unit), []).append(one)
     rows = []
-    for (name, parameter, _), members in groups.items():
+    for (name, parameter, unit), members in groups.items():
         ordered = sorted(members, key=lambda one: one.value)
         where = ordered[0].location if len(ordered) == 1 else f"{ordered[0].location} (best) to {ordered[-1].location}"
         ends = [ordered[0]] if len(ordered) == 1 else [ordered[0], ordered[-1]]
         size = " to ".join(_seen(one) for one in ends)
-        rows.append((wording.titled(name), where, wording.parameter(parameter), size))
+        rows.append((wording.titled(name), where, spoken(parameter, unit), size))
     return table("An effect that is absent, by itself at its place, would differ from none by five standard "
                  "deviations of the fit at this size, at the best and at the worst of its places: about what the "
                  "search asks for before it names one of so many. What is smaller may be there. \"At no size\": "

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Effect, Reported, library
+from avis_ctrl.gap.in_words import spoken
 from avis_ctrl.gap.judgement import UNEXPLAINED
 from avis_ctrl.gap.result import Considered, NamedEffect, Where
 from avis_ctrl.gap.search import CLOSED
@@ -31,9 +32,6 @@ CLAIMS = {
 PERCENT = 100.0
 # Shares below this are told as that.
 LEAST = 1e-5
-# What names of parameters end in, the longer before what it ends in itself.
-UNITS = ("_N_per_ms", "_m_per_s2", "_N_per_m3", "_Ns_per_m", "_N_per_m",
-         "_kgm2", "_per_s", "_Hz", "_deg", "_rad", "_kg", "_s", "_m", "_V", "_N")
 
 
 def titled(name: str) -> str:
@@ -79,14 +77,8 @@ def quantity(one: Reported) -> str:
 
 def quantities(parameters: Mapping[str, Reported], most: int | None = None) -> str:
     """Name = value ± std unit, of each, or of the first ones."""
-    told = [f"{parameter(name)} {quantity(one)}" for name, one in parameters.items()]
+    told = [f"{spoken(name, one.unit)} {quantity(one)}" for name, one in parameters.items()]
     return "; ".join([*told[:most], *([f"and {len(told) - most} more"] if most and len(told) > most else [])])
-
-
-def parameter(name: str) -> str:
-    """A parameter's name without its unit, which stands behind the number."""
-    tail = next((tail for tail in UNITS if name.endswith(tail)), "")
-    return name.removesuffix(tail).replace("_", " ")
 
 
 def said(text: str) -> str:
