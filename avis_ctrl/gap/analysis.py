@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, reduce
 
 import numpy as np
 
@@ -144,8 +144,11 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     left = left_by(prepared.campaign, found.best.model, each)
     prepared = prepared.measured_with(found.best.model, left)
     found = _contested(_again(prepared, found, effects, progress, each), prepared)
-    progress("fits to all lines, and what they leave of the held-out records")
+    progress("the last fit, and what is left of all lines of the held-out records")
     base, updated, left_out = _final(prepared, found)
+    if left_out:
+        rest = reduce(TableModel.without, set(found.best.labels) - set(updated.labels), found.best.model)
+        found = _shortened(found, refit(rest, prepared.thin, prepared.thin_held))
     faults = replace(prepared.faults, noise=levels(left, updated.model, prepared.faults.hum, prepared.faults.converter))
     judgement = judge(prepared.thin, found, base, updated, faults, left_out)
     limits: tuple[Detectable, ...] = ()
@@ -188,8 +191,7 @@ def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, p
         return replace(found, chain=(prepared.base,), reached_noise=prepared.base.held_per_dof <= NOISE)
     best = _without_spare(refit(found.best.model, prepared.thin, prepared.thin_held), prepared)
     if len(effects_of(best.model)) < len(found.chain) - 1:
-        # A stage of its own where the search had no refit with it alone.
-        found = replace(found, chain=(found.chain[0], best), pool=(*found.pool, (best,)))
+        found = _shortened(found, best)
     between = [judged(one.fit, prepared.thin_held) for one in found.chain[1:-1]]
     chain = (prepared.base, *between, best)
     longer = replace(found, chain=chain, reached_noise=best.held_per_dof <= CLOSED)
@@ -200,15 +202,30 @@ def _again(prepared: Prepared, found: Found, effects: Sequence[Effect] | None, p
                    rivals=(*found.rivals, *on.rivals))
 
 
+def _shortened(found: Found, best: Refit) -> Found:
+    """What was found with one effect less than its chain; a stage of its own, for the search may have no refit with
+    what is left alone."""
+    return replace(found, chain=(found.chain[0], best), pool=(*found.pool, (best,)))
+
+
 def _contested(found: Found, prepared: Prepared) -> Found:
-    """Competitors that came near, fitted to the noise that is known now as what was found is; what then wins, wins."""
+    """Competitors that came near, fitted to the noise that is known now as what was found is; what then wins, wins.
+    A name that was taken away is given back where it came near and is not to be given up by that noise."""
+    def again(one: Refit) -> Refit:
+        return try_refit(one.model, prepared.thin, prepared.thin_held) or one
+
     def told(one: Rival) -> Rival:
         if set(one.against.labels) != set(found.best.labels) or one.left > 1 - NO_CHANCE:
             return one
-        again = try_refit(one.refit.model, prepared.thin, prepared.thin_held)
-        return replace(one, refit=again or one.refit, against=found.best)
-    if found.beaten is not None:
-        return found
+        return replace(one, refit=again(one.refit), against=found.best)
+    if (rival := found.beaten) is not None:
+        if rival.left < NO_CHANCE:
+            return found
+        rival = replace(rival, refit=again(rival.refit), against=again(rival.against))
+        if rival.wins:
+            return replace(found, beaten=rival)
+        return replace(found, chain=(found.chain[0], rival.against), beaten=None, rivals=(rival,),
+                       reached_noise=rival.against.held_per_dof <= CLOSED)
     return contested(replace(found, rivals=tuple(map(told, found.rivals))))
 
 

@@ -21,7 +21,7 @@ from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 Item = TypeVar("Item")
 # Records at levels within this factor are of one level.
 SAME_LEVEL = 1.25
-# Lines of a record on which candidates are compared; the models that are reported are fitted to all.
+# Lines of a record on which candidates are compared; the updated model is fitted to more (`analysis.FINAL_LINES`).
 THIN_LINES = 450
 # Below this [Hz] lie the resonances of a table: there no line is left out before the others.
 DENSE_BELOW_Hz = 8.0

@@ -16,7 +16,7 @@ from avis_ctrl.gap.covariance import directions
 from avis_ctrl.gap.effects.base import Effect, library
 from avis_ctrl.gap.result import Detectable
 from avis_ctrl.gap.score import LEFT, Score
-from avis_ctrl.gap.search import location
+from avis_ctrl.gap.search import known_noise, location
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.spectra import SpectralBlock
 
@@ -35,7 +35,7 @@ def detectable(model: TableModel, blocks: Sequence[SpectralBlock], effects: Sequ
     model : fitted to the blocks. effects : the library where None.
     """
     score = Score(model, blocks)
-    deviation = DEVIATIONS * np.sqrt(max(1.0, score.chi2 / score.dof))
+    deviation = DEVIATIONS * np.sqrt(max(1.0, score.chi2 / score.dof) * known_noise(blocks))
     rows: dict[tuple[str, str, str], Detectable] = {}
     for effect in list(library().values()) if effects is None else effects:
         if effect.nonlinear and not model.motion:

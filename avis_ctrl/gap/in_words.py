@@ -18,7 +18,7 @@ def in_words(one: NamedEffect) -> str:
 
 def spoken(name: str, unit: str) -> str:
     """A parameter's name without its unit, which stands behind the number."""
-    tail = "" if unit == "1" else unit.replace(" ", "").replace("^", "").replace("/", "_per_")
+    tail = "".join(sign for sign in unit if sign not in " ^()").replace("/", "_per_").removeprefix("1").lstrip("_")
     return (name.removesuffix(f"_{tail}") if tail else name).replace("_", " ")
 
 

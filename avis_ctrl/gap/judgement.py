@@ -35,6 +35,8 @@ EARNED = 0.5
 # Halves agree within so many standard deviations (of parameters, widened by the misfit), or within this share.
 AGREE_STD, AGREE_SHARE = 4.0, 0.15
 LARGE_MOTION = "large_motion"
+# Runners-up that are told of.
+MOST_CONSIDERED = 12
 # A linear effect whose strength differs from level to level by this share, and by chance less often than that, is none.
 UNEQUAL_SHARE, UNEQUAL = 0.25, 1e-4
 
@@ -43,7 +45,8 @@ UNEQUAL_SHARE, UNEQUAL = 0.25, 1e-4
 class Judgement:
     """Verdict, effects and model; rivals that were refitted, and sentences on how it was decided.
 
-    like : what a gap without a name behaves most like.
+    like : what a gap without a name behaves most like. raised : sensors whose own noise, above ambient, is all that has
+    no name; empty where something else has none.
     """
 
     verdict: Verdict
@@ -53,6 +56,7 @@ class Judgement:
     reasons: tuple[str, ...]
     next_experiment: str | None
     like: str = ""
+    raised: tuple[str, ...] = ()
 
 
 def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Refit, faults: SignalFaults,
@@ -69,9 +73,7 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
         faults = replace(faults, noise=None)
     signal = named(faults)
     raised = faults.raised
-    reasons = [f"the noise of {', '.join(raised)} is above the rig file's ambient level; the library has no name for "
-               "that"] if raised else []
-    reasons += [*left_out, faint] if faint else left_out
+    reasons = [*left_out, faint] if faint else [*left_out]
     refused_by_level = False
     if own and updated.held_per_dof > CLOSED:
         refusal = refused(thin, base, updated)
@@ -83,7 +85,11 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
         own, updated, refused_by_level = [], base, True
     reasons += _beyond(found, updated, own)
     most = CLOSED if own or signal else UNEXPLAINED
-    residual_left = updated.held_per_dof > most or bool(raised) or refused_by_level or found.beaten is not None
+    table_left = updated.held_per_dof > most or refused_by_level or found.beaten is not None
+    residual_left = table_left or bool(raised)
+    if raised and table_left:
+        reasons.insert(0, f"the noise of {', '.join(raised)} is above the rig file's ambient level; the library has no "
+                          "name for that")
     effects = [*_table_effects(found, updated, own, known_noise(thin)), *signal]
     if effects:
         verdict: Verdict = "partly explained" if residual_left else "explained"
@@ -91,7 +97,7 @@ def judge(thin: Sequence[SpectralBlock], found: Found, base: Refit, updated: Ref
         verdict = "unexplained" if residual_left else "none"
     return Judgement(verdict, tuple(effects), updated, _considered(found, updated, known_noise(thin)), tuple(reasons),
                      _next(effects, found, updated),
-                     found.beaten.words if found.beaten is not None and not own else "")
+                     found.beaten.words if found.beaten is not None and not own else "", () if table_left else raised)
 
 
 def _beyond(found: Found, updated: Refit, own: Sequence[ActiveEffect]) -> list[str]:
@@ -260,7 +266,8 @@ def _in_place_of(label: str, found: Found, updated: Refit) -> tuple[list[Refit],
     """Refits that have some effect in the place of one of the updated model's, and the labels of the others."""
     others = {other for other in updated.labels if other != label}
     return [r for stage in found.pool for r in stage if others <= set(r.labels)
-            and len(r.labels) == len(updated.labels) and not r.implausible()], others
+            and len(r.labels) == len(updated.labels)
+            and (set(r.labels) == set(updated.labels) or not r.implausible())], others
 
 
 def _gain(found: Found, label: str) -> float:
@@ -272,33 +279,43 @@ def _gain(found: Found, label: str) -> float:
 
 
 def _considered(found: Found, updated: Refit, stretch: float) -> tuple[Considered, ...]:
-    """What was refitted and not taken, best first, and why."""
+    """What was refitted and not taken, the most probable first, and why. Probabilities are among all of it."""
     rows = []
-    chosen, left = set(updated.labels), 1.0 if found.beaten is None else found.beaten.left
+    left = 1.0 if found.beaten is None else found.beaten.left
     best, who = ((found.best, "the best model") if found.beaten is None else
                  (found.beaten.refit, "what it behaves most like"))
-    for stage in found.pool:
-        if not stage:
+    named, refitted = _names(updated), [one for stage in found.pool for one in stage]
+    shares: dict[frozenset[tuple[str, str]], float] = {}
+    for one, share in zip(refitted, probabilities(refitted, stretch) if refitted else (), strict=True):
+        shares[_names(one)] = shares.get(_names(one), 0.0) + float(share)
+    for rival in sorted(refitted, key=lambda one: one.criterion):
+        names, own = _names(rival), effects_of(rival.model)
+        if names <= named or not own:  # a step on the way to what was chosen, or a variant of it, lost to nothing
             continue
-        p = probabilities(stage, stretch)
-        for rival, share in sorted(zip(stage, p, strict=True), key=lambda pair: pair[0].criterion):
-            own = effects_of(rival.model)
-            if set(rival.labels) <= chosen or not own:  # a step on the way to what was chosen lost to nothing
-                continue
-            reason = rival.implausible() or (f"leaves {rival.held_per_dof:.3g} times the noise's power of the held-out "
-                                             f"records, {who} {best.held_per_dof:.3g}")
-            if rival.held_per_dof > found.chain[0].held_per_dof:
-                reason += ": more than without it; its fit stopped short, or does not hold beyond its records"
-            rows.append(Considered(" and ".join(one.effect.name for one in own),
-                                   " and ".join(location(one.place) for one in own), rival.held_per_dof,
-                                   float(share) * left, reason, rival.reported(own[-1])))
-    for rival in sorted(found.passed_over, key=lambda one: one.held_per_dof):
+        share, shares[names] = shares[names], 0.0  # of variants the first has what they have together
+        reason = rival.implausible() or (
+            "it comes nearest; why it is not named stands in the result" if names == _names(found.best) else
+            f"leaves {rival.held_per_dof:.3g} times the noise's power of the held-out records, {who} "
+            f"{best.held_per_dof:.3g}")
+        if rival.held_per_dof > found.chain[0].held_per_dof:
+            reason += ": more than without it; its fit stopped short, or does not hold beyond its records"
+        rows.append(Considered(" and ".join(one.effect.name for one in own),
+                               " and ".join(location(one.place) for one in own), rival.held_per_dof,
+                               min(share * left, MOST_SURE), reason, rival.reported(own[-1])))
+    for rival in found.passed_over:
         own = effects_of(rival.model)
+        if _names(rival) <= named:
+            continue
         rows.append(Considered(" and ".join(one.effect.name for one in own),
                                " and ".join(location(one.place) for one in own), rival.held_per_dof, 0.0,
                                rival.implausible() or "behind others after a refit to few lines, not refitted to all",
                                rival.reported(own[-1])))
-    return tuple(rows[:12])
+    return tuple(sorted(rows, key=lambda one: (-one.probability, one.chi2_per_dof))[:MOST_CONSIDERED])
+
+
+def _names(one: Refit) -> frozenset[tuple[str, str]]:
+    """Effects and places of a refit, without variants."""
+    return frozenset((each.effect.name, location(each.place)) for each in effects_of(one.model))
 
 
 def _next(effects: Sequence[NamedEffect], found: Found, updated: Refit) -> str | None:

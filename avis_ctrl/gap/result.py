@@ -158,6 +158,7 @@ class Gap:
     covariance : (n_p, n_p) of the updated model's parameters.
     detectable : where the verdict is none, sizes of five standard deviations of absent effects; else empty.
     shares : what accounts for the outputs' power, by level, the lowest first. records : what each record leaves.
+    raised : sensors whose own noise is all that has no name; `remaining` then holds these.
     """
 
     verdict: Verdict
@@ -179,6 +180,7 @@ class Gap:
     detectable: tuple[Detectable, ...] = ()
     shares: tuple[PowerShares, ...] = ()
     records: tuple[RecordGap, ...] = ()
+    raised: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """gap.json of the contract, format "avis-gap" version 1."""

@@ -48,7 +48,7 @@ GIVE_WAY = 4
 ITERATIONS = (20, 10)
 # And for the best ones if they are not at their end yet.
 MORE_ITERATIONS = 30
-# Share of what the chain before it leaves over the noise that a second or third effect must take.
+# Share of what the chain before it leaves over the noise that a second effect must take.
 TAKES = 0.8
 # And the share with which an effect may be given more of what it may have several of.
 LARGER_PART = 0.5
@@ -243,19 +243,22 @@ def search(base: Refit, fitted: Sequence[SpectralBlock], held_out: Sequence[Spec
             worth = max([worth, *(one.worth for one in scored[:1])])
             rough += _rough(chain, shortlist(scored, REFITS if depth == 1 else REFITS_LATER), data, depth)
         made, left = _promoted(_distinct(rough), depth, data)
-        if made and made[0][:-1] not in parents:  # an earlier effect has grown: what else may follow it as it is now?
-            parent = made[0][:-1]
-            scored = candidates(Score(parent[-1].model, fitted), known, each)
-            beside, behind = _promoted(_distinct(_rough(parent, shortlist(scored, REFITS_LATER), data, depth)), depth,
-                                       data)
+        before = parents
+        # Where an earlier effect has grown: what else may follow it as it is now?
+        while made and made[0][:-1] not in parents:
+            parents = [made[0][:-1]]
+            pool[-1:] = [(*(pool[-1] if pool else ()), parents[0][-1])]
+            scored = candidates(Score(parents[0][-1].model, fitted), known, each)
+            beside, behind = _promoted(_distinct(_rough(parents[0], shortlist(scored, REFITS_LATER), data, depth)),
+                                       depth, data)
             made, left = _distinct([*made, *beside]), [*left, *behind]
         passed_over += left
         pool.append(tuple(chain[-1] for chain in made))
         plausible = [chain for chain in made if not chain[-1].implausible()]
-        if plausible and _better(plausible[0], best, known_noise(fitted)):
-            best = plausible[0]
-        elif depth > 1 or not plausible:
+        better = _worth_it(plausible[0], best, before, known_noise(fitted)) if plausible else None
+        if better is None and (depth > 1 or not plausible):
             break
+        best = better or best
         if depth == 1:
             rivals += _rivals(base, plausible[0][-1], data, OUTSIDE_SHARE * worth)
             # On a table without a gap nothing is to be taken away.
@@ -307,10 +310,12 @@ def _rivals(parent: Refit, against: Refit, data: _Data, least: float) -> list[Ri
 
 def contested(found: Found) -> Found:
     """The chain without names where one of the competitors known takes them away."""
-    for one in found.rivals if len(found.chain) > 1 and found.beaten is None else ():
-        alone = replace(one, against=found.best)
-        if alone.wins:
-            return replace(found, chain=found.chain[:1], reached_noise=False, beaten=alone)
+    if len(found.chain) == 1 or found.beaten is not None:
+        return found
+    found = replace(found, rivals=tuple(replace(one, against=found.best) for one in found.rivals))
+    for one in found.rivals:
+        if one.wins:
+            return replace(found, chain=found.chain[:1], reached_noise=False, beaten=one)
     return found
 
 
@@ -409,19 +414,20 @@ def _to_the_end(chain: tuple[Refit, ...], fitted: Sequence[SpectralBlock], held_
 
 
 def _grown(chain: tuple[Refit, ...], data: _Data) -> tuple[Refit, ...]:
-    """A chain with as much more of one of its effects (a further mode) as takes the larger part of what the chain
-    leaves; as it was where none does. The shorter chains are refitted with that effect as it is then."""
+    """A chain with as much more of its effects (further modes) as takes the larger part of what the chain leaves, each
+    by more than chance; as it was where none does. The shorter chains are refitted with that effect as it is then."""
     last = found = chain[-1]
     while len(chain) > 1 and found.held_per_dof > CLOSED:
         more = [_with_more(found, k, data) for k in range(len(found.model.effects))]
-        best = min((one for one in more if one is not None), key=lambda r: r.criterion, default=found)
-        if best.criterion >= found.criterion:
+        likely = [one for one in more if one is not None and not one.implausible()]
+        best = min(likely, key=lambda r: r.criterion, default=found)
+        if not _gains(best, found, known_noise(data.fitted)):
             break
         found = best
-    misfit = max(1.0, found.held_per_dof) * known_noise(data.fitted)
-    if (last.criterion - found.criterion) / misfit <= LEAST_FALL or _share(found, last) <= LARGER_PART:
+    if found is last or _share(found, last) <= LARGER_PART:
         return chain
-    return (*(_alike(one, found, data) for one in chain[:-1]), found)
+    shorter = [_alike(one, found, data) for one in chain[:-1]]
+    return chain if None in shorter else (*(one for one in shorter if one is not None), found)
 
 
 def _with_more(found: Refit, k: int, data: _Data) -> Refit | None:
@@ -435,13 +441,23 @@ def _with_more(found: Refit, k: int, data: _Data) -> Refit | None:
     return coarse and try_refit(coarse.model, data.fitted, data.held_out, MORE_ITERATIONS)
 
 
-def _alike(one: Refit, found: Refit, data: _Data) -> Refit:
-    """A refit with the same effects as another one's first."""
+def _alike(one: Refit, found: Refit, data: _Data) -> Refit | None:
+    """A refit with the same effects as another one's first; None where it comes to no end."""
     first = found.model.effects[:len(one.model.effects)]
     if [effect.label for effect in first] == [effect.label for effect in one.model.effects]:
         return one
     return try_refit(replace(one.model, effects=first, fixed=found.model.fixed), data.fitted, data.held_out,
-                     ITERATIONS[1]) or one
+                     MORE_ITERATIONS)
+
+
+def _worth_it(longer: tuple[Refit, ...], best: tuple[Refit, ...], parents: Sequence[tuple[Refit, ...]], stretch: float
+              ) -> tuple[Refit, ...] | None:
+    """A stage's chain if it is worth its length, or, where an earlier effect has grown in it, its shorter part if that
+    alone brings it: what a further mode takes is no sign of the effect that follows it."""
+    shorter = longer[:-1]
+    if shorter in parents or _better(longer, shorter, stretch):
+        return longer if _better(longer, best, stretch) else None
+    return shorter if _gains(shorter[-1], best[-1], stretch) and _share(shorter[-1], best[-1]) > LARGER_PART else None
 
 
 def _share(found: Refit, before: Refit) -> float:
@@ -463,11 +479,16 @@ def _better(longer: tuple[Refit, ...], chain: tuple[Refit, ...], stretch: float)
     which the law is certain a faint second one may be small.
     """
     found, best = longer[-1], chain[-1]
-    misfit = max(1.0, found.held_per_dof) * stretch
-    fall, held = best.criterion - found.criterion, best.chi2_held - found.chi2_held
-    if fall / misfit <= LEAST_FALL or held / misfit <= LEAST_FALL / 2:
+    if not _gains(found, best, stretch):
         return False
     return len(chain) == 1 or definite(best) or (_share(found, best) > TAKES and not _mends(longer, chain))
+
+
+def _gains(found: Refit, before: Refit, stretch: float) -> bool:
+    """Whether a refit is better on the criterion, and on the held-out data by themselves, by more than chance."""
+    misfit = max(1.0, found.held_per_dof) * stretch
+    fall, held = before.criterion - found.criterion, before.chi2_held - found.chi2_held
+    return fall / misfit > LEAST_FALL and held / misfit > LEAST_FALL / 2
 
 
 def _mends(longer: tuple[Refit, ...], chain: tuple[Refit, ...]) -> bool:

@@ -18,7 +18,7 @@ from avis_ctrl.gap.power_shares import power_shares
 from avis_ctrl.gap.refit import Refit
 from avis_ctrl.gap.result import Gap, HeatMap, PowerShares, RecordGap, Stage, Where
 from avis_ctrl.gap.search import Found
-from avis_ctrl.gap.signals.noise_level import NoiseLevels
+from avis_ctrl.gap.signals.noise_level import SENSOR_BAND, NoiseLevels
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction_error import PredictionError, prediction_error
 from avis_ctrl.identification.response import ResponseModel
@@ -32,6 +32,8 @@ PLACE_ALARM = 0.01
 MOST_PLACES = 10
 # Error over that of noise alone up to which a sentence may call it the noise.
 IS_NOISE = 1.05
+# Of faults in the signals alone: share of the error above which nothing is said to fall.
+UNCHANGED = 0.95
 # Error over that of noise below which the noise was over-estimated.
 TOO_MUCH_NOISE = 0.8
 BANDS_PER_OCTAVE = 2
@@ -90,11 +92,22 @@ def shown(prepared: Prepared, found: Found, base: Refit, updated: Refit, judgeme
     onward = judgement.next_experiment
     if onward is None and judgement.verdict in ("unexplained", "partly explained"):
         onward = of_unexplained(remaining, records)
+    if judgement.raised and noise is not None:
+        remaining = _noisy(noise, judgement.raised, prepared.campaign.records[0].header.sample_rate_Hz)
+        where = where if judgement.effects else remaining
     return Gap(judgement.verdict, judgement.effects, tuple(ladder), where if judgement.verdict != "none" else (),
                remaining, after.noise_nrmse, onward, base.model, judgement.updated.model,
                judgement.considered, heat_map(before, after), sentences,
                prepared.halves.how, seed, seconds, judgement.updated.covariance,
-               shares=shares, records=records)
+               shares=shares, records=records, raised=judgement.raised)
+
+
+def _noisy(noise: NoiseLevels, raised: Sequence[str], rate_Hz: float) -> tuple[Where, ...]:
+    """Sensors of raised noise, in the band where it was measured, with their shares of its excess over ambient."""
+    excess = {one.channel: one.ratio ** 2 - 1 for one in noise.raised if one.channel in raised}
+    low, high = (part * rate_Hz for part in SENSOR_BAND)
+    return tuple(Where(low, high, "", name, part / sum(excess.values()), part + 1)
+                 for name, part in sorted(excess.items(), key=lambda item: -item[1]))
 
 
 def _figures(left: Left) -> tuple[float, float]:
@@ -119,6 +132,10 @@ def _steps(found: Found, base: Refit, judgement: Judgement, before: Left, after:
 def opening(judgement: Judgement, ladder: Sequence[Stage], after: Left) -> str:
     """The one sentence."""
     first, last = ladder[1], ladder[-1]
+    if judgement.raised and not judgement.effects:
+        return (f"The noise of {' and '.join(judgement.raised)} is above the rig file's ambient level, for which the "
+                f"library has no name; no other missing effect shows: after re-identification the model leaves "
+                f"{_percent(first.nrmse)} of the held-out records, noise alone {_percent(after.noise_nrmse)}.")
     if judgement.verdict == "none":
         return (f"No missing effect shows: after re-identification the model leaves {_percent(first.nrmse)} of the "
                 f"held-out records, noise alone {_percent(after.noise_nrmse)}.")
@@ -127,11 +144,16 @@ def opening(judgement: Judgement, ladder: Sequence[Stage], after: Left) -> str:
         return (f"Something is missing that the library has no name for{like}: after re-identification the model "
                 f"leaves {_percent(first.nrmse)} of the held-out records, noise alone {_percent(after.noise_nrmse)}.")
     named = " and ".join(in_words(one) for one in judgement.effects)
-    end = "and something else remains" if judgement.verdict != "explained" else (
+    end = "and something else remains" if judgement.verdict != "explained" and not judgement.raised else (
         f"less than the noise as it was estimated ({_percent(after.noise_nrmse)}), which is too much then"
         if last.nrmse < TOO_MUCH_NOISE * after.noise_nrmse else
         "which is the noise" if last.nrmse <= IS_NOISE * after.noise_nrmse else
         f"beside {_percent(after.noise_nrmse)} of noise")
+    if judgement.raised:
+        end += f", and {' and '.join(judgement.raised)} have more noise than the rig file says"
+    if not any(one.label for one in judgement.effects) and last.nrmse > UNCHANGED * first.nrmse:
+        return (f"Missing from the model: {named}; that is in the signals alone, of which the model leaves "
+                f"{_percent(last.nrmse)}, {end}.")
     return (f"Missing from the model: {named}; with that in it the gap falls from {_percent(first.nrmse)} to "
             f"{_percent(last.nrmse)}, {end}.")
 

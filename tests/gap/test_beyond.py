@@ -160,7 +160,8 @@ def test_what_came_near_is_contested_anew():
     rival = Rival(replace(near, chi2_fit=100.0), replace(far, chi2_fit=1000.0), "a competitor")
     assert rival.left < GIVEN_UP
     found = Found((base, named), (), True, (), (rival,))
-    assert contested(found) is found
+    kept = contested(found)
+    assert kept.chain is found.chain and kept.rivals[0].against is named
     # By what it falls short: odds of e^((1100 - 1000)/2), ten to one beforehand.
     assert replace(rival, against=named).odds == pytest.approx(2 * np.log(10.0) + 100.0)
     better = replace(rival, refit=Weighed(800.0, 990.0, -200.0))

@@ -12,7 +12,8 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.gap import analysis, judgement
 from avis_ctrl.gap.judgement import _considered, _gain
 from avis_ctrl.gap.result import NamedEffect, Stage
-from avis_ctrl.gap.show import opening, places
+from avis_ctrl.gap.search import _worth_it
+from avis_ctrl.gap.show import _noisy, opening, places
 
 
 def test_each_of_two_effects_is_confirmed_by_its_own_step():
@@ -42,8 +43,45 @@ def test_a_step_on_the_way_to_a_pair_is_no_runner_up():
 def test_a_gap_is_called_the_noise_only_where_it_is(left, said):
     one = NamedEffect("actuator_lag", "actuators", "the amplifiers lag", {}, 0.9)
     ladder = [Stage("nominal", 0.3, 900.0), Stage("re-identified", 0.1, 100.0), Stage("actuator_lag", left, 1.3)]
-    told = opening(SimpleNamespace(verdict="explained", effects=(one,)), ladder, SimpleNamespace(noise_nrmse=0.01))
+    judged = SimpleNamespace(verdict="explained", effects=(one,), raised=())
+    told = opening(judged, ladder, SimpleNamespace(noise_nrmse=0.01))
     assert told.endswith(said)
+
+
+def test_a_fault_of_the_signals_and_a_noisy_sensor_let_no_gap_fall():
+    ladder = [Stage("nominal", 0.3, 900.0), Stage("re-identified", 0.012, 1.0)]
+    after = SimpleNamespace(noise_nrmse=0.012)
+    floor = NamedEffect("ground_motion", "floor", "the floor moves more", {}, 0.99)
+    told = opening(SimpleNamespace(verdict="explained", effects=(floor,), raised=()),
+                   [*ladder, Stage("ground_motion", 0.012, 1.0)], after)
+    assert "falls" not in told and told.endswith("leaves 1.2 %, which is the noise.")
+    told = opening(SimpleNamespace(verdict="unexplained", effects=(), raised=("Sz3",)), ladder, after)
+    assert told.startswith("The noise of Sz3 is above") and "no other missing effect" in told
+
+
+def test_a_noisy_sensor_is_where_its_noise_was_measured():
+    noise = SimpleNamespace(raised=[SimpleNamespace(channel=name, ratio=ratio)
+                                    for name, ratio in (("Sz3", 2.0), ("Sy1", 3.0), ("Sz1", 9.0))])
+    found = _noisy(noise, ("Sy1", "Sz3"), 1000.0)
+    assert [(one.output, one.input, one.from_Hz, one.to_Hz) for one in found] == [("Sy1", "", 100.0, 490.0),
+                                                                                 ("Sz3", "", 100.0, 490.0)]
+    assert [one.share for one in found] == [pytest.approx(8 / 11), pytest.approx(3 / 11)]  # 3^2 - 1 and 2^2 - 1
+
+
+def _stand_in(held, labels):
+    effects = [SimpleNamespace(label=label, effect=SimpleNamespace(name=label, idealised=True, confusable=()))
+               for label in labels]
+    return SimpleNamespace(held_per_dof=held, criterion=3e4 * held, chi2_held=1e4 * held, labels=labels,
+                           model=SimpleNamespace(effects=effects))
+
+
+@pytest.mark.parametrize(("three", "with_more", "kept"), [
+    (1.18, 1.19, 2), (1.18, 1.17, 2), (30.0, 1.1, 3), (40.0, 39.0, 0)])
+def test_what_a_further_mode_takes_is_no_sign_of_the_effect_behind_it(three, with_more, kept):
+    base, two = _stand_in(100.0, ()), _stand_in(41.0, ("two",))
+    grown = (base, _stand_in(three, ("three",)), _stand_in(with_more, ("three", "more")))
+    found = _worth_it(grown, (base, two), [(base, two)], 1.0)
+    assert len(found or ()) == kept and (not kept or found == grown[:kept])
 
 
 @pytest.mark.parametrize("dof", [30.0, 100.0, 400.0])

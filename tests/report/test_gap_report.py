@@ -13,6 +13,7 @@ from test_report import HOSTILE, Reader, pdf_text
 
 from avis_ctrl.gap.effects.base import Reported, library
 from avis_ctrl.gap.effects.large_motion import LargeMotion
+from avis_ctrl.gap.in_words import spoken
 from avis_ctrl.gap.result import VERDICTS, Detectable, HeatMap, Stage, Where
 from avis_ctrl.gap.table_model import active
 from avis_ctrl.measurement.gates.finding import Finding
@@ -296,11 +297,12 @@ def test_terms_that_every_model_holds_are_no_effect(found):
     assert "no effect" in prose(part) and "motors turn" in prose(part)
 
 
-@pytest.mark.parametrize(("name", "read"), [
-    ("stiffness_N_per_m", "stiffness"), ("integral_gain_N_per_ms", "integral gain"),
-    ("time_constant_s", "time constant"), ("k3_N_per_m3", "k3"), ("mass_kg", "mass"), ("damping", "damping")])
-def test_parameters_are_read_without_their_units(name, read):
-    assert wording.parameter(name) == read
+@pytest.mark.parametrize(("name", "unit", "read"), [
+    ("stiffness_N_per_m", "N/m", "stiffness"), ("integral_gain_N_per_ms", "N/(m s)", "integral gain"),
+    ("time_constant_s", "s", "time constant"), ("k3_N_per_m3", "N/m^3", "k3"), ("mass_kg", "kg", "mass"),
+    ("damping", "1", "damping"), ("uneven_1", "1", "uneven 1"), ("slope_per_h", "1/h", "slope")])
+def test_parameters_are_read_without_their_units(name, unit, read):
+    assert spoken(name, unit) == read
 
 
 def test_sentences_of_the_finder_are_set_in_type():

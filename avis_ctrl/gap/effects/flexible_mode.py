@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 # Variants by number of modes.
 COUNTS = {"": 1, "two": 2, "three": 3}
-# A further mode is looked for where it takes this share of what the modes before it leave over the noise, and more than
-# chance would.
+# A further mode is looked for where it takes this share of what the modes before it leave over the noise, and, of
+# several at one look, more than chance would; beside fitted ones its refit says that.
 FURTHER = 0.25
 # log of the ratio of two modes' frequencies from which on they are looked for apart.
 APART = 0.08

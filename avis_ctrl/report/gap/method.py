@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from avis_ctrl.gap.result import Gap
+from avis_ctrl.gap.search import GIVEN_UP, PRIOR
 from avis_ctrl.report.pieces import Bullets, Formula, Heading, Paragraph, Piece, Section
 
 SOURCES = (
@@ -41,16 +42,19 @@ def method(gap: Gap) -> Section:
         Paragraph("Selection. Significant candidates are refitted together with all parameters of the rig, and "
                   "compared by the Bayesian information criterion of the fit, with p combinations of parameters that n "
                   "data determine, and by the likelihood of data that no fit has seen. Probabilities follow from the "
-                  "sum, over the candidates that were refitted, all equal beforehand. A factor m divides the criteria: "
+                  "sum, over the candidates that were refitted, all equal beforehand, but what has no name in the "
+                  f"library {PRIOR:g} times less likely than an effect of it. A factor m divides the criteria: "
                   "the chi-square per degree of freedom of the best one, at least 1, for where that leaves more than "
                   "noise, times what the noise's own uncertainty adds to a difference. What explains the data and has "
-                  "no name in the library takes its share, and none is stated above 99 %:"),
+                  "no name takes its share, and the name from a probability of "
+                  f"{1 - GIVEN_UP:.0%} on; none is stated above 99 %:"),
         Formula("kappa = chi_\"fit\"^2 + p ln n + chi_\"held out\"^2, quad P_i = e^(-kappa_i slash 2 m) "
                 "slash sum_j e^(-kappa_j slash 2 m)",
                 "the probability of candidate i is its share of the exponentials of minus half the criterion"),
         Paragraph("An effect of the table is named only if the held-out data confirm it; hum, converters and the "
-                  "floor's motion are judged in all records together. Effects are added one by one until the "
-                  "held-out residual is noise or nothing in the library helps. Error and noise in per cent:"),
+                  "floor's motion are judged in all records together. Effects are added one by one, up to "
+                  "two, until the held-out residual is noise or nothing that was tried helps enough. Error and noise "
+                  "in per cent:"),
         Formula("op(\"n.r.m.s.\") = (1 / n_y sum_i sum_k abs(e_(k i))^2 slash sum_k abs(Y_(k i))^2)^(1 slash 2)",
                 "the normalised error is the root of the mean over outputs of the residual's power over the output's"),
         Paragraph("What held out means. No parameter is fitted to the held-out records, but they have their say in "

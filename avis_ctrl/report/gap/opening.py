@@ -19,7 +19,7 @@ def opening(found: Found) -> Section:
     gap = found.gap
     good = {"none": True, "explained": True, "unexplained": False}.get(gap.verdict)
     pieces: list[Piece] = [Paragraph(sentence(gap), "verdict", good, gap.verdict == "partly explained")]
-    pieces.append(Paragraph(wording.CLAIMS[gap.verdict]))
+    pieces.append(Paragraph(wording.claim(gap)))
     if numbers := in_numbers(gap):
         pieces.append(Paragraph(numbers))
     if gap.effects:
@@ -88,7 +88,7 @@ def _effects(gap: Gap) -> Table:
              ", ".join(map(wording.titled, one.indistinguishable_from)) or "none")
             for one in gap.effects]
     return table("What is named. The probability of an effect of the table is that among the candidates that were "
-                 "refitted in its place, given the data; it does not count what nobody thought of. That of hum "
-                 "and of a converter is one less the chance of such a signal without them; that of ground motion is "
-                 "set, not computed. Sizes with one standard deviation.",
+                 "refitted in its place, given the data; it does not count what nobody thought of. That of hum, "
+                 "a converter and the floor's motion is one less the chance of such a signal without them. None is "
+                 "stated above 99 %. Sizes with one standard deviation.",
                  ("effect", "place", "size", "probability", "cannot be told from"), rows, "lllrl")

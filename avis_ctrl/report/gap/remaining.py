@@ -55,8 +55,11 @@ def _left(gap: Gap) -> str:
         after = " with the named effects" if gap.effects else ""
         return (f"No band of any channel stands out of the measured noise{after}." if not gap.remaining else
                 f"The held-out residual{after} counts as noise as a whole; the places below stand out by themselves.")
+    if gap.raised:
+        return ("The held-out residual is the measured noise. That of these sensors is above the rig file's ambient "
+                "level, in the band where it was measured.")
     what = "What the named effects leave" if gap.effects else "The whole gap"
-    return (f"{what} is significant, and nothing in the library accounts for it."
+    return (f"{what} is significant, and no effect of the library that was tried accounts for it."
             + (" The places below hold it." if gap.remaining else " Its places were not stated."))
 
 

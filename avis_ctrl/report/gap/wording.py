@@ -9,7 +9,7 @@ import numpy as np
 from avis_ctrl.gap.effects.base import Effect, Reported, library
 from avis_ctrl.gap.in_words import spoken
 from avis_ctrl.gap.judgement import UNEXPLAINED
-from avis_ctrl.gap.result import Considered, NamedEffect, Where
+from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Where
 from avis_ctrl.gap.search import CLOSED
 from avis_ctrl.report import words
 
@@ -23,15 +23,26 @@ CLAIMS = {
                  f"whole, within {CLOSED ** 0.5:.3g} times the r.m.s. of the measured noise, which counts as closed. "
                  "What hides below that this campaign cannot show.",
     "partly explained": "Verdict: partly explained. What is named above is confirmed by the held-out data, but a "
-                        "significant part of the gap remains and nothing in the library accounts for it. The updated "
-                        "model is better, not complete.",
+                        "significant part of the gap remains, and no further effect is named: at most two effects of "
+                        "the table are looked for, and a second one must take most of what the first leaves. The "
+                        "updated model is better, not complete.",
     "unexplained": "Verdict: unexplained. Model and held-out data disagree significantly and no effect of the library "
                    "accounts for it, so none is named: the nearest one would be wrong. The updated model is the "
                    "re-identified one.",
 }
+# What it claims where the noise of some sensors is all that has no name.
+RAISED = ("Verdict: {verdict}. The noise of {sensors} is above the rig file's ambient level, and the library has no "
+          "name for that. What the model{with_effects} leaves of the held-out data is the measured noise, as a whole.")
 PERCENT = 100.0
 # Shares below this are told as that.
 LEAST = 1e-5
+
+
+def claim(gap: Gap) -> str:
+    """What the verdict claims, and what it does not."""
+    return CLAIMS[gap.verdict] if not gap.raised else RAISED.format(
+        verdict=gap.verdict, sensors=words.joined(list(gap.raised)),
+        with_effects=", with what is named above," if gap.effects else "")
 
 
 def titled(name: str) -> str:
