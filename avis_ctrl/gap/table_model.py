@@ -233,6 +233,13 @@ class TableModel:
         n, n_in = len(omega), len(self.inputs)
         return self.driven(omega, np.broadcast_to(np.eye(n_in, dtype=complex), (n, n_in, n_in)), False).Y
 
+    def sensor_transients(self, omega: np.ndarray) -> np.ndarray:
+        """As `ResponseModel.sensor_transients`, with the states that effects add to a sensor's chain."""
+        own = self.base.sensor_transients(omega)
+        if not any(one.effect.holds_states for one in self.effects):
+            return own
+        return np.concatenate([own, *self.operators(omega).sensed], axis=2)
+
     def inner_transients(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y, n_t): y by unit initial states of what effects hold inside: modes, masses in mounts, a chassis.
 

@@ -28,7 +28,7 @@ from scipy.optimize import least_squares
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.identification.response import N_Q, ResponseModel
 from avis_ctrl.identification.sampling import aliases, hold
-from avis_ctrl.identification.spectra import SpectralBlock, chain_transients
+from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
 # A coordinate is named where it holds this share of the mode's kinetic energy.
@@ -274,7 +274,7 @@ def _rows(block: SpectralBlock, model: ResponseModel, driven: np.ndarray) -> tup
     sigma = np.sqrt(np.real(np.einsum("kii->ki", noise)))
     impulse, own = np.zeros((m * n, 0), complex), np.zeros((m * n, 0), complex)
     if block.transient:
-        impulse, own = chain[:, None], chain_transients(s, model)
+        impulse, own = chain[:, None], model.chain_transients(s)
     return (omega, np.moveaxis(block.Y, (1, 2), (0, 1)).reshape(n_y, m * n), np.sqrt(2) / sigma.T,
             noise / (sigma[:, :, None] * sigma[:, None, :]), inputs, impulse, folded[:, None] * U[:, volts], own)
 

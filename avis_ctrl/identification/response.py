@@ -253,6 +253,19 @@ class ResponseModel:
         U = block.U if body is None else np.concatenate([block.U, body], axis=1)
         return self.driven(block.omega, U, derivative)
 
+    def sensor_transients(self, omega: np.ndarray) -> np.ndarray:
+        """(n, n_y, n_t): `chain_transients` of each sensor."""
+        n_y = len(self.sensors.names)
+        one = self.chain_transients(1j * omega)
+        return (one[:, None, :, None] * np.eye(n_y)[:, None, :]).reshape(len(omega), n_y, -1)
+
+    def chain_transients(self, s: np.ndarray) -> np.ndarray:
+        """(n, k): what the ends of a record leave in a sensor by itself: the states of its chain, and a constant and a
+        slope in frequency, which hold the aliases of all others; s (n,) j omega."""
+        poles = np.asarray(self.sensors.transient_poles)
+        states = (s ** k / np.polyval(poles[::-1], s) for k in range(len(poles) - 1))
+        return np.stack([*states, np.ones(len(s)), s], axis=-1)
+
     def inner_transients(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y, 0): y by initial states beside those of body and sensors, of which this model has none."""
         return np.zeros((len(omega), len(self.sensors.names), 0), complex)

@@ -149,26 +149,17 @@ def _place(into: np.ndarray, names: Sequence[str], known: Sequence[str], values:
 def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.ndarray, np.ndarray]:
     """(n, n_y, n_t) columns, for real coefficients, of what the ends of a record leave in its spectra; (n_t,) norms.
 
-    Impulse and step on the body (12), the two states of each sensor's chain, and a constant and a slope in frequency
-    for each sensor, which hold the aliases of the others; last, the states that a model has inside beside the body.
+    Impulse and step on the body (12), the states of the sensors' chains (`ResponseModel.sensor_transients`), and last
+    the states that a model has inside beside the body.
     The columns have unit norm; each was divided by its own.
     """
-    n, n_y, n_in = len(block.omega), block.Y.shape[1], len(model.inputs)
-    s = 1j * block.omega
+    n, n_in = len(block.omega), len(model.inputs)
     U = np.zeros((n, n_in + 2 * N_Q, 2 * N_Q), complex)
     U[:, n_in:] = np.eye(2 * N_Q)
     body = model.driven(block.omega, U, derivative=False).Y
-    chains = chain_transients(s, model)[:, None, :, None] * np.eye(n_y)[:, None, :]
-    columns = np.concatenate([body, chains.reshape(n, n_y, -1), model.inner_transients(block.omega)], axis=2)
+    columns = np.concatenate([body, model.sensor_transients(block.omega), model.inner_transients(block.omega)], axis=2)
     norms = np.linalg.norm(columns, axis=(0, 1))
     return columns / norms, norms
-
-
-def chain_transients(s: np.ndarray, model: ResponseModel) -> np.ndarray:
-    """(n, k) of one sensor: the states of its chain, a constant and a slope in frequency; s (n,) j omega."""
-    poles = np.asarray(model.sensors.transient_poles)
-    states = (s ** k / np.polyval(poles[::-1], s) for k in range(len(poles) - 1))
-    return np.stack([*states, np.ones(len(s)), s], axis=-1)
 
 
 def transient_parts(x: np.ndarray, norms: np.ndarray, block: SpectralBlock, model: ResponseModel
@@ -176,7 +167,7 @@ def transient_parts(x: np.ndarray, norms: np.ndarray, block: SpectralBlock, mode
     """(n, 12, 1) impulses and steps on the body, and (m,) what the states inside start with: the part of unknowns
     x (n_t,) of the columns of `transient_columns`, norms (n_t,), that changes with the model's parameters."""
     n_b, true = 2 * N_Q, x / norms
-    chains = block.Y.shape[1] * chain_transients(1j * block.omega[:1], model).shape[1]
+    chains = model.sensor_transients(block.omega[:1]).shape[2]
     body = np.broadcast_to(true[None, :n_b, None], (len(block.omega), n_b, 1))
     return body, true[n_b + chains:]
 
