@@ -139,7 +139,7 @@ def earned(base: Refit, updated: Refit, stretch: float = 1.0) -> bool:
     """
     excess = base.held_per_dof - 1.0
     if excess < 0.1:
-        return base.chi2_held - updated.chi2_held > LEAST_FALL * stretch
+        return base.excess_held - updated.excess_held > LEAST_FALL * stretch
     return base.held_per_dof - updated.held_per_dof > EARNED * excess
 
 
@@ -274,7 +274,7 @@ def _gain(found: Found, label: str) -> float:
     """Rise of the held-out log-likelihood by the step of the chain that brought an effect, on the compared lines."""
     for before, after in pairwise(found.chain):
         if label in after.labels and label not in before.labels:
-            return (before.chi2_held - after.chi2_held) / 2
+            return (before.excess_held - after.excess_held) / 2
     return 0.0
 
 

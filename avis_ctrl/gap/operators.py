@@ -95,7 +95,6 @@ class Operators:
     sensor_gain : (n_y,) factors. drive : (n, n_u) factors on the volts. delay_s, amplifier_corner_Hz : of the drives.
     inner : (n, 6, m) forces on q by unit impulses on what an effect holds inside. decays : the same of states of first
         order, of which an impulse is all there is.
-    sensed : (n, n_y, m) what the sensors read of states that an effect adds to their chains.
     added : coordinates beside the six. recoil, follow : (n, 6, 6) B and (n, 6, 3) H_w, None for a stiff floor.
     """
 
@@ -121,7 +120,6 @@ class Operators:
     follow: np.ndarray | None = None
     inner: list[np.ndarray] = field(default_factory=list)
     decays: list[np.ndarray] = field(default_factory=list)
-    sensed: list[np.ndarray] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         base = self.base

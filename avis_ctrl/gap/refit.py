@@ -44,6 +44,16 @@ class Refit:
         return self.fit.information.rank
 
     @property
+    def excess_fit(self) -> float:
+        """Chi-square of the fitted data over what noise alone would leave of them with these parameters held."""
+        return self.chi2_fit - self.fit.dof - self.free
+
+    @property
+    def excess_held(self) -> float:
+        """Chi-square of the held-out data over what noise alone is expected to leave of them."""
+        return self.chi2_held - self.dof_held
+
+    @property
     def held_per_dof(self) -> float:
         return self.chi2_held / self.dof_held
 
@@ -55,8 +65,12 @@ class Refit:
     @property
     def criterion(self) -> float:
         """-2 log of the evidence, up to a constant: Bayesian information criterion of the fit (G. Schwarz 1978), and
-        the held-out data, which need no penalty."""
-        return self.chi2_fit + self.free * np.log(self.fit.dof + self.free) + self.chi2_held
+        the held-out data, which need no penalty.
+
+        Of both without their degrees of freedom: a model that holds states inside has more unknowns in the transients
+        of the records' ends, and noise alone makes chi-square less by one for each.
+        """
+        return self.excess_fit + self.free * np.log(self.fit.dof + self.free) + self.excess_held
 
     @property
     def labels(self) -> tuple[str, ...]:

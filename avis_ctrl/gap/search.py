@@ -93,12 +93,15 @@ class Rival:
     def odds(self) -> float:
         """-2 log of how many times as probable as the effects it is held against, beforehand and by the data.
 
-        By chi2 and by the criterion, whichever is the worse for the competitor: an effect of the library must not
-        lose its name to one that fits no better because it has a parameter that this table makes no use of.
+        By chi-square and by the criterion, whichever is the worse for the competitor: an effect of the library must not
+        lose its name to one that fits no better because it has a parameter that this table makes no use of. What the
+        held-out data by themselves do not bear out counts for nothing.
         """
         new, old = self.refit, self.against
         misfit = max(1.0, min(new.held_per_dof, old.held_per_dof)) * self.stretch
-        fall = min(old.criterion - new.criterion, old.chi2_fit + old.chi2_held - new.chi2_fit - new.chi2_held)
+        fall = min(old.criterion - new.criterion,
+                   old.excess_fit + old.excess_held - new.excess_fit - new.excess_held)
+        fall = fall if new.excess_held < old.excess_held else min(fall, 0.0)
         return 2 * math.log(PRIOR) - fall / misfit
 
     @property
@@ -108,7 +111,7 @@ class Rival:
 
     @property
     def wins(self) -> bool:
-        """Hardly anything is left of the probability of the others, and the held-out data by themselves say so.
+        """Hardly anything is left of the probability of the others.
 
         What a user's own effect explains to the noise is that effect's: he knows his table, and ours may only be a
         more pliable description of the same.
@@ -116,7 +119,7 @@ class Rival:
         own = any(not one.effect.shipped for one in self.against.model.effects)
         if own and self.against.held_per_dof <= CLOSED:
             return False
-        return self.left < GIVEN_UP and self.refit.chi2_held < self.against.chi2_held
+        return self.left < GIVEN_UP
 
     @property
     def closes(self) -> bool:
@@ -487,7 +490,7 @@ def _better(longer: tuple[Refit, ...], chain: tuple[Refit, ...], stretch: float)
 def _gains(found: Refit, before: Refit, stretch: float) -> bool:
     """Whether a refit is better on the criterion, and on the held-out data by themselves, by more than chance."""
     misfit = max(1.0, found.held_per_dof) * stretch
-    fall, held = before.criterion - found.criterion, before.chi2_held - found.chi2_held
+    fall, held = before.criterion - found.criterion, before.excess_held - found.excess_held
     return fall / misfit > LEAST_FALL and held / misfit > LEAST_FALL / 2
 
 

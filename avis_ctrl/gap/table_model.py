@@ -20,6 +20,8 @@ from avis_ctrl.rigs.rig import Parameter, Rig
 _MOUNT = re.compile(r"isolator(\d+)\.([kc])_([xyz])")
 # Relative step of differences by an effect's parameters, in units of their size.
 STEP = 1e-4
+# A sensor's chain is another one where its ratio to the rig's varies over the band by more than this share.
+UNCHANGED = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,11 +236,21 @@ class TableModel:
         return self.driven(omega, np.broadcast_to(np.eye(n_in, dtype=complex), (n, n_in, n_in)), False).Y
 
     def sensor_transients(self, omega: np.ndarray) -> np.ndarray:
-        """As `ResponseModel.sensor_transients`, with the states that effects add to a sensor's chain."""
-        own = self.base.sensor_transients(omega)
-        if not any(one.effect.holds_states for one in self.effects):
-            return own
-        return np.concatenate([own, *self.operators(omega).sensed], axis=2)
+        """As `ResponseModel.sensor_transients`, with the states that effects add to a sensor's chain.
+
+        Where they make r(s) times what the chain was, r a ratio of polynomials, r and s r are the transients of the
+        poles of r beside a constant and a slope, and r^2 and s r^2 what a small change of these poles makes of it: a
+        fit's gradient need not know of them then.
+        """
+        own, ops = self.base.sensor_transients(omega), self.operators(omega)
+        r = ops.sense / Operators(self.effective, ops.omega).sense
+        level = np.mean(r, axis=0)
+        changed = np.flatnonzero(np.max(np.abs(r - level), axis=0) > UNCHANGED * np.abs(level))
+        s = ops.s / np.mean(omega)
+        ringing = np.zeros((len(omega), r.shape[1], len(changed), 4), complex)
+        for j, k in enumerate(changed):
+            ringing[:, k, j] = np.stack([r[:, k], s * r[:, k], r[:, k] ** 2, s * r[:, k] ** 2], axis=-1)
+        return np.concatenate([own, ringing.reshape(len(omega), r.shape[1], -1)], axis=2)
 
     def inner_transients(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y, n_t): y by unit initial states of what effects hold inside: modes, masses in mounts, a chassis.

@@ -158,7 +158,8 @@ def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.
 
 def provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float) -> dict[str, Any]:
     """What made this result: versions, hash of the inputs, seed, time."""
-    text = repr(sorted((k, v.value) for k, v in rig.parameters().items())) + repr(options)
+    data = digest(measured)
+    text = repr(sorted((k, v.value) for k, v in rig.parameters().items())) + repr(options) + data
     own = options.own_effects
     told = {} if own is None else {"own_effects": f"{own.path.name}: {', '.join(own.names)}",
                                    "own_effects_sha256": own.sha256}
@@ -166,7 +167,7 @@ def provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float
         with contextlib.suppress(OSError):  # nothing was made of it then, which design_note says
             told["design_sha256"] = hashlib.sha256(options.design_file.read_bytes()).hexdigest()
     return {"avis_ctrl": avis_ctrl.__version__, "measurement": measured.source, **told,
-            "measurement_sha256": digest(measured), "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
+            "measurement_sha256": data, "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
             "seed": options.seed, "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
             "python": platform.python_version(),
             **{name: metadata.version(name) for name in ("numpy", "scipy", "numba", "h5py")}}

@@ -290,7 +290,7 @@ def provenance(measured: Campaign | FrequencyResponse, rig: Rig, options: Identi
     text = repr(sorted((k, v.value) for k, v in rig.parameters().items())) + repr(replace(options, priors={})) + repr(
         sorted(options.priors.items()))
     return {"avis_ctrl": avis_ctrl.__version__, "measurement": source, "measurement_sha256": data,
-            "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(), "seed": options.seed,
+            "inputs_sha256": hashlib.sha256((text + data).encode()).hexdigest(), "seed": options.seed,
             "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
             "python": platform.python_version(),
             **{name: metadata.version(name) for name in ("numpy", "scipy", "numba", "h5py")}}

@@ -136,7 +136,7 @@ def test_a_user_s_own_effect_that_closes_the_gap_is_not_taken_away():
     found = search(refit(MODEL, fitted, held), fitted, held, effects=[LateSensor()])
     assert found.best.labels == ("late_sensor@Sz1",)
     rival = found.rivals[0]
-    assert rival.refit.chi2_held < rival.against.chi2_held and not rival.wins
+    assert rival.refit.excess_held < rival.against.excess_held and not rival.wins
     # The same odds against an effect of the library would have counted.
     shipped = replace(rival, against=replace(rival.against, model=MODEL.with_effect(
         active(library()["sensor_gain"], MODEL, "Sz1"))))
@@ -148,8 +148,8 @@ class Weighed:
     """What a contest asks of a refit; of so many numbers that the held-out residual is noise."""
 
     criterion: float
-    chi2_held: float = 1000.0
-    chi2_fit: float = 0.0
+    excess_held: float = 1000.0
+    excess_fit: float = 0.0
     held_per_dof: float = 1.0
     model = SimpleNamespace(effects=())
 
@@ -157,8 +157,10 @@ class Weighed:
 def test_what_came_near_is_contested_anew():
     base, named, far, near = (Weighed(c) for c in (5000.0, 1000.0, 2000.0, 1100.0))
     # Held against what was found before it was refitted, the competitor would win; against the refit it does not.
-    rival = Rival(replace(near, chi2_fit=100.0), replace(far, chi2_fit=1000.0), "a competitor")
+    rival = Rival(replace(near, excess_fit=100.0), replace(far, excess_fit=1000.0, excess_held=1001.0), "a competitor")
     assert rival.left < GIVEN_UP
+    # What the held-out data do not bear out counts for nothing: ten to one beforehand.
+    assert replace(rival, refit=replace(rival.refit, excess_held=1001.0)).left == pytest.approx(10 / 11)
     found = Found((base, named), (), True, (), (rival,))
     kept = contested(found)
     assert kept.chain is found.chain and kept.rivals[0].against is named

@@ -10,8 +10,10 @@ from assembled_table import Assembly, mount_map
 
 from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.operators import assemble
+from avis_ctrl.gap.refit import refit
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs import load_rig
 
 RIG = load_rig("avis")
@@ -47,6 +49,52 @@ def added_stiffness(name, place, values, f, model=BARE):
 
 def test_bare_table():
     np.testing.assert_allclose(BARE.response(OMEGA), Assembly(RIG).mounts().response(F), rtol=1e-9, atol=1e-20)
+
+
+# --- sensors
+
+def test_what_a_geophone_rings_with_is_found_with_its_transient():
+    """Both states of its suspension, and what another corner or damping makes of them; of its own channel only."""
+    volts = TableModel(ResponseModel.of(RIG, (), sampled=False))
+    model = with_effect("geophone_corner", "Sy1", [6.0, 0.5], volts)
+    k = model.sensors.names.index("Sy1")
+
+    def left_of(y):
+        columns = model.sensor_transients(OMEGA)[:, k]
+        columns = columns[:, np.any(columns, axis=0)]
+        A, b = (np.concatenate([x.real, x.imag]) for x in (columns / np.linalg.norm(columns, axis=0), y))
+        return np.linalg.norm(b - A @ np.linalg.lstsq(A, b, rcond=None)[0]) / np.linalg.norm(b)
+    s, w = 1j * OMEGA, 2 * np.pi * 6.0
+    poles = s ** 2 + 2 * 0.5 * w * s + w ** 2
+    for ringing in (1 / poles, s / poles, 1 / poles ** 2, s ** 3 / poles ** 2):
+        assert left_of(ringing) < 1e-9
+    elsewhere = 1 / (s ** 2 + 2 * 0.5 * 2 * w * s + (2 * w) ** 2)
+    assert left_of(elsewhere) > 1e-2
+    plain = volts.sensor_transients(OMEGA)
+    added = model.sensor_transients(OMEGA)[:, :, plain.shape[2]:]
+    assert added.shape[2] == 4 and not np.any(np.delete(added, k, axis=1))
+    np.testing.assert_array_equal(with_effect("sensor_gain", "Sy1", [1.1], volts).sensor_transients(OMEGA), plain)
+
+
+def test_a_record_that_begins_driven_does_not_move_a_geophone_s_corner():
+    """Ringing of the suspension in the data, hundreds of times the noise."""
+    free = TableModel(ResponseModel.of(RIG, ("mass",), sampled=False))
+    truth = with_effect("geophone_corner", "Sy1", [6.0, 0.5], free)
+    k, rng, omega = free.sensors.names.index("Sy1"), np.random.default_rng(2), 2 * np.pi * np.geomspace(1.0, 40.0, 200)
+    U = np.zeros((200, 11, 1), complex)
+    U[:, :8, 0] = rng.standard_normal((200, 8)) + 1j * rng.standard_normal((200, 8))
+    made = SpectralBlock("00", omega, U, np.zeros((200, 6, 1), complex), transient=True)
+    Y = truth.answer(made, None, False).Y
+    noise = 1e-4 * np.sqrt(np.mean(np.abs(Y[:, k]) ** 2))
+    s = 1j * omega
+    ringing = (s + 20.0) / (s ** 2 + 2 * 0.5 * 2 * np.pi * 6.0 * s + (2 * np.pi * 6.0) ** 2)
+    Y[:, k, 0] += 300 * noise * ringing / np.abs(ringing).max()
+    Y = Y + noise / np.sqrt(2) * (rng.standard_normal(Y.shape) + 1j * rng.standard_normal(Y.shape))
+    block = replace(made, Y=Y).with_noise(np.broadcast_to(noise ** 2 * np.eye(6), (200, 6, 6)).astype(complex))
+    found = refit(with_effect("geophone_corner", "Sy1", [5.5, 0.55], free), [block], [block], 20)
+    assert found.held_per_dof == pytest.approx(1.0, abs=0.1)
+    told = found.reported(found.model.effects[0])
+    assert abs(told["corner_Hz"].value - 6.0) < 4 * told["corner_Hz"].std < 0.01
 
 
 # --- mounts

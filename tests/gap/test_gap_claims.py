@@ -17,7 +17,7 @@ from avis_ctrl.gap.show import _noisy, opening, places
 
 
 def test_each_of_two_effects_is_confirmed_by_its_own_step():
-    chain = [SimpleNamespace(labels=labels, chi2_held=chi2) for labels, chi2 in (
+    chain = [SimpleNamespace(labels=labels, excess_held=chi2) for labels, chi2 in (
         (("large_motion@payload",), 9000.0), (("large_motion@payload", "first@a"), 4000.0),
         (("large_motion@payload", "first@a", "second@b"), 1000.0))]
     found = SimpleNamespace(chain=chain)
@@ -71,7 +71,7 @@ def test_a_noisy_sensor_is_where_its_noise_was_measured():
 def _stand_in(held, labels):
     effects = [SimpleNamespace(label=label, effect=SimpleNamespace(name=label, idealised=True, confusable=()))
                for label in labels]
-    return SimpleNamespace(held_per_dof=held, criterion=3e4 * held, chi2_held=1e4 * held, labels=labels,
+    return SimpleNamespace(held_per_dof=held, criterion=3e4 * held, excess_held=1e4 * held, labels=labels,
                            model=SimpleNamespace(effects=effects))
 
 

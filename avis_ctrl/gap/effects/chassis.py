@@ -35,7 +35,7 @@ STIFF_Hz = 90.0
 TRIAL_MASS, TRIAL_Hz = 2.0, tuple(np.geomspace(10.0, 90.0, 7).tolist())
 SHAPE = (0.45, 0.45, 0.45, -0.4, -0.1)
 # Lines of a record, iterations, and how many are followed, only where the gap is more than this times the noise.
-TRIAL_LINES, TRIAL_ITERATIONS, TRIED, PLAIN = 50, 4, 1, 1.3
+TRIAL_LINES, TRIAL_ITERATIONS, TRIED, PLAIN = 50, 4, 3, 1.3
 
 
 @register

@@ -44,14 +44,11 @@ class GeophoneCorner(_OfSensor):
     """Output times (s^2 + 2 z0 w0 s + w0^2)/(s^2 + 2 z w s + w^2): the filter undoes a corner that is not there.
 
     Rademakers, section 2.1.1: the geophone is S s^2/(s^2 + 2 zn wn s + wn^2), the compensation has its zeros at wn, zn.
-    The poles that are not undone ring at a record's ends. Their transient is found with each pole twice, for then what
-    a small change of the poles makes of it is found, too, and a fit's gradient need not know of it.
     """
 
     name = "geophone_corner"
     title = "a geophone's suspension frequency is not the one that its compensation filter assumes"
     idealised = False
-    holds_states = True
     looks_like = "one output is off around and below the suspension frequency, by the same factor from every input"
     confusable = ("sensor_gain",)
 
@@ -69,11 +66,7 @@ class GeophoneCorner(_OfSensor):
         g = ops.base.rig.geophones
         assert g is not None
         assumed = second_order(ops.s, g.suspension_Hz, g.suspension_damping)
-        actual, k = second_order(ops.s, values["corner_Hz"], values["damping"]), ops.sensor(place)
-        ops.sense[:, k] *= assumed / actual
-        ringing = np.zeros((len(ops.s), ops.sense.shape[1], 4), complex)
-        ringing[:, k] = (ops.s[:, None] / (2 * np.pi * values["corner_Hz"])) ** np.arange(4) / actual[:, None] ** 2
-        ops.sensed.append(ringing)
+        ops.sense[:, ops.sensor(place)] *= assumed / second_order(ops.s, values["corner_Hz"], values["damping"])
 
 
 @register
