@@ -394,7 +394,13 @@ def _promoted(rough: list[tuple[Refit, ...]], depth: int, data: _Data) -> tuple[
     made = [(*chain[:-1], found.refit(chain[-1].model))
             for chain, found in zip(chosen, data.each(reached, chosen), strict=True) if found is not None]
     best, *others = _distinct(made) or [()]
-    return _distinct([_grown(_to_the_end(best, data.fitted, data.held_out), data), *others]) if best else [], left
+    if not best:
+        return [], left
+    before = _grown(_to_the_end(best, data.fitted, data.held_out), data)
+    best = _sought_again(before, data)
+    # What else may be its last effect, beside the others as they are now.
+    others = others if best is before else [_beside(best, one, data) for one in others]
+    return _distinct([best, *others]), left
 
 
 def _hopeless(chain: tuple[Refit, ...], first: Refit) -> bool:
@@ -451,6 +457,40 @@ def _alike(one: Refit, found: Refit, data: _Data) -> Refit | None:
         return one
     return try_refit(replace(one.model, effects=first, fixed=found.model.fixed), data.fitted, data.held_out,
                      MORE_ITERATIONS)
+
+
+def _sought_again(chain: tuple[Refit, ...], data: _Data) -> tuple[Refit, ...]:
+    """A chain of which the effect before the last is sought anew beside the last one, where that takes most of what it
+    left and still leaves more than noise: by itself it had stood for the other one, too, and ended elsewhere."""
+    found = chain[-1]
+    if len(chain) < 3 or found.held_per_dof <= CLOSED or _share(found, chain[-2]) <= TAKES:
+        return chain
+    k = len(found.model.effects) - 2
+    one = found.model.effects[k]
+    data.progress(f"{one.effect.name} ({location(one.place)}) beside {found.model.effects[-1].effect.name}?")
+    without = try_refit(found.model.without(one.label), data.fitted, data.held_out, ITERATIONS[1])
+    if without is None:
+        return chain
+    again = [other.effect for other in candidates(Score(without.model, data.fitted), [one.effect], data.each)
+             if location(other.effect.place) == location(one.place)]
+    coarse = min(_coarse(without.model, again[:REFITS_LATER], data, k), key=lambda r: r.criterion, default=None)
+    other = coarse and try_refit(coarse.model, data.fitted, data.held_out, MORE_ITERATIONS)
+    if other is None or other.implausible() or not _gains(other, found, known_noise(data.fitted)):
+        return chain
+    shorter = [_alike(before, other, data) for before in chain[:-1]]
+    return chain if None in shorter else (*(before for before in shorter if before is not None), other)
+
+
+def _beside(best: tuple[Refit, ...], chain: tuple[Refit, ...], data: _Data) -> tuple[Refit, ...]:
+    """A chain that differs from the best one in its last effect, refitted from where that one has all the others."""
+    *same, _ = best[-1].model.effects
+    *before, last = chain[-1].model.effects
+    if [one.label for one in before] != [one.label for one in same]:
+        return chain
+    model = best[-1].model
+    begin = replace(model, effects=tuple(same), fixed=chain[-1].model.fixed).with_effect(last)
+    found = try_refit(begin, data.fitted, data.held_out, MORE_ITERATIONS)
+    return (*best[:-1], found) if found is not None and found.criterion < chain[-1].criterion else chain
 
 
 def _worth_it(longer: tuple[Refit, ...], best: tuple[Refit, ...], parents: Sequence[tuple[Refit, ...]], stretch: float

@@ -16,7 +16,7 @@ from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.realise import realise
 from avis_ctrl.gap.refit import at_the_edge, refit
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.search import _Data, _grown, summits
+from avis_ctrl.gap.search import _beside, _Data, _grown, _sought_again, summits
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
@@ -372,6 +372,32 @@ def test_an_earlier_effect_of_a_chain_grows_in_its_place():
     assert grown[-1].model.effects[0].values[28] == pytest.approx(55.0, rel=1e-3)
     assert grown[-1].model.effects[1].values[0] == pytest.approx(0.08, rel=0.02)
     assert _grown(grown, data) is grown
+
+
+def test_an_effect_that_stood_for_another_is_sought_anew_beside_it():
+    """A sprung mass and a delay: found alone, the mass has taken a part of the delay, and its frequency along x is that
+    of another resonance, from where no fit comes back."""
+    rng = np.random.default_rng(4)
+    hidden, place = [11.0, 10.0, 7.0, 9.9, 0.03, -0.28, 0.38, 0.08], "payload/axes"
+
+    def late(model, name="loop_delay", where="loop", values=(1.5e-3,)):
+        return model.with_effect(active(library()[name], model, where, values))
+    block = measured(late(with_effect("attached_oscillator", place, hidden, IDENTIFIED)), rng)
+    wrong = with_effect("attached_oscillator", place, [10.6, 63.0, *hidden[2:]], IDENTIFIED)
+    chain = tuple(refit(model, [block], [block], 6) for model in (IDENTIFIED, wrong, late(wrong)))
+    assert chain[-1].held_per_dof > 10
+    data = _Data([block], [block], [thinned(block, 140, seed=1)], lambda text: None, one_by_one)
+    found = _sought_again(chain, data)
+    assert found[:2] == chain[:2]
+    assert found[-1].labels == ("attached_oscillator@payload/axes", "loop_delay@loop")
+    assert found[-1].held_per_dof == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_allclose(found[-1].model.effects[0].values[:4], hidden[:4], rtol=0.01)
+    assert _sought_again(found, data) is found
+    # What else may be late is refitted beside the mass as it is now.
+    lag = refit(late(chain[-1].model.without("loop_delay@loop"), "actuator_lag", "actuators"), [block], [block], 6)
+    beside = _beside(found, (*chain[:2], lag), data)
+    assert beside[-1].labels == ("attached_oscillator@payload/axes", "actuator_lag@actuators")
+    assert found[-1].held_per_dof < beside[-1].held_per_dof < 0.5 * lag.held_per_dof
 
 
 def test_a_mass_without_strength_changes_nothing():
