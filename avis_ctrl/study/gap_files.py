@@ -17,6 +17,7 @@ from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.signals.converter import nominal_converter
 from avis_ctrl.gap.simulate import simulate
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.gap.together import only_together
 from avis_ctrl.identification.prediction import model_inputs, predict
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.measurement.formats.hdf5 import replacing
@@ -71,8 +72,12 @@ def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
     names, known = model.base.names, rig.parameters()
     comments = {}
     if covariance is not None and covariance.shape == (len(model.names),) * 2:
+        shared = {name: group for group in only_together(model) for name in group}
         for k, name in enumerate(names):
-            if name in known:
+            if name in shared:
+                others = " and ".join(other for other in shared[name] if other != name)
+                comments[name] = f"{name.rpartition('.')[2]} known only together with {others}"
+            elif name in known:
                 sigma = float(np.sqrt(max(covariance[k, k], 0.0)))
                 comments[name] = f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}"
     header = [f"{rig.name}, {what} by avis gap", *(["standard deviations (1 sigma) beside the values: of the fit, "

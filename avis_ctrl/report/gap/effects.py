@@ -6,6 +6,7 @@ import numpy as np
 
 from avis_ctrl.gap.judgement import LARGE_MOTION
 from avis_ctrl.gap.result import Gap, NamedEffect
+from avis_ctrl.gap.together import only_together
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.finding import Found
@@ -22,7 +23,8 @@ def parameters(found: Found) -> Section:
         pieces.append(Paragraph("No effect is named, so the updated model is the re-identified one."))
     if len(gap.baseline.values):
         both = " and updated" if gap.effects else ""
-        pieces.append(Fold(f"The rig's own parameters, re-identified{both}", (_rig(gap), *_always(gap))))
+        pieces.append(Fold(f"The rig's own parameters, re-identified{both}",
+                           (_rig(gap), *_together(gap), *_always(gap))))
     return Section("Parameters", "parameters", tuple(pieces))
 
 
@@ -61,13 +63,15 @@ def _rig(gap: Gap) -> Table:
     before = dict(zip(gap.baseline.names, gap.baseline.values, strict=True))
     after = dict(zip(gap.updated.names, gap.updated.values, strict=True))
     units, sigma = dict(zip(gap.baseline.names, gap.baseline.units, strict=True)), _deviations(gap)
+    shared = {name for group in only_together(gap.updated) for name in group}
     rows = []
     for name, value in before.items():
         if name.startswith(f"{LARGE_MOTION}@"):
             continue
         new = after.get(name, np.nan)
-        shown, spread = words.with_deviation(new, sigma[name]) if name in sigma else (words.number(new, 5),
-                                                                                     "not stated")
+        shown, spread = words.number(new, 5), "not by itself" if name in shared else "not stated"
+        if name in sigma and name not in shared:
+            shown, spread = words.with_deviation(new, sigma[name])
         change = f"{100 * (new / value - 1):+.2f} %".replace("-", "−") if value and np.isfinite(new) else "none"
         middle = (words.number(value, 5), shown, spread, change) if gap.effects else (shown, spread)
         rows.append((name, *middle, words.unit(units[name])))
@@ -77,6 +81,16 @@ def _rig(gap: Gap) -> Table:
     return table("A model that lacks an effect bends its own parameters to make up for it; the change is what they "
                  "give back. A large one is no error: it may lie along a direction that the data hardly know.",
                  ("parameter", "re-identified", "updated", "± 1 σ", "change", "unit"), rows, "lrrrrl")
+
+
+def _together(gap: Gap) -> list[Piece]:
+    """What no record tells one by one."""
+    groups = only_together(gap.updated)
+    if not groups:
+        return []
+    told = "; ".join(words.joined(list(group)) for group in groups)
+    return [Paragraph(f"Determined only together, whatever the records: {told}. How they share it is as the rig "
+                      "file has it, and not known.", "note")]
 
 
 def _always(gap: Gap) -> list[Piece]:
