@@ -111,7 +111,7 @@ def _stages(gap: Gap) -> Table:
 def responses(seen: GapOverlay, named: bool) -> list[Piece]:
     """The pairs of input and output that disagree most, and in words what is drawn."""
     pairs, who = worst_pairs(seen), "updated" if named else "re-identified"
-    text = (f"Frequency responses, measured from records {', '.join(seen.records)}, those that were fitted among them: "
+    text = (f"Frequency responses from records {', '.join(seen.records)}, some of which were fitted. Points: "
             f"{seen.method}. Shown are the {len(pairs)} paths on which the re-identified model is furthest off, in "
             "standard deviations of the measured response; no two have the same output.")
     if seen.method.startswith(BESIDE):

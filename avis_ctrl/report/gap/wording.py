@@ -19,8 +19,8 @@ CLAIMS = {
             f"data is, as a whole, within {UNEXPLAINED ** 0.5:.3g} times the r.m.s. of the measured noise, and no "
             "effect is named. Nothing was added. An effect that is too weak for this campaign, or that these records "
             "do not excite, would not show.",
-    "explained": "Verdict: explained. With what is named above what the model leaves of the held-out data is, as a "
-                 f"whole, within {CLOSED ** 0.5:.3g} times the r.m.s. of the measured noise, which counts as closed. "
+    "explained": "Verdict: explained. With what is named above, the model leaves of the held-out data, as a whole, "
+                 f"no more than {CLOSED ** 0.5:.3g} times the r.m.s. of the measured noise, which counts as closed. "
                  "What hides below that this campaign cannot show.",
     "partly explained": "Verdict: partly explained. What is named above is confirmed by the held-out data, but a "
                         "significant part of the gap remains, and no further effect is named: at most two effects of "

@@ -25,8 +25,8 @@ def gates_of(findings: Sequence[Finding]) -> Section:
         return Section("Gates", "gates", (Paragraph("The gates look at records in time; there were none."),))
     ordered = sorted(findings, key=lambda f: -SEVERITIES.index(f.severity))
     rows = [(gate, MARKS[severity], text) for gate, severity, text in _together(ordered)]
-    counts = ", ".join(f"{sum(f.severity == s for f in ordered)} {s}" for s in reversed(SEVERITIES)
-                       if any(f.severity == s for f in ordered))
+    listed = [severity for _, severity, _ in _together(ordered)]
+    counts = ", ".join(f"{listed.count(s)} {s}" for s in reversed(SEVERITIES) if s in listed)
     pieces: list[Piece] = [
         table(f"What was tested before any fit, gravest first: {counts}. A note is to be known, a warning makes "
               "results worse, a stop makes them wrong.", ("gate", "severity", "finding"), rows, "lcl")]
