@@ -25,6 +25,8 @@ SAME_LEVEL = 1.25
 THIN_LINES = 450
 # Below this [Hz] lie the resonances of a table: there no line is left out before the others.
 DENSE_BELOW_Hz = 8.0
+# Bands to the octave in which silent lines are weighted by what is left of them, and how often.
+PER_OCTAVE, WEIGHTINGS = 2, 4
 # Periods of a record from which the first one may be left to the transient.
 SETTLED = 3
 
@@ -166,9 +168,16 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
         block = record_block(record.load(), model.base, band_Hz)
     else:
         return None
-    flat = np.mean(np.abs(block.Y) ** 2, axis=(0, 2))
-    weights = np.broadcast_to(np.diag(flat), (len(block.omega), *2 * flat.shape)).copy()
-    left = prediction_error(cast(ResponseModel, model), block.with_noise(weights), derivative=False)
+    # What the ends of the record leave is found by weighted least squares: where the noise falls with frequency, equal
+    # weights would leave of it, everywhere, as much as the noise where it is largest.
+    power = np.broadcast_to(np.mean(np.abs(block.Y) ** 2, axis=(0, 2)), block.Y.shape[:2])
+    octave = np.floor(PER_OCTAVE * np.log2(block.omega / block.omega[0])).astype(int)
+    for _ in range(WEIGHTINGS):
+        weights = power[:, :, None] * np.eye(power.shape[1])
+        left = prediction_error(cast(ResponseModel, model), block.with_noise(weights.astype(complex)), derivative=False)
+        found = np.mean(np.abs(left.error) ** 2, axis=2)
+        lines = np.maximum(np.bincount(octave), 1)
+        power = np.stack([(np.bincount(octave, one) / lines)[octave] for one in found.T], axis=1)
     return Residual(block, left.error, left.white, np.zeros_like(left.error))
 
 
