@@ -172,11 +172,11 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
     # weights would leave of it, everywhere, as much as the noise where it is largest.
     power = np.broadcast_to(np.mean(np.abs(block.Y) ** 2, axis=(0, 2)), block.Y.shape[:2])
     octave = np.floor(PER_OCTAVE * np.log2(block.omega / block.omega[0])).astype(int)
+    lines = np.maximum(np.bincount(octave), 1)
     for _ in range(WEIGHTINGS):
         weights = power[:, :, None] * np.eye(power.shape[1])
         left = prediction_error(cast(ResponseModel, model), block.with_noise(weights.astype(complex)), derivative=False)
         found = np.mean(np.abs(left.error) ** 2, axis=2)
-        lines = np.maximum(np.bincount(octave), 1)
         power = np.stack([(np.bincount(octave, one) / lines)[octave] for one in found.T], axis=1)
     return Residual(block, left.error, left.white, np.zeros_like(left.error))
 

@@ -435,8 +435,7 @@ def _grown(chain: tuple[Refit, ...], data: _Data) -> tuple[Refit, ...]:
         found = best
     if found is last or _share(found, last) <= LARGER_PART:
         return chain
-    shorter = [_alike(one, found, data) for one in chain[:-1]]
-    return chain if None in shorter else (*(one for one in shorter if one is not None), found)
+    return _ending_in(found, chain, data)
 
 
 def _with_more(found: Refit, k: int, data: _Data) -> Refit | None:
@@ -446,8 +445,24 @@ def _with_more(found: Refit, k: int, data: _Data) -> Refit | None:
     if not larger:
         return None
     data.progress(f"more of it: {one.effect.name} ({larger[0].place.replace('/', ', ')})?")
-    coarse = min(_coarse(found.model.without(one.label), larger, data, k), key=lambda r: r.criterion, default=None)
+    return _best_of(found.model.without(one.label), larger, data, k)
+
+
+def _best_of(model: TableModel, effects: Sequence[ActiveEffect], data: _Data, at: int) -> Refit | None:
+    """The best of a model's refits with one of the effects as number `at`."""
+    coarse = min(_coarse(model, effects, data, at), key=lambda r: r.criterion, default=None)
     return coarse and try_refit(coarse.model, data.fitted, data.held_out, MORE_ITERATIONS)
+
+
+def _ending_in(found: Refit, chain: tuple[Refit, ...], data: _Data) -> tuple[Refit, ...]:
+    """A chain with another end, its shorter parts with the effects as they are there; as it was where one of these
+    comes to no end."""
+    made = [found]
+    for one in chain[:-1]:
+        if (shorter := _alike(one, found, data)) is None:
+            return chain
+        made.insert(-1, shorter)
+    return tuple(made)
 
 
 def _alike(one: Refit, found: Refit, data: _Data) -> Refit | None:
@@ -473,12 +488,10 @@ def _sought_again(chain: tuple[Refit, ...], data: _Data) -> tuple[Refit, ...]:
         return chain
     again = [other.effect for other in candidates(Score(without.model, data.fitted), [one.effect], data.each)
              if location(other.effect.place) == location(one.place)]
-    coarse = min(_coarse(without.model, again[:REFITS_LATER], data, k), key=lambda r: r.criterion, default=None)
-    other = coarse and try_refit(coarse.model, data.fitted, data.held_out, MORE_ITERATIONS)
+    other = _best_of(without.model, again[:REFITS_LATER], data, k)
     if other is None or other.implausible() or not _gains(other, found, known_noise(data.fitted)):
         return chain
-    shorter = [_alike(before, other, data) for before in chain[:-1]]
-    return chain if None in shorter else (*(before for before in shorter if before is not None), other)
+    return _ending_in(other, chain, data)
 
 
 def _beside(best: tuple[Refit, ...], chain: tuple[Refit, ...], data: _Data) -> tuple[Refit, ...]:

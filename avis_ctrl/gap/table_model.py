@@ -20,8 +20,8 @@ from avis_ctrl.rigs.rig import Parameter, Rig
 _MOUNT = re.compile(r"isolator(\d+)\.([kc])_([xyz])")
 # Relative step of differences by an effect's parameters, in units of their size.
 STEP = 1e-4
-# A sensor's chain is another one where its ratio to the rig's varies over the band by more than this share.
-UNCHANGED = 1e-6
+# A sensor's chain is another one where its ratio to the rig's varies over these frequencies by more than this share.
+PROBED, UNCHANGED = 2 * np.pi * np.geomspace(0.5, 100.0, 5), 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,15 +242,25 @@ class TableModel:
         poles of r beside a constant and a slope, and r^2 and s r^2 what a small change of these poles makes of it: a
         fit's gradient need not know of them then.
         """
-        own, ops = self.base.sensor_transients(omega), self.operators(omega)
-        r = ops.sense / Operators(self.effective, ops.omega).sense
-        level = np.mean(r, axis=0)
-        changed = np.flatnonzero(np.max(np.abs(r - level), axis=0) > UNCHANGED * np.abs(level))
-        s = ops.s / np.mean(omega)
+        own, changed = self.base.sensor_transients(omega), self._changed_sensors
+        if not changed.size:
+            return own
+        r, s = self._chain_ratio(omega), 1j * omega
         ringing = np.zeros((len(omega), r.shape[1], len(changed), 4), complex)
         for j, k in enumerate(changed):
             ringing[:, k, j] = np.stack([r[:, k], s * r[:, k], r[:, k] ** 2, s * r[:, k] ** 2], axis=-1)
         return np.concatenate([own, ringing.reshape(len(omega), r.shape[1], -1)], axis=2)
+
+    @cached_property
+    def _changed_sensors(self) -> np.ndarray:
+        """Indices of the sensors whose chain effects change by more than a factor, whatever lines are asked for."""
+        r = self._chain_ratio(PROBED)
+        level = np.mean(r, axis=0)
+        return np.flatnonzero(np.max(np.abs(r - level), axis=0) > UNCHANGED * np.abs(level))
+
+    def _chain_ratio(self, omega: np.ndarray) -> np.ndarray:
+        """(n, n_y) chain of each sensor over that of the rig."""
+        return self.operators(omega).sense / Operators(self.effective, omega).sense
 
     def inner_transients(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y, n_t): y by unit initial states of what effects hold inside: modes, masses in mounts, a chassis.

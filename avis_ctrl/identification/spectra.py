@@ -167,7 +167,7 @@ def transient_parts(x: np.ndarray, norms: np.ndarray, block: SpectralBlock, mode
     """(n, 12, 1) impulses and steps on the body, and (m,) what the states inside start with: the part of unknowns
     x (n_t,) of the columns of `transient_columns`, norms (n_t,), that changes with the model's parameters."""
     n_b, true = 2 * N_Q, x / norms
-    chains = model.sensor_transients(block.omega).shape[2]
+    chains = model.sensor_transients(block.omega[:1]).shape[2]
     body = np.broadcast_to(true[None, :n_b, None], (len(block.omega), n_b, 1))
     return body, true[n_b + chains:]
 

@@ -73,6 +73,8 @@ def test_what_a_geophone_rings_with_is_found_with_its_transient():
     plain = volts.sensor_transients(OMEGA)
     added = model.sensor_transients(OMEGA)[:, :, plain.shape[2]:]
     assert added.shape[2] == 4 and not np.any(np.delete(added, k, axis=1))
+    # A fit counts its unknowns on one line.
+    assert model.sensor_transients(OMEGA[:1]).shape[2] == plain.shape[2] + 4
     np.testing.assert_array_equal(with_effect("sensor_gain", "Sy1", [1.1], volts).sensor_transients(OMEGA), plain)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from avis_ctrl.gap.judgement import LARGE_MOTION
@@ -23,8 +25,9 @@ def parameters(found: Found) -> Section:
         pieces.append(Paragraph("No effect is named, so the updated model is the re-identified one."))
     if len(gap.baseline.values):
         both = " and updated" if gap.effects else ""
+        groups = only_together(gap.updated)
         pieces.append(Fold(f"The rig's own parameters, re-identified{both}",
-                           (_rig(gap), *_together(gap), *_always(gap))))
+                           (_rig(gap, groups), *_together(groups), *_always(gap))))
     return Section("Parameters", "parameters", tuple(pieces))
 
 
@@ -59,11 +62,11 @@ def _told(one: NamedEffect) -> str:
     return text
 
 
-def _rig(gap: Gap) -> Table:
+def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
     before = dict(zip(gap.baseline.names, gap.baseline.values, strict=True))
     after = dict(zip(gap.updated.names, gap.updated.values, strict=True))
     units, sigma = dict(zip(gap.baseline.names, gap.baseline.units, strict=True)), _deviations(gap)
-    shared = {name for group in only_together(gap.updated) for name in group}
+    shared = {name for group in groups for name in group}
     rows = []
     for name, value in before.items():
         if name.startswith(f"{LARGE_MOTION}@"):
@@ -83,9 +86,8 @@ def _rig(gap: Gap) -> Table:
                  ("parameter", "re-identified", "updated", "± 1 σ", "change", "unit"), rows, "lrrrrl")
 
 
-def _together(gap: Gap) -> list[Piece]:
+def _together(groups: Sequence[Sequence[str]]) -> list[Piece]:
     """What no record tells one by one."""
-    groups = only_together(gap.updated)
     if not groups:
         return []
     told = "; ".join(words.joined(list(group)) for group in groups)

@@ -24,8 +24,9 @@ def gates_of(findings: Sequence[Finding]) -> Section:
     if not findings:
         return Section("Gates", "gates", (Paragraph("The gates look at records in time; there were none."),))
     ordered = sorted(findings, key=lambda f: -SEVERITIES.index(f.severity))
-    rows = [(gate, MARKS[severity], text) for gate, severity, text in _together(ordered)]
-    listed = [severity for _, severity, _ in _together(ordered)]
+    together = _together(ordered)
+    rows = [(gate, MARKS[severity], text) for gate, severity, text in together]
+    listed = [severity for _, severity, _ in together]
     counts = ", ".join(f"{listed.count(s)} {s}" for s in reversed(SEVERITIES) if s in listed)
     pieces: list[Piece] = [
         table(f"What was tested before any fit, gravest first: {counts}. A note is to be known, a warning makes "
