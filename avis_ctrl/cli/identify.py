@@ -142,9 +142,12 @@ def predict(
         errors = list(prediction_errors(out, measured))
     if errors:
         names = list(errors[0].relative)
-        table = Table("record", *names, title="error over measured y, r.m.s.; records are predicted from rest")
+        noisy = any(one.noise is not None for one in errors)
+        table = Table("record", *names, *["noise between periods"] * noisy,
+                      title="error over measured y, r.m.s.; records are predicted from rest")
         for one in errors:
-            table.add_row(one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names))
+            told = "" if one.noise is None else f"{100 * one.noise:.3g} %"
+            table.add_row(one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names), *[told] * noisy)
         console.print(table)
         if note := compared(errors):
             console.print(note)

@@ -9,34 +9,48 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.campaign import Campaign, Record
 
 
 @dataclass(frozen=True)
 class PredictionErrors:
     """Errors of one record by the predicted quantity (y, y_baseline, y_updated): r.m.s. of the error over that of the
-    measured y, both about their means, root mean square over the channels."""
+    measured y, both about their means, root mean square over the channels.
+
+    noise : the same of what differs between the periods of a periodic record after the first, which no prediction from
+    u can hold; None where the record has no two such periods, or its floor was measured.
+    """
 
     record: str
     relative: dict[str, float]
+    noise: float | None = None
 
 
 def prediction_errors(predicted: Path, campaign: Campaign) -> Iterator[PredictionErrors]:
     """Of every record of a campaign that measured something, from a file of predictions of it."""
     with h5py.File(predicted, "r") as file:
         for source in campaign.records:
-            y = source.load().y
-            y = y - y.mean(axis=0)
+            record = source.load()
+            y = record.y - record.y.mean(axis=0)
             size = np.sqrt(np.mean(y ** 2, axis=0))
             group = file[f"records/{source.header.name}"]
             if np.all(size > 0):
-                yield PredictionErrors(source.header.name, {name: _relative(data[()], y, size)
-                                                            for name, data in group.items()})
+                yield PredictionErrors(source.header.name, {name: _relative(data[()] - y, size)
+                                                            for name, data in group.items()}, _noise(record, size))
 
 
-def _relative(made: np.ndarray, y: np.ndarray, size: np.ndarray) -> float:
-    error = made - made.mean(axis=0) - y
-    return float(np.sqrt(np.mean(np.mean(error ** 2, axis=0) / size ** 2)))
+def _relative(error: np.ndarray, size: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.var(error, axis=0) / size ** 2)))
+
+
+def _noise(record: Record, size: np.ndarray) -> float | None:
+    period, count = record.header.period_samples, record.header.periods - 1
+    if not period or count < 2 or record.floor is not None:  # the response to a floor is predicted too
+        return None
+    y = record.y[period:(count + 1) * period].reshape(count, period, -1)
+    spread = (y - y.mean(axis=0)).reshape(-1, y.shape[2])
+    # The mean takes one period's share of the noise with it.
+    return _relative(spread, size) * float(np.sqrt(count / (count - 1)))
 
 
 def compared(errors: Sequence[PredictionErrors]) -> str:

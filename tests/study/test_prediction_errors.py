@@ -43,3 +43,25 @@ def test_a_worse_model_and_the_same_model_are_called_so(predicted):
         for group in file["records"].values():
             group["y_updated"][...] = group["y_baseline"][()]
     assert "the same" in compared(list(prediction_errors(path, campaign)))
+
+
+def test_noise_is_what_differs_between_the_periods_after_the_first(tmp_path):
+    """A period that repeats, a start that does not, and noise of a known r.m.s.: 3 % and 4 % of the channels' y."""
+    rng, periods, samples = np.random.default_rng(2), 6, 2000
+    wave = rng.standard_normal((samples, 2)) * [1.0, 1e-3]
+    y = np.tile(wave, (periods, 1))
+    noise = rng.standard_normal(y.shape) * [0.03, 0.04e-3]
+    y[:samples] *= np.linspace(0, 1, samples)[:, None]
+    header = RecordHeader("00", 1000.0, len(y), ("u1",), ("Sy1", "Sz1"), "multisine", 0.1, period_s=2.0)
+    plain = Record(header, np.zeros((len(y), 1)), y + noise, None)
+    path = tmp_path / "p.h5"
+    with h5py.File(path, "w") as file:
+        file["records/00/y"] = y
+    one, = prediction_errors(path, Campaign("avis", (plain,)))
+    size = np.std(plain.y, axis=0)
+    assert one.noise == pytest.approx(np.sqrt(np.mean(([0.03, 0.04e-3] / size) ** 2)), rel=0.03)
+    assert one.noise == pytest.approx(one.relative["y"], rel=0.05)
+
+
+def test_no_noise_is_told_where_nothing_repeats(predicted):
+    assert all(one.noise is None for one in prediction_errors(*predicted))
