@@ -331,7 +331,9 @@ class TableModel:
         scale = self.scales()
         for row in range(n, len(theta)):
             step = STEP * scale[row]
-            ends = [min(max(theta[row] + sign * step, low[row]), high[row]) for sign in (1, -1)]
+            # A bound that goes with the payload's mass may have moved past the value.
+            lowest, highest = min(low[row], theta[row]), max(high[row], theta[row])
+            ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]
             sides = []
             for end in ends:
                 other = self._with_effect_parameter(row - n, end)

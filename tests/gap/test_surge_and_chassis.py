@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from test_score import MODEL, gaussian
 from truth.cases import draw_case, rig, simulate_case
 
 from avis_ctrl.gap.analysis import prepare
 from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.operators import assemble
+from avis_ctrl.gap.refit import refit
+from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.search import CLOSED, search
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs.rigid_body import point_map
 
 OMEGA = 2 * np.pi * np.geomspace(0.5, 80.0, 40)
@@ -92,6 +98,30 @@ def test_a_chassis_bears_what_hangs_on_the_payload_and_what_holds_it():
     for found, push in ((made.T, motors), (made.floor_force(w), floor)):
         true = np.linalg.solve(full, push)[:, :6]
         np.testing.assert_allclose(made.inverse @ found, true, atol=1e-9 * np.abs(true).max())
+
+
+@pytest.mark.parametrize("values", [
+    pytest.param([1045.0, 0.0169, 5.86, 9.06, 7.13, 10.2, 6.64, 8.0, 0.558, 0.435, 0.47, -0.347, -0.243],
+                 id="beside the suspension's modes"),
+    pytest.param([721.0, 0.0159, 15.6, 13.8, 18.2, 23.3, 16.4, 19.7, 0.382, 0.594, 0.523, -0.513, -0.218],
+                 id="in the middle"),
+    pytest.param([2140.0, 0.0216, 21.1, 17.0, 18.8, 23.1, 17.4, 23.9, 0.469, 0.36, 0.466, -0.478, -0.211], id="heavy",
+                 marks=[pytest.mark.slow, pytest.mark.xfail(strict=True, reason="ends with four times the mass")])])
+def test_six_sharp_resonances_are_found_from_a_model_without(values):
+    """Each a per cent of damping wide, none at the frequency of another, and the rig fitted without them before."""
+    truth = MODEL.with_effect(active(library()["base_compliance"], MODEL, "chassis/rocking", values))
+    omega, rng, noise, blocks = 2 * np.pi * np.linspace(0.5, 60.0, 150), np.random.default_rng(5), 3e-4, []
+    for k in range(4):
+        U = np.zeros((len(omega), 11, 1), complex)
+        U[:, :8] = 0.3 * gaussian(rng, len(omega), 8, 1)
+        made = SpectralBlock(f"{k:02d}", omega, U, np.zeros((len(omega), 6, 1), complex), transient=False)
+        Y = truth.answer(made, None, False).Y + noise * gaussian(rng, len(omega), 6, 1)
+        blocks.append(replace(made, Y=Y).with_noise(noise ** 2 * np.tile(np.eye(6, dtype=complex), (len(omega), 1, 1))))
+    base = refit(MODEL, blocks, blocks)
+    assert base.fit.chi2_per_dof > 5
+    seed, = library()["base_compliance"].seeds(Score(base.model, blocks), "chassis/rocking")
+    np.testing.assert_allclose(seed.values[2:8], values[2:8], rtol=0.03)
+    assert seed.values[0] == pytest.approx(values[0], rel=0.1)
 
 
 def test_what_holds_no_states_leaves_none():

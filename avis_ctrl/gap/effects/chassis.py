@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import product
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -19,6 +22,7 @@ from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.score_algebra import reduction
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit
+from avis_ctrl.identification.noise import relative_noise
 from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs.rigid_body import point_map
 
@@ -32,10 +36,24 @@ LOWEST_Hz = 7.0
 STIFF_Hz = 90.0
 # Starts of which the most promising are followed: mass over the payload's, frequencies alike along all ways, and
 # radii of gyration and heights [m] of a frame of a table's size.
-TRIAL_MASS, TRIAL_Hz = 2.0, tuple(np.geomspace(10.0, 90.0, 7).tolist())
+TRIAL_MASS, TRIAL_Hz = 2.0, tuple(np.geomspace(6.0, 90.0, 13).tolist())
 SHAPE = (0.45, 0.45, 0.45, -0.4, -0.1)
 # Lines of a record, iterations, and how many are followed, only where the gap is more than this times the noise.
-TRIAL_LINES, TRIAL_ITERATIONS, TRIED, PLAIN = 50, 4, 3, 1.3
+TRIAL_LINES, TRIAL_ITERATIONS, TRIED, PLAIN = 50, 12, 3, 1.3
+# Where the gap is more than this times the noise, starts are followed by weights that ask at first for these shares of
+# the response, with so many iterations by the next ones; by those of the noise alone, too, where that leads to no end
+# at this times the noise.
+STEEP, SHARES, LATER_ITERATIONS, AN_END = 100.0, (0.3, 0.03), 8, 2.0
+# A start by a share of the response, or a step along one way, is taken where it leaves less than this of the gap; and
+# ways are looked at one by one where all together leave less than that, of so many starts.
+PROMISING, FOLLOWED, BOTH = 0.8, 0.25, 2
+# Where a chassis leaves more than so many times the noise, its ways are looked at again by so many lines of a record,
+# which tell minima apart that few do not.
+NOT_YET, MORE_LINES = 1.1, 150
+# Where else the frequency of one way is looked for, over the median of all ways, and how often.
+ELSEWHERE, ROUNDS = (0.65, 0.8, 1.0, 1.25, 1.55), 6
+# Ways of which a frame's low mass makes two modes, so that one may stand for the other.
+TOGETHER = (("x", "ry"), ("y", "rx"), ("z",), ("rz",))
 
 
 @register
@@ -77,36 +95,111 @@ class BaseCompliance(Effect):
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         """Short fits to few lines: from where each way of moving resonates best by itself, and from the most promising
-        of like frequencies along all ways, where one step of all parameters together is expected to lead furthest."""
-        blocks = [thinned(part.block, TRIAL_LINES, seed=2) for part in score.parts]
-        few = Score(score.model, blocks).chi2
-        scale = score.chi2 / max(few, 1.0)
-        own = self._by_ways(score, place)
-        trials = [] if score.chi2 < PLAIN * score.dof else self._alike(score.model, place, blocks)
-        found = []
-        for values in [*(one.values for one in own), *trials[:TRIED]]:
-            begin = score.model.with_effect(ActiveEffect(self, place, self.parameters(score.model, place), values))
-            if (made := _short_fit(begin, blocks)) is not None:
-                reached = cast(TableModel, made.model).effects[-1].values
-                # On few lines the rig's parameters take their part of the noise, too.
-                found.append(Seed(reached, score.chi2 - scale * made.chi2, len(made.model.names),
-                                  len(own) + len(TRIAL_Hz), few - made.chi2))
-        found = [one for one in found if one.chi2 > 0] or own
-        return sorted(found, key=lambda seed: -seed.chi2)
+        of like frequencies along all ways, where one step of all parameters together is expected to lead furthest. The
+        best is followed, each way of moving sought elsewhere beside the others.
 
-    def _alike(self, model: TableModel, place: str, blocks: Sequence[SpectralBlock]) -> list[tuple[float, ...]]:
-        """Starts of one frequency along all ways, the most promising first."""
-        parameters, found = self.parameters(model, place), []
+        Six resonances of a per cent of damping, each some widths away from where it is sought: by the noise's own
+        weights every line between them is a wall. By weights relative to the response, as of one who looks at a Bode
+        plot, they are slopes; from there the weights go to those of the noise.
+        """
+        blocks = [thinned(part.block, TRIAL_LINES, seed=2) for part in score.parts]
+        own = self._by_ways(score, place)
+        few = Score(score.model, blocks).chi2
+        wide, steep = (score.chi2 > times * score.dof for times in (PLAIN, STEEP))
+        by_share = [[_with_share(block, share) for block in blocks] for share in SHARES]
+        starts = [one.values for one in own]
+        reached = None
+        for weights in [[*by_share, blocks], [blocks]] if steep else [[blocks]]:
+            made = self._followed(score.model, place, starts, weights, wide)
+            if made is not None and (reached is None or made.chi2 < reached.chi2):
+                reached = made
+            if reached is not None and reached.chi2 < AN_END * reached.dof:
+                break
+        if reached is None:
+            return own
+        if wide and reached.chi2 - reached.dof < FOLLOWED * (few - reached.dof):
+            more = [thinned(part.block, MORE_LINES, seed=2) for part in score.parts]
+            made = _short_fit(cast(TableModel, reached.model), more, LATER_ITERATIONS)
+            if made is not None:
+                reached = made if made.chi2 < NOT_YET * made.dof else self._way_by_way(made, place, more, made.dof)
+                few = Score(score.model, more).chi2
+        # On few lines the rig's parameters take their part of the noise, too.
+        found = Seed(_effect(reached).values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2,
+                     len(reached.model.names), len(own) + len(TRIAL_Hz), few - reached.chi2)
+        return [found] if found.chi2 > 0 else own
+
+    def _followed(self, model: TableModel, place: str, starts: Sequence[tuple[float, ...]],
+                  weights: Sequence[Sequence[SpectralBlock]], wide: bool) -> LikelihoodFit | None:
+        """The best of what starts lead to by the first weights, followed by the others. wide : with those of one
+        frequency, and way by way."""
+        first, *later = weights
+        start = Score(model, first)
+        # What a share of the response adds to the noise is none: all that is left counts.
+        noise = 0 if later else start.dof
+        gap = start.chi2 - noise
+        alike = [values for left, values in (self._alike(model, place, first)[:TRIED] if wide else [])
+                 if left - noise < PROMISING * gap or not later]
+        fits = [_short_fit(self._standing(model, place, values), first, TRIAL_ITERATIONS)
+                for values in [*starts, *alike]]
+        made = sorted((one for one in fits if one is not None), key=lambda one: one.chi2)
+        if wide:
+            made[:BOTH] = [self._way_by_way(one, place, first, noise) if one.chi2 - noise < FOLLOWED * gap
+                           else one for one in made[:BOTH]]
+        reached = min(made, key=lambda one: one.chi2, default=None)
+        for then in later:
+            reached = reached and _short_fit(cast(TableModel, reached.model), then, LATER_ITERATIONS)
+        return reached
+
+    def _alike(self, model: TableModel, place: str, blocks: Sequence[SpectralBlock]
+               ) -> list[tuple[float, tuple[float, ...]]]:
+        """Starts of one frequency along all ways, the most promising first, and the chi-square expected of each."""
         payload = model.rig.mounted_body().mass
         shape = () if place.endswith("translation") else SHAPE
+        found = []
         for f in TRIAL_Hz:
             values = (TRIAL_MASS * payload, 0.05, *[f] * (6 if shape else 3), *shape)
             try:
-                left = Score(model.with_effect(ActiveEffect(self, place, parameters, values)), blocks).chi2
+                left = Score(self._standing(model, place, values), blocks).chi2
             except (AvisError, np.linalg.LinAlgError):
                 continue
             found.append((left, values))
-        return [values for _, values in sorted(found)]
+        return sorted(found)
+
+    def _way_by_way(self, reached: LikelihoodFit, place: str, blocks: Sequence[SpectralBlock],
+                    noise: float) -> LikelihoodFit:
+        """A fit with the frequencies of ways that go together sought elsewhere, as long as that brings it nearer to
+        `noise`, the chi-square of an exact model. With ten parameters of the others, which may stand for them, nothing
+        leads there downhill."""
+        parameters = _effect(reached).parameters
+        names = [one.name for one in parameters]
+        for _ in range(ROUNDS):
+            model = cast(TableModel, reached.model)
+            rest, values = model.without(_effect(reached).label), np.array(_effect(reached).values)
+            trials = []
+            free = [way for way in WAYS if f"{way}_Hz" in names]
+            middle = np.median([values[names.index(f"{way}_Hz")] for way in free])
+            for ways in [[way for way in together if way in free] for together in TOGETHER]:
+                for factors in product(ELSEWHERE, repeat=len(ways)):
+                    moved = values.copy()
+                    for way, factor in zip(ways, factors, strict=True):
+                        k = names.index(f"{way}_Hz")
+                        moved[k] = min(factor * middle, 0.9 * parameters[k].high)
+                        if len(way) > 1:
+                            moved[names.index(f"gyration_{way[1]}_m")] = SHAPE[0]
+                    with contextlib.suppress(AvisError, np.linalg.LinAlgError):
+                        other = self._standing(rest, place, tuple(moved.tolist()))
+                        trials.append((Score(other, blocks).chi2, other))
+            best = min(trials, key=lambda trial: trial[0], default=None)
+            if best is None or best[0] - noise > PROMISING * (reached.chi2 - noise):
+                return reached
+            made = _short_fit(best[1], blocks, LATER_ITERATIONS)
+            if made is None or made.chi2 - noise > PROMISING * (reached.chi2 - noise):
+                return reached
+            reached = made
+        return reached
+
+    def _standing(self, model: TableModel, place: str, values: tuple[float, ...]) -> TableModel:
+        return model.with_effect(ActiveEffect(self, place, self.parameters(model, place), values))
 
     def _by_ways(self, score: Score, place: str) -> list[Seed]:
         """Where each way of moving resonates best by itself; masses follow from all of them together."""
@@ -182,9 +275,20 @@ def of_chassis(values: Mapping[str, float]) -> np.ndarray:
     return found
 
 
-def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock]) -> LikelihoodFit | None:
+def _with_share(block: SpectralBlock, share: float) -> SpectralBlock:
+    """The block with noise of this share of its response beside its own."""
+    relative, = relative_noise([block], share)
+    assert block.noise is not None and relative.noise is not None
+    return replace(block, noise=block.noise + relative.noise)
+
+
+def _effect(found: LikelihoodFit) -> ActiveEffect:
+    return cast(TableModel, found.model).effects[-1]
+
+
+def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock], iterations: int) -> LikelihoodFit | None:
     try:
-        return likelihood(model, blocks, TRIAL_ITERATIONS)
+        return likelihood(model, blocks, iterations)
     except (AvisError, np.linalg.LinAlgError, FloatingPointError):
         return None
 
