@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, cast
@@ -106,10 +104,12 @@ class BaseCompliance(Effect):
         own = self._by_ways(score, place)
         few = Score(score.model, blocks).chi2
         wide, steep = (score.chi2 > times * score.dof for times in (PLAIN, STEEP))
-        by_share = [[_with_share(block, share) for block in blocks] for share in SHARES]
+        ladders = [[blocks]]
+        if steep:
+            ladders.insert(0, [*([_with_share(block, share) for block in blocks] for share in SHARES), blocks])
         starts = [one.values for one in own]
         reached = None
-        for weights in [[*by_share, blocks], [blocks]] if steep else [[blocks]]:
+        for weights in ladders:
             made = self._followed(score.model, place, starts, weights, wide)
             if made is not None and (reached is None or made.chi2 < reached.chi2):
                 reached = made
@@ -155,48 +155,34 @@ class BaseCompliance(Effect):
         """Starts of one frequency along all ways, the most promising first, and the chi-square expected of each."""
         payload = model.rig.mounted_body().mass
         shape = () if place.endswith("translation") else SHAPE
-        found = []
-        for f in TRIAL_Hz:
-            values = (TRIAL_MASS * payload, 0.05, *[f] * (6 if shape else 3), *shape)
-            try:
-                left = Score(self._standing(model, place, values), blocks).chi2
-            except (AvisError, np.linalg.LinAlgError):
-                continue
-            found.append((left, values))
-        return sorted(found)
+        starts = [(TRIAL_MASS * payload, 0.05, *[f] * (6 if shape else 3), *shape) for f in TRIAL_Hz]
+        expected = [(self._expected(model, place, values, blocks), values) for values in starts]
+        return sorted(one for one in expected if one[0] < np.inf)
 
     def _way_by_way(self, reached: LikelihoodFit, place: str, blocks: Sequence[SpectralBlock],
                     noise: float) -> LikelihoodFit:
         """A fit with the frequencies of ways that go together sought elsewhere, as long as that brings it nearer to
         `noise`, the chi-square of an exact model. With ten parameters of the others, which may stand for them, nothing
         leads there downhill."""
-        parameters = _effect(reached).parameters
-        names = [one.name for one in parameters]
         for _ in range(ROUNDS):
-            model = cast(TableModel, reached.model)
-            rest, values = model.without(_effect(reached).label), np.array(_effect(reached).values)
-            trials = []
-            free = [way for way in WAYS if f"{way}_Hz" in names]
-            middle = np.median([values[names.index(f"{way}_Hz")] for way in free])
-            for ways in [[way for way in together if way in free] for together in TOGETHER]:
-                for factors in product(ELSEWHERE, repeat=len(ways)):
-                    moved = values.copy()
-                    for way, factor in zip(ways, factors, strict=True):
-                        k = names.index(f"{way}_Hz")
-                        moved[k] = min(factor * middle, 0.9 * parameters[k].high)
-                        if len(way) > 1:
-                            moved[names.index(f"gyration_{way[1]}_m")] = SHAPE[0]
-                    with contextlib.suppress(AvisError, np.linalg.LinAlgError):
-                        other = self._standing(rest, place, tuple(moved.tolist()))
-                        trials.append((Score(other, blocks).chi2, other))
-            best = min(trials, key=lambda trial: trial[0], default=None)
-            if best is None or best[0] - noise > PROMISING * (reached.chi2 - noise):
+            now = _effect(reached)
+            rest = cast(TableModel, reached.model).without(now.label)
+            left, values = min((self._expected(rest, place, moved, blocks), moved) for moved in _elsewhere(now))
+            if left - noise > PROMISING * (reached.chi2 - noise):
                 return reached
-            made = _short_fit(best[1], blocks, LATER_ITERATIONS)
+            made = _short_fit(self._standing(rest, place, values), blocks, LATER_ITERATIONS)
             if made is None or made.chi2 - noise > PROMISING * (reached.chi2 - noise):
                 return reached
             reached = made
         return reached
+
+    def _expected(self, model: TableModel, place: str, values: tuple[float, ...], blocks: Sequence[SpectralBlock]
+                  ) -> float:
+        """Chi-square that one step of all parameters from a start is expected to leave; infinite without a step."""
+        try:
+            return Score(self._standing(model, place, values), blocks).chi2
+        except (AvisError, np.linalg.LinAlgError):
+            return np.inf
 
     def _standing(self, model: TableModel, place: str, values: tuple[float, ...]) -> TableModel:
         return model.with_effect(ActiveEffect(self, place, self.parameters(model, place), values))
@@ -279,7 +265,23 @@ def _with_share(block: SpectralBlock, share: float) -> SpectralBlock:
     """The block with noise of this share of its response beside its own."""
     relative, = relative_noise([block], share)
     assert block.noise is not None and relative.noise is not None
-    return replace(block, noise=block.noise + relative.noise)
+    return block.with_noise(block.noise + relative.noise, block.dof)
+
+
+def _elsewhere(one: ActiveEffect) -> Iterator[tuple[float, ...]]:
+    """Values of a chassis with the frequencies of ways that go together at others, around the median of all ways."""
+    names = [parameter.name for parameter in one.parameters]
+    free = [way for way in WAYS if f"{way}_Hz" in names]
+    middle = np.median([one.by_name[f"{way}_Hz"] for way in free])
+    for ways in [[way for way in together if way in free] for together in TOGETHER]:
+        for factors in product(ELSEWHERE, repeat=len(ways)):
+            moved = list(one.values)
+            for way, factor in zip(ways, factors, strict=True):
+                k = names.index(f"{way}_Hz")
+                moved[k] = float(min(factor * middle, 0.9 * one.parameters[k].high))
+                if len(way) > 1:
+                    moved[names.index(f"gyration_{way[1]}_m")] = SHAPE[0]
+            yield tuple(moved)
 
 
 def _effect(found: LikelihoodFit) -> ActiveEffect:
