@@ -39,8 +39,8 @@ SHAPE = (0.45, 0.45, 0.45, -0.4, -0.1)
 # Lines of a record, iterations, and how many are followed, only where the gap is more than this times the noise.
 TRIAL_LINES, TRIAL_ITERATIONS, TRIED, PLAIN = 50, 12, 3, 1.3
 # Where the gap is more than this times the noise, starts are followed by weights that ask at first for these shares of
-# the response, with so many iterations by the next ones; by those of the noise alone, too, where that leads to no end
-# at this times the noise.
+# the response, with so many iterations by the next ones; where that leads to no end at this times the noise, what each
+# way by itself tells is followed by the noise's own, too.
 STEEP, SHARES, LATER_ITERATIONS, AN_END = 100.0, (0.3, 0.03), 8, 2.0
 # A start by a share of the response, or a step along one way, is taken where it leaves less than this of the gap; and
 # ways are looked at one by one where all together leave less than that, of so many starts.
@@ -104,25 +104,21 @@ class BaseCompliance(Effect):
         own = self._by_ways(score, place)
         few = Score(score.model, blocks).chi2
         wide, steep = (score.chi2 > times * score.dof for times in (PLAIN, STEEP))
-        ladders = [[blocks]]
-        if steep:
-            ladders.insert(0, [*([_with_share(block, share) for block in blocks] for share in SHARES), blocks])
         starts = [one.values for one in own]
-        reached = None
-        for weights in ladders:
-            made = self._followed(score.model, place, starts, weights, wide)
-            if made is not None and (reached is None or made.chi2 < reached.chi2):
-                reached = made
-            if reached is not None and reached.chi2 < AN_END * reached.dof:
-                break
+        shares = [[_with_share(block, share) for block in blocks] for share in (SHARES if steep else ())]
+        reached = self._followed(score.model, place, starts, [*shares, blocks], wide)
+        if steep and starts and (reached is None or reached.chi2 > AN_END * reached.dof):
+            straight = self._followed(score.model, place, starts, [blocks], False)
+            reached = min((one for one in (reached, straight) if one is not None), key=_chi2, default=None)
         if reached is None:
             return own
         if wide and reached.chi2 - reached.dof < FOLLOWED * (few - reached.dof):
             more = [thinned(part.block, MORE_LINES, seed=2) for part in score.parts]
             made = _short_fit(cast(TableModel, reached.model), more, LATER_ITERATIONS)
             if made is not None:
-                reached = made if made.chi2 < NOT_YET * made.dof else self._way_by_way(made, place, more, made.dof)
                 few = Score(score.model, more).chi2
+                near = made.chi2 - made.dof < FOLLOWED * (few - made.dof)
+                reached = self._way_by_way(made, place, more, made.dof) if near else made
         # On few lines the rig's parameters take their part of the noise, too.
         found = Seed(_effect(reached).values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2,
                      len(reached.model.names), len(own) + len(TRIAL_Hz), few - reached.chi2)
@@ -141,11 +137,11 @@ class BaseCompliance(Effect):
                  if left - noise < PROMISING * gap or not later]
         fits = [_short_fit(self._standing(model, place, values), first, TRIAL_ITERATIONS)
                 for values in [*starts, *alike]]
-        made = sorted((one for one in fits if one is not None), key=lambda one: one.chi2)
-        if wide:
-            made[:BOTH] = [self._way_by_way(one, place, first, noise) if one.chi2 - noise < FOLLOWED * gap
-                           else one for one in made[:BOTH]]
-        reached = min(made, key=lambda one: one.chi2, default=None)
+        made = sorted((one for one in fits if one is not None), key=_chi2)
+        for one in made[:BOTH] if wide else []:
+            if one.chi2 - noise < FOLLOWED * gap and made[0].chi2 > NOT_YET * noise:
+                made = sorted([*made, self._way_by_way(one, place, first, noise)], key=_chi2)
+        reached = made[0] if made else None
         for then in later:
             reached = reached and _short_fit(cast(TableModel, reached.model), then, LATER_ITERATIONS)
         return reached
@@ -165,6 +161,8 @@ class BaseCompliance(Effect):
         `noise`, the chi-square of an exact model. With ten parameters of the others, which may stand for them, nothing
         leads there downhill."""
         for _ in range(ROUNDS):
+            if reached.chi2 < NOT_YET * noise:
+                return reached
             now = _effect(reached)
             rest = cast(TableModel, reached.model).without(now.label)
             left, values = min((self._expected(rest, place, moved, blocks), moved) for moved in _elsewhere(now))
@@ -286,6 +284,10 @@ def _elsewhere(one: ActiveEffect) -> Iterator[tuple[float, ...]]:
 
 def _effect(found: LikelihoodFit) -> ActiveEffect:
     return cast(TableModel, found.model).effects[-1]
+
+
+def _chi2(one: LikelihoodFit) -> float:
+    return one.chi2
 
 
 def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock], iterations: int) -> LikelihoodFit | None:
