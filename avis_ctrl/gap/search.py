@@ -291,7 +291,9 @@ def _rough(chain: tuple[Refit, ...], chosen: Sequence[Candidate], data: _Data, d
     """Coarse refits of what a shortlist holds."""
     effects = [one.effect for one in chosen]
     if effects:
-        data.progress(f"{_ordinal(depth)} effect: {', '.join(_words(chain[-1], one) for one in effects)}?")
+        # Variants of one law at one place are one to the reader.
+        named = dict.fromkeys(_words(chain[-1], one) for one in effects)
+        data.progress(f"{_ordinal(depth)} effect: {', '.join(named)}?")
     return [(*chain, found) for found in _coarse(chain[-1].model, effects, data)]
 
 
@@ -300,7 +302,7 @@ def _rivals(parent: Refit, against: Refit, data: _Data, least: float) -> list[Ri
     scored = candidates(Score(parent.model, data.fitted), list(beyond().values()), data.each)
     effects = [one.effect for one in shortlist([one for one in scored if one.worth > least], OUTSIDE_REFITS)]
     if effects:
-        data.progress(f"beyond the library: {', '.join(one.effect.title for one in effects)}?")
+        data.progress(f"beyond the library: {', '.join(dict.fromkeys(one.effect.title for one in effects))}?")
     made = []
     for coarse in sorted(_coarse(parent.model, effects, data), key=lambda r: r.criterion)[:OUTSIDE_PROMOTED]:
         if coarse.held_per_dof > HOPELESS * against.held_per_dof:

@@ -17,7 +17,7 @@ from avis_ctrl.gap.next_measurement import of_unexplained
 from avis_ctrl.gap.power_shares import power_shares
 from avis_ctrl.gap.refit import Refit
 from avis_ctrl.gap.result import Gap, HeatMap, PowerShares, RecordGap, Stage, Where
-from avis_ctrl.gap.search import Found
+from avis_ctrl.gap.search import CLOSED, Found
 from avis_ctrl.gap.signals.noise_level import SENSOR_BAND, NoiseLevels
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction_error import PredictionError, prediction_error
@@ -86,7 +86,7 @@ def shown(prepared: Prepared, found: Found, base: Refit, updated: Refit, judgeme
     where = places(before)
     # Of a gap that counts as closed, too: some band may stand out by itself.
     remaining = places(after)
-    sentences = (opening(judgement, ladder, after), *judgement.reasons, prepared.noise)
+    sentences = (opening(judgement, ladder, after), *judgement.reasons, *bent(*ladder[:2]), prepared.noise)
     sensors = None if noise is None else {name: one.value for name, one in noise.sensors.items()}
     records, shares = _every(prepared, base.model, judgement.updated.model, sensors)
     onward = judgement.next_experiment
@@ -127,6 +127,17 @@ def _steps(found: Found, base: Refit, judgement: Judgement, before: Left, after:
         elif {one.label for one in effects_of(found.chain[depth].model)} == {one.label for one in table[:depth]}:
             steps.append(Stage(label, *_figures(Left.of(found.chain[depth].model, blocks))))
     return steps
+
+
+def bent(nominal: Stage, again: Stage) -> tuple[str, ...]:
+    """A sentence where re-identification takes a model further from the held-out records than its file had it."""
+    closer = again.nrmse <= nominal.nrmse and again.chi2_per_dof <= nominal.chi2_per_dof
+    if closer or again.chi2_per_dof <= CLOSED:
+        return ()
+    figures = (f"{_percent(again.nrmse)} of the held-out records instead of {_percent(nominal.nrmse)}, chi-square per "
+               f"degree of freedom {again.chi2_per_dof:.3g} instead of {nominal.chi2_per_dof:.3g}")
+    return (f"re-identified without what it misses, the model leaves {figures}: its parameters bend to what they "
+            "cannot describe, and those of the baseline are not the table's",)
 
 
 def opening(judgement: Judgement, ladder: Sequence[Stage], after: Left) -> str:

@@ -13,7 +13,7 @@ from avis_ctrl.gap import analysis, judgement
 from avis_ctrl.gap.judgement import _considered, _gain
 from avis_ctrl.gap.result import NamedEffect, Stage
 from avis_ctrl.gap.search import _worth_it
-from avis_ctrl.gap.show import _noisy, opening, places
+from avis_ctrl.gap.show import _noisy, bent, opening, places
 
 
 def test_each_of_two_effects_is_confirmed_by_its_own_step():
@@ -57,6 +57,16 @@ def test_a_fault_of_the_signals_and_a_noisy_sensor_let_no_gap_fall():
     assert "falls" not in told and told.endswith("leaves 1.2 %, which is the noise.")
     told = opening(SimpleNamespace(verdict="unexplained", effects=(), raised=("Sz3",)), ladder, after)
     assert told.startswith("The noise of Sz3 is above") and "no other missing effect" in told
+
+
+def test_parameters_that_bend_to_what_is_missing_are_said_to():
+    nominal = Stage("nominal", 0.10, 50.0)
+    told, = bent(nominal, Stage("re-identified", 0.12, 20.0))
+    assert "12 % of the held-out records instead of 10 %" in told and "20 instead of 50" in told
+    assert bent(nominal, Stage("re-identified", 0.09, 60.0))
+    assert not bent(nominal, Stage("re-identified", 0.09, 20.0))
+    # An exact file, which noise makes a little worse: nothing bends.
+    assert not bent(Stage("nominal", 0.0100, 1.0), Stage("re-identified", 0.0101, 1.002))
 
 
 def test_a_noisy_sensor_is_where_its_noise_was_measured():

@@ -1,6 +1,9 @@
 """Campaign plans: files, the default ones, and everything that a user can get wrong in one."""
 
 import copy
+import re
+import tomllib
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -9,6 +12,7 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import simulate_campaign
+from avis_ctrl.simulation.campaign_plan import RecordPlan
 from avis_ctrl.study.campaign_plan import CampaignPlan, default_plan, plan_from_table, plan_toml, read_plan
 
 TEXT = """
@@ -135,3 +139,15 @@ def test_plans_are_written_as_they_are_read(tmp_path):
         path = tmp_path / "again.toml"
         path.write_text(plan_toml(plan), encoding="utf-8")
         assert read_plan(path) == plan
+
+
+def test_the_guide_lists_every_key_of_a_plan_and_no_other():
+    guide = (Path(__file__).parents[2] / "docs" / "campaign_plan.md").read_text()
+    example = plan_from_table(tomllib.loads(re.search(r"```toml\n(.*?)```", guide, re.S)[1]))
+    assert [one.excitation for one in example.record] == ["multisine", "noise", "floor"]
+    listed = {title or "": set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", rows, re.M))))
+              for title, rows in re.findall(r"^## (?:`\[+(\w+)\]+`)?(.*?)(?=^## |\Z)", guide, re.S | re.M)}
+    kept = CampaignPlan.model_fields
+    sections = {key: field.annotation for key, field in kept.items() if hasattr(field.annotation, "model_fields")}
+    expected = {key: set(section.model_fields) for key, section in sections.items()}
+    assert listed == {**expected, "record": set(RecordPlan.model_fields), "": set(kept) - set(sections) - {"record"}}
