@@ -52,6 +52,17 @@ def test_lines_are_found_and_measured(kind, f0, amplitudes):
         assert line.amplitude.std < 0.1 * true
 
 
+@pytest.mark.parametrize(("f0", "nominal"), [(50.012, 50.0), (59.986, 60.0)])
+def test_a_harmonic_of_both_mains_does_not_hide_which_it_is(f0, nominal):
+    """300 Hz is six times 50 and five times 60, and strong lines have a chance of zero in floating point."""
+    n = 60_000
+    lines = sum(1000 / k * np.sin(2 * np.pi * k * f0 / FS * np.arange(n) + k) for k in range(1, 7))
+    found = find_hum(white(0, samples=n, added=np.tile(lines[:, None], 6)))
+    assert found is not None and found.nominal_Hz == nominal
+    assert abs(found.frequency_Hz.value - f0) < 5 * found.frequency_Hz.std
+    assert set(found.harmonics) == {1, 2, 3, 4, 5, 6}
+
+
 def test_frequency_error_is_as_large_as_it_says():
     """50 draws of a weak line in white noise: the pull has unit variance."""
     t, pull = np.arange(10_000) / FS, []

@@ -36,8 +36,11 @@ STIFF_Hz = 90.0
 # radii of gyration and heights [m] of a frame of a table's size.
 TRIAL_MASS, TRIAL_Hz = 2.0, tuple(np.geomspace(6.0, 90.0, 13).tolist())
 SHAPE = (0.45, 0.45, 0.45, -0.4, -0.1)
-# Lines of a record, iterations, and how many are followed, only where the gap is more than this times the noise.
-TRIAL_LINES, TRIAL_ITERATIONS, TRIED, PLAIN = 50, 12, 3, 1.3
+# Lines of a record; what follows only where the gap is more than this times the noise.
+TRIAL_LINES, PLAIN = 50, 1.3
+# Of the starts that one step makes most promising so many are fitted with so many iterations, and then the best of
+# these; by shares of the response, where the step is a good guide and four iterations lead half way, in one go.
+TRIED, TRIED_BY_SHARES = ((7, 4), (3, 8)), ((3, 12),)
 # Where the gap is more than this times the noise, starts are followed by weights that ask at first for these shares of
 # the response, with so many iterations by the next ones; where that leads to no end at this times the noise, what each
 # way by itself tells is followed by the noise's own, too.
@@ -45,6 +48,8 @@ STEEP, SHARES, LATER_ITERATIONS, AN_END = 100.0, (0.3, 0.03), 8, 2.0
 # A start by a share of the response, or a step along one way, is taken where it leaves less than this of the gap; and
 # ways are looked at one by one where all together leave less than that, of so many starts.
 PROMISING, FOLLOWED, BOTH = 0.8, 0.25, 2
+# By a share of the response nothing is left where it is less than this of the gap.
+NOTHING = 0.01
 # Where a chassis leaves more than so many times the noise, its ways are looked at again by so many lines of a record,
 # which tell minima apart that few do not.
 NOT_YET, MORE_LINES = 1.1, 150
@@ -118,7 +123,7 @@ class BaseCompliance(Effect):
             if made is not None:
                 few = Score(score.model, more).chi2
                 near = made.chi2 - made.dof < FOLLOWED * (few - made.dof)
-                reached = self._way_by_way(made, place, more, made.dof) if near else made
+                reached = self._way_by_way(made, place, more, made.dof, NOT_YET * made.dof) if near else made
         # On few lines the rig's parameters take their part of the noise, too.
         found = Seed(_effect(reached).values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2,
                      len(reached.model.names), len(own) + len(TRIAL_Hz), few - reached.chi2)
@@ -133,14 +138,18 @@ class BaseCompliance(Effect):
         # What a share of the response adds to the noise is none: all that is left counts.
         noise = 0 if later else start.dof
         gap = start.chi2 - noise
-        alike = [values for left, values in (self._alike(model, place, first)[:TRIED] if wide else [])
+        alike = [values for left, values in (self._alike(model, place, first) if wide else [])
                  if left - noise < PROMISING * gap or not later]
-        fits = [_short_fit(self._standing(model, place, values), first, TRIAL_ITERATIONS)
-                for values in [*starts, *alike]]
-        made = sorted((one for one in fits if one is not None), key=_chi2)
+        trials = [self._standing(model, place, values) for values in [*starts, *alike]]
+        made: list[LikelihoodFit] = []
+        for most, iterations in TRIED_BY_SHARES if later else TRIED:
+            fits = [_short_fit(one, first, iterations) for one in trials[:most]]
+            made = sorted((one for one in fits if one is not None), key=_chi2)
+            trials = [cast(TableModel, one.model) for one in made]
+        enough = NOTHING * gap if later else NOT_YET * noise
         for one in made[:BOTH] if wide else []:
-            if one.chi2 - noise < FOLLOWED * gap and made[0].chi2 > NOT_YET * noise:
-                made = sorted([*made, self._way_by_way(one, place, first, noise)], key=_chi2)
+            if one.chi2 - noise < FOLLOWED * gap and made[0].chi2 > enough:
+                made = sorted([*made, self._way_by_way(one, place, first, noise, enough)], key=_chi2)
         reached = made[0] if made else None
         for then in later:
             reached = reached and _short_fit(cast(TableModel, reached.model), then, LATER_ITERATIONS)
@@ -156,12 +165,12 @@ class BaseCompliance(Effect):
         return sorted(one for one in expected if one[0] < np.inf)
 
     def _way_by_way(self, reached: LikelihoodFit, place: str, blocks: Sequence[SpectralBlock],
-                    noise: float) -> LikelihoodFit:
+                    noise: float, enough: float) -> LikelihoodFit:
         """A fit with the frequencies of ways that go together sought elsewhere, as long as that brings it nearer to
-        `noise`, the chi-square of an exact model. With ten parameters of the others, which may stand for them, nothing
-        leads there downhill."""
+        `noise`, the chi-square of an exact model, and until it is `enough`. With ten parameters of the others, which
+        may stand for them, nothing leads there downhill."""
         for _ in range(ROUNDS):
-            if reached.chi2 < NOT_YET * noise:
+            if reached.chi2 < enough:
                 return reached
             now = _effect(reached)
             rest = cast(TableModel, reached.model).without(now.label)
@@ -272,14 +281,18 @@ def _elsewhere(one: ActiveEffect) -> Iterator[tuple[float, ...]]:
     free = [way for way in WAYS if f"{way}_Hz" in names]
     middle = np.median([one.by_name[f"{way}_Hz"] for way in free])
     for ways in [[way for way in together if way in free] for together in TOGETHER]:
-        for factors in product(ELSEWHERE, repeat=len(ways)):
+        # One of two may be right as it is.
+        for factors in product((None, *ELSEWHERE), repeat=len(ways)):
             moved = list(one.values)
             for way, factor in zip(ways, factors, strict=True):
+                if factor is None:
+                    continue
                 k = names.index(f"{way}_Hz")
                 moved[k] = float(min(factor * middle, 0.9 * one.parameters[k].high))
                 if len(way) > 1:
                     moved[names.index(f"gyration_{way[1]}_m")] = SHAPE[0]
-            yield tuple(moved)
+            if any(factors):
+                yield tuple(moved)
 
 
 def _effect(found: LikelihoodFit) -> ActiveEffect:

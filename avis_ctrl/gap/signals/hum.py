@@ -105,14 +105,16 @@ def find_hum(left: Sequence[Leftover], false_alarm: float = FALSE_ALARM) -> HumF
     first = check_common(left)
     scores = [_scores(left, nominal) for nominal in MAINS_HZ]
     trials = sum(int(np.count_nonzero(one.tests)) for one in scores)
-    best = min(scores, key=lambda one: float(np.min(np.where(one.ratio > RATIO, one.p, 1.0))))
-    p = np.where(best.ratio > RATIO, best.p, 1.0)
-    chance = min(1.0, float(p.min()) * trials)
+    each = [np.where(one.ratio > RATIO, one.p, 1.0) for one in scores]
+    chance = min(1.0, min(float(p.min()) for p in each) * trials)
     if chance > false_alarm:
         return None
-    # p underflows where lines are strong, so that the sum of the scores tells where they are strongest.
-    sure = p * trials <= false_alarm
-    at = int(np.argmax(np.sum(np.where(sure, best.score, 0.0), axis=(1, 2))))
+    # p underflows where lines are strong, so that the sum of the scores tells where they are strongest: at 300 Hz
+    # stands a harmonic of either of the mains, elsewhere of one of them.
+    surest = [p * trials <= false_alarm for p in each]
+    strength = [np.sum(np.where(sure, one.score, 0.0), axis=(1, 2)) for one, sure in zip(scores, surest, strict=True)]
+    which = int(np.argmax([sums.max() for sums in strength]))
+    best, sure, at = scores[which], surest[which], int(np.argmax(strength[which]))
     frequency = _refined(left, float(best.f0[at]), np.argwhere(sure[at]))
     # With the frequency known, what else stands out is judged among the lines there.
     there = _scores(left, best.nominal_Hz, np.array([frequency.value]))
