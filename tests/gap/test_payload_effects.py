@@ -173,6 +173,18 @@ def test_gain_of_the_leveling_follows_from_its_rate():
     assert told["integral_gain_N_per_ms"].std == pytest.approx(2 * np.pi * 1e-3 * k)
 
 
+def test_a_valve_that_follows_at_once_is_no_fault_of_a_leveling_and_one_that_never_does_is():
+    own, place = library()["leveling_loop"], "isolators 1-3 z/lag"
+
+    def forbidden(corner):
+        one = with_effect("leveling_loop", place, [0.05, corner]).effects[-1]
+        return one.effect.implausible(one.by_name, dict.fromkeys(one.by_name, 1e-3)) or at_the_edge(one)
+    assert forbidden(100.0) == forbidden(0.3) == "" and "does not level" in forbidden(0.01)
+    told = [own.reported(BARE, place, {"rate_Hz": 0.05, "valve_corner_Hz": corner}, 1e-6 * np.eye(2))
+            for corner in (0.3, 100.0)]
+    assert ["valve_corner_Hz" in one for one in told] == [True, False]
+
+
 def test_leveling_measures_the_payload_against_a_chassis_that_moves():
     """On a chassis carried by springs, which the valves and mounts push back: explicit coordinates of both."""
     m, hertz, zeta, rate = 900.0, 11.0, 0.05, 0.1
