@@ -17,7 +17,9 @@ def design(
 ) -> None:
     """From a rig to certified controllers, checks and a design report.
 
-    Writes report.html, report.pdf, controllers/NAME.json, plant.json and result.json into DIR.
+    Writes report.html, report.pdf, controllers/NAME.json, sampled_controller.json (all axes, sensor volts to drive
+    volts, as a processor runs it), plant.json and result.json into DIR. Exit code 3 where the loop is unstable in any
+    of the plants simulated: the first sentence names the cause.
     """
     from rich.console import Console
 
@@ -30,17 +32,22 @@ def design(
     with output_folder(out, FILES, FOLDERS) as folder, Progress(console) as progress:
         from avis_ctrl.report import render_html, render_pdf
         from avis_ctrl.study.runner import run_design
+        from avis_ctrl.study.verdict import refuse_unstable
 
         result = run_design(design, rig, progress, source=file)
         progress("report")
         files = write_study(result, folder, render_html(result), render_pdf(result))
     _verdict(console, result)
     console.print(f"{len(files)} files in {folder}; open {folder / 'report.html'} or {folder / 'report.pdf'}")
+    refuse_unstable(result)
 
 
 def _verdict(console, result) -> None:
     from rich.table import Table
 
+    from avis_ctrl.study.verdict import first_sentence
+
+    console.print(first_sentence(result))
     table = Table("requirement", "asked", "measured", "", title=result.design.title)
     for r in result.requirements:
         unit = f" {r.unit}" if r.unit else ""

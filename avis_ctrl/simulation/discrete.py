@@ -146,7 +146,15 @@ def step_arrays(loop: SampledLoop, extra_substeps: int = 1) -> StepArrays:
 def spectral_radius(loop: SampledLoop) -> float:
     """Largest modulus of the poles of the linear loop over one control period: stable below 1.
 
-    Exact: the period map of table, drives, sensors, controller and the voltages still on their way.
+    Exact: the eigenvalues of `period_map`.
+    """
+    return float(np.max(np.abs(la.eigvals(period_map(loop)))))
+
+
+def period_map(loop: SampledLoop) -> np.ndarray:
+    """(n, n) the linear loop from one sample to the next: table, drives, sensors, controller, voltages on their way.
+
+    The state begins with q and q'.
     """
     arrays = step_arrays(loop)
     n, n_u = arrays.advance.shape[0], loop.n_drives
@@ -163,4 +171,4 @@ def spectral_radius(loop: SampledLoop) -> float:
     queue = [out[n_c:], *queue]
     for j in range(loop.substeps):
         x = Phi @ x + Gamma @ (queue[whole] if j >= late else queue[whole + 1])
-    return float(np.max(np.abs(la.eigvals(np.vstack([x, out[:n_c], *queue[:pending]])))))
+    return np.vstack([x, out[:n_c], *queue[:pending]])

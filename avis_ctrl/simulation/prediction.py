@@ -65,8 +65,11 @@ class SampledResponse:
 
 
 @dataclass(frozen=True, eq=False)
-class _Open:
-    """Payload velocity and sensor volts, sampled, over the sampled floor velocity and the voltages computed."""
+class OpenResponse:
+    """Payload velocity and sensor volts, sampled, over the sampled floor velocity and the voltages computed.
+
+    velocity_floor (n, 6, 6), velocity_volts (n, 6, n_u), sensed_floor (n, n_s, 6), sensed_volts (n, n_s, n_u).
+    """
 
     velocity_floor: np.ndarray
     velocity_volts: np.ndarray
@@ -80,14 +83,19 @@ def sampled_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES)
     images : pairs of images that are folded in, at least one.
     """
     omega = np.atleast_1d(np.asarray(omega, float))
-    G = _Open(*(centre + folded for centre, folded in zip(_image(loop, omega), _folded(loop, omega, images),
-                                                         strict=True)))
+    G = open_response(loop, omega, images)
     C = digital_controller(loop).frequency_response(omega)
     # u = C (S_w w + S_u u + n)
     volts = np.linalg.solve(np.eye(C.shape[1]) - C @ G.sensed_volts, np.concatenate([C @ G.sensed_floor, C], axis=2))
     volts_floor, volts_noise = volts[:, :, :len(COORDINATES)], volts[:, :, len(COORDINATES):]
     return SampledResponse(loop, omega, G.velocity_floor + G.velocity_volts @ volts_floor,
                            G.velocity_volts @ volts_noise, volts_floor, volts_noise)
+
+
+def open_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES) -> OpenResponse:
+    """The table with drives and sensors, without the controller, at omega (n,) [rad/s]."""
+    return OpenResponse(*(centre + folded for centre, folded in zip(_image(loop, omega), _folded(loop, omega, images),
+                                                                    strict=True)))
 
 
 def _folded(loop: SampledLoop, omega: np.ndarray, images: int) -> list[np.ndarray]:

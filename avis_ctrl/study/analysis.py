@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti.norms import hinf_norm
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.floor_motion import band_rms, third_octave_midbands, third_octave_rms
@@ -35,10 +36,20 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
     Parameters
     ----------
     samples : (n_samples, n_w, n_z) perturbations, held over frequency, for the band of sampled transmissibility.
+
+    Raises
+    ------
+    ComputationError : the closed loop of the nominal plant is unstable; what the bounds raise.
     """
+    full = plant.full.closed(K)
+    if not full.is_stable():
+        fastest_growing = max(full.poles(), key=lambda pole: pole.real)
+        raise ComputationError(
+            "unstable with the nominal plant, so that no bound of it exists",
+            measured=f"a closed-loop pole at {abs(fastest_growing.imag) / (2 * np.pi):.3g} Hz that grows by a factor "
+                     f"of e in {1 / max(fastest_growing.real, 1e-12):.3g} s")
     performance = plant.synthesis.closed(K)
     motion = plant.full.restricted([*plant.floor_velocities], [*plant.velocities]).closed(K)
-    full = plant.full.closed(K)
     blocks, all_blocks = plant.synthesis.blocks, plant.synthesis.all_blocks
     n_w, n_z = blocks.n_w, blocks.n_z
     low, high = design.transmissibility.band_Hz

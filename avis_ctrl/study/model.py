@@ -10,6 +10,9 @@ import numpy as np
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import ReductionError
+from avis_ctrl.simulation.campaign import SimulationCheck
+from avis_ctrl.simulation.culprit import Culprit
+from avis_ctrl.study.companions import Companions
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.plant import DesignPlant
 
@@ -129,6 +132,22 @@ class SixDofCheck:
     deviation_dB: float
 
 
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """The sampled loop of all axes: the other axes' loops, the plants simulated, the controller as a processor runs it.
+
+    digital : sensor volts to demanded drive volts at the rig's rate, decoding, companion loops and allocation included;
+        delay_samples from a sample to the voltage it causes.
+    culprit : what makes the first unstable plant unstable; None where every plant is stable.
+    """
+
+    companions: Companions
+    check: SimulationCheck
+    digital: StateSpace
+    delay_samples: float
+    culprit: Culprit | None
+
+
 @dataclass(frozen=True)
 class Requirement:
     """A line of the verdict table."""
@@ -142,9 +161,23 @@ class Requirement:
     note: str = ""
 
 
+@dataclass(frozen=True)
+class FailedController:
+    """A controller that was asked for and could not be made or measured, and why."""
+
+    name: str
+    title: str
+    kind: ControllerKind
+    reason: str
+
+
 @dataclass(frozen=True, eq=False)
 class DesignResult:
-    """Everything that `avis design` found."""
+    """Everything that `avis design` found.
+
+    loop : the sampled loop of all axes: companion loops, simulation, what makes it unstable.
+    failed : controllers that were to be compared and could not be.
+    """
 
     design: Design
     rig: Rig
@@ -154,10 +187,21 @@ class DesignResult:
     requirements: tuple[Requirement, ...]
     reduction: ReductionError
     six_dof: SixDofCheck
-    simulation: Any | None
+    loop: Simulated | None
     provenance: dict[str, Any]
     seconds: float
     notes: tuple[str, ...] = field(default=())
+    failed: tuple[FailedController, ...] = ()
+
+    @property
+    def simulation(self) -> SimulationCheck | None:
+        """The closed loop of the nonlinear rig, plant by plant; None where none was run."""
+        return self.loop.check if self.loop is not None else None
+
+    @property
+    def stable(self) -> bool:
+        """Whether every plant that was looked at is stable in the sampled loop of all axes."""
+        return self.simulation is None or all(plant.stable for plant in self.simulation.plants)
 
     def controller(self, name: str) -> ControllerResult:
         """By name."""

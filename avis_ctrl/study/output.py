@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,11 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.study.files import not_written, write_json, write_whole
-from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
+from avis_ctrl.study.model import Bound, ControllerResult, DesignResult, FailedController, Simulated
+from avis_ctrl.study.verdict import first_sentence
 
-FILES, FOLDERS = ("plant.json", "report.html", "report.pdf", "result.json"), ("controllers",)
+FILES = "plant.json", "sampled_controller.json", "report.html", "report.pdf", "result.json"
+FOLDERS = ("controllers",)
 
 
 def controller_dict(result: ControllerResult, units_in: str = "m/s", units_out: str = "N") -> dict[str, Any]:
@@ -28,12 +31,15 @@ def result_dict(result: DesignResult) -> dict[str, Any]:
     """The contract's avis-design form, with provenance."""
     return {
         "format": "avis-design", "version": 1, "plant": "plant.json",
-        "controllers": [_controller_row(c) for c in result.controllers],
+        "verdict": first_sentence(result), "stable": result.stable,
+        "controllers": [*(_controller_row(c) for c in result.controllers),
+                        *(_failed_row(c) for c in result.failed or ())],
         "dk_history": [{"iteration": row.iteration, "gamma": row.gamma, "mu_upper": row.mu_upper, "order": row.order,
                         "d_fit_error": row.d_fit_error, "seconds": row.seconds} for row in result.dk_history],
         "requirements": [{"name": r.name, "limit": r.limit, "value": r.value, "unit": r.unit, "met": r.met}
                          for r in result.requirements],
         "simulation": result.simulation.as_dict() if result.simulation is not None else {},
+        "all_axes": _all_axes(result.loop),
         "seconds": result.seconds, "provenance": result.provenance,
         "worst_cases": {c.name: {"mu": _worst_case(result, c.mu), "peak": _worst_case(result, c.worst_peak),
                                  "band": _worst_case(result, c.worst_band)} for c in result.controllers}}
@@ -57,7 +63,35 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
             "order": c.order, "gamma": c.gamma, "mu_upper": c.mu.upper, "mu_lower": c.mu.lower,
             "mu_peak_Hz": c.mu.omega / (2 * np.pi), "stable": c.stable,
             "peak_transmissibility_dB": dB(c.peak_transmissibility),
-            "worst_case_peak_transmissibility_dB": dB(c.worst_peak.upper)}
+            "worst_case_peak_transmissibility_dB": dB(c.worst_peak.upper), "note": "; ".join(c.notes)}
+
+
+def _failed_row(c: FailedController) -> dict[str, Any]:
+    """A controller without figures: the reason in its note."""
+    figures = ("gamma", "mu_upper", "mu_lower", "mu_peak_Hz", "peak_transmissibility_dB",
+               "worst_case_peak_transmissibility_dB")
+    return {"name": c.name, "kind": c.kind, "file": None, "order": None, "stable": False, **dict.fromkeys(figures),
+            "note": c.reason}
+
+
+def _all_axes(loop: Simulated | None) -> dict[str, Any]:
+    """Loops of the axes that the design does not keep, and what makes the whole unstable where it is."""
+    if loop is None:
+        return {}
+    culprit = None if loop.culprit is None else {**asdict(loop.culprit), "words": loop.culprit.words()}
+    return {"companions": [asdict(one) for one in loop.companions.loops],
+            "passive": [{"axis": axis, "reason": why} for axis, why in loop.companions.passive],
+            "culprit": culprit}
+
+
+def sampled_controller_dict(result: DesignResult, loop: Simulated) -> dict[str, Any]:
+    """What a processor runs, all axes included: x+ = A x + B y, u = C x + D y from sensor volts to drive volts."""
+    K, rig = loop.digital, result.rig
+    sensors, drives = rig.sensor_rows()[0], rig.equations_of_motion().actuators
+    return {"format": "avis-sampled-controller", "version": 1, "name": "mu", "sample_rate_Hz": rig.sample_rate_Hz,
+            "arithmetic": "float64", "A": K.A, "B": K.B, "C": K.C, "D": K.D, "inputs": sensors, "outputs": drives,
+            "input_units": ["V"] * len(sensors), "output_units": ["V"] * len(drives),
+            "limits_V": [rig.drive_limit_V] * len(drives), "delay_samples": loop.delay_samples}
 
 
 def write_study(result: DesignResult, folder: Path, html: bytes | None = None, pdf: bytes | None = None) -> list[Path]:
@@ -74,6 +108,9 @@ def write_study(result: DesignResult, folder: Path, html: bytes | None = None, p
         if c.K is not None:
             write_json(path := folder / "controllers" / f"{c.name}.json", controller_dict(c))
             written.append(path)
+    if result.loop is not None:
+        write_json(path := folder / "sampled_controller.json", sampled_controller_dict(result, result.loop))
+        written.append(path)
     write_json(folder / "plant.json", result.plant.synthesis.as_dict())
     written.append(folder / "plant.json")
     for name, content in (("report.html", html), ("report.pdf", pdf)):

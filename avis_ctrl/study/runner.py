@@ -7,6 +7,7 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import avis_ctrl
+from avis_ctrl.errors import ComputationError
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import MuSynthesis
@@ -30,11 +32,11 @@ from avis_ctrl.study.controllers import (
 )
 from avis_ctrl.study.design_file import Design, read_study
 from avis_ctrl.study.limits import best_found
-from avis_ctrl.study.model import ControllerResult, DesignResult
+from avis_ctrl.study.model import ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.plant import DesignPlant, build_plant
-from avis_ctrl.study.requirements import judge
+from avis_ctrl.study.requirements import judge, judge_loop
 from avis_ctrl.study.sampling import random_perturbations
-from avis_ctrl.study.simulation import SimulationCheck, simulate_study, six_dof_check
+from avis_ctrl.study.simulation import simulate_study, six_dof_check
 from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
@@ -58,73 +60,122 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
     began = time.monotonic()
     progress("model: rig, uncertainty, weights")
     plant = build_plant(design, rig)
-    candidates, synthesis = synthesise(design, plant, rig, progress)
-    controllers, simulation = compare(design, plant, rig, candidates, progress)
-    return conclude(design, plant, rig, synthesis, controllers, simulation, time.monotonic() - began, source)
+    candidates, failed, synthesis = synthesise(design, plant, rig, progress)
+    compared = compare(design, plant, rig, candidates, failed, progress)
+    return conclude(design, plant, rig, synthesis, compared, time.monotonic() - began, source)
 
 
-def synthesise(design: Design, plant: DesignPlant, rig: Rig,
-               progress: Progress = lambda text: None) -> tuple[list[Candidate], MuSynthesis]:
-    """The controllers that need no other: mu, nominal H-infinity, classical skyhook, none; and the D-K iteration."""
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Controllers in the report's order, those that failed with their reasons, and the loop of all axes."""
+
+    controllers: tuple[ControllerResult, ...]
+    failed: tuple[FailedController, ...]
+    loop: Simulated
+
+
+def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress = lambda text: None
+               ) -> tuple[list[Candidate], list[FailedController], MuSynthesis]:
+    """The controllers that need no other: mu, nominal H-infinity, classical skyhook, none; and the D-K iteration.
+
+    A rival that cannot be made is no reason to lose the design: it comes back among the failed.
+    """
     with threadpool_limits(1):
         progress("H-infinity synthesis of the nominal plant")
-        hinf = nominal_hinf(design, plant, rig)
+        rivals: list[Candidate] = []
+        failed: list[FailedController] = []
+        try:
+            rivals.append(nominal_hinf(design, plant, rig))
+        except ComputationError as error:
+            failed.append(FailedController("hinf", "H-infinity, nominal", "hinf", str(error)))
 
         def shown(row: Any) -> None:
             progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.4f}, peak mu {row.mu_upper:.4f}, "
                      f"order {row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
         mu, made = mu_optimal(design, plant, rig, shown)
         progress(mu.notes[-1])
-        return [mu, hinf, classical_skyhook(plant, rig, design), passive()], made
+        return [mu, *rivals, classical_skyhook(plant, rig, design), passive()], failed, made
 
 
-def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesis,
-             controllers: Sequence[ControllerResult], simulation: SimulationCheck, seconds: float,
+def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesis, compared: Compared, seconds: float,
              source: Path | None = None) -> DesignResult:
     """The verdict, with what the reduction to the kept axes leaves out, and the provenance."""
+    controllers = compared.controllers
     with threadpool_limits(1):
         reduction = reduction_error(rig, design.keep)
         mu = next(c for c in controllers if c.name == "mu")
-        six_dof = six_dof_check(design, rig, plant, mu)
+        six_dof = six_dof_check(design, rig, plant, mu, compared.loop.companions)
         assumed = plant.identified.assumption if plant.identified else ""
         verdict = best_found(plant, mu, controllers, synthesis.history) if mu.mu.upper >= 1 else ""
-        notes = tuple(text for text in (verdict, assumed) if text)
-    return DesignResult(design, rig, plant, tuple(controllers), synthesis.history, judge(design, controllers),
-                        reduction, six_dof, simulation, provenance(design, source, rig, seconds), seconds, notes)
+        unlike = [f"{one.title} is left out of the comparison: {one.reason}" for one in compared.failed]
+        passive_axes = [f"The axis {axis} stays passive: {why}." for axis, why in compared.loop.companions.passive]
+        notes = tuple(text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.notes)
+                      if text)
+    requirements = (*judge_loop(compared.loop.check), *judge(design, controllers))
+    return DesignResult(design, rig, plant, controllers, synthesis.history, requirements, reduction, six_dof,
+                        compared.loop, provenance(design, source, rig, seconds), seconds, notes, compared.failed)
+
+
+ORDER = ("passive", "skyhook_classical", "skyhook", "hinf", "mu")
 
 
 def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[Candidate],
-            progress: Progress = lambda text: None) -> tuple[list[ControllerResult], SimulationCheck]:
+            failed: Sequence[FailedController] = (), progress: Progress = lambda text: None) -> Compared:
     """Bounds of every controller, a skyhook tuned to the worst-case peak of mu, and the simulation of mu.
 
     On two processes: none needs another but the last two, which need the bounds of mu.
+
+    Raises
+    ------
+    ComputationError : the mu controller itself, or the table at rest, could not be measured.
     """
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     with Workers() as workers:
         jobs = {c.name: workers.submit(_measured, design, plant, c, samples) for c in candidates}
         progress("bounds of every controller over the whole uncertainty set, closed loop of the nonlinear rig")
         mu = jobs["mu"].result()
+        if isinstance(mu, FailedController):
+            raise ComputationError(f"the {mu.title} controller could not be measured: {mu.reason}")
         progress("  done: bounds of mu synthesis")
-        jobs["simulation"] = workers.submit(simulate_study, design, rig, plant, mu)
+        simulation = workers.submit(simulate_study, design, rig, plant, mu)
         jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, skyhook_limit(design, mu), samples)
-        found = {}
-        for job in as_completed(jobs.values()):
+        found: dict[str, ControllerResult | FailedController] = {}
+        for job in as_completed([*jobs.values(), simulation]):
+            if job is simulation:
+                progress(f"  done: {design.simulation.random_plants + 2} nonlinear plants")
+                continue
             name = next(name for name, one in jobs.items() if one is job)
-            found[name] = job.result()
-            if name != "mu":
-                progress(f"  done: {design.simulation.random_plants + 2} nonlinear plants" if name == "simulation"
-                         else f"  done: bounds of {found[name].title}")
-    return [found[name] for name in ("passive", "skyhook_classical", "skyhook", "hinf", "mu")], found["simulation"]
+            found[name] = one = job.result()
+            if isinstance(one, FailedController):
+                progress(f"  {one.title}: {one.reason}")
+            elif name != "mu":
+                progress(f"  done: bounds of {one.title}")
+        loop = simulation.result()
+    if isinstance(rest := found["passive"], FailedController):
+        raise ComputationError(f"the table without control could not be measured: {rest.reason}")
+    every = [*failed, *(one for one in found.values() if isinstance(one, FailedController))]
+    measured = {name: one for name, one in found.items() if isinstance(one, ControllerResult)}
+    return Compared(tuple(measured[name] for name in ORDER if name in measured),
+                    tuple(sorted(every, key=lambda one: ORDER.index(one.name))), loop)
 
 
-def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndarray) -> ControllerResult:
+def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndarray
+              ) -> ControllerResult | FailedController:
     with threadpool_limits(1):
-        return analyse(design, plant, c.K, c.name, c.title, c.kind, samples, c.notes)
+        try:
+            return analyse(design, plant, c.K, c.name, c.title, c.kind, samples, c.notes)
+        except ComputationError as error:
+            return FailedController(c.name, c.title, c.kind, str(error))
 
 
-def _tuned(design: Design, plant: DesignPlant, rig: Rig, peak_limit: float, samples: np.ndarray) -> ControllerResult:
+def _tuned(design: Design, plant: DesignPlant, rig: Rig, peak_limit: float, samples: np.ndarray
+           ) -> ControllerResult | FailedController:
     with threadpool_limits(1):
-        return _measured(design, plant, tuned_skyhook(plant, rig, design, peak_limit), samples)
+        try:
+            candidate = tuned_skyhook(plant, rig, design, peak_limit)
+        except ComputationError as error:
+            return FailedController("skyhook", "skyhook, tuned", "skyhook", str(error))
+        return _measured(design, plant, candidate, samples)
 
 
 def skyhook_limit(design: Design, mu: ControllerResult) -> float:

@@ -1,54 +1,74 @@
-"""The mu controller on the nonlinear six-degree-of-freedom rig, the other axes under their skyhook loops."""
+"""The mu controller on the nonlinear six-degree-of-freedom rig, the other axes under skyhook loops of their own."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from avis_ctrl.classical.skyhook import Skyhook
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.robust.mu_realise import realise_delta
-from avis_ctrl.simulation.campaign import SimulationCheck, check_designs
+from avis_ctrl.simulation.campaign import check_designs
+from avis_ctrl.simulation.culprit import find_culprit
+from avis_ctrl.simulation.discrete import digital_controller
 from avis_ctrl.simulation.prediction import predict_transmissibility_6dof
 from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, accelerometer_bank, geophone_bank
-from avis_ctrl.study.controllers import CUSTOMARY_CORNERS_HZ, critical_gains
+from avis_ctrl.study.companions import Companions, design_companions, until_stable
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.identified_uncertainty import RESPONSE
-from avis_ctrl.study.model import ControllerResult, SixDofCheck
+from avis_ctrl.study.model import ControllerResult, Simulated, SixDofCheck
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.study.sampling import random_perturbations
 
 
-def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult) -> SimulationCheck:
-    """Nominal, worst-case and random plants in closed loop, each judged against the linear prediction."""
-    loop = nominal_loop(design, rig, plant, result.K)
-    loops = [loop, *perturbed_loops(design, rig, plant, result, loop)]
+def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult) -> Simulated:
+    """Nominal, worst-case and random plants in closed loop, each judged against the linear prediction.
 
+    The other axes get loops that are designed here, around this controller and for this rig's sensors.
+    """
     with threadpool_limits(1):
-        return check_designs(loops, design.simulation.duration_s, design.simulation.seed)
+        bare = bare_loop(design, rig, plant, result.K)
+        errors = plant.weights.get("actuator chain *")
+        perturbed = list(perturbed_loops(design, rig, plant, result, bare))
+        companions = until_stable(design_companions(bare, errors), [bare, *perturbed])
+        loops = [replace(one, loops=companions.systems()) for one in (bare, *perturbed)]
+        check = check_designs(loops, design.simulation.duration_s, design.simulation.seed)
+        unstable = [loop for loop, one in zip(loops, check.plants, strict=True) if not one.stable]
+        nominal = loops[0]
+        return Simulated(companions, check, digital_controller(nominal),
+                         nominal.loop_delay_s * nominal.sample_rate_Hz,
+                         find_culprit(unstable[0]) if unstable else None)
 
 
-def nominal_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None) -> SampledLoop:
-    """The design's controller on its nominal rig, the floor moving along x, y, z and the kept rotations."""
+def bare_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None) -> SampledLoop:
+    """The design's controller on its nominal rig, the other axes without loops; the floor moves along x, y, z and
+    the kept rotations."""
     if K is None:
         K = gain(np.zeros((len(design.keep), len(design.keep))))
-    others = tuple(name for name in COORDINATES if name not in design.keep)
-    loops = Skyhook(others, critical_gains(rig, others), *CUSTOMARY_CORNERS_HZ)
-    return SampledLoop(rig, K, tuple(design.keep), {name: loops.loop(name) for name in others},
-                       sensor_bank(design, rig), floor_by_coordinate(design, rig, plant.floor), name="nominal",
+    return SampledLoop(rig, K, tuple(design.keep), {}, sensor_bank(design, rig),
+                       floor_by_coordinate(design, rig, plant.floor), name="nominal",
                        amplifier_corner_Hz=design.loop.amplifier_corner_Hz)
 
 
-def six_dof_check(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult) -> SixDofCheck:
+def nominal_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None,
+                 companions: Companions | None = None) -> SampledLoop:
+    """The design's controller and the loops of the other axes (designed here by default) on the nominal rig."""
+    bare = bare_loop(design, rig, plant, K)
+    companions = companions or design_companions(bare, plant.weights.get("actuator chain *"))
+    return replace(bare, loops=companions.systems())
+
+
+def six_dof_check(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult,
+                  companions: Companions) -> SixDofCheck:
     """Transmissibility of the sampled loop in six degrees of freedom against the design model's."""
     T2 = result.transmissibility
-    T = predict_transmissibility_6dof(nominal_loop(design, rig, plant, result.K), T2.omega)
+    T = predict_transmissibility_6dof(nominal_loop(design, rig, plant, result.K, companions), T2.omega)
     kept = [COORDINATES.index(name) for name in design.keep]
     others = [k for k in range(6) if k not in kept]
     sigma = np.linalg.norm(T[:, kept][:, :, kept], ord=2, axis=(1, 2))

@@ -88,8 +88,9 @@ class _Score:
 
     @property
     def p(self) -> np.ndarray:
-        """Of each line by itself."""
-        return np.where(self.tests > 0, stats.gamma.sf(self.score, np.maximum(self.tests, 1)), 1.0)
+        """Of each line by itself; 1 where it is not RATIO times as strong as those next to it."""
+        tested = (self.tests > 0) & (self.ratio > RATIO)
+        return np.where(tested, stats.gamma.sf(self.score, np.maximum(self.tests, 1)), 1.0)
 
 
 def find_hum(left: Sequence[Leftover], false_alarm: float = FALSE_ALARM) -> HumFinding | None:
@@ -105,7 +106,7 @@ def find_hum(left: Sequence[Leftover], false_alarm: float = FALSE_ALARM) -> HumF
     first = check_common(left)
     scores = [_scores(left, nominal) for nominal in MAINS_HZ]
     trials = sum(int(np.count_nonzero(one.tests)) for one in scores)
-    each = [np.where(one.ratio > RATIO, one.p, 1.0) for one in scores]
+    each = [one.p for one in scores]
     chance = min(1.0, min(float(p.min()) for p in each) * trials)
     if chance > false_alarm:
         return None
@@ -118,7 +119,7 @@ def find_hum(left: Sequence[Leftover], false_alarm: float = FALSE_ALARM) -> HumF
     frequency = _refined(left, float(best.f0[at]), np.argwhere(sure[at]))
     # With the frequency known, what else stands out is judged among the lines there.
     there = _scores(left, best.nominal_Hz, np.array([frequency.value]))
-    own = np.where(there.ratio > RATIO, there.p, 1.0)[0]
+    own = there.p[0]
     hits = np.argwhere((own < false_alarm / own.size) | sure[at])
     frequency = _refined(left, frequency.value, hits)
     lines = _lines(left, frequency.value, hits, own, there.ratio[0])

@@ -9,6 +9,7 @@ from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, 
 from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table
 from avis_ctrl.simulation.campaign import PlantCheck, SimulationCheck
 from avis_ctrl.simulation.spectrum_check import SpectrumAgreement
+from avis_ctrl.study.companions import Companions
 from avis_ctrl.study.model import DesignResult
 
 
@@ -25,6 +26,8 @@ def simulation(result: DesignResult) -> Section:
             "spectrum agrees with the linear prediction within what chance allows "
             f"(false alarm over the whole campaign: {words.number(100 * check.false_alarm, 2)} %).")
     pieces: list[Piece] = [Paragraph(text, "verdict", passed == len(check.plants)), _plants(check)]
+    if result.loop is not None and (result.loop.companions.loops or result.loop.companions.passive):
+        pieces.append(_companions(result.loop.companions))
     for plant in check.plants[:1]:
         if plant.spectrum is not None:
             pieces += [_spectrum(plant.name, plant.spectrum), _ratios(check)]
@@ -43,6 +46,16 @@ def _plants(check: SimulationCheck) -> Table:
                  "drives and converter together.",
                  ("plant", "verdict", "stable", "bands that agree", "peak voltage", "clipped",
                   "velocity r.m.s. [µm/s]"), rows, "lcccrrl")
+
+
+def _companions(companions: Companions) -> Table:
+    rows = [(words.axis(one.axis), f"{words.number(one.gain)} N s/m", f"{words.number(one.tilt_corner_Hz)} Hz",
+             f"{words.number(one.roll_off_Hz)} Hz", words.number(one.modulus_margin, 2)) for one in companions.loops]
+    rows += [(words.axis(axis), "passive", "", "", why) for axis, why in companions.passive]
+    return table("The axes that the design does not keep, each under a skyhook loop that was designed for this rig's "
+                 "sensors with all other loops closed. The modulus margin is the least distance of the Nyquist curve "
+                 "from the critical point, nominal plant. sampled_controller.json holds these loops and the mu "
+                 "controller together.", ("axis", "gain", "tilt corner", "roll-off", "modulus margin"), rows, "lrrrr")
 
 
 def _agreement(p: PlantCheck) -> Mark | str:

@@ -8,7 +8,8 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Section, table
-from avis_ctrl.study.model import Bound, ControllerResult, DesignResult, Requirement
+from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
+from avis_ctrl.study.verdict import first_sentence
 
 
 def verdict(result: DesignResult) -> Section:
@@ -23,22 +24,10 @@ def verdict(result: DesignResult) -> Section:
 
 
 def _sentence(result: DesignResult) -> Paragraph:
-    missed = [r for r in result.requirements if not r.met]
-    simulation = getattr(result.simulation, "passed", None)
-    begin = _counted(result.requirements, missed)
-    if simulation is False:
-        begin += " The closed-loop simulation did not pass every check."
-    good = None if not result.requirements else not missed and simulation is not False
-    return Paragraph(f"{begin} {_achieved(result)}", "verdict", good)
-
-
-def _counted(requirements: tuple[Requirement, ...], missed: list[Requirement]) -> str:
-    if not requirements:
-        return "The design file asks for nothing, so nothing is judged."
-    if missed:
-        return (f"{len(missed)} of {len(requirements)} requirements {'is' if len(missed) == 1 else 'are'} not met: "
-                f"{words.joined([r.name for r in missed])}.")
-    return f"All {len(requirements)} requirements are met." if len(requirements) > 1 else "The requirement is met."
+    good = None if not result.requirements else result.stable and all(r.met for r in result.requirements)
+    if not result.stable:
+        return Paragraph(first_sentence(result), "verdict", False)
+    return Paragraph(f"{first_sentence(result)} {_achieved(result)}", "verdict", good)
 
 
 def _achieved(result: DesignResult) -> str:
@@ -80,6 +69,7 @@ def comparison(result: DesignResult) -> Section:
     controllers = result.controllers
     body = [(name, *(value(c) for c in controllers)) for name, value in rows]
     notes = [Paragraph(f"{c.title}: {'; '.join(c.notes)}", "note") for c in controllers if c.notes]
+    notes += [Paragraph(f"{c.title} is not in the table: {c.reason}", "note") for c in result.failed]
     floor = controllers[0].site.floor_rating
     return Section("Controllers compared", "comparison", (
         table("Every controller measured in the same way on the same plants. Worst cases are upper bounds over the "

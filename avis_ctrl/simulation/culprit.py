@@ -1,0 +1,86 @@
+"""What makes a closed loop unstable: the axes that move in its unstable mode, and the loops that do it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.lti.statespace import gain
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.simulation.discrete import period_map, spectral_radius
+from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
+
+
+@dataclass(frozen=True)
+class Culprit:
+    """The cause of an instability of the linear sampled loop.
+
+    Attributes
+    ----------
+    plant : name of the plant. radius : its spectral radius over one sample.
+    frequency_Hz, growth_per_s : of the fastest-growing mode; the growth is negative where only the nonlinear
+        simulation diverges.
+    axes : coordinates that move most in that mode, the largest first, rotations as displacement of the edge.
+    kind : "table" (unstable without control), "controller" (the design's controller alone does it), "companions"
+        (loops of the other axes alone do it), "together" (only both).
+    loops : axes of the fewest companion loops without which this plant is stable; empty where there are none such.
+    """
+
+    plant: str
+    radius: float
+    frequency_Hz: float
+    growth_per_s: float
+    axes: tuple[str, ...]
+    kind: str
+    loops: tuple[str, ...] = ()
+
+    def words(self) -> str:
+        """One clause: who, at which frequency, how fast."""
+        how = (f"the motion along {_joined(self.axes)} grows at {self.frequency_Hz:.3g} Hz by a factor of e in "
+               f"{1 / self.growth_per_s:.3g} s" if self.growth_per_s > 0 else
+               "the nonlinear table leaves its stops, although the linear loop is stable")
+        loops = f"the loop{'s' if len(self.loops) > 1 else ''} of {_joined(self.loops)}"
+        who = {"table": "the table itself is unstable without control",
+               "controller": "the controller does it, without the other axes' loops too",
+               "companions": f"{loops} {'do' if len(self.loops) > 1 else 'does'} it; without "
+                             f"{'them' if len(self.loops) > 1 else 'it'} the table is stable",
+               "together": (f"the controller and {loops} do it together; without "
+                            f"{'them' if len(self.loops) > 1 else 'it'} the table is stable") if self.loops else
+                           "the controller and the other axes' loops do it together"}[self.kind]
+        return f"{how} (plant \"{self.plant}\", spectral radius {self.radius:.6f}): {who}"
+
+
+def find_culprit(loop: SampledLoop) -> Culprit:
+    """The cause of the instability of one plant's loop; a stable linear loop has the kind of what diverged nonlinearly.
+    """
+    values, vectors = la.eig(period_map(loop))
+    most = int(np.argmax(np.abs(values)))
+    rate = np.log(values[most]) * loop.sample_rate_Hz
+    motion = np.abs(vectors[:len(COORDINATES), most]) * lever_arms(loop.plant)
+    order = np.argsort(motion)[::-1]
+    axes = tuple(COORDINATES[k] for k in order if motion[k] >= 0.3 * motion[order[0]])
+    radius = float(np.abs(values[most]))
+    kind, loops = _who(loop) if radius >= 1 else ("together", ())
+    return Culprit(loop.name, radius, float(abs(rate.imag)) / (2 * np.pi), float(rate.real), axes, kind, loops)
+
+
+def _who(loop: SampledLoop) -> tuple[str, tuple[str, ...]]:
+    idle = gain(np.zeros(loop.K.D.shape))
+
+    def stable(K, keep) -> bool:
+        return spectral_radius(replace(loop, K=K, loops={a: s for a, s in loop.loops.items() if a in keep})) < 1
+    if not stable(idle, ()):
+        return "table", ()
+    if not stable(loop.K, ()):
+        return "controller", ()
+    names = tuple(loop.loops)
+    fewest = next((out for size in range(1, len(names) + 1) for out in combinations(names, size)
+                   if stable(loop.K, set(names) - set(out))), ())
+    return ("companions" if not stable(idle, names) else "together"), fewest
+
+
+def _joined(names: tuple[str, ...]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1]))) if names else "no axis"

@@ -1,0 +1,253 @@
+"""Velocity loops for the axes that a design does not keep, for the rig's own sensors, checked with the rest.
+
+The controller of a design drives the axes it keeps. Every other axis that the drives can push and the sensors can tell
+apart gets a skyhook loop of its own:
+
+    F = -g  s/(s + w_tilt)  1/(s/w_roll + 1)  v
+
+Loops are closed one after the other around the sampled table with six degrees of freedom, hold, delay, amplifiers,
+sensor dynamics and the design's own controller included, and once more with all the others closed. Of a grid of
+gains and corners each loop takes the one with the smallest payload velocity r.m.s. under the site's floor motion and
+sensor noise among those that keep a modulus margin (the distance of the Nyquist curve from the critical point) and
+that the neglected dynamics of the drives do not destabilise. Critical damping with customary corners, the classical
+rule, keeps neither with 1 Hz geophones: the geophone's phase lead below its corner turns damping into feeding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.classical.skyhook import Skyhook
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.statespace import StateSpace, gain
+from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.robust.frequency_grid import resonances
+from avis_ctrl.simulation.discrete import digital_controller, sampled, spectral_radius
+from avis_ctrl.simulation.prediction import OpenResponse, open_response
+from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
+from avis_ctrl.uncertainty.weight_base import Weight
+
+
+@dataclass(frozen=True)
+class CompanionSettings:
+    """Search of the companion loops.
+
+    modulus_margin : least |1 + L|, dimensionless; 0.5 is a sensitivity peak of 6 dB, the textbooks' usual limit.
+    gain_factors : gains tried, over critical damping of the axis taken alone; down to a value that hardly acts, up to
+        twice the classical rule.
+    tilt_corners_Hz, roll_offs_Hz : corners tried; the customary 0.1 and 100 Hz and their neighbours.
+    passes : rounds over the axes; the second one sees all the other loops closed.
+    shrink : factor on all gains while some plant of the uncertainty set is unstable, 3 dB a step.
+    shrinks : steps of it before the loops are left out, 18 dB in all.
+    low_Hz, points : start and number of points of the frequency grid; it ends at 90 % of half the sample rate.
+    """
+
+    modulus_margin: float = 0.5
+    gain_factors: tuple[float, ...] = tuple(np.geomspace(0.03, 2.0, 13))
+    tilt_corners_Hz: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5)
+    roll_offs_Hz: tuple[float, ...] = (20.0, 50.0, 100.0, 200.0)
+    passes: int = 2
+    shrink: float = 10 ** (-3 / 20)
+    shrinks: int = 6
+    low_Hz: float = 0.01
+    points: int = 400
+
+
+@dataclass(frozen=True)
+class Companion:
+    """One axis and its loop.
+
+    gain : N s/m, edge force per edge velocity for rotations.
+    modulus_margin : least |1 + L| with all other loops closed.
+    """
+
+    axis: str
+    gain: float
+    tilt_corner_Hz: float
+    roll_off_Hz: float
+    modulus_margin: float
+
+    def loop(self) -> StateSpace:
+        """Seen velocity [m/s] -> force [N]."""
+        return Skyhook((self.axis,), (self.gain,), self.tilt_corner_Hz, self.roll_off_Hz).loop(self.axis)
+
+
+@dataclass(frozen=True)
+class Companions:
+    """The loops of the axes that a design does not keep.
+
+    passive : (axis, reason) of those that have no loop.
+    notes : what had to be given up, in words.
+    """
+
+    loops: tuple[Companion, ...]
+    passive: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def systems(self) -> dict[str, StateSpace]:
+        """By axis, seen velocity [m/s] -> force [N]."""
+        return {one.axis: one.loop() for one in self.loops}
+
+    def scaled(self, factor: float) -> Companions:
+        """All gains times a factor."""
+        return replace(self, loops=tuple(replace(one, gain=factor * one.gain) for one in self.loops))
+
+
+def free_axes(rig: Rig, keep: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
+    """Axes besides `keep` that can have a loop of their own, and the others with the reason."""
+    chosen, passive = list(keep), []
+    for axis in COORDINATES:
+        if axis in keep:
+            continue
+        try:
+            actuator_axes(rig, [*chosen, axis])
+            sensor_axes(rig, [*chosen, axis])
+        except InputError as error:
+            passive.append((axis, error.expected))
+        else:
+            chosen.append(axis)
+    return chosen[len(keep):], passive
+
+
+def design_companions(bare: SampledLoop, chain_error: Weight | None = None,
+                      settings: CompanionSettings = CompanionSettings()) -> Companions:
+    """Loops for the axes that `bare` does not control.
+
+    Parameters
+    ----------
+    bare : the design's controller around the nominal rig, `loops` empty.
+    chain_error : relative error of the drives' neglected dynamics; None for none.
+    """
+    rig, T = bare.rig, bare.period_s
+    axes, passive = free_axes(rig, bare.axes)
+    even = np.geomspace(2 * np.pi * settings.low_Hz, 0.9 * np.pi / T, settings.points)
+    omega = np.unique(np.concatenate([even, resonances(rig.equations_of_motion().state_space().poles())]))
+    search = _Search(bare, omega, chain_error, settings)
+    found: dict[str, Companion] = {}
+    for _ in range(settings.passes):
+        for axis in axes:
+            others = {name: one for name, one in found.items() if name != axis}
+            best = search.best(axis, others)
+            found = others if best is None else {**others, axis: best}
+    missing = tuple((axis, "no loop tried keeps the margin") for axis in axes if axis not in found)
+    loops = tuple(replace(found[axis], modulus_margin=search.margin(axis, found)) for axis in axes if axis in found)
+    return Companions(loops, (*passive, *missing))
+
+
+def until_stable(companions: Companions, plants: Sequence[SampledLoop],
+                 settings: CompanionSettings = CompanionSettings()) -> Companions:
+    """The same loops with gains lowered until every plant is stable in the linear sampled loop; without them at last.
+
+    plants : the loop of each plant with any companions; theirs are replaced.
+    """
+    if not companions.loops:
+        return companions
+    for step in range(settings.shrinks + 1):
+        factor = settings.shrink ** step
+        tried = companions.scaled(factor)
+        if all(spectral_radius(replace(plant, loops=tried.systems())) < 1 for plant in plants):
+            lowered = (f"The gains of the other axes' loops are lowered by {-20 * np.log10(factor):.0f} dB: with more, "
+                       "a plant of the uncertainty set is unstable.")
+            return replace(tried, notes=(*tried.notes, lowered)) if step else tried
+    # The loops as designed are kept where none of this helps: the instability is not theirs alone, or not theirs.
+    without = [spectral_radius(replace(plant, loops={})) for plant in plants]
+    if max(without) < 1:
+        reason = "any loop makes a plant of the uncertainty set unstable"
+        return Companions((), (*companions.passive, *((one.axis, reason) for one in companions.loops)),
+                          companions.notes)
+    return companions
+
+
+class _Search:
+    """Candidates of one axis at a time, as rank-one changes of a closed sampled loop."""
+
+    def __init__(self, bare: SampledLoop, omega: np.ndarray, chain_error: Weight | None,
+                 settings: CompanionSettings):
+        self.bare, self.omega, self.settings = bare, omega, settings
+        self.open: OpenResponse = open_response(bare, omega)
+        self.K = digital_controller(replace(bare, loops={})).frequency_response(omega)
+        self.error = chain_error.magnitude(omega) if chain_error is not None else np.zeros(omega.size)
+        self.arms = lever_arms(bare.rig)
+        floor = np.zeros((omega.size, len(COORDINATES)))
+        for name, spectrum in bare.floor.items():
+            inside = omega >= 2 * np.pi * spectrum.low_Hz
+            floor[inside, COORDINATES.index(name)] = spectrum.asd(omega[inside] / (2 * np.pi), "velocity")
+        noise = np.sqrt(2 * bare.period_s * bare.sensors.white_variance_V2)
+        self.sources = np.hstack([floor, np.broadcast_to(noise, (omega.size, noise.size))])
+        self._units: dict[str, np.ndarray] = {}
+        self._filters: dict[tuple[float, float], np.ndarray] = {}
+        equations = bare.rig.equations_of_motion()
+        M, C, stiffness = (np.diag(X) / self.arms ** 2 for X in (equations.M, equations.C, equations.K))
+        self.critical = dict(zip(COORDINATES, np.maximum(2 * np.sqrt(M * stiffness) - C, 0.0), strict=True))
+
+    def best(self, axis: str, others: dict[str, Companion]) -> Companion | None:
+        """The candidate of least r.m.s. payload velocity that keeps the margins and is stable; None if none does."""
+        g, motion, through, seen = self._around(axis, others)
+        rows = []
+        for candidate in self._candidates(axis):
+            c = candidate.gain * self._filter(candidate)
+            returned = 1 - c * g
+            margin = float(np.min(np.abs(returned)))
+            if margin < self.settings.modulus_margin or np.max(np.abs(self.error * c * g / returned)) >= 1:
+                continue
+            total = motion + through * (c / returned)[:, None, None] * seen
+            density = np.sum(np.abs(total * self.sources[:, None, :]) ** 2, axis=(1, 2))
+            rows.append((float(np.trapezoid(density, self.omega)), candidate, margin))
+        for _, candidate, margin in sorted(rows, key=lambda row: row[0]):
+            loops = {**{name: one.loop() for name, one in others.items()}, axis: candidate.loop()}
+            if spectral_radius(replace(self.bare, loops=loops)) < 1:
+                return replace(candidate, modulus_margin=margin)
+        return None
+
+    def margin(self, axis: str, found: dict[str, Companion]) -> float:
+        """Least |1 + L| of a loop with all the others closed."""
+        g, *_ = self._around(axis, {name: one for name, one in found.items() if name != axis})
+        return float(np.min(np.abs(1 - found[axis].gain * self._filter(found[axis]) * g)))
+
+    def _candidates(self, axis: str) -> Iterator[Companion]:
+        s = self.settings
+        for factor in s.gain_factors:
+            for tilt in s.tilt_corners_Hz:
+                for roll in s.roll_offs_Hz:
+                    yield Companion(axis, factor * self.critical[axis], tilt, roll, np.nan)
+
+    def _filter(self, one: Companion) -> np.ndarray:
+        """(n,) the sampled loop at unit gain: force over seen velocity."""
+        key = one.tilt_corner_Hz, one.roll_off_Hz
+        if key not in self._filters:
+            unit = sampled(replace(one, gain=1.0).loop(), self.bare.period_s)
+            self._filters[key] = unit.frequency_response(self.omega)[:, 0, 0]
+        return self._filters[key]
+
+    def _unit(self, axis: str) -> np.ndarray:
+        """(n, n_u, n_s) sensor volts to drive volts of an axis alone under a loop of gain 1: of rank one."""
+        if axis not in self._units:
+            none = gain(np.zeros((len(self.bare.axes),) * 2))
+            alone = replace(self.bare, K=none, loops={axis: gain(1.0)})
+            self._units[axis] = digital_controller(alone).frequency_response(self.omega)
+        return self._units[axis]
+
+    def _around(self, axis: str, others: dict[str, Companion]) -> tuple[np.ndarray, ...]:
+        """What one loop sees with the rest closed: g (n,), motion (n, 6, sources), and the factors of its change."""
+        C = self.K + sum((one.gain * self._filter(one)[:, None, None] * self._unit(name)
+                          for name, one in others.items()), np.zeros(1))
+        G, n_s = self.open, self.K.shape[2]
+        closed = np.linalg.inv(np.eye(n_s) - G.sensed_volts @ C)  # sensor volts over what is added to them
+        added = np.concatenate([G.sensed_floor, np.broadcast_to(np.eye(n_s), (self.omega.size, n_s, n_s))], axis=2)
+        sensed = closed @ added
+        motion = np.concatenate([G.velocity_floor, np.zeros((*G.velocity_floor.shape[:2], n_s))], axis=2)
+        motion = self.arms[:, None] * (motion + G.velocity_volts @ C @ sensed)
+        unit = self._unit(axis)
+        # unit = a s': a the allocation of the axis, the same at every frequency up to its phase in s
+        a = unit[np.arange(unit.shape[0]), :, np.argmax(np.abs(unit).max(axis=1), axis=1)]
+        a = a / np.where(np.abs(a).max(axis=1) > 0, np.linalg.norm(a, axis=1), 1.0)[:, None]
+        s = np.einsum("fu,fus->fs", a.conj(), unit)
+        pushed = closed @ (G.sensed_volts @ a[:, :, None])
+        g = np.einsum("fs,fs->f", s, pushed[..., 0])
+        through = self.arms[:, None] * (G.velocity_volts @ (a[:, :, None] + C @ pushed))
+        return g, motion, through, s[:, None, :] @ sensed
