@@ -61,9 +61,9 @@ def main(folder: str = "reports/avis_z_phix") -> None:
     """Synthesise, compare with skyhook, simulate, write the report."""
     began, out = time.monotonic(), open_folder(folder)
     plant = build_plant(design, rig)
-    candidates, synthesis = synthesise(design, plant, rig, print)
-    controllers, simulation = compare(design, plant, rig, candidates, print)
-    result = conclude(design, plant, rig, synthesis, controllers, simulation, time.monotonic() - began)
+    candidates, failed, synthesis = synthesise(design, plant, rig, print)
+    compared = compare(design, plant, rig, candidates, failed, print)
+    result = conclude(design, plant, rig, synthesis, compared, time.monotonic() - began)
     for line in result.requirements:
         print(f"{line.name}: {line.value:.3g} {line.unit}, {line.comparison} {line.limit:g}: "
               f"{'met' if line.met else 'not met'}")
