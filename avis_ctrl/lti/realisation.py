@@ -102,7 +102,12 @@ def minimal(system: StateSpace, tolerance: float = 1e-9) -> StateSpace:
 
 
 def discretise(system: StateSpace, dt: float, method: Literal["zoh", "tustin"] = "tustin") -> StateSpace:
-    """Sampled system of period dt [s]: zero-order hold on the inputs, or the bilinear (Tustin) map."""
+    """Sampled system of period dt [s]: zero-order hold on the inputs ("zoh"), or the bilinear map ("tustin").
+
+    Raises InputError where the system is sampled already, dt is not positive, or the method is another one.
+    """
+    if method not in ("zoh", "tustin"):
+        raise InputError("expected 'zoh' or 'tustin'", field="method", value=method)
     if system.dt:
         raise InputError(f"the system is already sampled at {system.dt:g} s")
     if not (np.isfinite(dt) and dt > 0):

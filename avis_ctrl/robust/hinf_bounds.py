@@ -27,14 +27,15 @@ from avis_ctrl.robust.hinf_plant import (
     RANK_TOLERANCE,
     Plant,
     as_plant,
+    channel_sizes,
     check_stabilisable,
     normal_form,
+    parrott,
+    pointwise,
     rank_margins,
     regularised,
 )
 from avis_ctrl.robust.hinf_riccati import find_gamma
-
-RANK_AT_POINT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -108,24 +109,15 @@ def pointwise_bound(plant: Plant, omega: np.ndarray | None = None) -> LowerBound
     if omega is None:
         poles = np.abs(plant.sample_points())
         omega = np.geomspace(1e-2 * np.min(poles), 1e2 * np.max(poles), 400)
-    sizes = (float(plant.size(plant.B2, plant.C1, plant.D12)), float(plant.size(plant.B1, plant.C2, plant.D21)))
+    sizes = channel_sizes(plant)
     best = LowerBound(parrott(plant.D11, plant.D12, plant.D21, sizes), complex(np.inf),
                       "directions free at infinite frequency")
     for s, source in [*((1j * w, "directions free at one frequency") for w in omega),
                       *((z, "a right-half-plane zero of u -> z or w -> y") for z in right_zeros(plant))]:
-        value = _at(plant, s, sizes)
+        value = pointwise(plant, s, sizes)
         if value > best.gamma:
             best = LowerBound(value, complex(s), source)
     return best
-
-
-def parrott(P11: np.ndarray, P12: np.ndarray, P21: np.ndarray, sizes: tuple[float, float] = (0.0, 0.0)) -> float:
-    """min over Q of sigma(P11 + P12 Q P21), exactly (Parrott 1978).
-
-    sizes : yardsticks of P12 and P21, against which a singular value of 1e-9 counts as lost rank.
-    """
-    left, right = _kernel(P12.conj().T, sizes[0]).conj().T @ P11, P11 @ _kernel(P21, sizes[1])
-    return float(max(la.norm(left, 2) if left.size else 0.0, la.norm(right, 2) if right.size else 0.0))
 
 
 def right_zeros(plant: Plant) -> np.ndarray:
@@ -141,20 +133,3 @@ def right_zeros(plant: Plant) -> np.ndarray:
         zeros = alpha[finite] / beta[finite]
         found.append(zeros[(zeros.real > 1e-9 * np.abs(zeros)) & (zeros.imag >= 0)])
     return np.concatenate(found) if found else np.zeros(0, complex)
-
-
-def _at(plant: Plant, s: complex, sizes: tuple[float, float]) -> float:
-    """The bound at one point; 0 where P has a pole."""
-    resolvent = s * np.eye(plant.n) - plant.A
-    if plant.n and 1 / np.linalg.cond(resolvent) < 1e-13:
-        return 0.0
-    x1, x2 = np.linalg.solve(resolvent, plant.B1), np.linalg.solve(resolvent, plant.B2)
-    return parrott(plant.C1 @ x1 + plant.D11, plant.C1 @ x2 + plant.D12, plant.C2 @ x1 + plant.D21,
-                   sizes)
-
-
-def _kernel(matrix: np.ndarray, size: float) -> np.ndarray:
-    """Orthonormal basis of the null space of a matrix, singular values judged against `size` and their largest."""
-    _, s, Vh = la.svd(matrix)
-    rank = int(np.sum(s > RANK_AT_POINT * max(size, float(s[0])))) if s.size and s[0] > 0 else 0
-    return Vh[rank:].conj().T

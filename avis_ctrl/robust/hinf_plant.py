@@ -18,10 +18,12 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import StateSpace, balance
+from avis_ctrl.lti import StateSpace, balance, minimal
 
 RANK_TOLERANCE = 1e-8
 PBH_TOLERANCE = 1e-10
+RANK_AT_POINT = 1e-9
+RESPONSE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,29 @@ def check_stabilisable(plant: Plant) -> None:
                     next_step=f"make the mode stable, or give {who} that reaches it")
 
 
+def without_hidden_states(P: StateSpace, nmeas: int, ncon: int) -> StateSpace:
+    """P without the states that no input reaches or no output sees, where its response stays the same; else P itself.
+
+    Such states (a weight realised twice, say) do not change the problem once they are known to be stable, but X and Y
+    are singular on them, or ill conditioned. Compared block by block on the imaginary axis and off it.
+    """
+    small = minimal(P)
+    if small.nstates == P.nstates:
+        return P
+    old, new = Plant.of(P, nmeas, ncon), Plant.of(small, nmeas, ncon)
+    sizes = np.abs(old.sample_points())
+    sizes = np.unique(np.concatenate([sizes, np.sqrt(sizes[:-1] * sizes[1:]), sizes[[0]] / 100, sizes[[-1]] * 100]))
+    for s in np.concatenate([1j * sizes, sizes * np.exp(0.25j * np.pi)]):
+        for B, C, D in (("B1", "C1", "D11"), ("B2", "C1", "D12"), ("B1", "C2", "D21"), ("B2", "C2", "D22")):
+            try:
+                a, b = (one.at(s, getattr(one, B), getattr(one, C), getattr(one, D)) for one in (old, new))
+            except np.linalg.LinAlgError:
+                return P
+            if not la.norm(a - b) <= RESPONSE_TOLERANCE * la.norm(a):
+                return P
+    return small
+
+
 @dataclass(frozen=True)
 class NormalForm:
     """Plant with D12 = [0; I], D21 = [0 I], D22 = 0, and the maps back: K = S K_n T, then D22 is restored."""
@@ -175,3 +200,35 @@ def regularised(plant: Plant, epsilon: float, of_D12: bool, of_D21: bool, of_sta
 
 def _typical(matrix: np.ndarray) -> float:
     return float(la.norm(matrix, 2)) if np.any(matrix) else 1.0
+
+
+def parrott(P11: np.ndarray, P12: np.ndarray, P21: np.ndarray, sizes: tuple[float, float] = (0.0, 0.0)) -> float:
+    """min over Q of sigma(P11 + P12 Q P21), exactly (Parrott 1978).
+
+    sizes : yardsticks of P12 and P21, against which a singular value of 1e-9 counts as lost rank.
+    """
+    left, right = _kernel(P12.conj().T, sizes[0]).conj().T @ P11, P11 @ _kernel(P21, sizes[1])
+    return float(max(la.norm(left, 2) if left.size else 0.0, la.norm(right, 2) if right.size else 0.0))
+
+
+def channel_sizes(plant: Plant) -> tuple[float, float]:
+    """Typical sizes of u -> z and w -> y."""
+    return float(plant.size(plant.B2, plant.C1, plant.D12)), float(plant.size(plant.B1, plant.C2, plant.D21))
+
+
+def pointwise(plant: Plant, s: complex, sizes: tuple[float, float] | None = None) -> float:
+    """Parrott's bound at one point of the closed right half plane (see `hinf_bounds`); 0 where P has a pole."""
+    sizes = sizes or channel_sizes(plant)
+    resolvent = s * np.eye(plant.n) - plant.A
+    if plant.n and 1 / np.linalg.cond(resolvent) < 1e-13:
+        return 0.0
+    x1, x2 = np.linalg.solve(resolvent, plant.B1), np.linalg.solve(resolvent, plant.B2)
+    return parrott(plant.C1 @ x1 + plant.D11, plant.C1 @ x2 + plant.D12, plant.C2 @ x1 + plant.D21,
+                   sizes)
+
+
+def _kernel(matrix: np.ndarray, size: float) -> np.ndarray:
+    """Orthonormal basis of the null space of a matrix, singular values judged against `size` and their largest."""
+    _, s, Vh = la.svd(matrix)
+    rank = int(np.sum(s > RANK_AT_POINT * max(size, float(s[0])))) if s.size and s[0] > 0 else 0
+    return Vh[rank:].conj().T

@@ -4,6 +4,11 @@ Formulas of Glover and Doyle, Systems & Control Letters 11 (1988) 167-172, for a
 (D12 = [0; I], D21 = [0 I], D22 = 0). A controller with ||F_l(P, K)|| < gamma exists if and only if
 
     gamma > max(sigma [D1111 D1112], sigma [D1111; D1121]),   X >= 0,   Y >= 0,   rho(X Y) < gamma^2 .
+
+In double precision the test has a third outcome, in doubt. A bound is claimed only where it is not: a gamma is
+called too small where the failing condition fails by more than its error, or where the response at one frequency
+forbids it (Parrott's bound at the Hamiltonian's eigenvalue on the axis); a gamma that passes in doubt counts where
+the central controller's closed loop is measured to keep it.
 """
 
 from __future__ import annotations
@@ -13,13 +18,16 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
-from avis_ctrl.errors import ComputationError
-from avis_ctrl.lti import StateSpace
-from avis_ctrl.robust.hinf_plant import NormalForm, Plant
-from avis_ctrl.robust.riccati import solve_riccati
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti import StateSpace, balance, hinf_norm, lft_lower
+from avis_ctrl.robust.hinf_plant import NormalForm, Plant, pointwise
+from avis_ctrl.robust.riccati import solution_error, solve_riccati
 
 # Relative to the open channel w -> z, a gamma below this is round-off.
 ZERO_GAMMA = 1e-9
+# Relative accuracy of a norm or a bound beside gamma.
+NEARLY = 1e-6
+IN_DOUBT = "the Riccati test passes in doubt and its controller does not keep this gamma"
 
 
 @dataclass(frozen=True)
@@ -27,6 +35,8 @@ class GammaTest:
     """Outcome of the test at one gamma: feasible with X, Y, or the condition that fails.
 
     coupling : rho(X Y) / gamma^2, nan where X or Y does not exist or is indefinite.
+    forbidden : no controller reaches this; gamma itself where the failure is beyond round-off, 0 where in doubt.
+    doubtful : feasible, if the negative eigenvalues of X or Y are round-off.
     """
 
     gamma: float
@@ -35,16 +45,23 @@ class GammaTest:
     coupling: float = np.nan
     X: np.ndarray | None = None
     Y: np.ndarray | None = None
+    forbidden: float = 0.0
+    doubtful: bool = False
 
 
 @dataclass(frozen=True)
 class GammaBracket:
-    """lower: largest gamma at which the test failed (and why); upper: the smallest at which it passed."""
+    """lower: largest gamma at which the test failed for certain; upper: the smallest at which it passed.
+
+    undecided : the largest gamma at which the test did not pass, above `lower` where that was not for certain.
+    limited_by : why it did not.
+    """
 
     lower: float
     upper: GammaTest
     limited_by: str
     tests: int
+    undecided: float = 0.0
 
 
 def direct_term_bound(plant: Plant) -> float:
@@ -58,19 +75,61 @@ def direct_term_bound(plant: Plant) -> float:
 def gamma_test(plant: Plant, gamma: float) -> GammaTest:
     """The existence test at one gamma, for a plant in normal form."""
     if gamma <= direct_term_bound(plant):
-        return GammaTest(gamma, False, "gamma is not above what D11 leaves at infinite frequency")
-    try:
-        x = solve_riccati(*control_riccati(plant, gamma))
-        if x.X is None or not x.semidefinite:
-            return GammaTest(gamma, False, f"control Riccati equation: {x.reason or 'X is not positive semidefinite'}")
-        y = solve_riccati(*filter_riccati(plant, gamma))
-    except (np.linalg.LinAlgError, ValueError) as error:
-        return GammaTest(gamma, False, f"the Riccati equation is singular ({error})")
-    if y.X is None or not y.semidefinite:
-        return GammaTest(gamma, False, f"filter Riccati equation: {y.reason or 'Y is not positive semidefinite'}")
+        return GammaTest(gamma, False, "gamma is not above what D11 leaves at infinite frequency", forbidden=gamma)
+    solutions = []
+    for name, letter, data in (("control", "X", control_riccati), ("filter", "Y", filter_riccati)):
+        try:
+            found = solve_riccati(*data(plant, gamma))
+        except (np.linalg.LinAlgError, ValueError) as error:
+            return GammaTest(gamma, False, f"the Riccati equation is singular ({error})")
+        if found.X is None:
+            return GammaTest(gamma, False, f"{name} Riccati equation: {found.reason}",
+                             forbidden=_forbidden(plant, gamma, found.omega))
+        if not found.semidefinite:
+            return GammaTest(gamma, False, f"{name} Riccati equation: {letter} is not positive semidefinite",
+                             forbidden=gamma)
+        solutions.append(found)
+    x, y = solutions
+    assert x.X is not None and y.X is not None
     coupling = float(np.max(la.eigvals(x.X @ y.X).real, initial=0.0)) / gamma ** 2
-    reason = "" if coupling < 1 else "control and filter together: rho(X Y) is not below gamma^2"
-    return GammaTest(gamma, coupling < 1, reason, coupling, x.X, y.X)
+    doubtful = x.doubtful or y.doubtful
+    if coupling < 1:
+        return GammaTest(gamma, True, "", coupling, x.X, y.X, doubtful=doubtful)
+    certain = not doubtful and coupling - _coupling_error(plant, gamma, x.X, y.X) > 1
+    return GammaTest(gamma, False, "control and filter together: rho(X Y) is not below gamma^2", coupling, x.X, y.X,
+                     forbidden=gamma if certain else 0.0)
+
+
+def _forbidden(plant: Plant, gamma: float, omega: np.ndarray) -> float:
+    """What the response at these frequencies forbids, at most gamma; 0 where that is clearly less."""
+    best = max((pointwise(plant, 1j * w) for w in omega), default=0.0)
+    return min(best, gamma) if best > (1 - NEARLY) * gamma else 0.0
+
+
+def _coupling_error(plant: Plant, gamma: float, X: np.ndarray, Y: np.ndarray) -> float:
+    """First-order error of rho(X Y) / gamma^2 from those of X and Y; inf where it cannot be told."""
+    of_x = solution_error(*control_riccati(plant, gamma), X)
+    of_y = solution_error(*filter_riccati(plant, gamma), Y)
+    values, vectors = la.eig(X @ Y)
+    r = vectors[:, int(np.argmax(values.real))].real
+    rho, q = float(np.max(values.real)), Y @ r
+    if of_x is None or of_y is None or not q @ r > 0:
+        return np.inf
+    # Y r is the left eigenvector of X Y.
+    return float((q @ of_x @ q + rho * r @ of_y @ r) / (q @ r)) / gamma ** 2
+
+
+def keeps(plant: Plant, test: GammaTest) -> bool:
+    """Whether the central controller of a passed test is measured to keep its gamma."""
+    m2, p2 = plant.D12.shape[1], plant.D21.shape[0]
+    form = NormalForm(plant, np.eye(m2), np.eye(p2), np.zeros((p2, m2)))
+    try:
+        K = central_controller(form, test)
+        P = StateSpace(plant.A, np.hstack([plant.B1, plant.B2]), np.vstack([plant.C1, plant.C2]),
+                       np.block([[plant.D11, plant.D12], [plant.D21, plant.D22]]))
+        return hinf_norm(lft_lower(P, balance(K))).gain <= test.gamma * (1 + NEARLY)
+    except (ComputationError, InputError, np.linalg.LinAlgError):
+        return False
 
 
 def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit: float = 1e10) -> GammaBracket:
@@ -90,7 +149,7 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
             raise ComputationError("no controller reaches any gamma", measured=f"gamma up to {step:.3g} tried",
                                    cause=search.reason, next_step="check weights and scaling of the plant")
     factor = 1.05 if hint else 4.0
-    while search.lower <= max(floor, 0.0) and search.upper.gamma > nothing:
+    while search.failed <= max(floor, 0.0) and search.upper.gamma > nothing:
         step = search.upper.gamma / factor
         if step <= floor * (1 + tolerance):
             step = floor * (1 + tolerance / 2)
@@ -101,14 +160,17 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
     if search.upper.gamma <= 100 * nothing:
         return GammaBracket(0.0, search.upper, "nothing: the optimum is zero to working precision", search.tests)
     search.refine(tolerance, nothing)
-    return GammaBracket(search.lower, search.upper, search.reason or "the direct term D11", search.tests)
+    search.prove(tolerance)
+    return GammaBracket(search.lower, search.upper, search.reason or "the direct term D11", search.tests,
+                        search.failed)
 
 
 class _Search:
     """State of the search for gamma: the bracket and the couplings seen so far."""
 
     def __init__(self, plant: Plant, floor: float):
-        self.plant, self.lower = plant, floor
+        # `failed` steers the search, `lower` is what was proved on the way.
+        self.plant, self.lower, self.failed = plant, floor, floor
         self.upper: GammaTest | None = None
         self.below: GammaTest | None = None
         self.second: GammaTest | None = None
@@ -118,17 +180,33 @@ class _Search:
     def try_gamma(self, gamma: float) -> bool:
         outcome = gamma_test(self.plant, gamma)
         self.tests += 1
-        if outcome.feasible:
+        passed = outcome.feasible and (not outcome.doubtful or keeps(self.plant, outcome))
+        self.lower = max(self.lower, outcome.forbidden)
+        if passed:
             self.second, self.upper = self.upper, outcome
-        elif gamma >= self.lower:
-            self.lower, self.below, self.reason = gamma, outcome, outcome.reason
-        return outcome.feasible
+        elif gamma >= self.failed:
+            self.failed, self.below, self.reason = gamma, outcome, outcome.reason or IN_DOUBT
+        return passed
+
+    def prove(self, tolerance: float) -> None:
+        """Look for a provable failure where the last one was in doubt, by halving; few steps, each costs a test."""
+        unproved = self.failed
+        for _ in range(12):
+            if unproved - self.lower <= tolerance * unproved:
+                return
+            middle = np.sqrt(self.lower * unproved) if self.lower > 0.1 * unproved else unproved / 3
+            before = self.lower
+            outcome = gamma_test(self.plant, middle)
+            self.tests += 1
+            self.lower = max(self.lower, outcome.forbidden)
+            if self.lower == before:
+                unproved = middle
 
     def refine(self, tolerance: float, absolute: float) -> None:
         """Shrink the bracket to the tolerance, or to an absolute size where the optimum is zero."""
         for count in range(200):
             assert self.upper is not None
-            low, high = self.lower, self.upper.gamma
+            low, high = self.failed, self.upper.gamma
             if high - low <= max(tolerance * low, absolute):
                 return
             middle = np.sqrt(low * high) if low > 0 and high > 2 * low else (low + high) / 2
@@ -140,7 +218,7 @@ class _Search:
             below, above = guess * (1 - 0.4 * tolerance), guess * (1 + 0.4 * tolerance)
             if below > low and self.try_gamma(below):
                 continue
-            if self.upper.gamma > above > self.lower:
+            if self.upper.gamma > above > self.failed:
                 self.try_gamma(above)
 
     def _predicted(self) -> float:

@@ -26,9 +26,13 @@ from avis_ctrl.robust.hinf_plant import (
     normal_form,
     rank_margins,
     regularised,
+    without_hidden_states,
 )
-from avis_ctrl.robust.hinf_riccati import GammaBracket, central_controller, find_gamma, gamma_test
+from avis_ctrl.robust.hinf_riccati import ZERO_GAMMA, GammaBracket, central_controller, find_gamma, gamma_test
 from avis_ctrl.robust.riccati import INACCURATE, ON_AXIS
+
+# Relative accuracy to which a closed loop's norm contradicts a bound.
+LOOP_ACCURACY = 1e-5
 
 
 class Status(Enum):
@@ -39,6 +43,8 @@ class Status(Enum):
                    "of the plant without them")
     BACKED_OFF = ("the closed loop missed its target at the back-off asked for, which was raised: this usually "
                   "means a badly scaled plant or a nearly singular D12 or D21")
+    WIDE = ("the optimum lies between the bounds, which are wider apart than asked for: between them the Riccati "
+            "test is in doubt, and nothing is claimed")
     SUBOPTIMAL = "a controller at the gamma asked for; the optimum was not sought"
 
 
@@ -48,8 +54,9 @@ class Synthesis:
 
     K : controller, inputs named as the plant's y, outputs as its u; positive feedback u = K y.
     gamma : H-infinity norm of `closed_loop`, measured (relative accuracy 1e-6).
-    gamma_optimal_bounds : (largest gamma found infeasible, smallest found feasible). Where channels were added,
-        the upper one is of the plant with them, and the lower one is the pointwise bound of `hinf_lower_bound`.
+    gamma_optimal_bounds : (largest gamma found infeasible for certain, smallest found feasible). Where channels were
+        added, the lower one is the pointwise bound of `hinf_lower_bound`; there, and where the controller missed its
+        target, the upper one is the measured gamma.
     fastest_pole : largest magnitude [rad/s] of a controller pole (of its continuous image when P is sampled).
     limited_by : the condition that fails just below the optimum.
     notes : what was done that the caller did not ask for, and what it cost.
@@ -97,16 +104,20 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     problem = _Problem.of(P, nmeas, ncon)
     form, bracket, notes = problem.solve(tolerance, gamma_hint)
     status = Status.REGULARISED if notes else Status.OPTIMAL
-    # Extra channels only add to the problem: what fails with them may be possible without.
-    bounds = (pointwise_bound(problem.plant).gamma if notes else bracket.lower, bracket.upper.gamma)
+    bounds = bracket.lower, bracket.upper.gamma
     if method == "lmi":
         from avis_ctrl.robust.hinf_lmi import lmi_gamma
 
         optimum = lmi_gamma(P, nmeas, ncon)
         bounds = optimum.lower, optimum.upper
     result, raised = problem.realise(form, bounds[1] if not notes else bracket.upper.gamma, backoff)
+    if notes and method != "lmi":
+        # Extra channels only add to the problem: what fails with them may be possible without.
+        bounds = pointwise_bound(problem.plant).gamma, result.gamma
     if raised:
         status, notes = Status.BACKED_OFF, (*notes, raised)
+        bounds = bounds[0], max(bounds[1], result.gamma)
+    bounds, status, notes = _consistent(bounds, result.gamma, tolerance, status, notes)
     rate = _rate_note(result, sample_rate_Hz)
     return replace(result, gamma_optimal_bounds=(float(bounds[0]), float(bounds[1])), status=status,
                    limited_by=bracket.limited_by, notes=(*notes, *rate))
@@ -135,7 +146,7 @@ def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
 
 @dataclass(frozen=True)
 class _Problem:
-    """The plant as given, its continuous balanced partition, and which of the assumptions fail."""
+    """The plant as given, its continuous balanced partition without hidden states, and which assumptions fail."""
 
     P: StateSpace
     plant: Plant
@@ -143,8 +154,12 @@ class _Problem:
 
     @staticmethod
     def of(P: StateSpace, nmeas: int, ncon: int) -> _Problem:
-        plant = Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon)
+        continuous = bilinear_to_continuous(P) if P.dt else P
+        plant = Plant.of(continuous, nmeas, ncon)
         check_stabilisable(plant)
+        small = without_hidden_states(continuous, nmeas, ncon)
+        if small.nstates < P.nstates:
+            plant = replace(Plant.of(small, nmeas, ncon), u=plant.u, y=plant.y)
         of_u, of_y = rank_margins(plant)
         return _Problem(P, plant, (of_u < RANK_TOLERANCE, of_y < RANK_TOLERANCE))
 
@@ -237,6 +252,18 @@ class _Problem:
             K = discretise(K, self.P.dt, "tustin")
         closed = lft_lower(self.P, K)
         return Synthesis(K, hinf_norm(closed).gain, (0.0, np.inf), Status.OPTIMAL, closed, fastest, "")
+
+
+def _consistent(bounds: tuple[float, float], reached: float, tolerance: float, status: Status,
+                notes: tuple[str, ...]) -> tuple[tuple[float, float], Status, tuple[str, ...]]:
+    """Bounds that do not contradict what was measured, and a status that says so where they are far apart."""
+    lower, upper = bounds
+    if lower > reached * (1 + LOOP_ACCURACY):
+        notes = (*notes, f"the lower bound computed, {lower:.6g}, is passed by the measured loop and is not claimed")
+        lower = 0.0
+    if status is Status.OPTIMAL and upper - lower > max(2 * tolerance * upper, ZERO_GAMMA * upper) and lower > 0:
+        status = Status.WIDE
+    return (lower, upper), status, notes
 
 
 def _check_options(backoff: float, tolerance: float, method: str, gamma_hint: float | None) -> None:

@@ -5,11 +5,22 @@
 The stable invariant subspace [X1; X2] of H comes from an ordered real Schur form (Laub 1979) after a
 symplectic diagonal balancing, and is judged before it is used: eigenvalues on the imaginary axis,
 or a subspace that is not Lagrangian, mean that no stabilising solution exists.
+
+Whether X >= 0 cannot be read off its eigenvalues where X is singular, which is common (X vanishes on stable modes
+that the cost does not see): round-off decides the sign. So it is asked whether a negative eigenvalue is larger
+than the error of X. To first order an error of the residual between -W and W moves X by no more than E,
+
+    A_c' E + E A_c + W = 0,   A_c = A + R X,
+
+since a stable Lyapunov equation keeps the order of symmetric matrices. Near the smallest gamma X passes through
+infinity; (X - I) inv(X + I), a rotation of the subspace by 45 degrees, stays bounded there: X >= 0 puts its
+eigenvalues between -1 and 1.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg as la
@@ -18,6 +29,8 @@ from avis_ctrl.lti.norms import symplectic_scale
 
 AXIS_TOLERANCE = 1e-10
 LAGRANGIAN_TOLERANCE = 1e-6
+# Round-off of the residual in units of what each of its terms rounds to.
+ROUND_OFF = 32 * np.finfo(float).eps
 INACCURATE = "the Hamiltonian is too badly conditioned for its stable subspace"
 ON_AXIS = "the Hamiltonian has eigenvalues on the imaginary axis"
 
@@ -27,11 +40,15 @@ class RiccatiSolution:
     """X (n, n) symmetric, or None with the reason why there is none.
 
     semidefinite : whether X >= 0, judged on X1' X2 = X1' X X1, whose entries stay below 1 where X blows up.
+    doubtful : X has negative eigenvalues, none of them beyond its error; `semidefinite` is then true.
+    omega : (k,) frequencies [rad/s] of the eigenvalues on the imaginary axis, where those are the reason.
     """
 
     X: np.ndarray | None
     semidefinite: bool
     reason: str = ""
+    doubtful: bool = False
+    omega: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolution:
@@ -48,7 +65,8 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolutio
     poles = _schur_eigenvalues(T)
     on_axis = np.abs(poles.real) <= AXIS_TOLERANCE * np.abs(poles) + 1e-15 * la.norm(H)
     if stable != n or np.any(on_axis):
-        return RiccatiSolution(None, False, ON_AXIS)
+        nearest = np.argsort(np.abs(poles.real) / np.maximum(np.abs(poles), 1e-300))[:4]
+        return RiccatiSolution(None, False, ON_AXIS, omega=np.unique(np.abs(poles[nearest].imag)))
     X1, X2 = U[:n, :n], U[n:, :n]
     gram = X1.T @ X2
     asymmetry = float(la.norm(gram - gram.T, 2))
@@ -61,7 +79,56 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolutio
     X = la.lu_solve((lu, piv), X2.T).T
     X = (X + X.T) / 2 / np.outer(scale, scale)
     # Round-off in the subspace shows in the asymmetry: a negative value of that size proves nothing.
-    return RiccatiSolution(X, lowest >= -max(1e-13 * n, 10 * asymmetry))
+    if lowest >= -max(1e-13 * n, 10 * asymmetry):
+        return RiccatiSolution(X, True)
+    indefinite = _negative_beyond_error(H, U[:, :n])
+    return RiccatiSolution(X, not indefinite, doubtful=not indefinite)
+
+
+def solution_error(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> np.ndarray | None:
+    """E >= 0 with X - E <= true solution <= X + E, to first order in round-off; None where A + R X is not stable."""
+    residual, rounding = _residual(A, R, Q, X)
+    return _error(A + R @ X, np.abs(residual) + rounding)
+
+
+def _residual(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residual of the equation and, entry by entry, what round-off can make of it."""
+    a, r, x = np.abs(A), np.abs(R), np.abs(X)
+    product = A.T @ X
+    size = a.T @ x
+    return product + product.T + X @ R @ X + Q, ROUND_OFF * (size + size.T + x @ r @ x + np.abs(Q))
+
+
+def _error(closed: np.ndarray, size: np.ndarray) -> np.ndarray | None:
+    """E of an error of the residual that is nowhere larger than `size`: a diagonal W of its row sums holds it."""
+    if not np.all(np.isfinite(closed)) or np.max(la.eigvals(closed).real) >= 0:
+        return None
+    with np.errstate(all="ignore"):
+        E = la.solve_continuous_lyapunov(closed.T, -np.diag(np.sum(size, axis=1)))
+    return E if np.all(np.isfinite(E)) else None
+
+
+def _negative_beyond_error(H: np.ndarray, basis: np.ndarray) -> bool:
+    """Whether X = X2 inv(X1) has a negative eigenvalue for certain; basis = [X1; X2] of the stable subspace of H."""
+    n = basis.shape[1]
+    X1, X2 = basis[:n], basis[n:]
+    turn = np.kron(np.array([[1, 1], [-1, 1]]) / np.sqrt(2), np.eye(n))
+    for matrix, top, bottom, low, high in ((H, X1, X2, 0.0, np.inf), (turn @ H @ turn.T, X1 + X2, X2 - X1, -1.0, 1.0)):
+        A, R, Q = matrix[:n, :n], matrix[:n, n:], -matrix[n:, :n]
+        R, Q = (R + R.T) / 2, (Q + Q.T) / 2
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", la.LinAlgWarning)
+            try:
+                X = la.solve(top.T, bottom.T).T
+                X = (X + X.T) / 2
+                # One step of Newton's method brings the residual down to its own round-off.
+                X = X + la.solve_continuous_lyapunov((A + R @ X).T, -_residual(A, R, Q, X)[0])
+                E = solution_error(A, R, Q, X)
+            except (np.linalg.LinAlgError, ValueError):
+                continue
+        if E is not None and (la.eigvalsh(X + E)[0] < low or la.eigvalsh(X - E)[-1] > high):
+            return True
+    return False
 
 
 def _schur_eigenvalues(T: np.ndarray) -> np.ndarray:
