@@ -11,9 +11,11 @@ import pytest
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, library
+from avis_ctrl.gap.realise import Realised, notes_on
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.lti.connect import lft_lower, lft_upper
+from avis_ctrl.lti.statespace import gain
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.study.controllers import classical_skyhook, mu_optimal
@@ -181,9 +183,11 @@ class SensorLowpass(Effect):
 def test_an_effect_without_a_realisation_is_said_to_be_unchecked(monkeypatch, baseline, design, beside, held):
     """A low-pass of 2 Hz in one sensor would matter to any loop; the linear plant does not hold it."""
     monkeypatch.setattr("avis_ctrl.study.gap_design.mu_optimal", lambda asked, plant, rig: (
-        classical_skyhook(plant, rig, asked), SimpleNamespace(status="stand-in")))
+        SimpleNamespace(K=gain(np.zeros((2, 2)))), SimpleNamespace(status="stand-in")))
     same = LoopFigures(True, True, 0.8, 0.79, 3.0, 1.0, 4.0, 2.0, 50.0)
     monkeypatch.setattr("avis_ctrl.study.gap_design.figures", lambda *of: same)
+    monkeypatch.setattr("avis_ctrl.study.gap_design.realise", lambda model: Realised(
+        gain(np.zeros((1, 1))), OMEGA, 0.0, 0.0, notes_on(model)))
     left_out = (active(SensorLowpass(), baseline, "Sz1", (0.08,)),
                 active(library()["cubic_stiffness"], baseline, "isolators z", (1e9,)))
     updated = replace(baseline, effects=left_out)
