@@ -33,8 +33,9 @@ FLOOR = ("vx", "vy", "vz")
 # Effects that act through rig parameters, sensors or drives, and on signals alone.
 _ELSEWHERE = {"com_offset", "product_of_inertia", "geophone_corner", "sensor_gain", "sensor_misalignment",
               "tilt_coupling", "actuator_gain", "actuator_lag", "loop_delay", "base_compliance"}
-_NOTES = {"cubic_stiffness": "linear at rest: without it", "actuator_saturation": "below its limit: without it",
-          "contact_friction": "far below its slip: a spring at every motor",
+# Effects that are nothing in a linear loop about rest.
+_AT_REST = {"cubic_stiffness": "linear at rest: without it", "actuator_saturation": "below its limit: without it"}
+_NOTES = {"contact_friction": "far below its slip: a spring at every motor",
           "structural_damping": "a ladder of passive branches, causal"}
 
 
@@ -60,15 +61,27 @@ class Realised:
     notes: tuple[str, ...]
 
 
-def notes_on(model: TableModel) -> tuple[str, ...]:
-    """What a realisation of these effects approximates or leaves out."""
-    found = []
+def not_realised(model: TableModel) -> dict[str, str]:
+    """Labels of effects of which a realisation holds nothing, and why: no loop with it says anything of them."""
+    found = {}
     for one in model.effects:
         name = one.effect.name
-        if name in _NOTES:
-            found.append(f"{one.label}: {_NOTES[name]}")
+        if name in _AT_REST:
+            found[one.label] = _AT_REST[name]
         elif not (name in _ELSEWHERE or has_addition(one) or one.effect.rig_changes(model, one.place, one.by_name)):
-            found.append(f"{one.label}: it has no realisation and is left out")
+            found[one.label] = "it has no realisation in state space and is left out"
+    return found
+
+
+def notes_on(model: TableModel) -> tuple[str, ...]:
+    """What a realisation of these effects approximates or leaves out."""
+    left_out, found = not_realised(model), []
+    for one in model.effects:
+        name = one.effect.name
+        if one.label in left_out:
+            found.append(f"{one.label}: {left_out[one.label]}")
+        elif name in _NOTES:
+            found.append(f"{one.label}: {_NOTES[name]}")
         if name == "structural_damping" and one.place.endswith("complex"):
             found.append(f"{one.label}: no causal system has a constant loss at every frequency; the causal law "
                          "with the same loss is in its place")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.realise import Realised, realise
+from avis_ctrl.gap.realise import Realised, not_realised, realise
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.lti.norms import hinf_norm
@@ -76,6 +76,8 @@ class DesignEffect:
     in_files, not_in_files : labels of effects that rig.toml and design.toml hold, and of those that only this holds.
     files : contents of rig.toml and design.toml by name: `avis design` runs on them.
     sentences : the outcome first. seconds : wall clock.
+    not_checked : labels of named effects against which no controller was checked, and why: the loops hold nothing of
+        them, so that no figure here says whether they matter.
     """
 
     before: LoopFigures
@@ -89,6 +91,7 @@ class DesignEffect:
     files: dict[str, str]
     sentences: tuple[str, ...]
     seconds: float
+    not_checked: dict[str, str] = field(default_factory=dict)
 
     @property
     def mu_before(self) -> float:
@@ -107,7 +110,7 @@ class DesignEffect:
         loops = {"before": self.before, "after": self.after, "new": self.new}
         return {**{name: asdict(loop) if loop else None for name, loop in loops.items()},
                 "in_files": list(self.in_files), "not_in_files": list(self.not_in_files),
-                "sentences": list(self.sentences), "seconds": self.seconds}
+                "not_checked": dict(self.not_checked), "sentences": list(self.sentences), "seconds": self.seconds}
 
 
 def design_effect(gap: Gap, design: Path | Design | None = None,
@@ -128,12 +131,13 @@ def design_effect(gap: Gap, design: Path | Design | None = None,
     with threadpool_limits(1):
         # The second-order terms of large rotations are nothing at rest.
         before, after = (model.without(f"{LargeMotion.name}@payload") for model in (gap.baseline, gap.updated))
-        return compare_designs(before, after, design_for(gap.baseline.rig, design), progress)
+        signals = [f"{one.name}@{one.location}" for one in getattr(gap, "effects", ()) if not one.label]
+        return compare_designs(before, after, design_for(gap.baseline.rig, design), progress, signals)
 
 
 def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
-                    progress: Progress = lambda text: None) -> DesignEffect:
-    """`design_effect` of two models."""
+                    progress: Progress = lambda text: None, signals: Sequence[str] = ()) -> DesignEffect:
+    """`design_effect` of two models; signals : named effects that add to the signals and are in no model."""
     began = time.monotonic()
     progress("controller for the baseline: mu synthesis")
     plant, asked, rig = plant_of(design, baseline)
@@ -160,10 +164,13 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
             notes.append(f"No controller was found for the updated model: {error}")
     realised = realise(updated)
     files, in_files, not_in_files = start_files(design, updated, when)
-    words = (*_outcome(before, after, new, design.synthesis.target_mu), *notes,
+    left_out = not_realised(updated)
+    not_checked = left_out | dict.fromkeys(signals, "it adds to the signals and is no part of the loop")
+    held = "all" if not left_out else "none" if len(left_out) == len(updated.effects) else "some"
+    words = (*_outcome(before, after, new, design.synthesis.target_mu, held), *_unchecked(not_checked), *notes,
              *_told(realised, design, new_rig, updated, when, in_files, not_in_files))
     return DesignEffect(before, after, new, K, K_new, realised, in_files, not_in_files, files, words,
-                        time.monotonic() - began)
+                        time.monotonic() - began, not_checked)
 
 
 def design_for(rig: Rig, design: Path | Design | None = None) -> Design:
@@ -228,9 +235,19 @@ def start_files(design: Design, model: TableModel, when: float = 0.0
             found.outside)
 
 
-def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | None, target: float | None
-             ) -> list[str]:
-    """mu of the three, in words."""
+def _unchecked(not_checked: dict[str, str]) -> list[str]:
+    """That no figure says anything of these effects; empty where there are none."""
+    if not not_checked:
+        return []
+    each = "; ".join(f"{label}: {why}" for label, why in not_checked.items())
+    return [f"NOT checked: no controller here was designed or judged with {', '.join(not_checked)} ({each}). Whether "
+            f"{'it matters' if len(not_checked) == 1 else 'they matter'} to the design is not known from these "
+            "figures; a simulation or a measurement of the closed loop would tell."]
+
+
+def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | None, target: float | None,
+             held: str = "all") -> list[str]:
+    """mu of the three, in words; held : "all", "some" or "none" of the updated model's effects are in its loop."""
     if after is None:
         return [f"The controller designed on the baseline has mu {before.mu_upper:.3g} there; no named effect "
                 "changes the model, so nothing else was computed."]
@@ -240,7 +257,7 @@ def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | 
         first = f"{said} has {start} and makes the updated model unstable."
     else:
         first = (f"{said} has {start} and {after.mu_upper:.3g} on the updated model: "
-                 f"{_verdict(before.mu_upper, after.mu_upper)}; {_worst_case(before, after)}.")
+                 f"{_verdict(before.mu_upper, after.mu_upper, held)}; {_worst_case(before, after)}.")
     if after.stable and before.stable_in_six and not after.stable_in_six:
         first += " On all six coordinates it makes the updated model unstable, which the locked ones hide."
     if new is None:
@@ -267,13 +284,15 @@ def _worst_case(before: LoopFigures, after: LoopFigures) -> str:
             f"peak and from {before.worst_band_dB:.1f} to {after.worst_band_dB:.1f} dB in the band")
 
 
-def _verdict(before: float, after: float) -> str:
+def _verdict(before: float, after: float, held: str) -> str:
     if before < 1 <= after:
         return "robust performance is lost"
     if after < 1 <= before:
         return "robust performance is reached"
     if abs(after - before) <= 0.02 * before:
-        return "the effect does not matter to it"
+        return {"all": "the effect does not matter to it",
+                "some": "what of the named effects is in this loop does not matter to it",
+                "none": "mu stays because nothing of what was named is in this loop"}[held]
     kept = "robust performance is kept" if after < 1 else "robust performance is missed on both"
     return f"it is {'worse' if after > before else 'better'}, {kept}"
 

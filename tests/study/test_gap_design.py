@@ -10,15 +10,24 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, library
+from avis_ctrl.gap.realise import Realised, notes_on
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.lti.connect import lft_lower, lft_upper
+from avis_ctrl.lti.statespace import gain
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.study.controllers import classical_skyhook, mu_optimal
 from avis_ctrl.study.design_file import read_study
-from avis_ctrl.study.gap_design import PARAMETERS_PERCENT, compare_designs, design_effect, figures, start_files
+from avis_ctrl.study.gap_design import (
+    PARAMETERS_PERCENT,
+    LoopFigures,
+    compare_designs,
+    design_effect,
+    figures,
+    start_files,
+)
 from avis_ctrl.study.gap_plant import carried, plant_of, six_dof_is_stable
 from avis_ctrl.study.identification_design import default_design
 from avis_ctrl.study.plant import build_plant
@@ -154,6 +163,39 @@ def test_drift_is_carried_at_the_moment_asked(baseline, design):
 def test_files_say_what_they_do_not_hold(baseline, design):
     found = carried(design, with_one(baseline, "mount_relaxation", "isolators z", (0.4, 3.0)))
     assert found.inside == () and found.outside == ("mount_relaxation@isolators z",)
+
+
+class SensorLowpass(Effect):
+    """A user's own effect without a state space (docs/own_effect.md)."""
+
+    name, title, looks_like = "sensor_lowpass", "one sensor passes a low-pass", "one output lags"
+
+    def parameters(self, model, place):
+        return (EffectParameter("time_constant_s", "s", "of the low-pass", 0.0, 0.0, 0.1, 1e-3),)
+
+    def change(self, ops, place, values):
+        ops.sense[:, ops.sensor(place)] /= 1 + ops.s * values["time_constant_s"]
+
+
+def test_an_effect_without_a_realisation_is_said_to_be_unchecked(monkeypatch, baseline, design):
+    """A low-pass of 2 Hz in one sensor would matter to any loop; the linear plant does not hold it."""
+    monkeypatch.setattr("avis_ctrl.study.gap_design.mu_optimal", lambda asked, plant, rig: (
+        SimpleNamespace(K=gain(np.zeros((2, 2)))), SimpleNamespace(status="stand-in")))
+    same = LoopFigures(True, True, 0.8, 0.79, 3.0, 1.0, 4.0, 2.0, 50.0)
+    monkeypatch.setattr("avis_ctrl.study.gap_design.figures", lambda *of: same)
+    monkeypatch.setattr("avis_ctrl.study.gap_design.realise", lambda model: Realised(
+        gain(np.zeros((1, 1))), OMEGA, 0.0, 0.0, notes_on(model)))
+    left_out = (active(SensorLowpass(), baseline, "Sz1", (0.08,)),
+                active(library()["cubic_stiffness"], baseline, "isolators z", (1e9,)))
+    updated = replace(baseline, effects=left_out)
+    hum = SimpleNamespace(name="mains_hum", location="geophones", label="")
+    found = design_effect(SimpleNamespace(baseline=baseline, updated=updated, effects=(hum,)), design)
+    assert set(found.not_checked) == {"sensor_lowpass@Sz1", "cubic_stiffness@isolators z", "mains_hum@geophones"}
+    assert "nothing of what was named is in this loop" in found.sentences[0]
+    assert "the effect does not matter" not in " ".join(found.sentences)
+    said = next(one for one in found.sentences if one.startswith("NOT checked"))
+    assert all(label in said for label in found.not_checked) and "no realisation" in said
+    assert found.to_json()["not_checked"] == found.not_checked
 
 
 def test_two_ways_to_the_same_limit_of_stability(rig, baseline, design):
