@@ -133,7 +133,7 @@ def averaged(campaign: Campaign, band_Hz: tuple[float, float]) -> FrequencyRespo
     """
     if sum(record.header.duration_s * (band_Hz[1] - band_Hz[0]) for record in campaign.records) <= MOST_LINES:
         return None
-    return local_polynomial(campaign, band_Hz=band_Hz, apart=True, longest_piece=LONGEST_PIECE)
+    return local_polynomial(campaign, band_Hz=band_Hz, apart=True, longest_piece=LONGEST_PIECE, partial=True)
 
 
 def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float]

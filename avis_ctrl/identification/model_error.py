@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.identification.excited_space import excited_space
 from avis_ctrl.identification.prediction import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
@@ -63,12 +64,10 @@ def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[f
     """The frequency response as the records have it: the model's, and what it leaves unexplained.
 
     Windows of the local polynomial grow until the inputs can be told apart in each: with zippered lines each input has
-    only some of them. What is left is smooth, which wide windows need.
+    only some of them. What is left is smooth, which wide windows need. Inputs that no window tells apart, as drives that
+    are played together along six axes, leave a singular Gram matrix: the response is known along what they span.
 
-    Raises
-    ------
-    InputError : as `unexplained` and `local_polynomial`.
-    ComputationError : inputs that cannot be told apart.
+    Raises InputError as `unexplained` and `local_polynomial` do.
     """
     left = _local(unexplained(campaign, model), band_Hz, longest_piece, frequency_Hz)
     response = model.response(left.omega)[:, :, [model.inputs.index(name) for name in left.inputs]]
@@ -80,11 +79,13 @@ def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[f
 
 def _local(campaign: Campaign, band_Hz: tuple[float, float], longest_piece: int | None,
            frequency_Hz: np.ndarray | None) -> FrequencyResponse:
-    for half_width in HALF_WIDTHS[:-1]:
+    # Directions that the records do not play at all are missing in windows of any width.
+    widths = HALF_WIDTHS if excited_space(campaign, band_Hz).full else HALF_WIDTHS[:1]
+    for half_width in widths:
         try:
             return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=half_width,
                                     longest_piece=longest_piece)
         except ComputationError:
             continue
-    return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=HALF_WIDTHS[-1],
-                            longest_piece=longest_piece)
+    return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=widths[-1],
+                            longest_piece=longest_piece, partial=True)
