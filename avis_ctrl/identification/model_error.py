@@ -38,12 +38,12 @@ class Unexplained(RecordSource):
         if abs(h.sample_rate_Hz * model.period_s - 1) > 1e-6:
             raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
                              field=f"record {h.name}: sample_rate_Hz")
-        self.predictor, self.at = Predictor(model), 0
+        self.predictor, self.at = Predictor(model, large_motion=True), 0
 
     def load(self, start: int = 0, stop: int | None = None) -> Record:
         stop = self.header.samples if stop is None else stop
         if start < self.at:
-            self.predictor, self.at = Predictor(self.model), 0
+            self.predictor, self.at = Predictor(self.model, large_motion=True), 0
         piece = self.record.load(self.at, stop)
         read = self.predictor.read(*model_inputs(self.model, piece))
         keep, self.at = slice(start - self.at, None), stop
@@ -64,8 +64,8 @@ def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[f
     """The frequency response as the records have it: the model's, and what it leaves unexplained.
 
     Windows of the local polynomial grow until the inputs can be told apart in each: with zippered lines each input has
-    only some of them. What is left is smooth, which wide windows need. Inputs that no window tells apart, as drives that
-    are played together along six axes, leave a singular Gram matrix: the response is known along what they span.
+    only some of them. What is left is smooth, which wide windows need. Inputs that no window tells apart, as drives
+    that are played together along six axes, leave a singular Gram matrix: the response is known along what they span.
 
     Raises InputError as `unexplained` and `local_polynomial` do.
     """

@@ -177,7 +177,7 @@ def _played(measured: FrequencyResponse, at: Sequence[int]) -> np.ndarray:
     """(k, r) orthonormal proportions of the inputs `at` whose response is known on the line that knows most."""
     if measured.gram is None:
         return np.eye(len(at))
-    inverse, inside = measured.inverse_gram()
+    _, inside = measured.inverse_gram()
     line = int(np.argmax(np.real(np.trace(inside, axis1=1, axis2=2))))
     left, s, _ = np.linalg.svd(measured.gram[line][np.ix_(at, at)].real)
     known = left[:, s > SPANNED ** 2 * s[0]]

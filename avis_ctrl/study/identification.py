@@ -19,7 +19,6 @@ from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification.campaign_fit import (
     CampaignFit,
     Split,
-    averaged,
     driven_inputs,
     excited_band,
     fit_campaign,
@@ -38,7 +37,6 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.validation import Validation, validate
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 from avis_ctrl.measurement.gates import Expectation, Finding, examine
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
@@ -227,12 +225,7 @@ def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions):
         return None, *_divided_lines(measured.between(*band)), band
     split = split_campaign(measured, options.hold_out)
     band = options.band_Hz or excited_band(split.fitted)
-    fitted = averaged(split.fitted, band)
-    if fitted is None:
-        return split, split.fitted, split.held_out, band
-    # The records of the other side may be short: their responses are what can be compared.
-    held_out = averaged(split.held_out, band) or local_polynomial(split.held_out, band_Hz=band, partial=True)
-    return split, fitted, held_out, band
+    return split, split.fitted, split.held_out, band
 
 
 def _divided_lines(measured: FrequencyResponse) -> tuple[FrequencyResponse, FrequencyResponse]:
