@@ -16,12 +16,16 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial, noise_covariance
+from avis_ctrl.measurement.frequency_response.local_polynomial import noise_covariance
 
 # Longer records are cut: their spectra would fill the memory and their lines say the same.
 LONGEST_PIECE = 1 << 18
-# Spectral lines of all records together that are fitted one by one; more are averaged into frequency responses.
+# Spectral lines of all records together that are fitted: their derivatives by some thirty parameters fit into memory
+# (0.2 GB), and no rig of a few dozen parameters needs more. Of more, those without drive are left out first, then some
+# drawn at random: averaged into frequency responses they would round off the resonances.
 MOST_LINES = 60_000
+# Amplitude of a line's drive over that of the record's strongest line, below which it counts as silent.
+SILENT_LINE = 1e-3
 # Where no input says what band is excited.
 QUIET_BAND_Hz = (0.5, 60.0)
 # Share of an input's power that may lie below, and above, the band of the fit.
@@ -125,25 +129,28 @@ def excited_band(campaign: Campaign) -> tuple[float, float]:
     return max(low, 0.2), min(high, campaign.sample_rate_Hz / 4)
 
 
-def averaged(campaign: Campaign, band_Hz: tuple[float, float]) -> FrequencyResponse | None:
-    """Frequency responses in the place of records that hold more lines than are fitted one by one; None otherwise.
-
-    Made piece by piece: of records of any length only one piece is in memory. A fit counts frequencies as independent,
-    which windows that overlap are not: those taken here do not.
-    """
-    if sum(record.header.duration_s * (band_Hz[1] - band_Hz[0]) for record in campaign.records) <= MOST_LINES:
-        return None
-    return local_polynomial(campaign, band_Hz=band_Hz, apart=True, longest_piece=LONGEST_PIECE)
+def _fewer(block: SpectralBlock, share: float, crowded: bool, rng: np.random.Generator) -> SpectralBlock:
+    """A share of a block's driven lines, drawn at random, where a campaign is `crowded`; else the block as it is."""
+    power = np.sum(np.abs(block.U) ** 2, axis=(1, 2))
+    if not crowded or not np.any(power):
+        return block
+    driven = np.flatnonzero(power > SILENT_LINE ** 2 * power.max())
+    count = max(round(share * len(driven)), min(len(driven), 10))
+    return block.lines(np.sort(rng.choice(driven, min(count, len(driven)), replace=False)))
 
 
 def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float]
                     ) -> tuple[list[SpectralBlock], list[str]]:
     """Spectral blocks of every record, long ones in pieces, and sentences on what was left out."""
-    blocks = []
+    width = band_Hz[1] - band_Hz[0]
+    lines = [record.header.duration_s * width for record in campaign.records]
+    driven = [n / max(record.header.periods, 1) for n, record in zip(lines, campaign.records, strict=True)]
+    crowded, share = sum(lines) > MOST_LINES, min(MOST_LINES / max(sum(driven), 1.0), 1.0)
+    blocks, rng = [], np.random.default_rng(0)
     for record in campaign.records:
         for piece in record.pieces(max(LONGEST_PIECE, record.header.period_samples or 0)):
-            if piece.header.duration_s * (band_Hz[1] - band_Hz[0]) > 10:
-                blocks.append(record_block(piece, model, band_Hz))
+            if piece.header.duration_s * width > 10:
+                blocks.append(_fewer(record_block(piece, model, band_Hz), share, crowded, rng))
     if not blocks:
         raise InputError("expected a band that holds more than 10 lines of a record", field="band_Hz", value=band_Hz)
     # A record without input or measured floor says nothing of the response.
@@ -152,18 +159,37 @@ def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[flo
         raise InputError("expected a record that drives an actuator, or one with the floor measured", field="records")
     quiet = sorted({b.name for b in blocks} - {b.name for b in useful})
     said = [f"records at rest with the floor not measured ({', '.join(quiet)}) tell of the noise only"] if quiet else []
+    if crowded:
+        chosen = f", of which {100 * share:.3g} % at random" if share < 1 else ""
+        said.append(f"{sum(len(block.omega) for block in useful)} of {sum(lines):.0f} lines are fitted: those with "
+                    f"drive{chosen}")
     return useful, said
 
 
 def weighted(blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple[float, float]
              ) -> tuple[list[SpectralBlock], str, bool]:
     """The blocks with the noise that a local model measures, whatever the rig's; a sentence, and whether it did."""
+    known: dict[str, tuple[np.ndarray, SpectralBlock]] = {}
     try:
-        found = [measured_noise(campaign, block, band_Hz) for block in blocks]
+        found = []
+        for block in blocks:
+            if block.kind not in known:
+                # On the lines of all its kind at once: the local model is that of the whole campaign.
+                omega = np.unique(np.concatenate([one.omega for one in blocks if one.kind == block.kind]))
+                known[block.kind] = omega, measured_noise(campaign, _lines_only(block, omega), band_Hz)
+            omega, like = known[block.kind]
+            assert like.noise is not None
+            found.append(block.with_noise(like.noise[np.searchsorted(omega, block.omega)], like.dof))
     except AvisError as error:
         return relative_noise(blocks), f"no measured noise covariance ({error}); lines weigh alike at first", False
     return found, (f"noise covariance measured by a local polynomial model, {found[0].dof:.0f} degrees of freedom a "
                    "line"), True
+
+
+def _lines_only(block: SpectralBlock, omega: np.ndarray) -> SpectralBlock:
+    """A block of that kind on other lines, without data."""
+    return replace(block, omega=omega, U=np.zeros((len(omega), block.U.shape[1], 1)),
+                   Y=np.zeros((len(omega), block.Y.shape[1], 1)))
 
 
 def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:

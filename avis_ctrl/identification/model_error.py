@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.identification.excited_space import excited_space
 from avis_ctrl.identification.prediction import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
@@ -37,12 +38,12 @@ class Unexplained(RecordSource):
         if abs(h.sample_rate_Hz * model.period_s - 1) > 1e-6:
             raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
                              field=f"record {h.name}: sample_rate_Hz")
-        self.predictor, self.at = Predictor(model), 0
+        self.predictor, self.at = Predictor(model, large_motion=True), 0
 
     def load(self, start: int = 0, stop: int | None = None) -> Record:
         stop = self.header.samples if stop is None else stop
         if start < self.at:
-            self.predictor, self.at = Predictor(self.model), 0
+            self.predictor, self.at = Predictor(self.model, large_motion=True), 0
         piece = self.record.load(self.at, stop)
         read = self.predictor.read(*model_inputs(self.model, piece))
         keep, self.at = slice(start - self.at, None), stop
@@ -63,12 +64,10 @@ def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[f
     """The frequency response as the records have it: the model's, and what it leaves unexplained.
 
     Windows of the local polynomial grow until the inputs can be told apart in each: with zippered lines each input has
-    only some of them. What is left is smooth, which wide windows need.
+    only some of them. What is left is smooth, which wide windows need. Inputs that no window tells apart, as drives
+    that are played together along six axes, leave a singular Gram matrix: the response is known along what they span.
 
-    Raises
-    ------
-    InputError : as `unexplained` and `local_polynomial`.
-    ComputationError : inputs that cannot be told apart.
+    Raises InputError as `unexplained` and `local_polynomial` do.
     """
     left = _local(unexplained(campaign, model), band_Hz, longest_piece, frequency_Hz)
     response = model.response(left.omega)[:, :, [model.inputs.index(name) for name in left.inputs]]
@@ -80,11 +79,13 @@ def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[f
 
 def _local(campaign: Campaign, band_Hz: tuple[float, float], longest_piece: int | None,
            frequency_Hz: np.ndarray | None) -> FrequencyResponse:
-    for half_width in HALF_WIDTHS[:-1]:
+    # Directions that the records do not play at all are missing in windows of any width.
+    widths = HALF_WIDTHS if excited_space(campaign, band_Hz).full else HALF_WIDTHS[:1]
+    for half_width in widths:
         try:
             return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=half_width,
                                     longest_piece=longest_piece)
         except ComputationError:
             continue
-    return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=HALF_WIDTHS[-1],
-                            longest_piece=longest_piece)
+    return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=widths[-1],
+                            longest_piece=longest_piece, partial=True)

@@ -9,10 +9,12 @@ import numpy as np
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification import model_error
 from avis_ctrl.identification.campaign_fit import LONGEST_PIECE, Portion
-from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.response import FLOOR, ResponseModel
+from avis_ctrl.identification.spread import kept_axes
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
+from avis_ctrl.rigs.rigid_body import COORDINATES
 
 # Frequencies of a figure.
 POINTS = 400
@@ -20,7 +22,7 @@ POINTS = 400
 
 @dataclass(frozen=True, eq=False)
 class ResponseOverlay:
-    """From each driven input to each output.
+    """From each driven input to each output; where drives were not played apart, from forces along the coordinates.
 
     Attributes
     ----------
@@ -55,20 +57,23 @@ class ResponseOverlay:
 
 def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseModel, covariance: np.ndarray
             ) -> ResponseOverlay:
-    """Plain arrays for figures at the response's own frequencies.
+    """Plain arrays for figures at the response's own frequencies, on the lines where it is known.
 
     Raises
     ------
-    InputError : inputs or outputs that the model does not have.
+    InputError : inputs or outputs that the model does not have; a response that is known along no coordinate.
     """
     if missing := [name for name in measured.inputs if name not in model.inputs]:
         raise InputError(f"the model's inputs are {', '.join(model.inputs)}", field="inputs", value=missing)
+    V = np.eye(len(model.inputs))[:, [model.inputs.index(name) for name in measured.inputs]]
+    if not np.any(np.all(measured.spanned(np.eye(len(measured.inputs))), axis=1)):
+        measured, V = _along_coordinates(measured, model)
+    else:
+        measured = measured.at(np.all(measured.spanned(np.eye(len(measured.inputs))), axis=1))
     if missing := [name for name in model.sensors.names if name not in measured.outputs]:
         raise InputError(f"the response has {', '.join(measured.outputs)}", field="outputs", value=missing)
-    columns = [model.inputs.index(name) for name in measured.inputs]
     rows = [measured.outputs.index(name) for name in model.sensors.names]
-    U = np.broadcast_to(np.eye(len(model.inputs), dtype=complex)[:, columns],
-                        (len(measured.omega), len(model.inputs), len(columns)))
+    U = np.broadcast_to(V.astype(complex), (len(measured.omega), *V.shape))
     found = model.driven(measured.omega, U)
     with np.errstate(divide="ignore", invalid="ignore"):
         # d log G = d|G| / |G| + j d phase
@@ -80,6 +85,30 @@ def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseMo
         f"{measured.output_unit} per {measured.input_unit}", measured.value[:, rows],
         measured.standard_deviation[:, rows] / np.sqrt(2), start.driven(measured.omega, U, False).Y, found.Y,
         spread[0] * np.abs(found.Y), spread[1], measured.method)
+
+
+def _along_coordinates(measured: FrequencyResponse, model: ResponseModel) -> tuple[FrequencyResponse, np.ndarray]:
+    """The response to forces along the coordinates (of rotations at the edge) and to the floor, as far as the inputs
+    span them; and what these are of the model's inputs (n_u + 3, k)."""
+    columns, names = [], []
+    for axis in COORDINATES:
+        try:
+            volts, _ = kept_axes(model.rig, (axis,), model.actuators, model.sensors.names)
+        except InputError:
+            continue
+        columns.append(np.concatenate([volts[:, 0], np.zeros(len(FLOOR))]))
+        names.append(f"force on {axis}")
+    for k, name in enumerate(FLOOR):
+        columns.append(np.eye(len(model.inputs))[len(model.actuators) + k])
+        names.append(name)
+    V = np.array(columns).T
+    place = [model.inputs.index(name) for name in measured.inputs]
+    absent = [k for k in range(len(V)) if k not in place]
+    known = np.median(measured.spanned(V[place]), axis=0) >= 0.5
+    known &= ~np.any(V[absent], axis=0)
+    chosen = [name for name, one in zip(names, known, strict=True) if one]
+    unit = "N" + (f";{measured.input_unit.partition(';')[2]}" if any(name in FLOOR for name in chosen) else "")
+    return measured.along(V[place][:, known], tuple(chosen), unit), V[:, known]
 
 
 def measured_response(data: Campaign | FrequencyResponse, band_Hz: tuple[float, float], model: ResponseModel

@@ -2,6 +2,8 @@
 
 Between samples the voltage is held and the floor's velocity is a straight line, so that the step of the linear table
 with its sensor chains is exact (Van Loan 1978); a delay that is no whole number of samples divides the step in two.
+The second-order terms of the table's rotations act beside them as accelerations that are extended in a straight line
+from one sample to the next, as the simulator does it (`simulation.kernel`).
 """
 
 from __future__ import annotations
@@ -12,12 +14,14 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.identification.large_motion import March, arrays_of, march, march_linear, sensors_of
 from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.measurement.campaign import Record
 
 
 class Continuous(NamedTuple):
-    """x' = A x + B (u, w), y = C x + D (u, w): volts u at the motors, floor velocity w (3) [m/s]."""
+    """x' = A x + B (u, w, e), y = C x + D (u, w, e): volts u at the motors, floor velocity w (3) [m/s], and, where
+    asked for, accelerations e: of the payload (6), and beside it read by the sensors (n_y)."""
 
     A: np.ndarray
     B: np.ndarray
@@ -25,32 +29,47 @@ class Continuous(NamedTuple):
     D: np.ndarray
 
 
-def continuous(model: ResponseModel) -> Continuous:
-    """States q, q', displacement of the floor, and those of each sensor's chain (and of each amplifier)."""
+def continuous(model: ResponseModel, beside: bool = False) -> Continuous:
+    """States q, q', displacement of the floor, and those of each sensor's chain (and of each amplifier).
+
+    beside : with inputs e, whose readings add integrators in front of the chains as states behind the amplifiers.
+    """
     m, n_u, rows = model.matrices, len(model.actuators), model.matrices.R
     body = la.solve(m.M, np.hstack([-m.K, -m.C, m.K_floor[:, :3], m.T, m.C_floor[:, :3]]))
     chain, gains = model.sensors.chain, model.sensors.sensitivity
     n_c, n_y = (0 if chain is None else chain.nstates), len(rows)
     corner = 2 * np.pi * model.amplifier_corner_Hz if model.amplifier_corner_Hz else None
     n_a = n_u if corner else 0
-    n, size = 15, 15 + n_c * n_y + n_a
-    amplifiers, volts = slice(size - n_a, size), slice(0, n_u)
-    A, B = np.zeros((size, size)), np.zeros((size, n_u + 3))
+    n, plain = 15, 15 + n_c * n_y + n_a
+    integrations = {"displacement": 2, "velocity": 1, "acceleration": 0}[model.sensors.motion] if beside else 0
+    size, n_in, n_e = plain + integrations * n_y, n_u + 3, 6 + n_y if beside else 0
+    amplifiers, volts = slice(plain - n_a, plain), slice(0, n_u)
+    A, B = np.zeros((size, size)), np.zeros((size, n_in + n_e))
     A[:6, 6:12], A[6:12, :15] = np.eye(6), body[:, :15]
-    B[6:12, n_u:], B[12:15, n_u:] = body[:, 15 + n_u:], np.eye(3)
+    B[6:12, n_u:n_in], B[12:15, n_u:n_in] = body[:, 15 + n_u:], np.eye(3)
+    if beside:
+        B[6:12, n_in:n_in + 6] = np.eye(6)
+    if integrations:
+        # The last of a sensor's integrators is the motion that its chain takes in.
+        A[plain:plain + (integrations - 1) * n_y, plain + n_y:] = np.eye((integrations - 1) * n_y)
+        B[size - n_y:, n_in + 6:] = np.eye(n_y)
     if corner:
         A[6:12, amplifiers] = body[:, 15:15 + n_u]
         A[amplifiers, amplifiers], B[amplifiers, volts] = -corner * np.eye(n_u), corner * np.eye(n_u)
     else:
         B[6:12, volts] = body[:, 15:15 + n_u]
     # The motion that the sensors take in, along their axes.
-    motion = {"displacement": (np.eye(size)[:6], np.zeros((6, n_u + 3))),
-              "velocity": (np.eye(size)[6:12], np.zeros((6, n_u + 3))),
+    motion = {"displacement": (np.eye(size)[:6], np.zeros((6, n_in + n_e))),
+              "velocity": (np.eye(size)[6:12], np.zeros((6, n_in + n_e))),
               "acceleration": (A[6:12], B[6:12])}[model.sensors.motion]
     seen_x, seen_e = rows @ motion[0], rows @ motion[1]
+    if integrations:
+        seen_x[:, plain:plain + n_y] += np.eye(n_y)
+    elif beside:
+        seen_e[:, n_in + 6:] += np.eye(n_y)
     if chain is None:
         return Continuous(A, B, gains[:, None] * seen_x, gains[:, None] * seen_e)
-    C, D = np.zeros((n_y, size)), np.zeros((n_y, n_u + 3))
+    C, D = np.zeros((n_y, size)), np.zeros((n_y, n_in + n_e))
     for k in range(n_y):
         own = slice(n + n_c * k, n + n_c * (k + 1))
         A[own, own] = chain.A
@@ -66,12 +85,14 @@ class Predictor:
     """Reads of the sensors of a model that starts at rest, piece after piece.
 
     A floor that was not measured counts as still. Nothing is rounded or clipped.
+
+    large_motion : with the second-order terms of the table's rotations, motors and sensors as `model.turning` says.
     """
 
-    def __init__(self, model: ResponseModel):
+    def __init__(self, model: ResponseModel, large_motion: bool = False):
         if not model.period_s:
             raise InputError("expected a model with a sample time", field="period_s", value=model.period_s)
-        self.model, self.system = model, continuous(model)
+        self.model, self.system = model, continuous(model, large_motion)
         whole, part = divmod(model.delay_s / model.period_s, 1.0)
         if part > 1 - 1e-9:
             whole, part = whole + 1, 0.0
@@ -82,9 +103,28 @@ class Predictor:
         # In the first part of a period the older voltage still acts; the floor's line runs over the whole of it.
         whole_step = self._step(1.0)
         self.old, self.new = late[0] @ early[1][:, :n_u], late[1][:, :n_u]
-        self.floor, self.ramp = whole_step[1][:, n_u:], whole_step[2][:, n_u:]
+        self.floor, self.ramp = (step[:, n_u:n_u + 3] for step in whole_step[1:])
+        self.part = part
         self.x = np.zeros(len(self.Phi))
         self.pending = np.zeros((self.whole + 1, n_u))
+        self.table: March | None = None
+        if large_motion:
+            held, rising = (np.ascontiguousarray(step[:, n_u + 3:]) for step in whole_step[1:])
+            self.table, self.arrays = self._march(held, rising), arrays_of(model.rig)
+            self.before, self.started = np.zeros(6 + len(model.sensors.names)), False
+
+    def _march(self, held: np.ndarray, rising: np.ndarray) -> March:
+        model, m = self.model, self.model.matrices
+        n_u, corner = len(model.actuators), model.amplifier_corner_Hz
+        known = [one.name for one in model.rig.mounted_body().actuators]
+        chain = model.sensors.chain
+        first = 15 + (0 if chain is None else chain.nstates) * len(model.sensors.names) if corner else -1
+        body = la.solve(m.M, np.hstack([-m.K, -m.C, m.K_floor[:, :3], m.T, m.C_floor[:, :3]]))
+        parts = (np.ascontiguousarray(one) for one in (body[:, :15], body[:, 15:15 + n_u], body[:, 15 + n_u:]))
+        return March(np.ascontiguousarray(self.Phi), held, rising, *parts, first,
+                     np.array([known.index(name) for name in model.actuators], np.int64),
+                     np.ascontiguousarray(la.inv(m.M)), *sensors_of(model.rig, model.sensors.names),
+                     float(model.turning.motors), float(model.turning.sensors))
 
     def _step(self, fraction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Over a fraction of a period: e^(A h), and what a constant and a rising unit line add."""
@@ -108,18 +148,26 @@ class Predictor:
             w[:-1], w[-1] = floor, floor[-1]
             drive += w[:-1] @ self.floor.T + np.diff(w, axis=0) @ self.ramp.T
         x = np.empty((n, len(self.x)))
-        for k in range(n):
-            x[k] = self.x
-            self.x = self.Phi @ self.x + drive[k]
         acting = new if not np.any(self.old) else old
+        inputs = [acting, w[:-1]]
+        if self.table is None:
+            march_linear(drive, self.x, self.Phi, x)
+        else:
+            beside = np.empty((n, len(self.before)))
+            march(drive, np.ascontiguousarray(self.part * old + (1 - self.part) * new), w[:-1], self.x, self.before,
+                  self.started, self.table, self.arrays, x, beside)
+            self.started = self.started or n > 0
+            inputs.append(beside)
         y = x @ self.system.C.T
         if np.any(self.system.D):
-            y = y + np.hstack([acting, w[:-1]]) @ self.system.D.T
+            y = y + np.hstack(inputs) @ self.system.D.T
         return y
 
 
-def predict(model: ResponseModel, record: Record) -> np.ndarray:
+def predict(model: ResponseModel, record: Record, large_motion: bool = True) -> np.ndarray:
     """(samples, n_y) what the model reads in a record that starts at rest, in the unit of y.
+
+    large_motion : with the second-order terms of the table's rotations.
 
     Raises
     ------
@@ -129,7 +177,7 @@ def predict(model: ResponseModel, record: Record) -> np.ndarray:
     if abs(h.sample_rate_Hz * model.period_s - 1) > 1e-6:
         raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
                          field=f"record {h.name}: sample_rate_Hz")
-    return Predictor(model).read(*model_inputs(model, record))
+    return Predictor(model, large_motion).read(*model_inputs(model, record))
 
 
 def model_inputs(model: ResponseModel, record: Record) -> tuple[np.ndarray, np.ndarray | None]:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
 from avis_ctrl.identification.sampling import Motion, aliases, hold
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.converter import Converter
@@ -118,6 +119,7 @@ class ResponseModel:
     sensors : as `sensor_model`. actuators : inputs that records drive, by default all.
     period_s, delay_s : hold and loop delay; period_s = 0 for responses measured against the voltage itself.
     amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
+    turning : what turns with the payload, in the second-order terms of a prediction in time; the response is linear.
 
     Raises
     ------
@@ -131,6 +133,7 @@ class ResponseModel:
     period_s: float
     delay_s: float
     amplifier_corner_Hz: float | None = None
+    turning: Turning = AS_SIMULATED
 
     def __post_init__(self) -> None:
         known = self._known

@@ -18,6 +18,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.response import FLOOR, N_Q, ResponseModel
 from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.frequency_response.response import GRAM_TOLERANCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,11 +108,11 @@ def response_block(measured: FrequencyResponse, model: ResponseModel, name: str 
     """A measured frequency response, weighted by its covariance.
 
     Where neighbouring lines share their data, each is given a covariance as many times larger: together they then hold
-    the information that they have.
+    the information that they have. Directions that the inputs do not span on a line hold none: their columns are zero.
 
     Raises
     ------
-    InputError : channels or units that are not the model's, a Gram matrix that is not positive definite.
+    InputError : channels or units that are not the model's, a Gram matrix with negative eigenvalues.
     """
     if measured.output_unit != model.sensors.unit:
         raise InputError(f"expected {model.sensors.unit}", field="unit of the response's outputs",
@@ -122,10 +123,7 @@ def response_block(measured: FrequencyResponse, model: ResponseModel, name: str 
     rows = [measured.outputs.index(one) for one in model.sensors.names]
     if measured.entry_variance is None:
         assert measured.gram is not None and measured.noise is not None
-        try:
-            W = np.linalg.cholesky(measured.gram)
-        except np.linalg.LinAlgError:
-            raise InputError("expected inputs that excite every column on every line", field="gram") from None
+        W = _root(measured.gram)
         noise = measured.noise[:, None][:, :, rows][:, :, :, rows]
     else:
         W = np.broadcast_to(np.eye(n_in, dtype=complex), (n, n_in, n_in))
@@ -135,6 +133,25 @@ def response_block(measured: FrequencyResponse, model: ResponseModel, name: str 
     _place(U, measured.inputs, model.inputs, W, "inputs")
     return SpectralBlock(name, measured.omega, U, measured.value[:, rows] @ W, noise * measured.shared, measured.dof,
                          kind=name, shared=measured.shared)
+
+
+def _root(gram: np.ndarray) -> np.ndarray:
+    """(n, n_u, n_u) W with W W^H = gram, which may be singular; inputs are brought to unit size before, for units
+    differ by orders.
+
+    Raises InputError for eigenvalues that are negative beyond round-off.
+    """
+    try:
+        return np.linalg.cholesky(gram)
+    except np.linalg.LinAlgError:
+        pass
+    size = np.sqrt(np.maximum(np.real(np.einsum("nii->ni", gram)), 0.0))
+    safe = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(gram / (safe[:, :, None] * safe[:, None, :]))
+    if np.any(values < -1e-9 * np.maximum(values[:, -1:], np.finfo(float).tiny)):
+        raise InputError("expected a Gram matrix without negative eigenvalues", field="gram")
+    kept = np.where(values > GRAM_TOLERANCE * values[:, -1:], values, 0.0)
+    return safe[:, :, None] * vectors * np.sqrt(kept)[:, None, :]
 
 
 def _place(into: np.ndarray, names: Sequence[str], known: Sequence[str], values: np.ndarray, field: str,

@@ -23,6 +23,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.frequency_response.response import SPANNED
 from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.rig import Rig
 
@@ -109,17 +110,22 @@ def frf_spread(measured: FrequencyResponse, model: ResponseModel, keep: Sequence
     model : at the identified parameters.
     confidences : shares of repeated measurements in which a bound holds at a line.
 
+    Where the records do not play every drive by itself, the kept coordinates are pushed by what they do play; lines on
+    which that is not known are left out.
+
     Raises
     ------
     InputError : a confidence outside 0 .. 1, channels or units that are not the model's, coordinates that the
-        channels cannot push or tell apart.
+        channels cannot push or tell apart, or that the records do not push.
     """
     if not confidences or not all(0 < one < 1 for one in confidences):
         raise InputError("expected shares between 0 and 1", field="confidences", value=list(confidences))
-    rows, columns = _channels(measured, model)
+    rows, drives = _channels(measured, model)
     A, D = kept_axes(model.rig, keep, model.actuators, model.sensors.names)
     D = D / model.sensors.sensitivity
-    response = model.response(measured.omega)[:, :, :len(model.actuators)]
+    measured, A = _pushed(measured, model, A, keep)
+    columns = [measured.inputs.index(model.actuators[k]) for k in drives]
+    response = model.response(measured.omega)[:, :, drives]
     G_k = D @ response @ A
     L = np.linalg.solve(G_k, D @ (measured.value[:, rows][:, :, columns] - response) @ A)
     left = np.linalg.solve(G_k, np.broadcast_to(D, (len(G_k), *D.shape)))
@@ -139,17 +145,58 @@ def largest_singular_value(L: np.ndarray) -> np.ndarray:
     return np.linalg.norm(L, ord=2, axis=(-2, -1))
 
 
+def _pushed(measured: FrequencyResponse, model: ResponseModel, A: np.ndarray, keep: Sequence[str]
+            ) -> tuple[FrequencyResponse, np.ndarray]:
+    """The lines on which the response to the kept coordinates is known, and how the measured drives push along them.
+
+    That is A (n_u, k) as a design would have it, in the order of those drives, where the records hold it; otherwise
+    the least of what they play that makes the same forces.
+    """
+    drives = [k for k, name in enumerate(model.actuators) if name in measured.inputs]
+    at = [measured.inputs.index(model.actuators[k]) for k in drives]
+
+    def known(volts: np.ndarray) -> np.ndarray:
+        V = np.zeros((len(measured.inputs), volts.shape[1]))
+        V[at] = volts
+        return np.all(measured.spanned(V), axis=1)
+    own = A[drives]
+    lines = known(own) if len(drives) == len(A) else np.zeros(len(measured.frequency_Hz), bool)
+    if not np.any(lines):
+        T = model.matrices.T
+        played = _played(measured, at)
+        own = played @ np.linalg.pinv(T[:, drives] @ played, rcond=1e-9) @ (T @ A)
+        made = np.linalg.norm(T[:, drives] @ own - T @ A, axis=0) < 1e-6 * np.linalg.norm(T @ A, axis=0)
+        lines = known(own)
+        if not np.all(made) or not np.any(lines):
+            raise InputError("expected records that push along each of them by themselves", field="keep",
+                             value=[name for name, one in zip(keep, made, strict=True) if not one] or list(keep))
+    return measured.at(lines), own
+
+
+def _played(measured: FrequencyResponse, at: Sequence[int]) -> np.ndarray:
+    """(k, r) orthonormal proportions of the inputs `at` whose response is known on the line that knows most."""
+    if measured.gram is None:
+        return np.eye(len(at))
+    _, inside = measured.inverse_gram()
+    line = int(np.argmax(np.real(np.trace(inside, axis1=1, axis2=2))))
+    left, s, _ = np.linalg.svd(measured.gram[line][np.ix_(at, at)].real)
+    known = left[:, s > SPANNED ** 2 * s[0]]
+    return known
+
+
 def _channels(measured: FrequencyResponse, model: ResponseModel) -> tuple[list[int], list[int]]:
+    """Rows of the model's sensors in the response, and which of the model's actuators it has."""
     if measured.output_unit != model.sensors.unit:
         raise InputError(f"expected {model.sensors.unit}", field="unit of the response's outputs",
                          value=measured.output_unit)
-    for field, wanted, given in (("outputs", model.sensors.names, measured.outputs),
-                                 ("inputs", model.actuators, measured.inputs)):
-        if missing := [name for name in wanted if name not in given]:
-            raise InputError(f"expected a response with {', '.join(wanted)}; {', '.join(missing)} missing",
-                             field=field, value=list(given))
-    return ([measured.outputs.index(name) for name in model.sensors.names],
-            [measured.inputs.index(name) for name in model.actuators])
+    if missing := [name for name in model.sensors.names if name not in measured.outputs]:
+        raise InputError(f"expected a response with {', '.join(model.sensors.names)}; {', '.join(missing)} missing",
+                         field="outputs", value=list(measured.outputs))
+    drives = [k for k, name in enumerate(model.actuators) if name in measured.inputs]
+    if not drives:
+        raise InputError(f"expected a response to some of {', '.join(model.actuators)}", field="inputs",
+                         value=list(measured.inputs))
+    return [measured.outputs.index(name) for name in model.sensors.names], drives
 
 
 def _covariance(measured: FrequencyResponse, rows: list[int], columns: list[int], left: np.ndarray,
@@ -157,7 +204,7 @@ def _covariance(measured: FrequencyResponse, rows: list[int], columns: list[int]
     """(n, k k, k k) covariance of vec(left N A), the columns of the error stacked."""
     if measured.entry_variance is None:
         assert measured.gram is not None and measured.noise is not None
-        inverse = np.linalg.inv(measured.gram)[:, columns][:, :, columns]
+        inverse = measured.inverse_gram()[0][:, columns][:, :, columns]
         row = left @ measured.noise[:, rows][:, :, rows] @ np.conj(np.swapaxes(left, 1, 2))
         column = A.T @ np.swapaxes(inverse, 1, 2) @ A
         n, k = row.shape[:2]

@@ -19,7 +19,6 @@ from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification.campaign_fit import (
     CampaignFit,
     Split,
-    averaged,
     driven_inputs,
     excited_band,
     fit_campaign,
@@ -28,6 +27,7 @@ from avis_ctrl.identification.campaign_fit import (
 from avis_ctrl.identification.ekf import identify_ekf
 from avis_ctrl.identification.ekf_result import EkfResult
 from avis_ctrl.identification.ekf_settings import HONEST_SETTINGS
+from avis_ctrl.identification.excited_space import excited_space
 from avis_ctrl.identification.experiment_plan import needed_experiment
 from avis_ctrl.identification.experiments import Drive, campaign_noise
 from avis_ctrl.identification.identifiability import IdentifiabilityReport, identifiability_report
@@ -37,7 +37,6 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.validation import Validation, validate
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 from avis_ctrl.measurement.gates import Expectation, Finding, examine
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
@@ -133,11 +132,15 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
         findings = gates(measured, model, options, progress)
         progress("which records to fit, which to hold out, and the band")
         split, fitted, held_out, band = _divide(measured, options)
+        unplayed = excited_space(split.fitted, band).sentence if split else ""
+        if unplayed:
+            progress(unplayed)
         if model.amplifier_corner_Hz:
             progress(amplifier_words(model.amplifier_corner_Hz, options.amplifier_corner_Hz))
         progress(f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
                  + (f"; {split.how}" if split else ""))
         found = fit_campaign(fitted, model, band, options.priors, options.starts, options.seed, progress=progress)
+        found = replace(found, notes=(*found.notes, *([unplayed] if unplayed else [])))
         floor = any(block.block.kind == "floor measured" for block in found.fit.residuals)
         report = identifiability_report(found.fit.information, found.fit.model, floor,
                                         {name: sigma for name, (_, sigma) in found.fit.priors.items()})
@@ -222,12 +225,7 @@ def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions):
         return None, *_divided_lines(measured.between(*band)), band
     split = split_campaign(measured, options.hold_out)
     band = options.band_Hz or excited_band(split.fitted)
-    fitted = averaged(split.fitted, band)
-    if fitted is None:
-        return split, split.fitted, split.held_out, band
-    # The records of the other side may be short: their responses are what can be compared.
-    held_out = averaged(split.held_out, band) or local_polynomial(split.held_out, band_Hz=band)  # knows what it shares
-    return split, fitted, held_out, band
+    return split, split.fitted, split.held_out, band
 
 
 def _divided_lines(measured: FrequencyResponse) -> tuple[FrequencyResponse, FrequencyResponse]:

@@ -26,6 +26,8 @@ from avis_ctrl.errors import ComputationError, InputError
 BATCH = 192
 # Relative size of an input's own part (not explained by the others) below which it counts as dependent.
 RANK_TOLERANCE = 1e-8
+# The same where the inputs need not be told apart: what single precision rounds is no direction of its own.
+SPAN_TOLERANCE = 1e-6
 # Amplitude relative to the band's r.m.s. below which an input counts as silent.
 SILENT = 1e-5
 
@@ -159,25 +161,65 @@ class LocalFit:
                              "longer record, a wider band or fewer inputs", field="lines in the band",
                              value=line_Hz.size)
 
-    def estimate(self, names: tuple[str, ...] | None = None) -> LocalEstimate:
+    def estimate(self, names: tuple[str, ...] | None = None, partial: bool = False) -> LocalEstimate:
         """G, C and S on all lines.
+
+        partial : inputs need not be told apart. S is singular then along what the inputs do not span on a line, where
+            G is not known; C and G along what they span are as with fewer inputs. Polynomial method only.
 
         Raises
         ------
         InputError : no degrees of freedom left.
-        ComputationError : inputs that cannot be told apart, by name.
+        ComputationError : inputs that cannot be told apart, by name, unless `partial`.
         """
         if self.dof < 1 or self._unit is None:
             raise InputError(f"expected a wider window or more records: {self.dof} degrees of freedom are left on "
                              f"each line with {self.n_u} inputs, order {self.order}, {self.records} records",
                              field="half_width", value=self.half_width)
         names = tuple(f"u{j}" for j in range(self.n_u)) if names is None else names
-        self._check_rank(names)
-        value, noise, gram = self._rational() if self.rational else self._polynomial()
+        dof = self.dof
+        if partial and not self.rational and np.any(self._weakest() < SPAN_TOLERANCE):
+            value, noise, gram, dof = self._spanned()
+        else:
+            self._check_rank(names)
+            value, noise, gram = self._rational() if self.rational else self._polynomial()
         unit_u, unit_y = self._unit
         return LocalEstimate(self.frequency_Hz, value * unit_y[:, None] / unit_u,
-                             noise * unit_y[:, None] * unit_y, gram * unit_u[:, None] * unit_u, self.dof,
+                             noise * unit_y[:, None] * unit_y, gram * unit_u[:, None] * unit_u, dof,
                              self.half_width)
+
+    def _spanned(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+        """As `_polynomial` where inputs depend on each other, and the least degrees of freedom of a line.
+
+        The triangular factor has the Gram matrix of all columns, whatever their rank; of dependent columns its rows
+        alone are not what each adds to those before. So the slopes are taken out by an orthonormal basis of what they
+        span, and G by the pseudo-inverse of what is left of the inputs.
+        """
+        lead, first = self._lead, self._lead + self.n_u
+        slopes, own, outputs = self._factor[:, :, :lead], self._factor[:, :, lead:first], self._factor[:, :, first:]
+        size = self._sizes()
+        Q, found = _basis(slopes / np.tile(size, self.order)[:, None, :])
+        own, outputs = (part - Q @ (np.swapaxes(Q.conj(), 1, 2) @ part) for part in (own, outputs))
+        left, s, right = np.linalg.svd(own / size[:, None, :], full_matrices=False)
+        known = s > SPAN_TOLERANCE
+        along = np.swapaxes(left.conj(), 1, 2) @ outputs * known[:, :, None]
+        inverse = np.where(known, 1 / np.where(known, s, 1.0), 0.0)
+        value = np.swapaxes(right.conj(), 1, 2) @ (inverse[:, :, None] * along) / size[:, :, None]
+        dof = self.records * (2 * self.half_width - self.order) - found - np.sum(known, axis=1)
+        noise = _covariance(outputs - left @ along) / dof[:, None, None]
+        spanned = (s * known)[:, :, None] * right * size[:, None, :]
+        return np.swapaxes(value, 1, 2), noise, _covariance(spanned), int(dof.min())
+
+    def _sizes(self) -> np.ndarray:
+        """(n, n_u) of each input in the window, no less than what counts as silent."""
+        raw = np.linalg.norm(self._factor[:, :, self._lead:self._lead + self.n_u], axis=1)
+        return np.maximum(raw, SILENT * np.sqrt(self.records * (2 * self.half_width - self.order)))
+
+    def _weakest(self) -> np.ndarray:
+        """(n,) relative size of the weakest direction's own part."""
+        if not self.n_u:
+            return np.ones(self.frequency_Hz.size)
+        return np.linalg.svd(self._corner()[0] / self._sizes()[:, None, :], compute_uv=False)[:, -1]
 
     def _corner(self) -> tuple[np.ndarray, np.ndarray]:
         """Triangular factor of the inputs' own part (n, n_u, n_u) and the outputs along it (n, n_u, n_y)."""
@@ -224,10 +266,7 @@ class LocalFit:
     def _check_rank(self, names: tuple[str, ...]) -> None:
         if not self.n_u:
             return
-        own, _ = self._corner()
-        raw = np.linalg.norm(self._factor[:, :, self._lead:self._lead + self.n_u], axis=1)
-        size = np.maximum(raw, SILENT * np.sqrt(self.records * (2 * self.half_width - self.order)))
-        weakest = np.linalg.svd(own / size[:, None, :], compute_uv=False)[:, -1]
+        own, size, weakest = self._corner()[0], self._sizes(), self._weakest()
         bad = np.flatnonzero(weakest < RANK_TOLERANCE)
         if bad.size == 0:
             return
@@ -242,6 +281,13 @@ class LocalFit:
                   f"of {2 * self.half_width + 1}",
             next_step="keep to the excited band, leave out the inputs that no record excites, take in records that "
                       "drive them differently, or widen the window")
+
+
+def _basis(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n, m, k) orthonormal columns, zero beyond the rank, that span columns (n, m, k); (n,) their rank."""
+    left, s, _ = np.linalg.svd(columns, full_matrices=False)
+    known = s > SPAN_TOLERANCE
+    return left * known[:, None, :], np.sum(known, axis=1)
 
 
 def _scale(x: np.ndarray) -> np.ndarray:

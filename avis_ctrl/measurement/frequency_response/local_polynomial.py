@@ -15,7 +15,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
-from avis_ctrl.measurement.frequency_response.local_fit import LocalFit, least_half_width
+from avis_ctrl.measurement.frequency_response.local_fit import SPAN_TOLERANCE, LocalFit, least_half_width
 from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.spectra import (
     Band,
@@ -64,7 +64,7 @@ class _Spectra(NamedTuple):
 def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
                      order: int = 2, half_width: int | None = None, inputs: Sequence[str] | None = None,
                      floor: bool | None = None, longest_piece: int | None = None,
-                     apart: bool = False) -> FrequencyResponse:
+                     apart: bool = False, partial: bool = False) -> FrequencyResponse:
     """Local polynomial estimate, all records pooled (Pintelon and Schoukens 2012, section 7.2).
 
     The bias grows with the half width and the curvature of G: (half width / record length)^(order + 1). Nonlinear
@@ -84,16 +84,18 @@ def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequen
         take part only then.
     longest_piece : samples; longer records are read and used in pieces, each with its own transient.
     apart : estimate at the centres of windows that do not overlap, in place of frequency_Hz.
+    partial : inputs need not be told apart, as of drives that are played together along six axes: the Gram matrix is
+        then singular along what they do not span (`FrequencyResponse.along` gives what they do).
 
     Raises
     ------
     InputError : bands, names, windows or records that do not allow an estimate, `apart` beside frequency_Hz.
-    ComputationError : inputs that cannot be told apart.
+    ComputationError : inputs that cannot be told apart, unless `partial`.
     """
     if apart and frequency_Hz is not None:
         raise InputError("expected frequencies, or windows that do not overlap, not both", field="apart", value=apart)
     return _local_response(campaign, False, band_Hz, frequency_Hz, order, half_width, inputs, floor, longest_piece,
-                           apart)
+                           apart, partial)
 
 
 def local_rational(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
@@ -109,12 +111,12 @@ def local_rational(campaign: Campaign, *, band_Hz: Band | None = None, frequency
 
 def _local_response(campaign: Campaign, rational: bool, band_Hz: Band | None, frequency_Hz: np.ndarray | None,
                     order: int, half_width: int | None, inputs: Sequence[str] | None, floor: bool | None,
-                    longest: int | None, apart: bool = False) -> FrequencyResponse:
+                    longest: int | None, apart: bool = False, partial: bool = False) -> FrequencyResponse:
     records = taking_part(campaign, floor)
     used = channels(campaign, records, inputs, floor)
     band = checked_band(band_Hz, campaign.sample_rate_Hz)
     plan = _Plan.of(campaign, records, longest)
-    moving, spacing = _driven(records, used, band, plan)
+    moving, spacing, rank = _driven(records, used, band, plan)
     driven = list(range(len(used.inputs))) if inputs is not None else moving
     names = tuple(used.inputs[j] for j in driven)
     if not names:
@@ -122,14 +124,14 @@ def _local_response(campaign: Campaign, rational: bool, band_Hz: Band | None, fr
     n_y = len(used.outputs)
     width = half_width
     if width is None:
-        width = least_half_width(plan.count, len(names), n_y, order, rational, spacing)
+        width = least_half_width(plan.count, min(rank, len(names)), n_y, order, rational, spacing)
     where = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
     if apart:
         where = _apart(where, width)
     fit = LocalFit(where, len(names), n_y, order, width, width * campaign.sample_rate_Hz / plan.shortest, rational)
     for part in _spectra(records, used, driven, band, width, plan):
         fit.add(*part)
-    found = fit.estimate(names)
+    found = fit.estimate(names, partial)
     kind = "rational" if rational else "polynomial"
     left_out = [name for name in used.inputs if name not in names] if inputs is None else []
     method = (f"local {kind} method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces"
@@ -177,11 +179,11 @@ def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz:
     used = channels(campaign, records, None, floor)
     band = checked_band(band_Hz, campaign.sample_rate_Hz)
     plan = _Plan.of(campaign, records, longest_piece)
-    driven, spacing = _driven(records, used, band, plan)
+    driven, spacing, rank = _driven(records, used, band, plan)
     n_y = len(used.outputs)
     width = half_width
     if width is None:
-        width = least_half_width(plan.count, len(driven), n_y, order, spacing=spacing)
+        width = least_half_width(plan.count, rank, n_y, order, spacing=spacing)
     step = campaign.sample_rate_Hz / plan.shortest
     every = _grid(None, band, plan.shortest, campaign.sample_rate_Hz, width)
     asked = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
@@ -191,7 +193,8 @@ def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz:
     fit = LocalFit(centres, len(driven), n_y, order, width, width * step)
     for part in _spectra(records, used, driven, band, width, plan):
         fit.add(*part)
-    found = fit.estimate(tuple(used.inputs[j] for j in driven))
+    # What the outputs hold beside the inputs is known whether or not these are told apart.
+    found = fit.estimate(tuple(used.inputs[j] for j in driven), partial=True)
     least = min(-(-(n_y + 2) // found.dof), centres.size)
     return _smoothed(centres, found.noise, found.dof, asked, smooth_Hz or width * step, least,
                      used.outputs, campaign.sample_rate_Hz)
@@ -288,16 +291,22 @@ def _together(held: list[_Spectra]) -> _Spectra:
     return _Spectra(np.concatenate([p.U for p in held]), np.concatenate([p.Y for p in held]), held[0].line_Hz)
 
 
-def _driven(records: Sequence[RecordSource], used: Channels, band: Band, plan: _Plan) -> tuple[list[int], int]:
-    """Inputs that are not silent in the band in every record, relative to their samples; and how many lines lie from
-    one excited line to the next, more than one for periodic records."""
+def _driven(records: Sequence[RecordSource], used: Channels, band: Band, plan: _Plan) -> tuple[list[int], int, int]:
+    """Inputs that are not silent in the band in every record, relative to their samples; how many lines lie from one
+    excited line to the next, more than one for periodic records; and how many directions the inputs span in all."""
     moving, spacing = np.zeros(len(used.inputs), bool), 1
+    gram = np.zeros((len(used.inputs),) * 2, complex)
     for record in records:
         u, _ = used.of(next(equal_pieces(record, plan.longest)))
-        U = np.abs(transform(u, lines(u.shape[0], record.header.sample_rate_Hz, band)))
+        spectrum = transform(u, lines(u.shape[0], record.header.sample_rate_Hz, band))
+        gram += spectrum.conj().T @ spectrum
+        U = np.abs(spectrum)
         here = np.linalg.norm(U, axis=0) > 1e-9 * np.linalg.norm(u, axis=0)
         moving |= here
         if U.size and np.any(here):
             excited = np.flatnonzero(np.any(U[:, here] > 1e-3 * U[:, here].max(axis=0), axis=1))
             spacing = max(spacing, round((excited[-1] - excited[0] + 1) / excited.size))
-    return [int(j) for j in np.flatnonzero(moving)], spacing
+    kept = np.flatnonzero(moving)
+    size = np.sqrt(np.real(np.diag(gram)))[kept]
+    values = np.linalg.eigvalsh(gram[np.ix_(kept, kept)] / np.outer(size, size)) if kept.size else np.zeros(0)
+    return [int(j) for j in kept], spacing, int(np.count_nonzero(values > SPAN_TOLERANCE ** 2))

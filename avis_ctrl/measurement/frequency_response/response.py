@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
+
+# Eigenvalue of a Gram matrix of inputs of unit size, over the largest, below which nothing is spanned; and the share of
+# a combination of inputs that may lie outside of what is spanned.
+GRAM_TOLERANCE, SPANNED = 1e-13, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +27,8 @@ class FrequencyResponse:
     value : (n, n_y, n_u) complex, unit of y per unit of u.
     noise : (n, n_y, n_y) complex Hermitian covariance C of the total error (noise and, where it was separated,
         nonlinear distortion), E[e e^H].
-    gram : (n, n_u, n_u) complex Hermitian, S above.
+    gram : (n, n_u, n_u) complex Hermitian, S above; singular where the inputs do not span all directions, along which
+        nothing is known of G (`spanned`, `along`).
     dof : complex degrees of freedom of the noise covariance estimate; infinite where the covariance is given.
     measurement_noise : the part of `noise` that does not repeat from period to period, where separated.
     distortion : the part of `noise` that repeats: stochastic nonlinear distortion, where separated; may be indefinite
@@ -85,10 +90,59 @@ class FrequencyResponse:
         covariance = getattr(self, part)
         if covariance is None or self.gram is None:
             raise InputError("this estimate did not separate noise and distortion", field=part)
-        inverse = np.linalg.inv(self.gram)
+        inverse, _ = self.inverse_gram()
         rows = np.real(np.einsum("nii->ni", covariance))
         columns = np.real(np.einsum("njj->nj", inverse))
-        return rows[:, :, None] * columns[:, None, :]
+        return rows[:, :, None] * np.where(self.spanned(np.eye(len(self.inputs))), columns, np.inf)[:, None, :]
+
+    def inverse_gram(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pseudo-inverse of the Gram matrix, and the projector (n, n_u, n_u) on what it spans in inputs of unit size.
+
+        Of columns of unit size, for units differ by orders.
+        """
+        assert self.gram is not None
+        size = np.sqrt(np.real(np.einsum("nii->ni", self.gram)))
+        size = np.where(size > 0, size, 1.0)
+        values, vectors = np.linalg.eigh(self.gram / (size[:, :, None] * size[:, None, :]))
+        known = values > GRAM_TOLERANCE * values[:, -1:]
+        inverse = np.where(known, 1 / np.where(known, values, 1.0), 0.0)
+        adjoint = np.swapaxes(vectors.conj(), 1, 2)
+        return ((vectors * inverse[:, None, :]) @ adjoint / (size[:, :, None] * size[:, None, :]),
+                (vectors * known[:, None, :]) @ adjoint)
+
+    def spanned(self, V: np.ndarray) -> np.ndarray:
+        """(n, k) bool: whether the response to inputs played in the proportions of V (n_u, k) is known on a line."""
+        V = np.asarray(V, float)
+        if self.gram is None:
+            return np.ones((len(self.frequency_Hz), V.shape[1]), bool)
+        size = np.sqrt(np.real(np.einsum("nii->ni", self.gram)))
+        # A combination counts in inputs of unit size; one that holds a silent input is out of reach.
+        scaled = V[None] / np.where(size > 0, size, np.finfo(float).tiny ** 0.25)[:, :, None]
+        left = scaled - self.inverse_gram()[1] @ scaled
+        return np.asarray(np.linalg.norm(left, axis=1) < SPANNED * np.linalg.norm(scaled, axis=1))
+
+    def along(self, V: np.ndarray, names: tuple[str, ...], unit: str) -> FrequencyResponse:
+        """The response to inputs played in the proportions of V (n_u, k), under names and a unit of input of their own,
+        on the lines where it is known.
+
+        Raises InputError where it is known on no line, or where the proportions depend on each other.
+        """
+        keep = np.all(self.spanned(V), axis=1)
+        if not np.any(keep):
+            raise InputError(f"expected records that play {', '.join(names)}", field="inputs", value=list(self.inputs))
+        one = self.at(keep)
+        if one.entry_variance is not None:
+            return replace(one, value=one.value @ V, entry_variance=one.entry_variance @ np.abs(V) ** 2, inputs=names,
+                           input_unit=unit)
+        inverse = V.T @ one.inverse_gram()[0] @ V
+        size = np.sqrt(np.real(np.einsum("nii->ni", inverse)))
+        scale = size[:, :, None] * size[:, None, :]
+        try:
+            gram = np.linalg.inv(inverse / scale) / scale
+        except np.linalg.LinAlgError:
+            raise InputError("expected proportions that do not depend on each other", field="inputs",
+                             value=list(names)) from None
+        return replace(one, value=one.value @ V, gram=gram, inputs=names, input_unit=unit)
 
     @property
     def standard_deviation(self) -> np.ndarray:

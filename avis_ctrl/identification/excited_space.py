@@ -1,0 +1,91 @@
+"""Which combinations of the drives a campaign plays: six logical axes of a table with eight drives leave two unplayed.
+
+A parametric fit needs no response to each drive by itself. What is not played is said, for whatever belongs to it (the
+force constant of one drive, say) counts as known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+
+from avis_ctrl.identification.sparse_space import sparse_rows
+from avis_ctrl.measurement.campaign import Campaign, ranges
+from avis_ctrl.measurement.frequency_response.local_fit import SPAN_TOLERANCE
+
+# Samples that are read at once.
+PIECE = 1 << 18
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitedSpace:
+    """Of the drives (n_u) in a band.
+
+    names : of the drives. driven : those that some record plays. unplayed : (d, k) combinations of the k driven ones
+    that no record plays, sparse, the largest entry of each 1.
+    """
+
+    names: tuple[str, ...]
+    driven: tuple[str, ...]
+    unplayed: np.ndarray
+
+    @property
+    def full(self) -> bool:
+        """Whether every driven one is also played apart from the others."""
+        return not len(self.unplayed)
+
+    @property
+    def sentence(self) -> str:
+        """What is not played, in words; empty where everything is."""
+        said = []
+        if silent := [name for name in self.names if name not in self.driven]:
+            said.append(f"no record drives {', '.join(silent)}: nothing is known of {_its(silent)} own response, and "
+                        f"what the rig file says of {'them' if len(silent) > 1 else 'it'} counts as exact")
+        if not self.full:
+            k, d = len(self.driven), len(self.unplayed)
+            combinations = "; ".join(_in_words(row, self.driven) for row in self.unplayed)
+            said.append(f"the records play {k - d} of the {k} combinations of {', '.join(self.driven)}; not played: "
+                        f"{combinations}. The fit needs no response of each drive by itself; the proportion of their "
+                        "force constants counts as the rig file has it")
+        return "; ".join(said)
+
+
+def excited_space(campaign: Campaign, band_Hz: tuple[float, float]) -> ExcitedSpace:
+    """The combinations of drives that some record plays inside a band."""
+    names = campaign.u_names
+    gram = np.zeros((len(names),) * 2)
+    for record in campaign.records:
+        for start, stop in ranges(record.header.samples, PIECE):
+            u = record.load(start, stop).u
+            if not np.any(u):
+                continue
+            f = scipy.fft.rfftfreq(len(u), 1 / record.header.sample_rate_Hz)
+            U = scipy.fft.rfft(u, axis=0)[(f >= band_Hz[0]) & (f <= band_Hz[1]) & (f > 0)]
+            gram += np.real(U.conj().T @ U)
+    size = np.sqrt(np.diag(gram))
+    driven = np.flatnonzero(size > SPAN_TOLERANCE * np.max(size, initial=0.0))
+    if not driven.size or not np.any(size):
+        return ExcitedSpace(names, (), np.zeros((0, 0)))
+    size = size[driven]
+    values, vectors = np.linalg.eigh(gram[np.ix_(driven, driven)] / np.outer(size, size))
+    missing = vectors[:, values < SPAN_TOLERANCE ** 2]
+    # w with w^T u = 0: in volts the entries are over the sizes.
+    rows = sparse_rows(missing / size[:, None], 1e-4) if missing.size else np.zeros((0, len(driven)))
+    return ExcitedSpace(names, tuple(names[j] for j in driven), rows)
+
+
+def _its(names: list[str]) -> str:
+    return "their" if len(names) > 1 else "its"
+
+
+def _in_words(row: np.ndarray, names: tuple[str, ...]) -> str:
+    """Such as "Ay1 - Ay3"."""
+    parts = [(value, name) for value, name in zip(row, names, strict=True) if value]
+    text = ""
+    for value, name in parts:
+        size = "" if abs(abs(value) - 1) < 1e-3 else f"{abs(value):.3g} "
+        sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
+        text += f"{sign}{size}{name}"
+    return text

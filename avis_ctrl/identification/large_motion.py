@@ -1,0 +1,214 @@
+"""What large rotations add to the linear table: second-order terms that are there on any table.
+
+The nonlinear table of Rademakers (eqs. 2.1-2.21, `rigs.nonlinear`) less its linearisation, as an acceleration of the
+payload. Whether motors and sensors turn with the payload the source leaves open (its forces act along earth axes, its
+sensors sit on the payload): `Turning` says it of each.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from avis_ctrl.rigs.nonlinear import RigArrays, payload_acceleration, rig_arrays
+from avis_ctrl.rigs.rig import Rig
+
+
+class Turning(NamedTuple):
+    """Share of the payload's rotation that turns the axes of the motors, and those of the sensors: 0 for axes fixed in
+    space, as the simulator of this package has them, and 1 for axes fixed to the payload."""
+
+    motors: float = 0.0
+    sensors: float = 0.0
+
+    @property
+    def sentence(self) -> str:
+        """In words."""
+        def of(share: float) -> str:
+            return "turn with the table" if share > 0.5 else "stay as they are in space"
+        return (f"second-order terms of the table's rotations are part of the model; in them the motors' axes "
+                f"{of(self.motors)} and the sensors' {of(self.sensors)}")
+
+
+AS_SIMULATED = Turning()
+
+
+class Sensors(NamedTuple):
+    """Places (n_y, 3) [m] and directions (n_y, 3) of sensors on the payload."""
+
+    place: np.ndarray
+    direction: np.ndarray
+
+
+def sensors_of(rig: Rig, names: tuple[str, ...]) -> Sensors:
+    """Of the named sensors."""
+    axes = rig.sensor_axes()
+    place, direction = (np.array([axes[name][k] for name in names], float).reshape(-1, 3) for k in (0, 1))
+    return Sensors(place, direction)
+
+
+def second_order(rig: Rig, q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, sensors: tuple[str, ...]
+                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Second-order force of the table and of turned motors (samples, 6), and acceleration (samples, n_y) read by turned
+    sensors.
+
+    q, q_dot : (samples, 6) payload relative to the chassis. u : (samples, n_u) acting volts.
+    """
+    body, eom = rig.mounted_body(), rig.equations_of_motion()
+    arrays = rig_arrays(body)
+    q, q_dot, u = (np.ascontiguousarray(one, float) for one in (q, q_dot, u))
+    q_ddot, turned = _along(q, q_dot, u, arrays)
+    large = q_ddot @ eom.M.T + q_dot @ eom.C.T + q @ eom.K.T - u @ eom.T.T
+    return large, turned, _turned_readings(q, q_ddot, *sensors_of(rig, sensors))
+
+
+@njit(cache=True)
+def _along(q, q_dot, u, arrays):
+    """Accelerations (n, 6), and forces (n, 6) of turned motors."""
+    acceleration, turned = np.empty_like(q), np.empty_like(q)
+    still = np.zeros(6)
+    for k in range(len(q)):
+        acceleration[k] = payload_acceleration(q[k], q_dot[k], u[k], still, still, arrays)
+        turned_force(turned[k], q[k], u[k], arrays)
+    return acceleration, turned
+
+
+def _turned_readings(q: np.ndarray, q_ddot: np.ndarray, place: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    out = np.empty((len(q), len(place)))
+    for k in range(len(q)):
+        turned_reading(out[k], q[k], q_ddot[k], place, direction)
+    return out
+
+
+@njit(cache=True)
+def turned_force(out, q, u, arrays):
+    """out (6,): what motors push beside their force when their axes turn by the payload's small rotation."""
+    for i in range(6):
+        out[i] = 0.0
+    for k in range(u.shape[0]):
+        f, p = arrays.actuator_force[k], arrays.actuator_position[k]
+        x = (q[4] * f[2] - q[5] * f[1]) * u[k]
+        y = (q[5] * f[0] - q[3] * f[2]) * u[k]
+        z = (q[3] * f[1] - q[4] * f[0]) * u[k]
+        out[0] += x
+        out[1] += y
+        out[2] += z
+        out[3] += p[1] * z - p[2] * y
+        out[4] += p[2] * x - p[0] * z
+        out[5] += p[0] * y - p[1] * x
+
+
+@njit(cache=True)
+def turned_reading(out, q, q_ddot, place, direction):
+    """out (n_y,): acceleration that sensors read beside their own when their axes turn by the payload's rotation."""
+    for k in range(place.shape[0]):
+        p, d = place[k], direction[k]
+        a0 = q_ddot[0] + q_ddot[4] * p[2] - q_ddot[5] * p[1]
+        a1 = q_ddot[1] + q_ddot[5] * p[0] - q_ddot[3] * p[2]
+        a2 = q_ddot[2] + q_ddot[3] * p[1] - q_ddot[4] * p[0]
+        out[k] = ((q[4] * d[2] - q[5] * d[1]) * a0 + (q[5] * d[0] - q[3] * d[2]) * a1
+                  + (q[3] * d[1] - q[4] * d[0]) * a2)
+
+
+class March(NamedTuple):
+    """A sampled table with its second-order terms, from sample to sample.
+
+    Phi (N, N); held, ramp (N, 6 + n_y): what constant and rising accelerations of the payload, and beside those read
+    by the sensors, add in a period. body (6, 15), of volts (6, n_u), of floor velocity (6, 3): acceleration of the
+    linear table. amplifiers : index of the first of their states, -1 for none. order : (n_u,) of the model's actuators
+    among the body's. inverse (6, 6) of the mass matrix.
+    """
+
+    Phi: np.ndarray
+    held: np.ndarray
+    ramp: np.ndarray
+    body: np.ndarray
+    of_volts: np.ndarray
+    of_floor: np.ndarray
+    amplifiers: int
+    order: np.ndarray
+    inverse: np.ndarray
+    place: np.ndarray
+    direction: np.ndarray
+    motors: float
+    sensors: float
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def march(drive, volts, floor, x, before, started, table, arrays, states, beside):
+    """Steps through a piece.
+
+    drive : (n, N) what inputs add to the state in a period. volts (n, n_u), floor (n, 3): acting at its start.
+    x : (N,) state at the start, changed. before : (6 + n_y,) second-order terms of the sample before, changed;
+    started : whether there is one. states (n, N), beside (n, 6 + n_y) : what comes out.
+    """
+    N, n_u, n_e = x.shape[0], volts.shape[1], before.shape[0]
+    q, q_dot, floor_q, floor_v = np.empty(6), np.empty(6), np.zeros(6), np.zeros(6)
+    u, full = np.empty(n_u), np.zeros(arrays.actuator_position.shape[0])
+    force, linear, total, read = np.empty(6), np.empty(6), np.empty(6), np.empty(n_e - 6)
+    after = np.empty(N)
+    for k in range(drive.shape[0]):
+        for i in range(6):
+            q[i], q_dot[i] = x[i], x[6 + i]
+        for i in range(3):
+            floor_q[i], floor_v[i] = x[12 + i], floor[k, i]
+        for i in range(n_u):
+            u[i] = volts[k, i] if table.amplifiers < 0 else x[table.amplifiers + i]
+            full[table.order[i]] = u[i]
+        true = payload_acceleration(q, q_dot, full, floor_q, floor_v, arrays)
+        turned_force(force, q, full, arrays)
+        for i in range(6):
+            sum_ = 0.0
+            for j in range(15):
+                sum_ += table.body[i, j] * x[j]
+            for j in range(n_u):
+                sum_ += table.of_volts[i, j] * u[j]
+            for j in range(3):
+                sum_ += table.of_floor[i, j] * floor_v[j]
+            linear[i] = sum_
+        for i in range(6):
+            more = 0.0
+            for j in range(6):
+                more += table.inverse[i, j] * force[j]
+            beside[k, i] = true[i] - linear[i] + table.motors * more
+            total[i] = linear[i] + beside[k, i]
+        turned_reading(read, q, total, table.place, table.direction)
+        for i in range(n_e - 6):
+            beside[k, 6 + i] = table.sensors * read[i]
+        for i in range(N):
+            states[k, i] = x[i]
+            sum_ = drive[k, i]
+            for j in range(N):
+                sum_ += table.Phi[i, j] * x[j]
+            for j in range(n_e):
+                rise = beside[k, j] - before[j] if started else 0.0
+                sum_ += table.held[i, j] * beside[k, j] + table.ramp[i, j] * rise
+            after[i] = sum_
+        for i in range(N):
+            x[i] = after[i]
+        for j in range(n_e):
+            before[j] = beside[k, j]
+        started = True
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def march_linear(drive, x, Phi, states):
+    """As `march`, of the linear table."""
+    N = x.shape[0]
+    after = np.empty(N)
+    for k in range(drive.shape[0]):
+        for i in range(N):
+            states[k, i] = x[i]
+            sum_ = drive[k, i]
+            for j in range(N):
+                sum_ += Phi[i, j] * x[j]
+            after[i] = sum_
+        for i in range(N):
+            x[i] = after[i]
+
+
+def arrays_of(rig: Rig) -> RigArrays:
+    """The rig's body for `march`."""
+    return rig_arrays(rig.mounted_body())
