@@ -1,8 +1,12 @@
-"""The air-mount AVIS (Rademakers, TU/e 2005): a payload on four isolators with eight linear motors."""
+"""A payload on isolators along earth axes, with drives and sensors in the isolators or anywhere.
+
+The air-mount AVIS (Rademakers, TU/e 2005) is one: four isolators, eight linear motors and six geophones in them.
+"""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,6 +14,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
+from avis_ctrl.rigs.instruments import Drive, FloorSensor, GeophoneAt, Instrument, Sensor, Tolerances, Triple, with_gain
 from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
 from avis_ctrl.rigs.rig import Parameter, Place, Rig
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion
@@ -49,11 +54,14 @@ class LinearMotor:
 
 @dataclass(frozen=True)
 class AvisTable(Rig):
-    """The AVIS.
+    """A table on isolators.
 
     inertia : (J1, J2, J3, J12, J13, J23) [kg m^2] about the centre of mass; the last three are the
         entries of the inertia tensor itself, J12 = -integral of x y dm.
     centre_of_mass : [m] from the geometric centre.
+    motors, geophones : in the isolators, with which they move. drives, instruments : at places of their own. All
+        together, in this order, are `all_drives` and `sensors`.
+    limit_V : of drives that have no limit of their own.
     """
 
     name: str
@@ -63,10 +71,14 @@ class AvisTable(Rig):
     isolators: tuple[Isolator, ...]
     motors: tuple[LinearMotor, ...]
     limit_V: float
-    geophones: Geophones
+    geophones: Geophones | None
     acquisition: Acquisition
     ambient: Ambient | None = None
     accelerometers: Accelerometers | None = None
+    drives: tuple[Drive, ...] = ()
+    instruments: tuple[Instrument, ...] = ()
+    floor_sensors: tuple[FloorSensor, ...] = ()
+    tolerances: Tolerances | None = None
 
     def __post_init__(self) -> None:
         self.mounted_body()  # refuses a mass or an inertia that is not positive
@@ -79,6 +91,16 @@ class AvisTable(Rig):
     @property
     def drive_limit_V(self) -> float:
         return self.limit_V
+
+    @cached_property
+    def all_drives(self) -> tuple[Drive, ...]:
+        """Motors of the isolators, then the drives at places of their own."""
+        motors = (Drive(motor.name, self._at(motor.isolator), _unit(motor.axis), motor.constant_N_per_V)
+                  for motor in self.motors)
+        return (*motors, *self.drives)
+
+    def drive_limits_V(self) -> np.ndarray:
+        return np.array([min(self.limit_V, drive.limit_V or self.limit_V) for drive in self.all_drives])
 
     @property
     def sample_rate_Hz(self) -> float:
@@ -109,8 +131,8 @@ class AvisTable(Rig):
                 for axis, value in zip(AXES, triple, strict=True):
                     found[f"isolator{number}.{kind}_{axis}"] = Parameter(
                         value, _UNITS[kind], f"{_WORDS[kind]} of isolator {number} along {axis}")
-        for motor in self.motors:
-            found[f"actuator.{motor.name}"] = Parameter(motor.constant_N_per_V, "N/V", "force constant")
+        for drive in self.all_drives:
+            found[f"actuator.{drive.name}"] = Parameter(drive.constant_N_per_V, "N/V", "force constant")
         return found
 
     def _with_values(self, values: dict[str, float]) -> AvisTable:
@@ -125,10 +147,11 @@ class AvisTable(Rig):
                           for old, k, c, p in zip(self.isolators, tables["k"], tables["c"], tables["p"], strict=True))
         motors = tuple(replace(m, constant_N_per_V=get(f"actuator.{m.name}", m.constant_N_per_V))
                        for m in self.motors)
+        drives = tuple(replace(d, constant_N_per_V=get(f"actuator.{d.name}", d.constant_N_per_V)) for d in self.drives)
         inertia = tuple(get(name, old) for name, old in zip(INERTIA, self.inertia, strict=True))
         com = tuple(get(f"com_{axis}", old) for axis, old in zip(AXES, self.centre_of_mass, strict=True))
         return replace(self, mass=get("mass", self.mass), inertia=inertia, centre_of_mass=com,
-                       isolators=isolators, motors=motors)
+                       isolators=isolators, motors=motors, drives=drives)
 
     def mounted_body(self) -> MountedBody:
         return self._body
@@ -140,8 +163,8 @@ class AvisTable(Rig):
             Mount(f"isolator{number}", np.array(one.position), np.add(one.position, one.chassis_offset),
                   np.diag(one.stiffness), np.diag(one.damping))
             for number, one in enumerate(self.isolators, 1))
-        actuators = tuple(PointActuator(motor.name, self._at(motor.isolator), _unit(motor.axis),
-                                        motor.constant_N_per_V) for motor in self.motors)
+        actuators = tuple(PointActuator(one.name, np.array(one.position), np.array(one.direction), one.constant_N_per_V)
+                          for one in self.all_drives)
         return MountedBody(self.mass, self.inertia_matrix(), np.array(self.centre_of_mass), mounts, actuators)
 
     def equations_of_motion(self) -> EquationsOfMotion:
@@ -154,20 +177,42 @@ class AvisTable(Rig):
 
     def points(self) -> dict[str, Place]:
         found = {f"isolator{k}": Place(np.array(one.position), "isolator") for k, one in enumerate(self.isolators, 1)}
-        found |= {motor.name: Place(self._at(motor.isolator), "actuator") for motor in self.motors}
-        found |= {name: Place(place, "sensor") for name, (place, _) in self.sensor_axes().items()}
+        found |= {one.name: Place(np.array(one.position), "actuator") for one in self.all_drives}
+        found |= {one.name: Place(np.array(one.position), "sensor") for one in self.sensors()}
         return found | {"centre of mass": Place(np.array(self.centre_of_mass), "centre of mass")}
 
-    def sensor_axes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """The geophones, in the isolators (fig. 2.2)."""
-        channels = zip(self.geophones.names, self.geophones.isolator, self.geophones.axis, strict=True)
-        return {name: (self._at(isolator), _unit(axis)) for name, isolator, axis in channels}
+    def sensors(self) -> tuple[Sensor, ...]:
+        """The geophones in the isolators (fig. 2.2), then the instruments at places of their own."""
+        return self._sensors
 
-    def _at(self, isolator: int) -> np.ndarray:
+    @cached_property
+    def _sensors(self) -> tuple[Sensor, ...]:
+        return tuple(one.sensor(self.acquisition, self.ambient) for one in (*self._attached(), *self.instruments))
+
+    def _attached(self) -> tuple[GeophoneAt, ...]:
+        if (g := self.geophones) is None:
+            return ()
+        channels = zip(g.names, g.isolator, g.axis, g.sensitivity_Vs_per_m, strict=True)
+        return tuple(GeophoneAt(name, self._at(isolator), _unit(axis), sensitivity, g.suspension_Hz,
+                                g.suspension_damping, g.compensated_Hz, g.compensated_damping, g.preamplifier_gain)
+                     for name, isolator, axis, sensitivity in channels)
+
+    def with_sensor_gains(self, gains: Mapping[str, float]) -> AvisTable:
+        g = self.geophones
+        if g is not None:
+            volts = (gains[name] / g.preamplifier_gain if name in gains else old
+                     for name, old in zip(g.names, g.sensitivity_Vs_per_m, strict=True))
+            g = replace(g, sensitivity_Vs_per_m=tuple(volts))
+        return replace(self, geophones=g, instruments=tuple(
+            with_gain(one, gains[one.name]) if one.name in gains else one for one in self.instruments))
+
+    def _at(self, isolator: int) -> Triple:
         if not 1 <= isolator <= len(self.isolators):
             raise InputError(f"expected an isolator from 1 to {len(self.isolators)}", field="isolator", value=isolator)
-        return np.array(self.isolators[isolator - 1].position)
+        x, y, z = self.isolators[isolator - 1].position
+        return x, y, z
 
 
-def _unit(axis: str) -> np.ndarray:
-    return np.eye(3)[AXES.index(axis)]
+def _unit(axis: str) -> Triple:
+    x, y, z = (1.0 if axis == one else 0.0 for one in AXES)
+    return x, y, z

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
+from avis_ctrl.rigs.instruments import Sensor, Tolerances, Triple, white_rms
 from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
 from avis_ctrl.rigs.rig import Parameter, Place, Rig
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, cross_matrix, point_map
@@ -124,6 +125,7 @@ class Halcyonics(Rig):
     geophones: Geophones | None = None
     acquisition: Acquisition | None = None
     ambient: Ambient | None = None
+    tolerances: Tolerances | None = None
 
     def __post_init__(self) -> None:
         if len(self.k_s) != 4 or len(self.e) != 8 or len(self.actuator_names) != 8:
@@ -290,10 +292,13 @@ class Halcyonics(Rig):
                   "centre of mass": Place(self._rigid_body()[2], "centre of mass")}
         return found | ({"load": Place(self.load.position(), "load")} if self.load else {})
 
-    def sensor_axes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def sensors(self) -> tuple[Sensor, ...]:
         """The built-in accelerometers (section 3.1), "acc_A1" at actuator A1 and along its axis, and so on."""
-        axes = self.actuator_axes()
-        return {f"acc_{name}": axes[name] for name in self.accelerometers.at}
+        axes, acc = self.actuator_axes(), self.accelerometers
+        noise = white_rms(acc.noise_m_per_s2_rtHz, acc.sensitivity_Vs2_per_m, acc.sample_rate_Hz)
+        pole = complex(-2 * np.pi * acc.low_corner_Hz)
+        return tuple(Sensor(f"acc_{name}", _triple(axes[name][0]), _triple(axes[name][1]), "acceleration", (0j,),
+                            (pole,), acc.sensitivity_Vs2_per_m, noise) for name in acc.at)
 
     def parameters(self) -> dict[str, Parameter]:
         """Symbols of the source; k_s1..k_s4 by corner (k_s: their mean), e1..e8, load.mass, load.L7, load.Ixx .."""
@@ -317,3 +322,8 @@ class Halcyonics(Rig):
                                                    if name.startswith("load.")})
         plain: dict[str, Any] = {name: value for name, value in values.items() if name in _SCALARS}
         return replace(self, k_s=springs, e=constants, load=load, **plain)
+
+
+def _triple(values: np.ndarray) -> Triple:
+    x, y, z = values.tolist()
+    return x, y, z

@@ -12,6 +12,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
+from avis_ctrl.rigs.instruments import FloorSensor, Sensor, Tolerances
 from avis_ctrl.rigs.mounted_body import MountedBody
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, point_map
 
@@ -44,6 +45,8 @@ class Rig(ABC):
     accelerometers: Accelerometers | None
     acquisition: Acquisition | None
     ambient: Ambient | None
+    tolerances: Tolerances | None
+    floor_sensors: tuple[FloorSensor, ...] = ()
 
     @property
     @abstractmethod
@@ -53,7 +56,11 @@ class Rig(ABC):
     @property
     @abstractmethod
     def drive_limit_V(self) -> float:
-        """Largest voltage of an actuator."""
+        """Largest voltage of an actuator that has no limit of its own."""
+
+    def drive_limits_V(self) -> np.ndarray:
+        """(n_u,) largest voltage of each actuator."""
+        return np.full(len(self.equations_of_motion().actuators), self.drive_limit_V)
 
     @property
     @abstractmethod
@@ -86,8 +93,20 @@ class Rig(ABC):
         """Named points for a drawing."""
 
     @abstractmethod
+    def sensors(self) -> tuple[Sensor, ...]:
+        """Every sensor on the payload, with its place and its dynamics."""
+
     def sensor_axes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Position (3,) [m] and unit direction (3,) of each sensor."""
+        return {one.name: (np.array(one.position), np.array(one.direction)) for one in self.sensors()}
+
+    def with_sensor_gains(self, gains: Mapping[str, float]) -> Self:
+        """The rig with other volts per unit of motion of some sensors, preamplifiers included.
+
+        Raises InputError where the rig's file has no place for them.
+        """
+        raise InputError("a rig file of this kind has one sensitivity for all; leave them out", field="parameters",
+                         value=[f"sensor.{name}" for name in gains])
 
     def sensor_rows(self) -> tuple[tuple[str, ...], np.ndarray]:
         """Sensor names and the (n, 6) matrix from q to the displacement along each sensor's axis."""

@@ -1,6 +1,7 @@
 """Rig files: TOML with the numbers of a rig, checked entry by entry.
 
-Two kinds, told apart by their sections: [[isolator]] makes an `AvisTable`, [suspension] a `Halcyonics`.
+Two kinds, told apart by their sections: [[isolator]] makes an `AvisTable`, [suspension] a `Halcyonics`. What each key
+means stands in docs/rig_file.md.
 Whatever is wrong is one `InputError` line that names file, field, value and what was expected.
 """
 
@@ -8,183 +9,41 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.avis import AvisTable, Isolator, LinearMotor
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
 from avis_ctrl.rigs.file_errors import first_complaint
-from avis_ctrl.rigs.floor_spectrum import shipped_spectra
 from avis_ctrl.rigs.halcyonics import Halcyonics, Load, ReactionMass
+from avis_ctrl.rigs.instruments import (
+    AccelerometerAt,
+    Drive,
+    FloorSensor,
+    GeophoneAt,
+    Instrument,
+    PositionSensorAt,
+    Tolerances,
+    unit_vector,
+)
+from avis_ctrl.rigs.rig_sections import (
+    AmbientSection,
+    AvisFile,
+    HalcyonicsFile,
+    IsolatorSection,
+    LoadSection,
+    PlateSection,
+    TolerancesSection,
+)
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
 SHIPPED = {"avis": ("avis.toml", False), "halcyonics": ("halcyonics.toml", False),
            "halcyonics_loaded": ("halcyonics.toml", True)}
 
-# In SI units nothing on a table comes near the limit; it keeps the products of such numbers finite.
-LIMIT = 1e12
-Number = Annotated[float, Field(ge=-LIMIT, le=LIMIT)]
-Positive = Annotated[float, Field(gt=0, le=LIMIT)]
-NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
-# No table is larger: far points leave no digits for the inertia beside m r^2.
-Length = Annotated[float, Field(ge=-100.0, le=100.0)]
-PositiveLength = Annotated[float, Field(gt=0, le=100.0)]
-Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
-Point = Annotated[list[Length], Field(min_length=3, max_length=3)]
-PositiveVector = Annotated[list[Positive], Field(min_length=3, max_length=3)]
-DampingVector = Annotated[list[NotNegative], Field(min_length=3, max_length=3)]
-Axis = Literal["x", "y", "z"]
-
-
-def _rising(band: list[float]) -> list[float]:
-    if band[0] >= band[1]:
-        raise ValueError("expected the lower end first, the upper one after it")
-    return band
-
-
-def _shipped(spectrum: str) -> str:
-    if spectrum not in shipped_spectra():
-        raise ValueError(f"expected one of {', '.join(shipped_spectra())}")
-    return spectrum
-
-
-# What other files share: a frequency band [Hz], and the name of a shipped spectrum of floor motion.
-Band = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(_rising)]
-Spectrum = Annotated[str, AfterValidator(_shipped)]
-
-
 File = TypeVar("File", bound=BaseModel)
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
-
-
-class AvisPayload(_Section):
-    mass_kg: Positive
-    inertia_kgm2: PositiveVector
-    inertia_offdiagonal_kgm2: Vector = [0.0, 0.0, 0.0]
-    centre_of_mass_m: Point
-
-
-class IsolatorSection(_Section):
-    position_m: Point
-    stiffness_N_per_m: PositiveVector
-    damping_Ns_per_m: DampingVector
-    chassis_point_m: Point | None = None
-
-
-class MotorSection(_Section):
-    names: list[str]
-    isolator: list[int]
-    axis: list[Axis]
-    constant_N_per_V: list[Positive]
-    limit_V: Positive
-
-
-class GeophoneSection(_Section):
-    names: list[str]
-    isolator: list[int]
-    axis: list[Axis]
-    sensitivity_Vs_per_m: list[Positive]
-    suspension_Hz: Positive
-    suspension_damping: Positive
-    compensated_Hz: Positive
-    compensated_damping: Positive
-    preamplifier_gain: Positive
-
-
-class AcquisitionSection(_Section):
-    sample_rate_Hz: Positive
-    adc_bits: Annotated[int, Field(ge=1, le=64)]
-    adc_range_V: Positive
-    loop_delay_s: NotNegative
-
-
-class AmbientSection(_Section):
-    floor_velocity_rms_m_per_s: NotNegative
-    sensor_noise_rms_V: NotNegative
-
-
-class AvisFile(_Section):
-    name: str
-    payload: AvisPayload
-    isolator: Annotated[list[IsolatorSection], Field(min_length=3)]
-    actuators: MotorSection
-    geophones: GeophoneSection
-    acquisition: AcquisitionSection
-    ambient: AmbientSection | None = None
-
-
-class PlateSection(_Section):
-    mass_kg: Positive
-    inertia_kgm2: PositiveVector
-    L1_m: PositiveLength
-    L2_m: PositiveLength
-    L3_m: PositiveLength
-    L4_plus_L5_m: PositiveLength
-    L6_m: Length
-    M2_arm_m: Length = 0.2
-    M3_arm_m: Length = 0.15
-
-
-class SuspensionSection(_Section):
-    """k_s_each_N_per_m : the springs at the corners of A1..A4, where they differ; k_s_N_per_m is then their mean."""
-
-    k_s_N_per_m: Positive
-    k_s_each_N_per_m: Annotated[list[Positive], Field(min_length=4, max_length=4)] | None = None
-    k_a_N_per_m: Positive
-    k_t_N_per_m: Positive
-    k_r_Nm_per_rad: Positive
-    d1_Ns_per_m: NotNegative
-    d3_Ns_per_m: NotNegative
-    d4_Nms_per_rad: NotNegative
-    d5_Nms_per_rad: NotNegative
-    d6_Nms_per_rad: NotNegative
-
-
-class VoiceCoilSection(_Section):
-    names: Annotated[list[str], Field(min_length=8, max_length=8)]
-    constant_N_per_V: Annotated[list[Positive], Field(min_length=8, max_length=8)]
-    reaction_mass_kg: Positive
-    reaction_damping_Ns_per_m: NotNegative
-    free_constant_N_per_V: Positive
-
-
-class AccelerometerSection(_Section):
-    at: Annotated[list[str], Field(min_length=1)]
-    sensitivity_Vs2_per_m: Positive
-    low_corner_Hz: Positive
-    noise_m_per_s2_rtHz: NotNegative
-    sample_rate_Hz: Positive
-    loop_delay_s: NotNegative
-    drive_limit_V: Positive
-
-
-class LoadSection(_Section):
-    mass_kg: Positive
-    L7_m: Length
-    L8_m: Length
-    L9_m: Length
-    Ixx_total_kgm2: Positive
-    Iyy_total_kgm2: Positive
-    Izz_total_kgm2: Positive
-    Ixy_load_kgm2: Number = 0.0
-    Ixz_load_kgm2: Number = 0.0
-    Iyz_load_kgm2: Number = 0.0
-
-
-class HalcyonicsFile(_Section):
-    name: str
-    payload: PlateSection
-    suspension: SuspensionSection
-    actuators: VoiceCoilSection
-    accelerometers: AccelerometerSection
-    load: LoadSection | None = None
-    ambient: AmbientSection | None = None
 
 
 def load_rig(path_or_name: str | Path, loaded: bool = False) -> AvisTable | Halcyonics:
@@ -265,21 +124,76 @@ def _checked(model: type[File], content: dict[str, Any]) -> File:
 
 def _avis(file: AvisFile) -> AvisTable:
     payload, motors, geophones = file.payload, file.actuators, file.geophones
-    _same_length("actuators", motors.model_dump(), ("names", "isolator", "axis", "constant_N_per_V"))
-    _same_length("geophones", geophones.model_dump(), ("names", "isolator", "axis", "sensitivity_Vs_per_m"))
-    for section, numbers in (("actuators", motors.isolator), ("geophones", geophones.isolator)):
-        if bad := [number for number in numbers if not 1 <= number <= len(file.isolator)]:
-            raise InputError(f"expected isolators from 1 to {len(file.isolator)}", field=f"{section}.isolator",
+    lists = {"actuators": (motors, "constant_N_per_V"), "geophones": (geophones, "sensitivity_Vs_per_m")}
+    for name, (section, own) in lists.items():
+        if section is None:
+            continue
+        _same_length(name, section.model_dump(), ("names", "isolator", "axis", own))
+        if bad := [number for number in section.isolator if not 1 <= number <= len(file.isolator)]:
+            raise InputError(f"expected isolators from 1 to {len(file.isolator)}", field=f"{name}.isolator",
                              value=bad[0])
     J = np.diag(payload.inertia_kgm2)
     J[0, 1], J[0, 2], J[1, 2] = payload.inertia_offdiagonal_kgm2
     _check_inertia(J + np.triu(J, 1).T, "payload.inertia_kgm2", payload.inertia_kgm2)
     isolators = tuple(_isolator(one) for one in file.isolator)
     inertia = (*_triple(payload.inertia_kgm2), *_triple(payload.inertia_offdiagonal_kgm2))
-    rows = zip(motors.names, motors.isolator, motors.axis, motors.constant_N_per_V, strict=True)
-    return AvisTable(file.name, payload.mass_kg, inertia, _triple(payload.centre_of_mass_m), isolators,
-                     tuple(LinearMotor(*row) for row in rows), motors.limit_V, Geophones(**_tuples(geophones)),
-                     Acquisition(**_tuples(file.acquisition)), _ambient(file.ambient))
+    rows = zip(motors.names, motors.isolator, motors.axis, motors.constant_N_per_V, strict=True) if motors else ()
+    drives = tuple(Drive(**_at_place(one)) for one in file.drive)
+    table = AvisTable(file.name, payload.mass_kg, inertia, _triple(payload.centre_of_mass_m), isolators,
+                      tuple(LinearMotor(*row) for row in rows), _common_limit(file),
+                      Geophones(**_tuples(geophones)) if geophones else None,
+                      Acquisition(**_tuples(file.acquisition)), _ambient(file.ambient), drives=drives,
+                      instruments=_instruments(file),
+                      floor_sensors=tuple(FloorSensor(**_tuples(one)) for one in file.floor_sensor),
+                      tolerances=_tolerances(file.tolerances))
+    _distinct("drive", [one.name for one in table.all_drives])
+    _distinct("geophone, accelerometer, position_sensor", [one.name for one in table.sensors()])
+    _distinct("floor_sensor.axis", [one.axis for one in table.floor_sensors], some=False)
+    return table
+
+
+def _common_limit(file: AvisFile) -> float:
+    """The limit of drives without one of their own: that of [actuators], or where all have their own the largest."""
+    if file.actuators is not None:
+        return file.actuators.limit_V
+    for k, one in enumerate(file.drive, 1):
+        if one.limit_V is None:
+            raise InputError("this key is missing, and there is no limit_V for all drives in [actuators]",
+                             field=f"drive[{k}].limit_V")
+    return max((one.limit_V for one in file.drive if one.limit_V is not None), default=1.0)
+
+
+def _instruments(file: AvisFile) -> tuple[Instrument, ...]:
+    for k, geophone in enumerate(file.geophone, 1):
+        if (geophone.compensated_Hz is None) != (geophone.compensated_damping is None):
+            absent = "compensated_Hz" if geophone.compensated_Hz is None else "compensated_damping"
+            raise InputError("expected compensated_Hz and compensated_damping, both or neither",
+                             field=f"geophone[{k}].{absent}")
+    for name, sections in (("accelerometer", file.accelerometer), ("position_sensor", file.position_sensor)):
+        for k, one in enumerate(sections, 1):
+            density = "noise_m_per_s2_rtHz" if name == "accelerometer" else "noise_m_rtHz"
+            content = one.model_dump()
+            if content["noise_rms_V"] is not None and content[density] is not None:
+                raise InputError(f"expected noise_rms_V or {density}, not both", field=f"{name}[{k}].noise_rms_V",
+                                 value=content["noise_rms_V"])
+    return (*(GeophoneAt(**_at_place(one)) for one in file.geophone),
+            *(AccelerometerAt(**_at_place(one)) for one in file.accelerometer),
+            *(PositionSensorAt(**_at_place(one)) for one in file.position_sensor))
+
+
+def _at_place(section: BaseModel) -> dict[str, Any]:
+    """What a drive or sensor is made from: the section, its direction of length one."""
+    content = _tuples(section)
+    place = content.pop("position_m")
+    return content | {"position": place, "direction": unit_vector(content["direction"], "direction")}
+
+
+def _distinct(field: str, names: list[str], some: bool = True) -> None:
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError("expected different names", field=field, value=twice)
+    if some and not names:
+        raise InputError(f"expected at least one {field.split(',')[0]}", field=field)
 
 
 def _isolator(section: IsolatorSection) -> Isolator:
@@ -308,11 +222,16 @@ def _halcyonics(file: HalcyonicsFile, loaded: bool) -> Halcyonics:
                       reaction=ReactionMass(actuators.reaction_mass_kg, actuators.reaction_damping_Ns_per_m,
                                             actuators.free_constant_N_per_V),
                       accelerometers=Accelerometers(**_tuples(file.accelerometers)),
-                      ambient=_ambient(file.ambient), load=load if loaded else None)
+                      ambient=_ambient(file.ambient), load=load if loaded else None,
+                      tolerances=_tolerances(file.tolerances))
 
 
 def _ambient(section: AmbientSection | None) -> Ambient | None:
     return Ambient(**_tuples(section)) if section else None
+
+
+def _tolerances(section: TolerancesSection | None) -> Tolerances | None:
+    return Tolerances(**_tuples(section)) if section else None
 
 
 def _load(section: LoadSection, plate: PlateSection) -> Load:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.avis import AXES, INERTIA, AvisTable
 from avis_ctrl.rigs.equipment import Ambient
 from avis_ctrl.rigs.halcyonics import Halcyonics
+from avis_ctrl.rigs.instruments import AccelerometerAt, Drive, GeophoneAt, Instrument
 from avis_ctrl.rigs.rig import Rig
 
 
@@ -119,17 +120,41 @@ def _avis_sections(rig: AvisTable) -> list[_Section]:
             lines.append(_Line("chassis_point_m", _sum_for(one.chassis_offset, one.position)))
         sections.append(("[[isolator]]", f"isolator[{number}]", lines))
     motors, a = rig.motors, rig.acquisition
-    sections.append(("[actuators]", "actuators", [
+    lines = [
         _Line("names", [m.name for m in motors]), _Line("isolator", [m.isolator for m in motors]),
         _Line("axis", [m.axis for m in motors]),
-        _Line("constant_N_per_V", [m.constant_N_per_V for m in motors], tuple(f"actuator.{m.name}" for m in motors)),
-        _Line("limit_V", rig.limit_V)]))
-    sections.append(("[geophones]", "geophones", _plain(
-        rig.geophones, "names", "isolator", "axis", "sensitivity_Vs_per_m", "suspension_Hz", "suspension_damping",
-        "compensated_Hz", "compensated_damping", "preamplifier_gain")))
+        _Line("constant_N_per_V", [m.constant_N_per_V for m in motors], tuple(f"actuator.{m.name}" for m in motors))]
+    sections.append(("[actuators]", "actuators", [*(lines if motors else []), _Line("limit_V", rig.limit_V)]))
+    sections += [("[[drive]]", f"drive[{k}]", _at_place(one)) for k, one in enumerate(rig.drives, 1)]
+    if rig.geophones is not None:
+        sections.append(("[geophones]", "geophones", _plain(
+            rig.geophones, "names", "isolator", "axis", "sensitivity_Vs_per_m", "suspension_Hz", "suspension_damping",
+            "compensated_Hz", "compensated_damping", "preamplifier_gain")))
+    counted: dict[str, int] = {}
+    for instrument in rig.instruments:
+        kind = ("geophone" if isinstance(instrument, GeophoneAt) else "accelerometer"
+                if isinstance(instrument, AccelerometerAt) else "position_sensor")
+        counted[kind] = counted.get(kind, 0) + 1
+        sections.append((f"[[{kind}]]", f"{kind}[{counted[kind]}]", _at_place(instrument)))
+    sections += [("[[floor_sensor]]", f"floor_sensor[{k}]", _all(one)) for k, one in enumerate(rig.floor_sensors, 1)]
     sections.append(("[acquisition]", "acquisition",
                      _plain(a, "sample_rate_Hz", "adc_bits", "adc_range_V", "loop_delay_s")))
-    return sections + _ambient(rig.ambient)
+    return sections + _ambient(rig.ambient) + _tolerances(rig)
+
+
+def _all(thing: Any) -> list[_Line]:
+    """Every field that has a value."""
+    return [_Line(one.name, value) for one in fields(thing) if (value := getattr(thing, one.name)) is not None]
+
+
+def _at_place(thing: Drive | Instrument) -> list[_Line]:
+    held = {"constant_N_per_V": (f"actuator.{thing.name}",)} if isinstance(thing, Drive) else {}
+    return [replace(line, key="position_m" if line.key == "position" else line.key, parameters=held.get(line.key, ()))
+            for line in _all(thing)]
+
+
+def _tolerances(rig: Rig) -> list[_Section]:
+    return [("[tolerances]", "tolerances", _all(rig.tolerances))] if rig.tolerances else []
 
 
 def _halcyonics_sections(rig: Halcyonics) -> list[_Section]:
@@ -166,4 +191,4 @@ def _halcyonics_sections(rig: Halcyonics) -> list[_Section]:
             *(_Line(f"{name}_total_kgm2", total, (f"load.{name}",))
               for name, total in zip(moments, totals, strict=True)),
             *(_Line(f"{name}_load_kgm2", getattr(load, name), (f"load.{name}",)) for name in ("Ixy", "Ixz", "Iyz"))]))
-    return sections + _ambient(rig.ambient)
+    return sections + _ambient(rig.ambient) + _tolerances(rig)

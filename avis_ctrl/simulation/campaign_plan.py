@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
-from avis_ctrl.rigs.rig_file import Band, NotNegative, Positive, Spectrum
+from avis_ctrl.rigs.rig_sections import Band, NotNegative, Positive, Spectrum
 
 Duration = Annotated[float, Field(gt=0, le=36000)]
 Percent = Annotated[float, Field(gt=0, le=100)]

@@ -25,7 +25,8 @@ from pydantic import (
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.file_errors import first_complaint, read_toml
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.rig_file import LIMIT, SHIPPED, Band, Spectrum, load_rig
+from avis_ctrl.rigs.rig_file import SHIPPED, load_rig
+from avis_ctrl.rigs.rig_sections import LIMIT, Band, Spectrum
 from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty
 from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter
 

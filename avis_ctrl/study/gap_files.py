@@ -120,10 +120,8 @@ def _in_rig(rig: Rig, one: ActiveEffect) -> Rig | None:
         name = f"actuator.{one.place}"
         return rig.with_parameters({name: rig.parameters()[name].value * values["gain"]})
     if one.effect.name == "sensor_gain":
-        g = rig.geophones
-        volts = tuple(s * values["gain"] if name == one.place else s
-                      for name, s in zip(g.names, g.sensitivity_Vs_per_m, strict=True))
-        return replace(rig, geophones=replace(g, sensitivity_Vs_per_m=volts))
+        gain = next(sensor.gain for sensor in rig.sensors() if sensor.name == one.place)
+        return rig.with_sensor_gains({one.place: gain * values["gain"]})
     if one.effect.name == "loop_delay":
         return replace(rig, acquisition=replace(rig.acquisition, loop_delay_s=rig.acquisition.loop_delay_s
                                                 + values["extra_delay_s"]))

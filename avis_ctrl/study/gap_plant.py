@@ -21,6 +21,7 @@ from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.lti.connect import connect, lft_lower
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, append, gain
+from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.plant import DesignPlant, build_plant
@@ -192,7 +193,7 @@ def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
         name, values = one.effect.name, one.by_name
         own = bool(one.effect.rig_changes(model, one.place, values))
         fits = name in CARRIED and not (name == "actuator_lag" and lag_known) and not (
-            name == "sensor_gain" and getattr(rig, "geophones", None) is None)
+            name == "sensor_gain" and isinstance(rig, Halcyonics))
         (inside if own or fits else outside).append(one.label)
         if name == "actuator_lag":
             lag_known = True
@@ -215,13 +216,8 @@ def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
 
 
 def _with_sensitivity(rig: Any, model: TableModel, factors: Mapping[str, float]) -> Any:
-    """Sensitivities of the model's geophones, their effects included."""
-    g = rig.geophones
-    if g is None or model.sensors.unit != "V":
+    """Sensitivities of the model's sensors, their effects included."""
+    if isinstance(rig, Halcyonics) or model.sensors.unit != "V":
         return rig
-    new = dict(zip(g.names, g.sensitivity_Vs_per_m, strict=True))
-    for name, value in zip(model.sensors.names, model.sensors.sensitivity, strict=True):
-        new[name] = float(value) * factors[name] / g.preamplifier_gain
-    return replace(rig, geophones=replace(g, sensitivity_Vs_per_m=tuple(new[name] for name in g.names)))
-
-
+    return rig.with_sensor_gains({name: float(value) * factors[name] for name, value
+                                  in zip(model.sensors.names, model.sensors.sensitivity, strict=True)})

@@ -39,11 +39,8 @@ def identified_rig(model: ResponseModel) -> Rig:
     if not isinstance(rig, AvisTable):
         raise InputError("a rig file of this kind has one sensitivity and one delay for all; leave them out",
                          field="parameters", value=sensitive or ["loop_delay_s"])
-    g = rig.geophones
-    found = dict(zip(model.sensors.names, model.sensors.sensitivity / g.preamplifier_gain, strict=True))
-    volts = tuple(float(found.get(name, old)) for name, old in zip(g.names, g.sensitivity_Vs_per_m, strict=True))
-    return replace(rig, geophones=replace(g, sensitivity_Vs_per_m=volts),
-                   acquisition=replace(rig.acquisition, loop_delay_s=model.delay_s))
+    rig = rig.with_sensor_gains(dict(zip(model.sensors.names, model.sensors.sensitivity.tolist(), strict=True)))
+    return replace(rig, acquisition=replace(rig.acquisition, loop_delay_s=model.delay_s))
 
 
 def require_readable(found: Identification) -> None:

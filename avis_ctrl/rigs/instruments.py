@@ -1,0 +1,224 @@
+"""Drives and sensors by position and direction, each sensor with its own dynamics and noise.
+
+    motion along the sensor's axis -> zeros and poles of the sensor -> volts at the converter
+
+A geophone reads velocity and an accelerometer acceleration, both in space; a position sensor reads the displacement of
+the payload against the chassis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.equipment import Acquisition, Ambient
+from avis_ctrl.rigs.geophone import second_order_roots
+
+Quantity = Literal["velocity", "acceleration", "displacement"]
+Triple = tuple[float, float, float]
+# Derivatives that each quantity is of a displacement.
+ORDER: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
+
+
+def unit_vector(direction: Triple, field: str) -> Triple:
+    """The direction with length one, as it is where it has that. Raises InputError for a vector without length."""
+    length = float(np.linalg.norm(direction))
+    if not (np.isfinite(length) and length > 0):
+        raise InputError("expected a vector with a length", field=field, value=list(direction))
+    if abs(length - 1.0) <= 1e-12:
+        return direction
+    x, y, z = (float(part) / length for part in direction)
+    return x, y, z
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A force anywhere: constant_N_per_V * volts at position [m] along direction (unit vector; its sign counts).
+
+    limit_V : largest voltage, None for the rig's common one.
+    """
+
+    name: str
+    position: Triple
+    direction: Triple
+    constant_N_per_V: float
+    limit_V: float | None = None
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One channel of any kind.
+
+    Attributes
+    ----------
+    quantity : what it takes in along its axis: "velocity" [m/s] and "acceleration" [m/s^2] of the payload in space,
+        "displacement" [m] of the payload against the chassis.
+    zeros, poles : rad/s, of its chain from there to volts.
+    gain : volts per unit of motion in the passband: far above all corners, of a position sensor at rest.
+    noise_rms_V : white noise of one sample, before the converter.
+    suspension : corner [Hz] and damping ratio of a geophone's own suspension, None for other kinds.
+    """
+
+    name: str
+    position: Triple
+    direction: Triple
+    quantity: Quantity
+    zeros: tuple[complex, ...]
+    poles: tuple[complex, ...]
+    gain: float
+    noise_rms_V: float
+    suspension: tuple[float, float] | None = None
+
+    @property
+    def inertial(self) -> bool:
+        """Whether it reads motion in space, not against the chassis."""
+        return self.quantity != "displacement"
+
+    @property
+    def leading(self) -> float:
+        """Leading coefficient of the chain for a passband gain of one."""
+        excess = len(self.poles) - len(self.zeros)
+        return float(np.prod(np.abs(self.poles))) if excess else 1.0
+
+    def chain(self, gain: float | None = None) -> StateSpace:
+        """Motion -> volts; `gain` in the place of its own where given."""
+        size = self.gain if gain is None else gain
+        return cascade(np.array(self.zeros), np.array(self.poles), self.leading * size, "motion", "voltage")
+
+    def velocity_noise(self, omega: np.ndarray, rounding_rms_V: float, sample_rate_Hz: float) -> np.ndarray:
+        """(n,) the velocity [m/s/sqrt(Hz)] that would make the same voltage noise; omega > 0."""
+        s = 1j * np.asarray(omega, float)
+        chain = self.leading * self.gain * np.prod([s - z for z in self.zeros] or [np.ones_like(s)], axis=0)
+        chain = chain / np.prod([s - p for p in self.poles] or [np.ones_like(s)], axis=0)
+        density = np.hypot(self.noise_rms_V, rounding_rms_V) * np.sqrt(2.0 / sample_rate_Hz)
+        return density / np.abs(chain * s ** (ORDER[self.quantity] - 1))
+
+
+@dataclass(frozen=True)
+class GeophoneAt:
+    """A geophone of a rig file; without compensated_Hz no filter follows it. Noise: None for the ambient one."""
+
+    name: str
+    position: Triple
+    direction: Triple
+    sensitivity_Vs_per_m: float
+    suspension_Hz: float
+    suspension_damping: float
+    compensated_Hz: float | None = None
+    compensated_damping: float | None = None
+    preamplifier_gain: float = 1.0
+    noise_rms_V: float | None = None
+
+    def sensor(self, acquisition: Acquisition, ambient: Ambient | None) -> Sensor:
+        corner, damping = self.suspension_Hz, self.suspension_damping
+        if self.compensated_Hz is not None and self.compensated_damping is not None:
+            # The filter assumes exactly this suspension: its zeros cancel the geophone's poles on paper.
+            corner, damping = self.compensated_Hz, self.compensated_damping
+        noise = _noise_rms(self.noise_rms_V, None, 1.0, acquisition, ambient)
+        return Sensor(self.name, self.position, self.direction, "velocity", (0j, 0j),
+                      tuple(second_order_roots(corner, damping).tolist()),
+                      self.sensitivity_Vs_per_m * self.preamplifier_gain, noise,
+                      (self.suspension_Hz, self.suspension_damping))
+
+
+@dataclass(frozen=True)
+class AccelerometerAt:
+    """A charge-amplified accelerometer of a rig file: S s/(s + w) on acceleration, its noise white at the output."""
+
+    name: str
+    position: Triple
+    direction: Triple
+    sensitivity_Vs2_per_m: float
+    low_corner_Hz: float
+    noise_m_per_s2_rtHz: float | None = None
+    preamplifier_gain: float = 1.0
+    noise_rms_V: float | None = None
+
+    def sensor(self, acquisition: Acquisition, ambient: Ambient | None = None) -> Sensor:
+        gain = self.sensitivity_Vs2_per_m * self.preamplifier_gain
+        noise = _noise_rms(self.noise_rms_V, self.noise_m_per_s2_rtHz, gain, acquisition, ambient)
+        return Sensor(self.name, self.position, self.direction, "acceleration", (0j,),
+                      (complex(-2 * np.pi * self.low_corner_Hz),), gain, noise)
+
+
+def white_rms(density: float, gain: float, sample_rate_Hz: float) -> float:
+    """R.m.s. of one sample [V] of a motion's noise density, limited to half the sample rate."""
+    return float(density * gain * np.sqrt(sample_rate_Hz / 2))
+
+
+def _noise_rms(rms_V: float | None, density: float | None, gain: float, acquisition: Acquisition,
+               ambient: Ambient | None) -> float:
+    """What the file states of a sensor's noise, or else the ambient noise of its channels."""
+    if rms_V is not None:
+        return rms_V
+    if density is not None:
+        return white_rms(density, gain, acquisition.sample_rate_Hz)
+    return ambient.sensor_noise_rms_V if ambient else 0.0
+
+
+@dataclass(frozen=True)
+class PositionSensorAt:
+    """A position sensor of a rig file, payload against chassis; bandwidth_Hz : first-order lag, None for none."""
+
+    name: str
+    position: Triple
+    direction: Triple
+    sensitivity_V_per_m: float
+    bandwidth_Hz: float | None = None
+    noise_m_rtHz: float | None = None
+    preamplifier_gain: float = 1.0
+    noise_rms_V: float | None = None
+
+    def sensor(self, acquisition: Acquisition, ambient: Ambient | None = None) -> Sensor:
+        gain = self.sensitivity_V_per_m * self.preamplifier_gain
+        poles = () if self.bandwidth_Hz is None else (complex(-2 * np.pi * self.bandwidth_Hz),)
+        noise = _noise_rms(self.noise_rms_V, self.noise_m_rtHz, gain, acquisition, ambient)
+        return Sensor(self.name, self.position, self.direction, "displacement", (), poles, gain, noise)
+
+
+Instrument = GeophoneAt | AccelerometerAt | PositionSensorAt
+
+
+def with_gain(instrument: Instrument, gain: float) -> Instrument:
+    """The instrument with other volts per unit of motion behind its preamplifier."""
+    sensitivity = gain / instrument.preamplifier_gain
+    if isinstance(instrument, GeophoneAt):
+        return replace(instrument, sensitivity_Vs_per_m=sensitivity)
+    if isinstance(instrument, AccelerometerAt):
+        return replace(instrument, sensitivity_Vs2_per_m=sensitivity)
+    return replace(instrument, sensitivity_V_per_m=sensitivity)
+
+
+@dataclass(frozen=True)
+class FloorSensor:
+    """What a column of floor velocity of a campaign was measured with: along x, y or z of the floor.
+
+    noise_rms_m_per_s : white noise of one sample, as velocity of the floor.
+    """
+
+    name: str
+    axis: str
+    noise_rms_m_per_s: float
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """One standard deviation each of what a rig file states; the defaults are those of the contract.
+
+    Places: every coordinate of isolators, drives and sensors. Directions: of every drive and sensor, about both
+    normals.
+    """
+
+    place_m: float = 0.001
+    direction_rad: float = 0.005
+    actuator_gain_percent: float = 1.0
+    sensor_gain_percent: float = 1.0
+    sensor_corner_percent: float = 1.0
+    sensor_damping_percent: float = 3.0
+    centre_of_mass_m: float = 0.001
+    product_of_inertia_kgm2: float = 0.2

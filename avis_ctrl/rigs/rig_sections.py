@@ -1,0 +1,252 @@
+"""The sections of a rig file and their keys: what docs/rig_file.md documents."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from avis_ctrl.rigs.floor_spectrum import shipped_spectra
+from avis_ctrl.rigs.instruments import Tolerances
+
+# In SI units nothing on a table comes near the limit; it keeps the products of such numbers finite.
+LIMIT = 1e12
+Number = Annotated[float, Field(ge=-LIMIT, le=LIMIT)]
+Positive = Annotated[float, Field(gt=0, le=LIMIT)]
+NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
+# No table is larger: far points leave no digits for the inertia beside m r^2.
+Length = Annotated[float, Field(ge=-100.0, le=100.0)]
+PositiveLength = Annotated[float, Field(gt=0, le=100.0)]
+Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Point = Annotated[list[Length], Field(min_length=3, max_length=3)]
+PositiveVector = Annotated[list[Positive], Field(min_length=3, max_length=3)]
+DampingVector = Annotated[list[NotNegative], Field(min_length=3, max_length=3)]
+Axis = Literal["x", "y", "z"]
+
+
+def _with_a_length(direction: list[float]) -> list[float]:
+    if not any(direction):
+        raise ValueError("expected a vector with a length")
+    return direction
+
+
+Direction = Annotated[list[Number], Field(min_length=3, max_length=3), AfterValidator(_with_a_length)]
+# Signals of a model are named after channels: letters, digits, _ and -, a letter first.
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")]
+Percent = Annotated[float, Field(ge=0, le=100)]
+
+
+def _rising(band: list[float]) -> list[float]:
+    if band[0] >= band[1]:
+        raise ValueError("expected the lower end first, the upper one after it")
+    return band
+
+
+def _shipped(spectrum: str) -> str:
+    if spectrum not in shipped_spectra():
+        raise ValueError(f"expected one of {', '.join(shipped_spectra())}")
+    return spectrum
+
+
+# What other files share: a frequency band [Hz], and the name of a shipped spectrum of floor motion.
+Band = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(_rising)]
+Spectrum = Annotated[str, AfterValidator(_shipped)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class AvisPayload(_Section):
+    mass_kg: Positive
+    inertia_kgm2: PositiveVector
+    inertia_offdiagonal_kgm2: Vector = [0.0, 0.0, 0.0]
+    centre_of_mass_m: Point
+
+
+class IsolatorSection(_Section):
+    position_m: Point
+    stiffness_N_per_m: PositiveVector
+    damping_Ns_per_m: DampingVector
+    chassis_point_m: Point | None = None
+
+
+class MotorSection(_Section):
+    """Motors in the isolators, along their axes; without any, only the limit of [[drive]] tables."""
+
+    names: list[str] = []
+    isolator: list[int] = []
+    axis: list[Axis] = []
+    constant_N_per_V: list[Positive] = []
+    limit_V: Positive
+
+
+class DriveSection(_Section):
+    name: Name
+    position_m: Point
+    direction: Direction
+    constant_N_per_V: Positive
+    limit_V: Positive | None = None
+
+
+class GeophoneSection(_Section):
+    names: list[str]
+    isolator: list[int]
+    axis: list[Axis]
+    sensitivity_Vs_per_m: list[Positive]
+    suspension_Hz: Positive
+    suspension_damping: Positive
+    compensated_Hz: Positive
+    compensated_damping: Positive
+    preamplifier_gain: Positive
+
+
+class GeophoneAtSection(_Section):
+    name: Name
+    position_m: Point
+    direction: Direction
+    sensitivity_Vs_per_m: Positive
+    suspension_Hz: Positive
+    suspension_damping: Positive
+    compensated_Hz: Positive | None = None
+    compensated_damping: Positive | None = None
+    preamplifier_gain: Positive = 1.0
+    noise_rms_V: NotNegative | None = None
+
+
+class AccelerometerAtSection(_Section):
+    name: Name
+    position_m: Point
+    direction: Direction
+    sensitivity_Vs2_per_m: Positive
+    low_corner_Hz: Positive
+    noise_m_per_s2_rtHz: NotNegative | None = None
+    preamplifier_gain: Positive = 1.0
+    noise_rms_V: NotNegative | None = None
+
+
+class PositionSensorSection(_Section):
+    name: Name
+    position_m: Point
+    direction: Direction
+    sensitivity_V_per_m: Positive
+    bandwidth_Hz: Positive | None = None
+    noise_m_rtHz: NotNegative | None = None
+    preamplifier_gain: Positive = 1.0
+    noise_rms_V: NotNegative | None = None
+
+
+class FloorSensorSection(_Section):
+    name: Name
+    axis: Axis
+    noise_rms_m_per_s: NotNegative
+
+
+class TolerancesSection(_Section):
+    """One standard deviation each; what is left out takes the default."""
+
+    place_m: NotNegative = Tolerances.place_m
+    direction_rad: NotNegative = Tolerances.direction_rad
+    actuator_gain_percent: Percent = Tolerances.actuator_gain_percent
+    sensor_gain_percent: Percent = Tolerances.sensor_gain_percent
+    sensor_corner_percent: Percent = Tolerances.sensor_corner_percent
+    sensor_damping_percent: Percent = Tolerances.sensor_damping_percent
+    centre_of_mass_m: NotNegative = Tolerances.centre_of_mass_m
+    product_of_inertia_kgm2: NotNegative = Tolerances.product_of_inertia_kgm2
+
+
+class AcquisitionSection(_Section):
+    sample_rate_Hz: Positive
+    adc_bits: Annotated[int, Field(ge=1, le=64)]
+    adc_range_V: Positive
+    loop_delay_s: NotNegative
+
+
+class AmbientSection(_Section):
+    floor_velocity_rms_m_per_s: NotNegative
+    sensor_noise_rms_V: NotNegative
+
+
+class AvisFile(_Section):
+    name: str
+    payload: AvisPayload
+    isolator: Annotated[list[IsolatorSection], Field(min_length=3)]
+    actuators: MotorSection | None = None
+    drive: list[DriveSection] = []
+    geophones: GeophoneSection | None = None
+    geophone: list[GeophoneAtSection] = []
+    accelerometer: list[AccelerometerAtSection] = []
+    position_sensor: list[PositionSensorSection] = []
+    floor_sensor: Annotated[list[FloorSensorSection], Field(max_length=3)] = []
+    acquisition: AcquisitionSection
+    ambient: AmbientSection | None = None
+    tolerances: TolerancesSection | None = None
+
+
+class PlateSection(_Section):
+    mass_kg: Positive
+    inertia_kgm2: PositiveVector
+    L1_m: PositiveLength
+    L2_m: PositiveLength
+    L3_m: PositiveLength
+    L4_plus_L5_m: PositiveLength
+    L6_m: Length
+    M2_arm_m: Length = 0.2
+    M3_arm_m: Length = 0.15
+
+
+class SuspensionSection(_Section):
+    """k_s_each_N_per_m : the springs at the corners of A1..A4, where they differ; k_s_N_per_m is then their mean."""
+
+    k_s_N_per_m: Positive
+    k_s_each_N_per_m: Annotated[list[Positive], Field(min_length=4, max_length=4)] | None = None
+    k_a_N_per_m: Positive
+    k_t_N_per_m: Positive
+    k_r_Nm_per_rad: Positive
+    d1_Ns_per_m: NotNegative
+    d3_Ns_per_m: NotNegative
+    d4_Nms_per_rad: NotNegative
+    d5_Nms_per_rad: NotNegative
+    d6_Nms_per_rad: NotNegative
+
+
+class VoiceCoilSection(_Section):
+    names: Annotated[list[str], Field(min_length=8, max_length=8)]
+    constant_N_per_V: Annotated[list[Positive], Field(min_length=8, max_length=8)]
+    reaction_mass_kg: Positive
+    reaction_damping_Ns_per_m: NotNegative
+    free_constant_N_per_V: Positive
+
+
+class AccelerometerSection(_Section):
+    at: Annotated[list[str], Field(min_length=1)]
+    sensitivity_Vs2_per_m: Positive
+    low_corner_Hz: Positive
+    noise_m_per_s2_rtHz: NotNegative
+    sample_rate_Hz: Positive
+    loop_delay_s: NotNegative
+    drive_limit_V: Positive
+
+
+class LoadSection(_Section):
+    mass_kg: Positive
+    L7_m: Length
+    L8_m: Length
+    L9_m: Length
+    Ixx_total_kgm2: Positive
+    Iyy_total_kgm2: Positive
+    Izz_total_kgm2: Positive
+    Ixy_load_kgm2: Number = 0.0
+    Ixz_load_kgm2: Number = 0.0
+    Iyz_load_kgm2: Number = 0.0
+
+
+class HalcyonicsFile(_Section):
+    name: str
+    payload: PlateSection
+    suspension: SuspensionSection
+    actuators: VoiceCoilSection
+    accelerometers: AccelerometerSection
+    load: LoadSection | None = None
+    ambient: AmbientSection | None = None
+    tolerances: TolerancesSection | None = None
