@@ -12,6 +12,7 @@ it.
 - `campaign`: measurement campaigns in every usual form, written as `avis-campaign` HDF5 files (`write_campaign`).
 - `closed_loop`: a sampled controller (`controller.json` of `avis export`) on a table: `linearise` (spectral radius of
   the one-sample map, axis of the least stable mode), `run` (stable or not, r.m.s. velocity), `transmissibility`.
+- `agreement`: the two routes of `closed_loop` against each other on all tables.
 - `tables`: the five tables, `NOMINAL[name]()` as a rig file would say, `truth(name, seed)` as the table really is.
 
 Use, from the root of the repository:

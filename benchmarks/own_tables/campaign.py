@@ -149,16 +149,27 @@ def scale(table: Table, u: np.ndarray, settings: Settings) -> float:
     return 0.01 / max(abs(u).max(), 1e-300) / max(worst, drives)
 
 
-def record(table: Table, u: np.ndarray, settings: Settings, rng, floor_rms: float | None = None):
-    """One record after `settle_s` of ambient motion: y (N, sensors) V, floor velocity (N, 3) m/s, the `Record`."""
+def record(table: Table, u: np.ndarray, settings: Settings, rng, floor_rms: float | None = None, shares: bool = False):
+    """One record after `settle_s` of ambient motion: y (N, sensors) V, floor velocity (N, 3) m/s, noise shares.
+
+    Shares (asked for): per sensor, in percent of its r.m.s., what the best prediction from the commands alone and from
+    commands and floor leaves: ambient motion, sensor noise and converter.
+    """
     before = round(settings.settle_s * table.sample_rate_Hz)
     rms = table.floor_velocity_rms_m_per_s if floor_rms is None else floor_rms
     floor = floor_motion(before + len(u), table.dt, rms, rng)
     state = State.rest(table)
-    simulate(table, np.zeros((before, len(table.drives))), floor=floor[: before + 1], state=state, rng=rng)
-    result = simulate(table, u, floor=floor[before:], state=state, rng=rng)
+    simulate(table, np.zeros((before, len(table.drives))), floor=floor[: before + 1], state=state)
+    quiet = state.copy()
+    y = simulate(table, u, floor=floor[before:], state=state, rng=rng).y
     velocity = floor[before:-1, 6:9] + settings.floor_noise_m_per_s * rng.standard_normal((len(u), 3))
-    return result.y, velocity, result
+    left = {}
+    if shares:
+        alone = simulate(table, u, quantise=False).y
+        known = simulate(table, u, floor=floor[before:], state=quiet, quantise=False).y
+        for name, best in (("commands", alone), ("commands_and_floor", known)):
+            left[name] = (100 * (y - best).std(axis=0) / y.std(axis=0)).round(3).tolist()
+    return y, velocity, left
 
 
 def write_campaign(
@@ -172,7 +183,9 @@ def write_campaign(
     floor_record_rms_m_per_s: float | None = None,
     rig: str | None = None,
 ) -> list[dict]:
-    """Simulate a campaign and write it whole; returns one line per record (excitation, seconds, level, largest volts).
+    """Simulate a campaign and write it whole; returns one line per record (excitation, level, largest volts).
+
+    The last line, of the validation record, has `left_by_noise_percent`: what no model can predict of each sensor.
 
     `floor_record_rms_m_per_s`: also a record with the floor shaken so strongly, drives silent. `rig`: name in the file,
     the table's if not given.
@@ -192,7 +205,7 @@ def write_campaign(
     with h5py.File(partial, "w") as file:
         file.attrs.update(format="avis-campaign", version=1, rig=rig or table.name)
         for k, (word, u, period, floor_rms) in enumerate(plan):
-            y, velocity, _ = record(table, u, s, rng, floor_rms)
+            y, velocity, left = record(table, u, s, rng, floor_rms, shares=k == len(plan) - 1)
             driven = u[:, abs(u).max(axis=0) > 0]
             level = float(driven.std()) if driven.size else 0.0
             group = file.create_group(f"records/{k:02d}")
@@ -206,8 +219,9 @@ def write_campaign(
                 data_set = group.create_dataset(name, data=data, compression="gzip", compression_opts=1)
                 data_set.attrs.update(names=names, unit=unit)
             start += len(u) * table.dt + s.settle_s
-            told.append({"record": f"{k:02d}", "excitation": word, "seconds": len(u) * table.dt, "level_V": level,
-                         "largest_u_V": float(abs(u).max()), "largest_y_V": float(abs(y).max())})  # fmt: skip
+            told.append({"record": f"{k:02d}", "excitation": word, "seconds": len(u) * table.dt, "level_V": level})
+            told[-1] |= {"largest_u_V": float(abs(u).max()), "largest_y_V": float(abs(y).max())}
+            told[-1] |= {"left_by_noise_percent": left} if left else {}
     os.replace(partial, path)
     return told
 

@@ -12,7 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
-from .physics import AXES, Accelerometer, Geophone, State, Table, drive_matrix, floor_motion, sensor_matrix, simulate
+from .physics import (
+    AXES,
+    Accelerometer,
+    Geophone,
+    Record,
+    State,
+    Table,
+    drive_matrix,
+    floor_motion,
+    sensor_matrix,
+    simulate,
+)
 from .tables import truth
 
 
@@ -208,6 +219,7 @@ class Run:
     velocity_rms: dict  # per axis, m/s or rad/s, second half
     passive_rms: dict  # the same table, same floor, no controller
     saturated: float  # share of the second half with a drive at its limit
+    overloaded: float  # share of the second half with a sensor beyond the converter
     largest_y_V: float
 
 
@@ -219,9 +231,10 @@ def run(table: Table, controller: Controller, seconds: float = 60.0, seed: int =
         push_m_per_s: float = 1e-7, own_delay: bool = False) -> Run:  # fmt: skip
     """Nonlinear simulation from rest under floor motion and sensor noise: converter, hold, delay, limits; seeded.
 
-    Stable: nothing left its mounts, no drive is at its limit more than a hundredth of the second half, and what a small
-    push leaves does not grow. The last is told by a twin of the run with the same floor and noise but a small push of
-    all axes at the start, both without converter; it sees a growth that takes minutes to show above the noise.
+    Stable: nothing left its mounts, no drive is at its limit and no sensor beyond the converter for more than a
+    hundredth of the second half, and what a small push leaves does not grow. The last is told by a twin of the run with
+    the same floor and noise but a small push of all axes at the start, both without converter; it sees a growth that
+    takes minutes to show above the noise.
     """
     K, delay = controller.on(table), controller.delay_s(table, own_delay)
     N = round(seconds * table.sample_rate_Hz)
@@ -240,28 +253,49 @@ def run(table: Table, controller: Controller, seconds: float = 60.0, seed: int =
     measured = one(K, True, 0.0)
     passive = one(None, True, 0.0)
     half = len(measured.u) // 2
-    saturated = float((abs(measured.u[half:]) >= 0.999 * table.limits).any(axis=1).mean())
-    growth, axis, left = math.inf, "", measured.left
-    if not left:
-        a, b = one(K, False, 0.0), one(K, False, push_m_per_s)
-        left = a.left or b.left
-        if not left:
-            weight = np.sqrt(np.concatenate([np.full(3, table.mass_kg), np.diag(table.inertia_kgm2)]))
-            d = (b.velocity - a.velocity) * weight
-            q = N // 4
-            third, last = (np.sqrt((d[k * q : (k + 1) * q] ** 2).mean(axis=0)) for k in (2, 3))
-            size3, size4 = np.linalg.norm(third), np.linalg.norm(last)
-            start = push_m_per_s * np.linalg.norm(weight)
-            axis = AXES[int(last.argmax())]
-            rounding = 1e-6 * start
-            growth = math.log(max(size4, rounding) / max(size3, rounding)) / (q * table.dt)
-    why = "the body left its mounts" if left else ""
+    saturated = _share(abs(measured.u[half:]) >= 0.999 * table.limits)
+    overloaded = _share(abs(measured.y[half:]) >= 0.999 * table.adc_range_V)
+    a, b = one(K, False, 0.0), one(K, False, push_m_per_s)
+    growth, axis = _growth(table, a, b, push_m_per_s)
+    why = "the body left its mounts" if measured.left else ""
     if not why and saturated > 0.01:
         why = f"drives at their limit {100 * saturated:.0f} % of the time"
-    if not why and growth > 0.0:
-        why = f"a small push grows by {growth:.3g} 1/s, most in {axis}"
-    return Run(not why, why or "a small push dies out", growth, axis, _per_axis(_rms(measured.velocity[half:])),
-               _per_axis(_rms(passive.velocity[half:])), saturated, float(abs(measured.y).max()))  # fmt: skip
+    if not why and overloaded > 0.01:
+        why = f"converter overloaded {100 * overloaded:.0f} % of the time"
+    if growth > 0.0:
+        why = f"a small push grows by {growth:.3g} 1/s, most in {axis}" + (f"; {why}" if why else "")
+    return Run(
+        stable=not why,
+        why=why or "a small push dies out",
+        growth_per_s=growth,
+        growing_axis=axis,
+        velocity_rms=_per_axis(_rms(measured.velocity[half:])),
+        passive_rms=_per_axis(_rms(passive.velocity[half:])),
+        saturated=saturated,
+        overloaded=overloaded,
+        largest_y_V=float(abs(measured.y).max()),
+    )
+
+
+def _share(hit) -> float:
+    return float(hit.any(axis=1).mean()) if hit.size else 0.0
+
+
+def _growth(table: Table, a: Record, b: Record, push: float) -> tuple[float, str]:
+    """Rate at which two runs part, 1/s, and the axis; before a drive reaches its limit, where growth would end.
+
+    From the third to the fourth quarter of that time; nothing is taken for growth that is a millionth of the push.
+    """
+    N = min(len(a.u), len(b.u))
+    limited = ((abs(a.u[:N]) >= 0.999 * table.limits) | (abs(b.u[:N]) >= 0.999 * table.limits)).any(axis=1)
+    N = int(limited.argmax()) if limited.any() else N
+    q = max(N // 4, 1)
+    weight = np.sqrt(np.concatenate([np.full(3, table.mass_kg), np.diag(table.inertia_kgm2)]))
+    d = (b.velocity - a.velocity)[: 4 * q] * weight
+    third, last = _rms(d[2 * q : 3 * q]), _rms(d[3 * q :])
+    floor = 1e-6 * push * np.linalg.norm(weight)
+    growth = math.log(max(np.linalg.norm(last), floor) / max(np.linalg.norm(third), floor)) / (q * table.dt)
+    return growth, AXES[int(last.argmax())]
 
 
 def _rms(v):
