@@ -19,18 +19,16 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, discretise, hinf_norm, lft_lower
-from avis_ctrl.lti.norms import bilinear_to_continuous
 from avis_ctrl.robust.hinf_bounds import pointwise_bound
 from avis_ctrl.robust.hinf_plant import (
     RANK_TOLERANCE,
     NormalForm,
     Plant,
     as_plant,
-    check_stabilisable,
     normal_form,
+    posed_plant,
     rank_margins,
     regularised,
-    without_hidden_states,
 )
 from avis_ctrl.robust.hinf_riccati import ZERO_GAMMA, GammaBracket, central_controller, find_gamma, gamma_test
 from avis_ctrl.robust.reduction import residualise_fast
@@ -163,12 +161,7 @@ class _Problem:
 
     @staticmethod
     def of(P: StateSpace, nmeas: int, ncon: int) -> _Problem:
-        continuous = bilinear_to_continuous(P) if P.dt else P
-        plant = Plant.of(continuous, nmeas, ncon)
-        check_stabilisable(plant)
-        small = without_hidden_states(continuous, nmeas, ncon)
-        if small.nstates < P.nstates:
-            plant = replace(Plant.of(small, nmeas, ncon), u=plant.u, y=plant.y)
+        plant = posed_plant(P, nmeas, ncon)
         of_u, of_y = rank_margins(plant)
         return _Problem(P, plant, (of_u < RANK_TOLERANCE, of_y < RANK_TOLERANCE))
 

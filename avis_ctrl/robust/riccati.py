@@ -41,7 +41,7 @@ class RiccatiSolution:
 
     semidefinite : whether X >= 0, judged on X1' X2 = X1' X X1, whose entries stay below 1 where X blows up.
     doubtful : X has negative eigenvalues, none of them beyond its error; `semidefinite` is then true.
-    omega : (k,) frequencies [rad/s] of the eigenvalues on the imaginary axis, where those are the reason.
+    omega : (k,) frequencies [rad/s] of the eigenvalues on, or nearest to, the imaginary axis where X is None.
     """
 
     X: np.ndarray | None
@@ -64,14 +64,15 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolutio
     T, U, stable = la.schur(H, output="real", sort="lhp")
     poles = _schur_eigenvalues(T)
     on_axis = np.abs(poles.real) <= AXIS_TOLERANCE * np.abs(poles) + 1e-15 * la.norm(H)
+    angle = np.abs(poles.real) / np.maximum(np.abs(poles), 1e-300)
+    nearest = np.unique(np.abs(poles[np.argsort(angle)[:4]].imag))
     if stable != n or np.any(on_axis):
-        nearest = np.argsort(np.abs(poles.real) / np.maximum(np.abs(poles), 1e-300))[:4]
-        return RiccatiSolution(None, False, ON_AXIS, omega=np.unique(np.abs(poles[nearest].imag)))
+        return RiccatiSolution(None, False, ON_AXIS, omega=nearest)
     X1, X2 = U[:n, :n], U[n:, :n]
     gram = X1.T @ X2
     asymmetry = float(la.norm(gram - gram.T, 2))
     if asymmetry > LAGRANGIAN_TOLERANCE:
-        return RiccatiSolution(None, False, INACCURATE)
+        return RiccatiSolution(None, False, INACCURATE, omega=nearest)
     lowest = float(la.eigvalsh((gram + gram.T) / 2)[0])
     lu, piv = la.lu_factor(X1.T, check_finite=False)
     if np.min(np.abs(np.diag(lu))) < 1e-15:
