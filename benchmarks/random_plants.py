@@ -16,7 +16,8 @@ A problem is WRONG where
     I - M Delta is not singular, Delta has not its structure or its norm, or a bound of mu is passed by a perturbation;
     an exception is neither InputError nor ComputationError.
 
---sb10ad K: every K-th synthesis is also given to SLICOT's SB10AD (python-control's hinfsyn); its claims are counted.
+--sb10ad K: every K-th synthesis of low order is also given to SLICOT's SB10AD (python-control's hinfsyn); its claims
+are counted.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
 
 SAME = 1e-3  # relative difference from which two computations of one figure are called different
+SB10AD_ORDER = 12  # it takes minutes above
 LIMIT_S = 120  # seconds after which a problem counts as hung
 
 
@@ -221,6 +223,9 @@ def judge_synthesis(P: StateSpace, base: StateSpace, u: int, y: int, r: Any, sec
     """What is wrong with a synthesis; `second`: other opinions on the bracket, too."""
     wrong = []
     own = closed(P, r.K)
+    # An optimum of zero is met to round-off of the open loop.
+    w, z = base.ninputs - u, base.noutputs - y
+    tiny = 1e-9 * float(np.median([la.norm(at(base, omega)[:z, :w], 2) for omega in frequencies(base, count=20)]))
     balanced = la.matrix_balance(own.A, permute=False)[0] if own.nstates else own.A
     poles = la.eigvals(balanced) if own.nstates else np.zeros(0)
     margin = np.max(np.abs(poles) - 1 if P.dt else poles.real, initial=-1.0)
@@ -231,14 +236,14 @@ def judge_synthesis(P: StateSpace, base: StateSpace, u: int, y: int, r: Any, sec
     if margin < 0:
         with contextlib.suppress(ComputationError):
             norm = max(norm, hinf_norm_slicot(own))
-    if not r.gamma >= norm * (1 - SAME):
+    if not r.gamma >= norm * (1 - SAME) - tiny:
         wrong.append(f"gamma {r.gamma:.6g} below the norm {norm:.6g} ({on_grid:.6g} on the grid)")
-    if not r.gamma <= norm * (1 + 10 * SAME):
+    if not r.gamma <= norm * (1 + 10 * SAME) + tiny:
         wrong.append(f"gamma {r.gamma:.6g} above the norm {norm:.6g}")
     lower, upper = r.gamma_optimal_bounds
     if not lower <= upper * (1 + 1e-9):
         wrong.append(f"bracket {lower:.6g}..{upper:.6g} upside down")
-    if lower > norm * (1 + 1e-6):
+    if lower > norm * (1 + 1e-6) + tiny:
         wrong.append(f"lower bound {lower:.6g} above the norm {norm:.6g} of its own loop")
     others: list[tuple[str, float, float]] = []
     references = [("plain", base, u, y)] if base is not P else []
@@ -257,11 +262,10 @@ def judge_synthesis(P: StateSpace, base: StateSpace, u: int, y: int, r: Any, sec
                 others.append(("inequalities", o.lower, o.upper))
         except ComputationError:
             pass
-    tiny = 1e-6 * on_grid
     for name, low, high in others:
         if lower > high * (1 + SAME) + tiny:
             wrong.append(f"lower bound {lower:.6g} above {high:.6g} reached: {name}")
-        if low > min(upper if r.status.name == "OPTIMAL" else np.inf, norm) * (1 + SAME) + tiny:
+        if low > min(upper, norm) * (1 + SAME) + 100 * tiny:
             wrong.append(f"upper bound {upper:.6g} (norm {norm:.6g}) below what is possible, {low:.6g}: {name}")
     return wrong
 
@@ -436,7 +440,7 @@ def _sb10ad(seed: int, index: int, queue: Any) -> None:
         queue.put((np.nan, np.nan, f"{type(error).__name__}"))
 
 
-def sb10ad(seed: int, index: int, limit: float = 30.0) -> dict[str, Any]:
+def sb10ad(seed: int, index: int, limit: float = 20.0) -> dict[str, Any]:
     """SB10AD in a process of its own: it cannot be interrupted."""
     queue: Any = multiprocessing.Queue()
     process = multiprocessing.Process(target=_sb10ad, args=(seed, index, queue))
@@ -502,7 +506,8 @@ def main() -> None:
     todo = [(asked.seed, k) for k in range(asked.first, asked.first + asked.count) if k not in done]
     with asked.out.open("a") as file, multiprocessing.Pool(asked.jobs) as pool:
         for row in pool.imap_unordered(_work, todo):
-            if asked.sb10ad and row["kind"] == "hinfsyn" and row["index"] % asked.sb10ad == 0:
+            if (asked.sb10ad and row["kind"] == "hinfsyn" and row["index"] % asked.sb10ad == 0
+                    and row["n"] <= SB10AD_ORDER and "sampled" not in row["tags"]):
                 row["sb10ad"] = sb10ad(asked.seed, row["index"])
             file.write(json.dumps(row) + "\n")
             file.flush()

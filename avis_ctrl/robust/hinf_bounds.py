@@ -22,16 +22,15 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace
-from avis_ctrl.lti.norms import bilinear_to_continuous
 from avis_ctrl.robust.hinf_plant import (
     RANK_TOLERANCE,
     Plant,
     as_plant,
     channel_sizes,
-    check_stabilisable,
     normal_form,
     parrott,
     pointwise,
+    posed_plant,
     rank_margins,
     regularised,
 )
@@ -58,8 +57,7 @@ def hinf_lower_bound(P: Any, nmeas: int, ncon: int, omega: np.ndarray | None = N
     Errors as in `hinfsyn`.
     """
     P = as_plant(P, nmeas, ncon)
-    plant = Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon)
-    check_stabilisable(plant)
+    plant = posed_plant(P, nmeas, ncon)
     best = pointwise_bound(plant, omega)
     if min(rank_margins(plant)) >= RANK_TOLERANCE:
         lower = find_gamma(normal_form(plant).plant, 1e-3).lower
@@ -77,7 +75,7 @@ def limiting_weights(P: Any, nmeas: int, ncon: int, step: float = 0.02) -> tuple
     ComputationError where they do not add up, to 10 %: then round-off or those channels decide.
     """
     P = as_plant(P, nmeas, ncon)
-    check_stabilisable(Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon))
+    posed_plant(P, nmeas, ncon)
     found = []
     for count, names, of_outputs in ((P.noutputs - nmeas, P.outputs, True), (P.ninputs - ncon, P.inputs, False)):
         for k in range(count):
@@ -97,7 +95,7 @@ def limiting_weights(P: Any, nmeas: int, ncon: int, step: float = 0.02) -> tuple
 
 
 def _optimum(P: StateSpace, nmeas: int, ncon: int) -> float:
-    plant = Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon)
+    plant = posed_plant(P, nmeas, ncon)
     singular = [margin < RANK_TOLERANCE for margin in rank_margins(plant)]
     if any(singular):
         plant = regularised(plant, 1e-4, singular[0], singular[1], True)

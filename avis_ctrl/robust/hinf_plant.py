@@ -19,6 +19,7 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, minimal
+from avis_ctrl.lti.norms import bilinear_to_continuous
 
 RANK_TOLERANCE = 1e-8
 PBH_TOLERANCE = 1e-10
@@ -110,11 +111,21 @@ def check_stabilisable(plant: Plant) -> None:
                     next_step=f"make the mode stable, or give {who} that reaches it")
 
 
+def posed_plant(P: StateSpace, nmeas: int, ncon: int) -> Plant:
+    """The problem's continuous plant, known to be stabilisable (ComputationError), without hidden states."""
+    continuous = bilinear_to_continuous(P) if P.dt else P
+    plant = Plant.of(continuous, nmeas, ncon)
+    check_stabilisable(plant)
+    small = without_hidden_states(continuous, nmeas, ncon)
+    return plant if small.nstates == plant.n else Plant.of(small, nmeas, ncon)
+
+
 def without_hidden_states(P: StateSpace, nmeas: int, ncon: int) -> StateSpace:
     """P without the states that no input reaches or no output sees, where its response stays the same; else P itself.
 
     Such states (a weight realised twice, say) do not change the problem once they are known to be stable, but X and Y
-    are singular on them, or ill conditioned. Compared block by block on the imaginary axis and off it.
+    are singular on them, or ill conditioned. Compared block by block off the imaginary axis: on it the
+    response near a lightly damped pole is not known to RESPONSE_TOLERANCE.
     """
     small = minimal(P)
     if small.nstates == P.nstates:
@@ -122,7 +133,7 @@ def without_hidden_states(P: StateSpace, nmeas: int, ncon: int) -> StateSpace:
     old, new = Plant.of(P, nmeas, ncon), Plant.of(small, nmeas, ncon)
     sizes = np.abs(old.sample_points())
     sizes = np.unique(np.concatenate([sizes, np.sqrt(sizes[:-1] * sizes[1:]), sizes[[0]] / 100, sizes[[-1]] * 100]))
-    for s in np.concatenate([1j * sizes, sizes * np.exp(0.25j * np.pi)]):
+    for s in np.concatenate([sizes * np.exp(0.1j), sizes * np.exp(0.25j * np.pi)]):
         for B, C, D in (("B1", "C1", "D11"), ("B2", "C1", "D12"), ("B1", "C2", "D21"), ("B2", "C2", "D22")):
             try:
                 a, b = (one.at(s, getattr(one, B), getattr(one, C), getattr(one, D)) for one in (old, new))

@@ -21,7 +21,7 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, hinf_norm, lft_lower
 from avis_ctrl.robust.hinf_plant import NormalForm, Plant, pointwise
-from avis_ctrl.robust.riccati import solution_error, solve_riccati
+from avis_ctrl.robust.riccati import refined_balanced, solve_riccati
 
 # Relative to the open channel w -> z, a gamma below this is round-off.
 ZERO_GAMMA = 1e-9
@@ -95,7 +95,7 @@ def gamma_test(plant: Plant, gamma: float) -> GammaTest:
     doubtful = x.doubtful or y.doubtful
     if coupling < 1:
         return GammaTest(gamma, True, "", coupling, x.X, y.X, doubtful=doubtful)
-    certain = not doubtful and coupling - _coupling_error(plant, gamma, x.X, y.X) > 1
+    certain = not doubtful and _coupled_for_certain(plant, gamma, x.X, y.X)
     return GammaTest(gamma, False, "control and filter together: rho(X Y) is not below gamma^2", coupling, x.X, y.X,
                      forbidden=gamma if certain else 0.0)
 
@@ -106,17 +106,18 @@ def _forbidden(plant: Plant, gamma: float, omega: np.ndarray) -> float:
     return min(best, gamma) if best > (1 - NEARLY) * gamma else 0.0
 
 
-def _coupling_error(plant: Plant, gamma: float, X: np.ndarray, Y: np.ndarray) -> float:
-    """First-order error of rho(X Y) / gamma^2 from those of X and Y; inf where it cannot be told."""
-    of_x = solution_error(*control_riccati(plant, gamma), X)
-    of_y = solution_error(*filter_riccati(plant, gamma), Y)
+def _coupled_for_certain(plant: Plant, gamma: float, X: np.ndarray, Y: np.ndarray) -> bool:
+    """Whether rho(X Y) is above gamma^2 by more than X and Y, refined, leave it uncertain to first order."""
+    of_x, of_y = (refined_balanced(*data, one) for data, one in ((control_riccati(plant, gamma), X),
+                                                                 (filter_riccati(plant, gamma), Y)))
+    if of_x is None or of_y is None:
+        return False
+    (X, E_x), (Y, E_y) = of_x, of_y
     values, vectors = la.eig(X @ Y)
     r = vectors[:, int(np.argmax(values.real))].real
-    rho, q = float(np.max(values.real)), Y @ r
-    if of_x is None or of_y is None or not q @ r > 0:
-        return np.inf
     # Y r is the left eigenvector of X Y.
-    return float((q @ of_x @ q + rho * r @ of_y @ r) / (q @ r)) / gamma ** 2
+    rho, q = float(np.max(values.real)), Y @ r
+    return bool(q @ r > 0 and rho - (q @ E_x @ q + rho * r @ E_y @ r) / (q @ r) > gamma ** 2)
 
 
 def keeps(plant: Plant, test: GammaTest) -> bool:
@@ -146,7 +147,7 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
         search.try_gamma(step)
         step, factor = step * factor, factor ** 2
         if step > limit * start:
-            raise ComputationError("no controller reaches any gamma", measured=f"gamma up to {step:.3g} tried",
+            raise ComputationError("no controller was found at any gamma", measured=f"gamma up to {step:.3g} tried",
                                    cause=search.reason, next_step="check weights and scaling of the plant")
     factor = 1.05 if hint else 4.0
     while search.failed <= max(floor, 0.0) and search.upper.gamma > nothing:

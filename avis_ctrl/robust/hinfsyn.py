@@ -1,8 +1,11 @@
 """H-infinity synthesis: K with u = K y that makes ||F_l(P, K)|| small, and stabilises.
 
-The optimum is bracketed by the two-Riccati test; the controller is taken `backoff` above it, where its
-poles are still slow enough to implement. Every figure reported is measured on the closed loop of the
-plant as it was given, before any scaling or regularisation.
+The optimum is bracketed by the two-Riccati test; the controller is taken at most `backoff` above it. As gamma falls
+to its optimum, I - X Y / gamma^2 or an inverse of X or Y becomes singular, and poles of the central controller go to
+infinity as 1 / backoff: in the limit they are a gain (Safonov, Limebeer and Chiang, Int. J. Control 50, 1989). Poles
+far beyond the plant's are therefore replaced by their gain, in a controller nearer to the optimum where that is nearly
+exact, if the loop is then measured to keep the target of the back-off. Every figure reported is measured on the closed
+loop of the plant as it was given, before any scaling or regularisation.
 """
 
 from __future__ import annotations
@@ -12,27 +15,31 @@ from enum import Enum
 from typing import Any, Literal
 
 import numpy as np
+import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, discretise, hinf_norm, lft_lower
-from avis_ctrl.lti.norms import bilinear_to_continuous
 from avis_ctrl.robust.hinf_bounds import pointwise_bound
 from avis_ctrl.robust.hinf_plant import (
     RANK_TOLERANCE,
     NormalForm,
     Plant,
     as_plant,
-    check_stabilisable,
     normal_form,
+    posed_plant,
     rank_margins,
     regularised,
-    without_hidden_states,
 )
 from avis_ctrl.robust.hinf_riccati import ZERO_GAMMA, GammaBracket, central_controller, find_gamma, gamma_test
+from avis_ctrl.robust.reduction import residualise_fast
 from avis_ctrl.robust.riccati import INACCURATE, ON_AXIS
 
 # Relative accuracy to which a closed loop's norm contradicts a bound.
 LOOP_ACCURACY = 1e-5
+# A controller pole this many times the plant's fastest comes from the formulas, not from the plant.
+FAR_BEYOND = 10.0
+# Shares of the back-off at which a controller without them is tried: the smaller, the nearer they are to a gain.
+CLOSER = (1.0, 0.3, 0.1, 0.03, 0.01)
 
 
 class Status(Enum):
@@ -120,7 +127,7 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     bounds, status, notes = _consistent(bounds, result.gamma, tolerance, status, notes)
     rate = _rate_note(result, sample_rate_Hz)
     return replace(result, gamma_optimal_bounds=(float(bounds[0]), float(bounds[1])), status=status,
-                   limited_by=bracket.limited_by, notes=(*notes, *rate))
+                   limited_by=bracket.limited_by, notes=(*notes, *result.notes, *rate))
 
 
 def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
@@ -154,12 +161,7 @@ class _Problem:
 
     @staticmethod
     def of(P: StateSpace, nmeas: int, ncon: int) -> _Problem:
-        continuous = bilinear_to_continuous(P) if P.dt else P
-        plant = Plant.of(continuous, nmeas, ncon)
-        check_stabilisable(plant)
-        small = without_hidden_states(continuous, nmeas, ncon)
-        if small.nstates < P.nstates:
-            plant = replace(Plant.of(small, nmeas, ncon), u=plant.u, y=plant.y)
+        plant = posed_plant(P, nmeas, ncon)
         of_u, of_y = rank_margins(plant)
         return _Problem(P, plant, (of_u < RANK_TOLERANCE, of_y < RANK_TOLERANCE))
 
@@ -236,13 +238,34 @@ class _Problem:
                 best = result
             if result.gamma <= target * (1 + 1e-5):
                 said = f"the back-off was raised from {100 * backoff:.3g} % to {100 * margin:.3g} %" if k else ""
-                return result, said
+                return self._slower(form, result, gamma, target), said
         if best is None or not np.isfinite(best.gamma):
             raise ComputationError("no controller's closed loop was measured to be stable",
                                    measured=f"gamma from {gamma:.4g} upwards tried",
                                    cause="the plant is too badly scaled or conditioned for double precision",
                                    next_step="rescale signals, or raise the smallest weights")
         return best, f"no back-off was confirmed; the best measured is {best.gamma:.6g} against an optimum {gamma:.6g}"
+
+    def _slower(self, form: NormalForm, result: Synthesis, gamma: float, target: float) -> Synthesis:
+        """A controller without poles far beyond the plant's and its own others that keeps the target, or the given."""
+        plant_fastest = float(np.max(np.abs(la.eigvals(self.plant.A)), initial=0.0))
+        if not result.fastest_pole > FAR_BEYOND * plant_fastest > 0:
+            return result
+        for share in CLOSER:
+            test = gamma_test(form.plant, gamma + share * (target - gamma))
+            if not test.feasible:
+                continue
+            try:
+                K = balance(central_controller(form, test))
+                found = self.measured(residualise_fast(K, _widest_gap(K.poles(), plant_fastest), also_unstable=True))
+            except (ComputationError, np.linalg.LinAlgError):
+                continue
+            if found.gamma <= target * (1 + LOOP_ACCURACY) and found.fastest_pole < result.fastest_pole:
+                said = (f"the central controller has poles up to {result.fastest_pole:.3g} rad/s, the plant up to "
+                        f"{plant_fastest:.3g}: those far beyond were replaced by their gain, up to "
+                        f"{found.fastest_pole:.3g} remain, and the loop was measured with that")
+                return replace(found, notes=(said,))
+        return result
 
     def measured(self, K: StateSpace) -> Synthesis:
         """K in the plant's time domain and names, with the closed loop it makes measured on the plant as given."""
@@ -252,6 +275,14 @@ class _Problem:
             K = discretise(K, self.P.dt, "tustin")
         closed = lft_lower(self.P, K)
         return Synthesis(K, hinf_norm(closed).gain, (0.0, np.inf), Status.OPTIMAL, closed, fastest, "")
+
+
+def _widest_gap(poles: np.ndarray, plant_fastest: float) -> float:
+    """The magnitude [rad/s] in the middle of the widest gap (as a ratio) of the poles beyond the plant's."""
+    sizes = np.sort(np.abs(poles))
+    sizes = np.concatenate([[plant_fastest], sizes[sizes > plant_fastest]])
+    widest = int(np.argmax(sizes[1:] / sizes[:-1]))
+    return float(np.sqrt(sizes[widest] * sizes[widest + 1]))
 
 
 def _consistent(bounds: tuple[float, float], reached: float, tolerance: float, status: Status,

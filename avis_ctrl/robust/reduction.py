@@ -109,18 +109,19 @@ def split_stable(K: StateSpace) -> tuple[StateSpace, StateSpace]:
     return _split(K, inside)
 
 
-def residualise_fast(K: StateSpace, limit: float) -> StateSpace:
+def residualise_fast(K: StateSpace, limit: float, also_unstable: bool = False) -> StateSpace:
     """K with every pole faster than `limit` [rad/s] replaced by what it contributes at rest.
 
     A controller that runs at a sample rate cannot have them, and one taken close to the optimum often does; K(0) is
-    kept exactly. Raises InputError for sampled K, ComputationError where a fast pole is unstable.
+    kept exactly. Raises InputError for sampled K, ComputationError where a fast pole is unstable (unless
+    `also_unstable`, for callers who measure the loop that results).
     """
     if K.dt:
         raise InputError("expected a continuous controller", field="K.dt", value=K.dt)
     slow, fast = _split(K, lambda re, im: np.hypot(re, im) <= limit)
     if not fast.nstates:
         return K
-    if not fast.is_stable():
+    if not fast.is_stable() and not also_unstable:
         raise ComputationError("an unstable pole is too fast to implement",
                                measured=f"{np.max(np.abs(fast.poles())):.4g} rad/s, limit {limit:.4g} rad/s",
                                next_step="raise the back-off, or sample faster")

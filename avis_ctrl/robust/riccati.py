@@ -30,7 +30,7 @@ from avis_ctrl.lti.norms import symplectic_scale
 AXIS_TOLERANCE = 1e-10
 LAGRANGIAN_TOLERANCE = 1e-6
 # Round-off of the residual in units of what each of its terms rounds to.
-ROUND_OFF = 32 * np.finfo(float).eps
+ROUND_OFF = 8 * np.finfo(float).eps
 INACCURATE = "the Hamiltonian is too badly conditioned for its stable subspace"
 ON_AXIS = "the Hamiltonian has eigenvalues on the imaginary axis"
 
@@ -41,7 +41,7 @@ class RiccatiSolution:
 
     semidefinite : whether X >= 0, judged on X1' X2 = X1' X X1, whose entries stay below 1 where X blows up.
     doubtful : X has negative eigenvalues, none of them beyond its error; `semidefinite` is then true.
-    omega : (k,) frequencies [rad/s] of the eigenvalues on the imaginary axis, where those are the reason.
+    omega : (k,) frequencies [rad/s] of the eigenvalues on, or nearest to, the imaginary axis where X is None.
     """
 
     X: np.ndarray | None
@@ -64,14 +64,15 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolutio
     T, U, stable = la.schur(H, output="real", sort="lhp")
     poles = _schur_eigenvalues(T)
     on_axis = np.abs(poles.real) <= AXIS_TOLERANCE * np.abs(poles) + 1e-15 * la.norm(H)
+    angle = np.abs(poles.real) / np.maximum(np.abs(poles), 1e-300)
+    nearest = np.unique(np.abs(poles[np.argsort(angle)[:4]].imag))
     if stable != n or np.any(on_axis):
-        nearest = np.argsort(np.abs(poles.real) / np.maximum(np.abs(poles), 1e-300))[:4]
-        return RiccatiSolution(None, False, ON_AXIS, omega=np.unique(np.abs(poles[nearest].imag)))
+        return RiccatiSolution(None, False, ON_AXIS, omega=nearest)
     X1, X2 = U[:n, :n], U[n:, :n]
     gram = X1.T @ X2
     asymmetry = float(la.norm(gram - gram.T, 2))
     if asymmetry > LAGRANGIAN_TOLERANCE:
-        return RiccatiSolution(None, False, INACCURATE)
+        return RiccatiSolution(None, False, INACCURATE, omega=nearest)
     lowest = float(la.eigvalsh((gram + gram.T) / 2)[0])
     lu, piv = la.lu_factor(X1.T, check_finite=False)
     if np.min(np.abs(np.diag(lu))) < 1e-15:
@@ -85,10 +86,30 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolutio
     return RiccatiSolution(X, not indefinite, doubtful=not indefinite)
 
 
-def solution_error(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> np.ndarray | None:
-    """E >= 0 with X - E <= true solution <= X + E, to first order in round-off; None where A + R X is not stable."""
-    residual, rounding = _residual(A, R, Q, X)
-    return _error(A + R @ X, np.abs(residual) + rounding)
+def refined(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """X after a step of Newton's method, and E >= 0 with X - E <= true solution <= X + E to first order in round-off.
+
+    None where A + R X is not stable or a linear equation is singular.
+    """
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            X = X + la.solve_continuous_lyapunov((A + R @ X).T, -_residual(A, R, Q, X)[0])
+            X = (X + X.T) / 2
+            residual, rounding = _residual(A, R, Q, X)
+            E = _error(A + R @ X, np.abs(residual) + rounding)
+        except (np.linalg.LinAlgError, ValueError):
+            return None
+    return None if E is None else (X, E)
+
+
+def refined_balanced(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
+                     X: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """`refined` in the units of the states in which round-off counts least."""
+    d = symplectic_scale(A, R, Q)
+    both = np.outer(d, d)
+    found = refined(A / d[:, None] * d, R / both, Q * both, X * both)
+    return None if found is None else (found[0] / both, found[1] / both)
 
 
 def _residual(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -103,8 +124,7 @@ def _error(closed: np.ndarray, size: np.ndarray) -> np.ndarray | None:
     """E of an error of the residual that is nowhere larger than `size`: a diagonal W of its row sums holds it."""
     if not np.all(np.isfinite(closed)) or np.max(la.eigvals(closed).real) >= 0:
         return None
-    with np.errstate(all="ignore"):
-        E = la.solve_continuous_lyapunov(closed.T, -np.diag(np.sum(size, axis=1)))
+    E = la.solve_continuous_lyapunov(closed.T, -np.diag(np.sum(size, axis=1)))
     return E if np.all(np.isfinite(E)) else None
 
 
@@ -116,17 +136,17 @@ def _negative_beyond_error(H: np.ndarray, basis: np.ndarray) -> bool:
     for matrix, top, bottom, low, high in ((H, X1, X2, 0.0, np.inf), (turn @ H @ turn.T, X1 + X2, X2 - X1, -1.0, 1.0)):
         A, R, Q = matrix[:n, :n], matrix[:n, n:], -matrix[n:, :n]
         R, Q = (R + R.T) / 2, (Q + Q.T) / 2
-        with np.errstate(all="ignore"), warnings.catch_warnings():
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore", la.LinAlgWarning)
             try:
                 X = la.solve(top.T, bottom.T).T
-                X = (X + X.T) / 2
-                # One step of Newton's method brings the residual down to its own round-off.
-                X = X + la.solve_continuous_lyapunov((A + R @ X).T, -_residual(A, R, Q, X)[0])
-                E = solution_error(A, R, Q, X)
             except (np.linalg.LinAlgError, ValueError):
                 continue
-        if E is not None and (la.eigvalsh(X + E)[0] < low or la.eigvalsh(X - E)[-1] > high):
+        found = refined(A, R, Q, (X + X.T) / 2)
+        if found is None:
+            continue
+        X, E = found
+        if la.eigvalsh(X + E)[0] < low or la.eigvalsh(X - E)[-1] > high:
             return True
     return False
 

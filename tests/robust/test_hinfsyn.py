@@ -304,6 +304,19 @@ class TestUse:
         assert result.fastest_pole == pytest.approx(np.max(np.abs(result.K.poles())))
         assert "too fast" in result.notes[-1]
 
+    def test_pole_that_comes_from_the_formulas_is_left_out(self):
+        """The central controller's fourth pole grows as 1 / backoff (437 rad/s at 1 %, 3900 at 0.1 %; the plant's
+        fastest is 20), and the loop of 1 % does not need it: the others are below 40."""
+        P = mixed_sensitivity(([1 / 1.5, 10.0], [1, 1e-3]))
+        result = hinfsyn(P, 1, 1)
+        assert result.K.nstates == 3 and result.fastest_pole < 40 and "replaced by their gain" in result.notes[0]
+        check(P, 1, 1, result)
+        assert result.fastest_pole == pytest.approx(np.max(np.abs(result.K.poles())), rel=1e-6)
+        # A controller whose own poles are no faster than that of the plant is the central one.
+        slow = hinfsyn(P, 1, 1, backoff=0.2)
+        assert slow.K.nstates == 4 and not slow.notes
+        check(P, 1, 1, slow, 0.2)
+
     def test_two_plants_side_by_side_have_the_larger_optimum(self, rng):
         a, b = (random_plant(rng, 2, 2, 2, 1, 1) for _ in range(2))
         both = append(a.renamed(["w1", "w2", "u1"], ["z1", "z2", "y1"]), b.renamed(["w3", "w4", "u2"],
