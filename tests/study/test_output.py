@@ -148,7 +148,7 @@ def test_several_files_are_all_written_or_none(tmp_path, monkeypatch):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fsync(descriptor)
     monkeypatch.setattr(files.os, "fsync", full)
-    with pytest.raises(ComputationError, match="before is untouched.*No space left"):
+    with pytest.raises(ComputationError, match=r"before is untouched.*No space left"):
         write_together(tmp_path, contents, [tmp_path / "old.pdf", tmp_path / "absent"])
     assert {one.name: one.read_bytes() for one in tmp_path.iterdir()} == {"result.json": b"old", "old.pdf": b"old"}
     monkeypatch.undo()
