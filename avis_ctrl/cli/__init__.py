@@ -16,7 +16,7 @@ from avis_ctrl.cli.gap import gap
 from avis_ctrl.cli.gap_axis import gap_axis
 from avis_ctrl.cli.identify import identify, predict, single_axis
 from avis_ctrl.cli.measure import convert, excite, simulate_campaign
-from avis_ctrl.errors import AvisError
+from avis_ctrl.errors import AvisError, ComputationError
 from avis_ctrl.measurement.layouts import FORMATS
 
 # A line a paragraph: the terminal breaks them.
@@ -75,6 +75,13 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+def _refusal(error: OSError) -> str:
+    """One line of what the system refused."""
+    where = f"{error.filename}: " if error.filename else ""
+    lines = str(error.strerror or error).splitlines() or [type(error).__name__]
+    return f"{where}the system refused: {lines[0]}; next: look at the disk's space and rights"
+
+
 def main() -> None:
     """Entry point: errors of ours end in one line and their exit code."""
     # Before numpy is loaded: several BLAS threads round differently from one, and are slower on small matrices.
@@ -84,9 +91,15 @@ def main() -> None:
     try:
         # The parser hands back the code of typer.Exit, and 130 after Ctrl-C.
         code = app(standalone_mode=False)
+        sys.stdout.flush()  # where it goes to a file, the disk may refuse what was printed
     except AvisError as error:
         print(f"avis: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
+    except OSError as error:
+        print(f"avis: {_refusal(error)}", file=sys.stderr)
+        # What cannot be printed is not tried again at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        sys.exit(ComputationError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except Exception as error:  # usage errors of the command line parser carry their own code

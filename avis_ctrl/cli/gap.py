@@ -43,10 +43,11 @@ def gap(
     """
     from rich.console import Console
 
+    from avis_ctrl.files import write_together
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.rigs import load_rig
-    from avis_ctrl.study.files import open_folder, output_folder, write_whole
+    from avis_ctrl.study.files import open_folder, output_folder
     from avis_ctrl.study.gap_names import GAP_FILES
     from avis_ctrl.study.rig_channels import in_words_of
 
@@ -87,8 +88,7 @@ def gap(
         files = write_gap(folder, found.gap, gap_html(found), gap_pdf(found), found.to_json())
         if found.design is not None and found.design.files:
             onward = open_folder(folder / "design", tuple(found.design.files))
-            for name, text in found.design.files.items():
-                write_whole(onward / name, text.encode())
+            write_together(onward, {name: text.encode() for name, text in found.design.files.items()})
     _summary(console, found)
     console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
 

@@ -36,8 +36,9 @@ def gap_axis(
     from rich.console import Console
 
     from avis_ctrl.cli.console import Progress
+    from avis_ctrl.files import write_whole
     from avis_ctrl.gap.single_axis import find_axis_gap_in
-    from avis_ctrl.study.files import output_folder, write_whole
+    from avis_ctrl.study.files import output_folder
 
     roles = dict(_pair(part, "--columns") for part in columns.split(",")) if columns else None
     factors = {role: _number(text) for role, text in (_pair(part, "--scale") for part in scale.split(","))} \

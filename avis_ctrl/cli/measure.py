@@ -87,11 +87,12 @@ def simulate_campaign(
     """A measurement campaign from the nonlinear model, to plan and rehearse an identification."""
     from rich.console import Console
 
+    from avis_ctrl.files import write_whole
     from avis_ctrl.measurement.formats.hdf5 import write_campaign
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.simulation import rehearse
     from avis_ctrl.study.campaign_plan import default_plan, plan_toml, read_plan
-    from avis_ctrl.study.files import require_other, write_whole
+    from avis_ctrl.study.files import require_other
 
     for written in (out, write_plan, truth):
         if written is not None:

@@ -1,10 +1,9 @@
-"""Files that are whole or absent, also when the disk fills or the process is killed."""
+"""Folders that commands write, and JSON. How files are written: `avis_ctrl.files`."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,13 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.errors import InputError
+from avis_ctrl.files import FULL, not_written, write_whole
 
 
 def open_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
     """Create the output folder and make sure, before hours of computing, that it can be written.
 
-    Raises InputError where it is a file, read-only, below something that is, or holds a folder in place of a file.
+    Raises InputError where it is a file, read-only, below something that is, or holds a folder in place of a file;
+    ComputationError where the disk is full.
     """
     path = Path(folder)
     try:
@@ -26,6 +27,8 @@ def open_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
+        if error.errno in FULL:
+            raise not_written(path, error) from None
         raise InputError(f"expected a folder that can be written ({error.strerror or error})", field="--out",
                          value=str(path)) from None
     for name, is_folder in (*((name, True) for name in folders), *((name, False) for name in files)):
@@ -57,57 +60,14 @@ def require_other(out: Path, *inputs: Path | str | None) -> None:
                 raise InputError("expected another file than the one that is read", field="--out", value=str(out))
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that nobody ever sees half of it.
-
-    The bytes go into a file without a name in the same folder (it vanishes with the process), are synced, and only
-    then get the name. Raises ComputationError where the disk refuses.
-    """
-    try:
-        if hasattr(os, "O_TMPFILE"):
-            with contextlib.suppress(OSError):
-                _write_nameless(path, content)
-                return
-        _write_renamed(path, content)
-    except OSError as error:
-        raise not_written(path, error) from None
-
-
-def not_written(path: Path, error: OSError) -> ComputationError:
-    return ComputationError(f"{path} was not written; what was there before is untouched",
-                            cause=str(error.strerror or error),
-                            next_step="free some space or choose another --out folder")
-
-
-def _write_nameless(path: Path, content: bytes) -> None:
-    with open(os.open(path.parent, os.O_TMPFILE | os.O_WRONLY, 0o644), "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".") as private:
-            named = Path(private) / path.name
-            os.link(f"/proc/self/fd/{file.fileno()}", named, follow_symlinks=True)
-            os.replace(named, path)
-
-
-def _write_renamed(path: Path, content: bytes) -> None:
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with open(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(name)
-        raise
-
-
 def write_json(path: Path, value: dict[str, Any]) -> None:
+    """`as_json` in a file, whole or not at all."""
+    write_whole(path, as_json(value))
+
+
+def as_json(value: dict[str, Any]) -> bytes:
     """JSON, floats as they are, infinities and nan as null (JSON has neither)."""
-    write_whole(path, json.dumps(_plain(value), indent=1, allow_nan=False).encode())
+    return json.dumps(_plain(value), indent=1, allow_nan=False).encode()
 
 
 def _plain(value: Any) -> Any:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.files import write_together
 from avis_ctrl.gap.line_response import MOST_SAMPLES
 from avis_ctrl.gap.model_files import model_to_dict, read_model
 from avis_ctrl.gap.result import Gap
@@ -20,11 +21,11 @@ from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.gap.together import only_together
 from avis_ctrl.identification.prediction import model_inputs, predict
 from avis_ctrl.measurement.campaign import Campaign, Record
-from avis_ctrl.measurement.formats.hdf5 import replacing
+from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
-from avis_ctrl.study.files import write_json, write_whole
+from avis_ctrl.study.files import as_json
 from avis_ctrl.study.gap_names import (
     BASELINE_FILE,
     BASELINE_RIG,
@@ -43,7 +44,7 @@ UNPREDICTABLE = {"mains_hum": "the hum's phase in another campaign is not known"
 
 def write_gap(folder: Path, gap: Gap, html: str | None = None, pdf: bytes | None = None,
               told: Mapping[str, Any] | None = None) -> list[Path]:
-    """All files; gap.json last, so that its presence says that the others are complete.
+    """All files or none; gap.json last, so that its presence says that the others are complete.
 
     told : content of gap.json, by default the gap's own without provenance.
 
@@ -54,16 +55,10 @@ def write_gap(folder: Path, gap: Gap, html: str | None = None, pdf: bytes | None
         UPDATED_RIG: _toml(gap.updated, "the rig with the named effects, all parameters refitted", gap.covariance),
         BASELINE_FILE: json.dumps(model_to_dict(gap.baseline), indent=1, allow_nan=False),
         UPDATED_FILE: json.dumps(model_to_dict(gap.updated), indent=1, allow_nan=False),
-        GAP_REPORTS[0]: html, GAP_REPORTS[1]: pdf}
-    for name in GAP_FILES:
-        (folder / name).unlink(missing_ok=True)
-    written = []
-    for name, content in texts.items():
-        if content is not None:
-            write_whole(folder / name, content.encode() if isinstance(content, str) else content)
-            written.append(folder / name)
-    write_json(folder / GAP_FILE, dict(told or gap.to_json()))
-    return [*written, folder / GAP_FILE]
+        GAP_REPORTS[0]: html, GAP_REPORTS[1]: pdf, GAP_FILE: as_json(dict(told or gap.to_json()))}
+    contents = {name: content.encode() if isinstance(content, str) else content for name, content in texts.items()
+                if content is not None}
+    return write_together(folder, contents, [folder / name for name in GAP_FILES])
 
 
 def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
@@ -165,7 +160,7 @@ def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
     Raises
     ------
     InputError : a folder or campaign that does not fit, a place that cannot be written.
-    ComputationError : an effect with which the table leaves every bound.
+    ComputationError : an effect with which the table leaves every bound; the disk refuses.
     """
     effects = read_gap(folder)["effects"]
     models = {"y_baseline": read_model(folder / BASELINE_FILE), "y_updated": read_model(folder / UPDATED_FILE)}

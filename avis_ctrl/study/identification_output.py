@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.files import write_together
 from avis_ctrl.identification.prediction import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, ranges
-from avis_ctrl.measurement.formats.hdf5 import replacing
+from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig, rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
-from avis_ctrl.study.files import write_json, write_whole
+from avis_ctrl.study.files import as_json
 from avis_ctrl.study.identification import CAUTION, Identification
 from avis_ctrl.study.identification_files import FILES, RESULT_FILE, RIG_FILE
 
@@ -100,18 +101,11 @@ def result_dict(found: Identification) -> dict[str, Any]:
 
 def write_identification(found: Identification, folder: Path, html: bytes | None = None, pdf: bytes | None = None,
                          more: dict[str, str] | None = None) -> list[Path]:
-    """All files; result.json last, so that its presence says that the others are complete."""
-    for name in FILES:
-        (folder / name).unlink(missing_ok=True)
+    """All files or none; result.json last, so that its presence says that the others are complete."""
     texts = {RIG_FILE: identified_toml(found).encode(), **{name: text.encode() for name, text in (more or {}).items()},
-             "report.html": html, "report.pdf": pdf}
-    written = []
-    for name, content in texts.items():
-        if content is not None:
-            write_whole(folder / name, content)
-            written.append(folder / name)
-    write_json(folder / RESULT_FILE, result_dict(found))
-    return [*written, folder / RESULT_FILE]
+             "report.html": html, "report.pdf": pdf, RESULT_FILE: as_json(result_dict(found))}
+    return write_together(folder, {name: content for name, content in texts.items() if content is not None},
+                          [folder / name for name in FILES])
 
 
 def read_identified(folder: Path) -> tuple[Rig, float | None]:
@@ -140,6 +134,7 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
     Raises
     ------
     InputError : a folder or campaign that does not fit, a place that cannot be written.
+    ComputationError : the disk refuses.
     """
     rig, corner = read_identified(folder)
     model = ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner)

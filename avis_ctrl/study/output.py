@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.study.files import not_written, write_json, write_whole
+from avis_ctrl.files import write_together
+from avis_ctrl.study.files import as_json
 from avis_ctrl.study.model import Bound, ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.verdict import first_sentence
 
@@ -95,27 +96,14 @@ def sampled_controller_dict(result: DesignResult, loop: Simulated) -> dict[str, 
 
 
 def write_study(result: DesignResult, folder: Path, html: bytes | None = None, pdf: bytes | None = None) -> list[Path]:
-    """All files of a study; result.json last, so that its presence says that the others are complete."""
-    try:
-        (folder / "controllers").mkdir(exist_ok=True)
-        # Of an earlier study nothing stays: an old report beside new controllers would lie.
-        for old in (*(folder / name for name in FILES), *(folder / "controllers").glob("*.json")):
-            old.unlink(missing_ok=True)
-    except OSError as error:
-        raise not_written(folder, error) from None
-    written = []
-    for c in result.controllers:
-        if c.K is not None:
-            write_json(path := folder / "controllers" / f"{c.name}.json", controller_dict(c))
-            written.append(path)
+    """All files of a study or none; result.json last, so that its presence says that the others are complete."""
+    contents = {f"controllers/{c.name}.json": as_json(controller_dict(c)) for c in result.controllers
+                if c.K is not None}
     if result.loop is not None:
-        write_json(path := folder / "sampled_controller.json", sampled_controller_dict(result, result.loop))
-        written.append(path)
-    write_json(folder / "plant.json", result.plant.synthesis.as_dict())
-    written.append(folder / "plant.json")
-    for name, content in (("report.html", html), ("report.pdf", pdf)):
-        if content is not None:
-            write_whole(folder / name, content)
-            written.append(folder / name)
-    write_json(folder / "result.json", result_dict(result))
-    return [*written, folder / "result.json"]
+        contents["sampled_controller.json"] = as_json(sampled_controller_dict(result, result.loop))
+    contents["plant.json"] = as_json(result.plant.synthesis.as_dict())
+    contents |= {name: content for name, content in (("report.html", html), ("report.pdf", pdf)) if content is not None}
+    contents["result.json"] = as_json(result_dict(result))
+    # Of an earlier study nothing stays.
+    return write_together(folder, contents, [*(folder / name for name in FILES),
+                                             *(folder / "controllers").glob("*.json")])

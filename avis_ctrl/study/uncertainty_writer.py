@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.files import write_whole
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.spread import FrfSpread
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.study.files import write_whole
 from avis_ctrl.study.uncertainty_file import (
     DirectionSection,
     ParameterSection,

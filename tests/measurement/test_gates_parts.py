@@ -118,7 +118,7 @@ def test_h1_of_white_noise_is_the_gain_with_its_stated_error(rng):
     y = u @ G.T + 0.1 * rng.standard_normal((40000, 3))
     made = h1([spectra(u, y, 100.0, 256, wrap=False)])
     np.testing.assert_allclose(made.G.mean(axis=0).real, G, atol=0.005)
-    variance = np.einsum("fi,fjj->fij", made.noise, np.linalg.inv(made.gram)).real
+    variance = np.einsum("fi,fjj->fij", made.noise, made.covariance).real
     ratio = np.mean(np.abs(made.G - G) ** 2 / variance)
     assert ratio == pytest.approx(1.0, abs=0.15)
 
@@ -129,6 +129,7 @@ def spectra_of(rng, M, noise=0.02, K=60):
     return Spectra(np.arange(40.0), U, Y + noise * rng.standard_normal(Y.shape)), U
 
 
+@settings(deadline=None, max_examples=30)
 @given(seeds)
 def test_faults_of_a_random_matrix_are_recovered(seed):
     """Any permutation and any signs (fewer flips than half) of a generic response."""
@@ -139,7 +140,7 @@ def test_faults_of_a_random_matrix_are_recovered(seed):
     r[rng.integers(4)] = -1
     measured, U = spectra_of(rng, r[:, None] * E[:, p][:, :, q])
     expected = Spectra(measured.f, U, np.einsum("fij,kfj->kfi", E, U))
-    faults = explain(compare([(measured, expected)]), 0.1)
+    faults = explain(compare([(measured, expected)]))
     assert np.array_equal(faults.p, p) and np.array_equal(faults.r, r)
     assert np.array_equal(faults.q, q) and np.all(faults.c > 0)
 

@@ -16,9 +16,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from avis_ctrl import files
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.study import files
-from avis_ctrl.study.files import write_json, write_whole
+from avis_ctrl.files import write_together, write_whole
+from avis_ctrl.study import files as folders
+from avis_ctrl.study.files import write_json
 from avis_ctrl.study.output import FILES, FOLDERS
 
 SIZE = 300_000
@@ -26,7 +28,7 @@ SIZE = 300_000
 WRITER = f"SIZE = {SIZE}" + """
 import sys
 from pathlib import Path
-from avis_ctrl.study import files
+from avis_ctrl import files
 if sys.argv[2] == "renamed":
     del files.os.O_TMPFILE
 k = 0
@@ -65,7 +67,7 @@ FULL = """
 import resource, signal, sys
 from pathlib import Path
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.study import files
+from avis_ctrl import files
 if sys.argv[2] == "renamed":
     del files.os.O_TMPFILE
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -111,12 +113,55 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(step, tmp_path, monkeypatch
 
 def test_without_nameless_files_the_renamed_way_is_taken(tmp_path, monkeypatch):
     """Some file systems (NFS, old overlays) refuse O_TMPFILE."""
-    def unsupported(*args):
-        raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
-    monkeypatch.setattr(files, "_write_nameless", unsupported)
+    opened = os.open
+
+    def unsupported(path, flags, *args, **kwargs):
+        if flags & os.O_TMPFILE == os.O_TMPFILE:
+            raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
+        return opened(path, flags, *args, **kwargs)
+    monkeypatch.setattr(files.os, "open", unsupported)
     write_whole(tmp_path / "plant.json", b"{}")
     assert (tmp_path / "plant.json").read_bytes() == b"{}"
     assert list(tmp_path.iterdir()) == [tmp_path / "plant.json"]
+
+
+def test_without_links_a_copy_takes_the_name(tmp_path, monkeypatch):
+    """Without /proc a file that has no name cannot get one."""
+    def absent(*args, **kwargs):
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+    monkeypatch.setattr(files.os, "link", absent)
+    write_whole(tmp_path / "plant.json", b"{}" * 10000)
+    assert (tmp_path / "plant.json").read_bytes() == b"{}" * 10000
+    assert list(tmp_path.iterdir()) == [tmp_path / "plant.json"]
+
+
+def test_several_files_are_all_written_or_none(tmp_path, monkeypatch):
+    """The third of three is refused: the folder is as it was, with an old file that was to go."""
+    (tmp_path / "result.json").write_bytes(b"old")
+    (tmp_path / "old.pdf").write_bytes(b"old")
+    contents = {"controllers/mu.json": b"1", "report.html": b"2", "result.json": b"3"}
+    synced, fsync = [], os.fsync
+
+    def full(descriptor):
+        synced.append(descriptor)
+        if len(synced) == 3:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(descriptor)
+    monkeypatch.setattr(files.os, "fsync", full)
+    with pytest.raises(ComputationError, match=r"before is untouched.*No space left"):
+        write_together(tmp_path, contents, [tmp_path / "old.pdf", tmp_path / "absent"])
+    assert {one.name: one.read_bytes() for one in tmp_path.iterdir()} == {"result.json": b"old", "old.pdf": b"old"}
+    monkeypatch.undo()
+    written = write_together(tmp_path, contents, [tmp_path / "old.pdf", tmp_path / "absent"])
+    assert [one.read_bytes() for one in written] == [b"1", b"2", b"3"]
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["controllers", "report.html", "result.json"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device")
+def test_a_device_is_not_replaced():
+    with pytest.raises(InputError, match="no regular file"):
+        write_whole(Path("/dev/full"), b"x")
+    assert Path("/dev/full").is_char_device()
 
 
 def test_files_can_be_read_by_others(tmp_path):
@@ -125,15 +170,15 @@ def test_files_can_be_read_by_others(tmp_path):
 
 
 def open_folder(folder):
-    return files.open_folder(folder, FILES, FOLDERS)
+    return folders.open_folder(folder, FILES, FOLDERS)
 
 
 def test_what_was_made_goes_again_where_an_error_leaves_it_empty(tmp_path):
     (tmp_path / "mine").mkdir()
     for folder in ("a/b", "mine"):
-        with pytest.raises(KeyError), files.output_folder(tmp_path / folder):
+        with pytest.raises(KeyError), folders.output_folder(tmp_path / folder):
             raise KeyError
-    with pytest.raises(KeyError), files.output_folder(tmp_path / "written" / "b") as path:
+    with pytest.raises(KeyError), folders.output_folder(tmp_path / "written" / "b") as path:
         (path / "result.json").write_text("{}")
         raise KeyError
     assert sorted(one.relative_to(tmp_path).as_posix() for one in tmp_path.rglob("*")) == [
@@ -146,8 +191,8 @@ def test_what_is_read_is_never_written(tmp_path):
     (tmp_path / "link.h5").symlink_to(campaign)
     for out in (campaign, tmp_path / "link.h5", tmp_path / "." / "campaign.h5"):
         with pytest.raises(InputError, match="another file"):
-            files.require_other(out, "avis", None, campaign)
-    files.require_other(tmp_path / "new.h5", campaign, None, "avis")
+            folders.require_other(out, "avis", None, campaign)
+    folders.require_other(tmp_path / "new.h5", campaign, None, "avis")
 
 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path):

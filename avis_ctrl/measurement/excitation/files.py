@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import h5py
 import numpy as np
 from scipy.io import savemat
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.files import whole_file
 from avis_ctrl.measurement.excitation.design import ExcitationSignals
+from avis_ctrl.measurement.formats.hdf5_writing import replacing
 
 SUFFIXES = (".h5", ".hdf5", ".csv", ".mat")
 # A variable of a .mat file of version 5 holds less than 2^31 bytes.
@@ -29,6 +30,7 @@ def write_signals(signals: ExcitationSignals, path: str | Path, periods: int = 1
     ------
     InputError : another suffix, a number of periods below one (or other than one for noise), a file that cannot be
         written, too many samples for .mat.
+    ComputationError : the disk refuses; the file is then as it was.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -37,14 +39,11 @@ def write_signals(signals: ExcitationSignals, path: str | Path, periods: int = 1
         raise InputError("expected a whole number, 1 or more (noise is not periodic: 1)", field="periods",
                          value=periods)
     writer = {".csv": _write_csv, ".mat": _write_mat}.get(path.suffix.lower(), _write_hdf5)
-    try:
-        writer(signals, int(periods), path, rig)
-    except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror or error}", file=path) from None
+    writer(signals, int(periods), path, rig)
 
 
 def _write_hdf5(signals: ExcitationSignals, periods: int, path: Path, rig: str) -> None:
-    with h5py.File(path, "w") as file:
+    with replacing(path) as file:
         file.attrs.update({"format": "avis-excitation", "version": 1, "rig": rig,
                            "seed": signals.settings.get("seed", 0), "settings": json.dumps(signals.settings)})
         for k, (one, level) in enumerate(zip(signals.u, signals.rms_V, strict=True)):
@@ -62,12 +61,12 @@ def _write_hdf5(signals: ExcitationSignals, periods: int, path: Path, rig: str) 
 def _write_csv(signals: ExcitationSignals, periods: int, path: Path, rig: str) -> None:
     settings = {"rig": rig, "excitation": signals.kind, "period_s": signals.period_s, **signals.settings}
     time = np.arange(periods * signals.u.shape[1]) / signals.sample_rate_Hz
-    with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.writelines(f"# {key} = {json.dumps(value)}\n" for key, value in settings.items())
-        file.write(",".join(["record", "time_s", *signals.inputs]) + "\n")
+    with whole_file(path) as file:
+        file.writelines(f"# {key} = {json.dumps(value)}\n".encode() for key, value in settings.items())
+        file.write((",".join(["record", "time_s", *signals.inputs]) + "\n").encode())
         for k, record in enumerate(signals.u):
             rows = zip(time.tolist(), np.tile(record, (periods, 1)).tolist(), strict=True)
-            file.writelines(f"{k},{t!r},{','.join(map(repr, row))}\n" for t, row in rows)
+            file.writelines(f"{k},{t!r},{','.join(map(repr, row))}\n".encode() for t, row in rows)
 
 
 def _write_mat(signals: ExcitationSignals, periods: int, path: Path, rig: str) -> None:
@@ -79,4 +78,5 @@ def _write_mat(signals: ExcitationSignals, periods: int, path: Path, rig: str) -
                "period_s": np.nan if signals.period_s is None else signals.period_s, "excitation": signals.kind,
                "level_V": signals.rms_V, "seed": signals.settings.get("seed", 0),
                "settings": json.dumps(signals.settings)}
-    savemat(path, content, do_compression=True, appendmat=False)
+    with whole_file(path) as file:
+        savemat(file, content, do_compression=True, appendmat=False)

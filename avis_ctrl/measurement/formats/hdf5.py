@@ -6,11 +6,7 @@ where it was measured, floor. A frequency response lies in the group /frf (see `
 
 from __future__ import annotations
 
-import contextlib
-import os
 import re
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +25,9 @@ from avis_ctrl.measurement.formats.common import (
     printable,
     reading,
     require,
-    short,
     units_of,
 )
+from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.measurement.formats.stored import (
     Columns,
     StoredRecord,
@@ -148,30 +144,6 @@ def _shape(dataset: Any, field: str) -> tuple[int, int]:
     return samples, count
 
 
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[h5py.File]:
-    """A new HDF5 file that takes its name only when it is complete."""
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-        os.close(handle)
-    except OSError as error:
-        raise InputError(f"cannot be written ({short(error)})", file=path) from None
-    temporary = Path(name)
-    try:
-        try:
-            with h5py.File(temporary, "w", track_order=True) as file:
-                yield file
-            # mkstemp opens the file to its owner alone; give it the rights that a new file would have.
-            mask = os.umask(0)
-            os.umask(mask)
-            temporary.chmod(0o666 & ~mask)
-            temporary.replace(path)
-        except OSError as error:
-            raise InputError(f"cannot be written ({short(error)})", file=path) from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def write_campaign(path: str | Path, campaign: Campaign, longest: int = 1 << 20) -> None:
     """Write an HDF5 campaign, in pieces of at most `longest` samples and under its name only when complete.
 
@@ -179,6 +151,7 @@ def write_campaign(path: str | Path, campaign: Campaign, longest: int = 1 << 20)
     ------
     InputError : a record's name that is used twice or cannot be a group's, a place that cannot be written, and
         whatever loading the records raises; the file is then as it was.
+    ComputationError : the disk refuses; the file is then as it was.
     """
     path = Path(path)
     names = [record.header.name for record in campaign.records]

@@ -29,7 +29,8 @@ from avis_ctrl.measurement.formats.common import (
     require_small,
     unit_of,
 )
-from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_root, listed, replacing
+from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_root, listed
+from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.measurement.formats.response import response_from
 from avis_ctrl.measurement.formats.stored import attributes, layout, member, open_hdf5, values
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -44,6 +45,7 @@ def write_frequency_response(path: str | Path, response: FrequencyResponse, rig:
     Raises
     ------
     InputError : a place that cannot be written; the file is then as it was.
+    ComputationError : the disk refuses; the file is then as it was.
     """
     with replacing(Path(path)) as file:
         file.attrs.update({"format": FORMAT, "version": VERSION, "rig": rig})

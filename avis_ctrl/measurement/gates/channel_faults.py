@@ -1,69 +1,107 @@
 """Which channels are exchanged or flipped, by comparison of measured and expected responses.
 
-Measured and expected responses pass through the same estimator (H1 over the same segments of the same u, the model's
-y computed in the frequency domain), so that leakage changes both alike. With a channel's row (or column) M of the
-measured
-and E of the expected response, similarity is the real correlation
+Measured and expected responses pass through the same estimator (H1 over the same segments of the same u, the model's y
+computed in the frequency domain), so that leakage changes both alike. A hypothesis says that the measured row i is r_i
+times the model's row p(i), and column j c_j times its column q(j). How far it agrees is, for each row,
 
-    c_ik = Re sum w E_k* M_i / sqrt(sum w |E_k|^2  sum w |M_i|^2),   w(f) = 1 / (|E(f)|^2 + noise(f)),  Frobenius norms
+    a_i = Re sum_f w e^(j w t_i) sum_j M_ij (E P)_ij* / sqrt(sum w |M_i|^2  sum w |(E P)_i|^2),
 
-so that each frequency counts alike where the model expects something above the noise. It feels magnitude and phase.
+with E the expected response in the order and signs of the hypothesis, P the projection onto the directions of u that
+are excited, and w(f) = 1 / (|E|^2 + noise), so that each frequency counts alike where the model expects something. A
+gain cancels in it, and the delay t_i is fitted: both are effects that a model may lack, and a lag is nearly a delay.
+
+What is left of the row, 1 - a_i^2, is the likelihood of the hypothesis. A model that is wrong is wrong alike at
+neighbouring frequencies, and a table's drives differ by little but a pattern: a row counts for as many independent
+complex numbers as a pattern over the excited directions times a shape over thirds of octaves has, N = directions +
+thirds - 1. Its log-likelihood ratio is N log((1 - a^2) / (1 - a'^2)), and an unrelated response agrees by more than a
+with probability (1 - a^2)^(N - 1).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1
 
-# The other channel must agree better than the own one by this much in correlation (of at most 1).
-MARGIN = 0.15
+# A drive of which a smaller share lies in the directions that are excited does not move.
+STILL = 1e-9
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """What counts as evidence.
+
+    chance : that the map is called wrong where it is right, shared over the alternatives; a stop ends the work, so it
+        is rarer than other alarms. least_agreement : of a channel with what it is said to be; a model that agrees less
+        with the data than that describes them by less than half their power, and proves nothing. delay_s : range of
+        delays that are fitted, from a u recorded late to the slowest loop. delay_step_s : a tenth of a turn at 100 Hz.
+        closest : 1 - a^2 is not taken for less: resonances 2.5 % beside the model's leave as much.
+    """
+
+    chance: float = 1e-4
+    least_agreement: float = 0.7
+    delay_s: tuple[float, float] = (-0.005, 0.02)
+    delay_step_s: float = 0.001
+    closest: float = 0.1
+
+
+SETTINGS = MapSettings()
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Inner products of measured entry (i, j) with expected entry (k, l), and what normalises them.
 
-    C : (n_y, n_y, n_u, n_u), index i, k, j, l; rows_M, rows_E : (n_y,) and columns_M, columns_E : (n_u,) norms.
-    standard : largest standard deviation that noise gives a correlation.
+    C : (n_y, n_y, n_u, n_u), index i, k, j, l, the delay of the pair (i, k) taken out. B : (n_y, n_u, n_u), of the
+    expected entries (k, a) and (k, b). P : (n_u, n_u) projection onto what is excited. rows_M : (n_y,) norms.
+    delay_s : (n_y, n_y). N : independent complex numbers in a row.
     """
 
     C: np.ndarray
+    B: np.ndarray
+    P: np.ndarray
     rows_M: np.ndarray
-    rows_E: np.ndarray
-    columns_M: np.ndarray
-    columns_E: np.ndarray
+    delay_s: np.ndarray
+    N: int
     measured: H1
-    standard: float
+    settings: MapSettings
 
-    def rows(self, q: np.ndarray, c: np.ndarray | None = None) -> np.ndarray:
-        """(n_y, n_y) correlation of measured row i with expected row k, columns matched by q with signs c."""
-        j = np.arange(len(q))
-        own = self.C[:, :, j, q] @ (np.ones(len(q)) if c is None else c)
-        return own / (self.rows_M[:, None] * self.rows_E)
+    @property
+    def moving(self) -> np.ndarray:
+        """(n_u,) drives that move."""
+        return np.diag(self.P) > STILL
 
-    def columns(self, p: np.ndarray, r: np.ndarray | None = None) -> np.ndarray:
-        """(n_u, n_u), the same for columns, with rows matched by p with signs r."""
-        i = np.arange(len(p))
-        own = np.einsum("i,ijl->jl", np.ones(len(p)) if r is None else r, self.C[i, p])
-        return own / (self.columns_M[:, None] * self.columns_E)
+    def agreement(self, q: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """(n_y, n_y) of measured row i with expected row k, columns matched by q with signs c."""
+        own: np.ndarray = self.C[:, :, np.arange(len(q)), q] @ c
+        power = np.einsum("kab,ab->k", self.B[:, q][:, :, q], self.P * np.outer(c, c))
+        return np.asarray(own / np.maximum(self.rows_M[:, None] * np.sqrt(np.maximum(power, 0.0)), 1e-300))
 
-    def own(self, order: dict[str, np.ndarray], sign: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Correlation of each row (n_y,) and column (n_u,) with the expectation that order and sign give it."""
-        p, q = order["row"], order["column"]
-        entries = self.C[np.arange(len(p))[:, None], p[:, None], np.arange(len(q)), q] * np.outer(
-            sign["row"], sign["column"]
-        )
-        return {
-            "row": entries.sum(axis=1) / (self.rows_M * self.rows_E[p]),
-            "column": entries.sum(axis=0) / (self.columns_M * self.columns_E[q]),
-        }
+    def likelihood(self, a: np.ndarray) -> np.ndarray:
+        """Log-likelihood of agreements; opposite signs are worse than none."""
+        left = 1 - (1 - self.settings.closest) * a * np.abs(a)
+        return np.asarray(-self.N * np.log(left))
+
+    def evidence(self, alternatives: int) -> float:
+        """Log-likelihood ratio that chance reaches in one of so many alternatives with the stated probability."""
+        return float(np.log(alternatives / self.settings.chance))
+
+    def least(self, alternatives: int) -> float:
+        """Agreement that a response must have with what it is said to be."""
+        by_chance = 1 - (self.settings.chance / alternatives) ** (1 / max(self.N - 1, 1))
+        return max(self.settings.least_agreement, float(np.sqrt(by_chance)))
 
 
-def compare(pairs: list[tuple[Spectra, Spectra]]) -> Comparison | None:
-    """Of measured and expected spectra of records (those of the commonest segment length); None where too few."""
+def compare(pairs: list[tuple[Spectra, Spectra]], response: Callable[[np.ndarray], np.ndarray] | None = None,
+            settings: MapSettings = SETTINGS) -> Comparison | None:
+    """Of measured and expected spectra of records (those of the commonest segment length); None where too few.
+
+    response : (n,) Hz -> (n, n_y, n_u) of the model. Where the voltages do not span all drives that move, what the
+        records would be with exchanged drives does not follow from them: the model says it, without leakage.
+    """
     if not pairs:
         return None
     lengths = [len(m.f) for m, _ in pairs]
@@ -73,70 +111,128 @@ def compare(pairs: list[tuple[Spectra, Spectra]]) -> Comparison | None:
     if measured is None or expected is None:
         return None
     M, E = measured.G, expected.G
-    size = np.linalg.norm(E, axis=(1, 2))
-    inverse = np.linalg.pinv(measured.gram, hermitian=True)
-    spread = np.sqrt(np.einsum("fi,fjj->fij", measured.noise, inverse).real.clip(0))
-    w = 1 / np.maximum(size**2 + np.sum(spread**2, axis=(1, 2)), 1e-300)
-    C = np.einsum("f,fij,fkl->ikjl", w, M, E.conj(), optimize=True).real
-    rows_M, rows_E, columns_M, columns_E = (
-        np.maximum(np.sqrt(np.einsum(to, w, np.abs(A) ** 2)), 1e-300) for to in ("f,fij->i", "f,fij->j") for A in (M, E)
-    )
-    variance = np.einsum("f,fij,fij->ij", w**2, spread**2, np.abs(E) ** 2, optimize=True) / 2
-    live = columns_M > 1e-200
-    standard = max(
-        float(np.max(np.sqrt(variance.sum(axis=1)) / (rows_M * rows_E))),
-        float(np.max((np.sqrt(variance.sum(axis=0)) / (columns_M * columns_E))[live], initial=0.0)),
-    )
-    return Comparison(C, rows_M, rows_E, columns_M, columns_E, measured, standard)
+    P = measured.basis @ measured.basis.T
+    if response is not None and measured.rank < np.count_nonzero(np.diag(P) > STILL):
+        E = response(measured.f)
+    spread = measured.noise * np.trace(measured.covariance, axis1=1, axis2=2).real[:, None]
+    w = 1 / np.maximum(np.sum(np.abs(E) ** 2, axis=(1, 2)) + np.sum(spread, axis=1), 1e-300)
+    delay_s, turned = _delays(measured.f, w, M, E, settings)
+    C = np.einsum("fik,fij,fkl->ikjl", turned, M, E.conj(), optimize=True).real
+    B = np.einsum("f,fka,fkb->kab", w, E, E.conj(), optimize=True).real
+    rows_M = np.sqrt(np.einsum("f,fij->i", w, np.abs(M) ** 2))
+    thirds = len(np.unique(np.floor(3 * np.log2(measured.f / measured.f[0]))))
+    return Comparison(C, B, P, rows_M, delay_s, measured.rank + thirds - 1, measured, settings)
+
+
+def _delays(f: np.ndarray, w: np.ndarray, M: np.ndarray, E: np.ndarray, settings: MapSettings
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """(n_y, n_y) s by which measured row i is best behind expected row k, whatever the signs of the columns; and
+    w e^(j omega delay) (n, n_y, n_y)."""
+    low, high = settings.delay_s
+    steps = np.arange(round(low / settings.delay_step_s), round(high / settings.delay_step_s) + 1)
+    trial = settings.delay_step_s * steps[np.argsort(np.abs(steps), kind="stable")]  # none where all are alike
+    turn = np.exp(2j * np.pi * f * trial[:, None])
+    products = np.einsum("f,fij,fkj->fikj", w, M, E.conj(), optimize=True)
+    found = np.abs(np.tensordot(turn, products, 1).real).sum(axis=-1)
+    best = trial[np.argmax(found, axis=0)]
+    return best, w[:, None, None] * np.exp(2j * np.pi * f[:, None, None] * best)
 
 
 @dataclass(frozen=True, eq=False)
 class Faults:
     """Measured row i is r[i] times expected row p[i], column j is c[j] times expected column q[j].
 
-    before : correlation of each exchanged or flipped channel with its own expectation when it was found, keyed by
-    ("row" or "column", index); after : with what was found.
+    own, other : (n_y,) agreement of each row with its own expectation and with what was found for it, the rest as
+    found. columns : for each drive that was exchanged or flipped, the row that says so, and its agreement without and
+    with that.
+    doubtful : names of nothing: rows ("row", i) and columns ("column", j) that would agree better otherwise, but
+    without evidence that is strong in absolute terms.
     """
 
     p: np.ndarray
     q: np.ndarray
     r: np.ndarray
     c: np.ndarray
-    before: dict[tuple[str, int], float]
-    after: dict[tuple[str, int], float]
+    own: np.ndarray
+    other: np.ndarray
+    columns: dict[int, tuple[int, float, float]]
+    doubtful: tuple[tuple[str, int], ...]
 
 
-def explain(comparison: Comparison, limit: float) -> Faults:
+def explain(comparison: Comparison) -> Faults:
     """The fewest exchanges and flips that explain the measured rows and columns, found one after the other.
 
-    Each step takes the fault that raises the sum of all rows' and columns' correlations most, among those whose own
-    channels gain more than twice the limit: a flip -2 c_ii, an exchange c_ik + c_ki - c_ii - c_kk. A symmetric rig
-    turned about its axis is many exchanges at once: one by one, the simplest comes first.
+    Each step takes the fault that raises the likelihood most, of all rows together, and by more than chance does among
+    all steps, an exchange by twice that. For columns one row must make up half of it, since a wrong model makes all
+    rows wrong a little. A symmetric rig turned about its axis is many exchanges at once: one by one, the simplest comes
+    first. At the end every channel that was touched must agree with what it is said to be by more than
+    `Comparison.least`, and by more than chance better than with its own; otherwise that is doubtful, and nothing is
+    called a fault.
     """
-    n_y, n_u = len(comparison.rows_M), len(comparison.columns_M)
+    n_y, n_u = len(comparison.rows_M), len(comparison.P)
     order, sign = {"row": np.arange(n_y), "column": np.arange(n_u)}, {"row": np.ones(n_y), "column": np.ones(n_u)}
-    before: dict[tuple[str, int], float] = {}
+    steps = [step for step in _steps(n_y, n_u) if step[0] == "row" or comparison.moving[[step[1], step[2]]].all()]
+    alternatives = sum(1 if step[0] == "row" else n_y for step in steps)
+    cost = comparison.evidence(alternatives)
     for _ in range(n_y + n_u):
-        start = comparison.own(order, sign)
-        total = sum(float(c.sum()) for c in start.values())
-        best: tuple[float, str, int, int] | None = None
-        for what, i, k, flips in _steps(n_y, n_u):
-            new_order, new_sign = _after(order, sign, what, i, k, flips)
-            then = comparison.own(new_order, new_sign)
-            extra = 0.5 * sum(flip < 0 for flip in flips) if k != i else 0.0
-            gain = float((then[what] - start[what])[[i, k] if k != i else [i]].sum()) - extra
-            raised = sum(float(c.sum()) for c in then.values()) - total - extra
-            if gain > 2 * limit and (best is None or raised > best[0]):
-                best, found = (raised, what, i, k), (new_order, new_sign)
+        start = comparison.likelihood(_agreements(comparison, order, sign))
+        best: tuple[float, dict[str, np.ndarray], dict[str, np.ndarray]] | None = None
+        for what, i, k, flips in steps:
+            new = _after(order, sign, what, i, k, flips)
+            gain = comparison.likelihood(_agreements(comparison, *new)) - start
+            faults = (i != k) * 2 + sum(flip < 0 for flip in flips)
+            raised = float(gain.sum()) - cost * faults
+            single = what == "row" or 2 * float(gain.max()) > cost
+            if raised > 0 and single and (best is None or raised > best[0]):
+                best = raised, *new
         if best is None:
             break
-        for index in best[2:]:
-            before.setdefault((best[1], index), float(start[best[1]][index]))
-        order, sign = found
-    end = comparison.own(order, sign)
-    after = {(what, i): float(end[what][i]) for what, i in before}
-    r, c = _fewest(sign["row"], sign["column"], comparison.columns_M > 1e-200)
-    return Faults(order["row"], order["column"], r, c, before, after)
+        order, sign = best[1:]
+    r, c = _fewest(sign["row"], sign["column"], comparison.moving)
+    return _judged(comparison, order["row"], order["column"], r, c, alternatives)
+
+
+def _judged(comparison: Comparison, p: np.ndarray, q: np.ndarray, r: np.ndarray, c: np.ndarray,
+            alternatives: int) -> Faults:
+    """What was found, where the evidence for all of it is strong; nothing, and what is doubtful, otherwise."""
+    n_y, n_u = len(p), len(q)
+    rows, straight, ones = np.arange(n_y), np.arange(n_u), np.ones(n_y)
+    least, evidence = comparison.least(alternatives), comparison.evidence(alternatives)
+    a = comparison.agreement(q, c)
+    other, own = r * a[rows, p], a[rows, rows]
+    touched = [i for i in rows if p[i] != i or r[i] < 0]
+    gain = comparison.likelihood(other) - np.maximum(comparison.likelihood(own), 0.0)
+    doubtful = [("row", int(i)) for i in touched if other[i] < least or gain[i] < evidence]
+    columns: dict[int, tuple[int, float, float]] = {}
+    for j in map(int, straight[(q != straight) | (c < 0)]):
+        cycle = cycle_of(q, j)
+        back_q, back_c = q.copy(), c.copy()
+        back_q[cycle], back_c[cycle] = cycle, 1.0
+        before = r * comparison.agreement(back_q, back_c)[rows, p]
+        better = comparison.likelihood(other) - np.maximum(comparison.likelihood(before), 0.0)
+        best = int(np.argmax(better))
+        columns[j] = best, float(before[best]), float(other[best])
+        if other[best] < least or 2 * better[best] < evidence or better.sum() < evidence:
+            doubtful.append(("column", j))
+    if doubtful:
+        own = comparison.agreement(straight, np.ones(n_u))[rows, rows]
+        return Faults(rows, straight, ones, np.ones(n_u), own, own, {}, tuple(doubtful))
+    return Faults(p, q, r, c, own, other, columns, ())
+
+
+def cycle_of(order: np.ndarray, start: int) -> list[int]:
+    """The places that an exchange moves around, from one of them."""
+    found, k = [start], int(order[start])
+    while k != start:
+        found.append(k)
+        k = int(order[k])
+    return found
+
+
+def _agreements(comparison: Comparison, order: dict[str, np.ndarray], sign: dict[str, np.ndarray]) -> np.ndarray:
+    """(n_y,) of each row with the expectation that order and sign give it."""
+    a = comparison.agreement(order["column"], sign["column"])
+    return np.asarray(sign["row"] * a[np.arange(len(a)), order["row"]])
 
 
 def _steps(n_y: int, n_u: int) -> list[tuple[str, int, int, tuple[float, float]]]:

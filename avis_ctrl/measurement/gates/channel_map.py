@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.measurement.gates.channel_faults import MARGIN, Faults, compare, explain
+from avis_ctrl.measurement.gates.channel_faults import Comparison, Faults, compare, cycle_of, explain
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Response, Series, Severity
+from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Response, Series, quoted
 from avis_ctrl.measurement.gates.h1 import Spectra, segment_length, spectra, usable
 
 # Two channels are one where their difference is below this part of either, after scaling.
@@ -25,13 +25,28 @@ class _Kept:
 
 
 class ChannelMap(Gate):
-    """`ChannelOrder` and `Polarity`, which look at the same."""
+    """`ChannelOrder` and `Polarity`, which look at the same.
+
+    With a model: the fewest exchanges and flips that explain the measured rows (sensors) and columns (drives), see
+    `explain`; settings and the chance of a false stop: `MapSettings`. What fits better otherwise without such evidence
+    is a note.
+    """
 
     name = "channel map"
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        of = ChannelOrder(), Polarity()
-        return [finding for gate in of for finding in gate.conclude(kept, campaign, expectation)]
+        def response(f: np.ndarray) -> np.ndarray:
+            assert expectation.response is not None
+            G = expectation.response(2 * np.pi * f, campaign.u_names)
+            return G[:, _order(campaign.y_names, expectation.y_names, G.shape[1])]
+
+        comparison = compare(_pairs(kept), response)
+        faults = None if comparison is None else explain(comparison)
+        why = "no model was given" if expectation.response is None else "too few driven samples"
+        return [
+            *ChannelOrder().conclude(kept, campaign, comparison, faults, why),
+            *Polarity().conclude(campaign, comparison, faults, why),
+        ]
 
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
         copies = _copies(seen)
@@ -52,85 +67,103 @@ class ChannelMap(Gate):
 class ChannelOrder:
     """Exchanged or mislabelled channels, and copies of one channel under two names.
 
-    With a model: the fewest exchanges and flips that explain the measured rows (sensors) and columns (drives), see
-    `explain`. An exchange needs a gain in correlation of 0.15 + 5 standard deviations of its noise for each of the two,
-    so
-    that noise alone raises less than 1e-5 alarms; 0.15 is above what stiffness errors of 5 % and damping errors of
-    20 % do (tests/measurement/test_gates_channels.py).
-    Without one, copies only: a channel that equals another one times a constant within 0.1 % of its r.m.s.; independent
-    sensor noise of more than that keeps true channels apart.
+    Without a model, copies only: a channel that equals another one times a constant within 0.1 % of its r.m.s.;
+    independent sensor noise of more than that keeps true channels apart.
     """
 
     name = "channel order"
 
-    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[_Kept], campaign: Campaign, comparison: Comparison | None, faults: Faults | None,
+                 why: str) -> list[Finding]:
         found = self._copied(kept, campaign)
-        comparison = compare(_pairs(kept))
-        if comparison is None:
+        if comparison is None or faults is None:
             if not found:
-                why = "no model was given" if expectation.response is None else "too few driven samples"
                 found.append(
                     Finding(
                         self.name,
-                        "note" if expectation.response is not None else "ok",
+                        "ok" if why.startswith("no model") else "note",
                         f"No channel is a copy of another; their order was not compared with a model ({why}).",
                         picture=_copy_picture(kept),
                     )
                 )
             return found
-        limit = MARGIN + 5 * comparison.standard
-        faults = explain(comparison, limit)
-        rows, columns = comparison.rows(faults.q, faults.c), comparison.columns(faults.p, faults.r)
-        rows, columns = faults.r[:, None] * rows, faults.c[:, None] * columns
-        found += self._exchanged(rows, faults, "row", campaign.y_names, limit)
-        found += self._exchanged(columns, faults, "column", campaign.u_names, limit)
+        agreement = comparison.agreement(faults.q, faults.c)
+        picture = _picture(faults.r[:, None] * agreement, campaign.y_names, comparison.settings.least_agreement)
+        found += self._exchanged(faults, "row", campaign.y_names, campaign.y_names, comparison, picture)
+        found += self._exchanged(faults, "column", campaign.u_names, campaign.y_names, comparison, picture)
         if not found:
-            own = np.diag(rows)
-            worst = int(np.argmin(own))
-            found.append(
-                Finding(
-                    self.name,
-                    "ok",
-                    "Every channel agrees best with its own expected response; the least, "
-                    f"{campaign.y_names[worst]!r}, with correlation {own[worst]:.3f}.",
-                    value=float(own[worst]),
-                    picture=_picture(rows, campaign.y_names, "Sensor", limit),
-                )
-            )
+            found.append(self._right(faults, campaign, comparison, picture))
         return found
 
-    def _exchanged(
-        self, c: np.ndarray, faults: Faults, kind: str, names: tuple[str, ...], limit: float
-    ) -> list[Finding]:
+    def _right(self, faults: Faults, campaign: Campaign, comparison: Comparison, picture: Picture) -> Finding:
+        worst, enough = int(np.argmin(faults.other)), comparison.settings.least_agreement
+        low, high = comparison.settings.delay_s
+        alone = tuple(campaign.y_names[k] for k in np.flatnonzero(faults.other < enough))
+        if alone and not faults.doubtful and 2 * len(alone) < len(faults.other):
+            return Finding(
+                self.name,
+                "warning",
+                f"Sensor {quoted(alone)} agrees with no response of the model (by {faults.other[worst]:.2f} at least,"
+                f" where 1 is all), while the others do: its signal comes more than {1000 * high:g} ms late or"
+                f" {-1000 * low:g} ms early, is not what the channel list says, or lacks something in the model.",
+                alone,
+                value=float(faults.other[worst]),
+                limit=enough,
+                picture=picture,
+            )
+        least = f"the least, {campaign.y_names[worst]!r}, by {faults.other[worst]:.2f}"
+        if faults.doubtful:
+            names = [(campaign.y_names if what == "row" else campaign.u_names)[k] for what, k in faults.doubtful]
+            sentence = (
+                f"Model and records agree too little to tell the channels apart ({least}; of {quoted(names)} another"
+                f" order or sign would agree better, but not beyond what a wrong model does by chance). Check the"
+                " channel list by hand."
+            )
+        else:
+            sentence = f"No other order of the channels agrees better with the model; own responses do, {least}."
+        return Finding(
+            self.name,
+            "note" if faults.doubtful else "ok",
+            sentence,
+            value=float(faults.other[worst]),
+            limit=comparison.settings.least_agreement,
+            picture=picture,
+        )
+
+    def _exchanged(self, faults: Faults, kind: str, names: tuple[str, ...], sensors: tuple[str, ...],
+                   comparison: Comparison, picture: Picture) -> list[Finding]:
         p, what = (faults.p, "Sensor") if kind == "row" else (faults.q, "Drive")
         found: list[Finding] = []
         done: set[int] = set()
         for i in range(len(p)):
             if p[i] == i or i in done:
                 continue
-            cycle, k = [i], int(p[i])
-            while k != i:
-                cycle.append(k)
-                k = int(p[k])
+            cycle = cycle_of(p, i)
             done.update(cycle)
             pair = tuple(names[j] for j in cycle)
-            gain = min(faults.after[kind, j] - faults.before[kind, j] for j in cycle)
-            listed = "; ".join(
-                f"{names[j]!r} agrees with the model's {names[int(p[j])]!r} by {faults.after[kind, j]:.2f}, with its"
-                f" own by {faults.before[kind, j]:.2f}"
-                for j in cycle
-            )
+            if kind == "row":
+                gain = min(faults.other[j] - faults.own[j] for j in cycle)
+                listed = "; ".join(
+                    f"{names[j]!r} agrees with the model's {names[int(p[j])]!r} by {faults.other[j]:.2f}, with its own"
+                    f" by {faults.own[j]:.2f}"
+                    for j in cycle
+                )
+            else:
+                of, before, after = faults.columns[i]
+                gain = after - before
+                listed = f"with that {sensors[of]!r} agrees with the model by {after:.2f}, without it by {before:.2f}"
             verb = "are exchanged" if len(pair) == 2 else "are mixed up"
             found.append(
                 Finding(
                     self.name,
                     "stop",
-                    f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (correlation of "
-                    "magnitude and phase). Exchange their names or their cables.",
+                    f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is all; magnitude and phase, any gain"
+                    f" and delay; chance less than {comparison.settings.chance:g}). Exchange their names or their"
+                    " cables.",
                     pair,
                     value=float(gain),
-                    limit=limit,
-                    picture=_picture(c, names, what, limit),
+                    limit=comparison.settings.least_agreement,
+                    picture=picture,
                 )
             )
         return found
@@ -161,80 +194,74 @@ class ChannelOrder:
 class Polarity:
     """Flipped signs of drives (columns) and sensors (rows).
 
-    Found by `explain` with the exchanges: a channel counts as flipped where its correlation with its own expectation
-    is below -(0.15 + 5 standard deviations of its noise), which noise alone reaches less than once in 1e6. Flipping all
-    sensors cannot be told from flipping all drives: the explanation with fewer flips is named, and the sentence says so
-    where both have equally many.
+    Found by `explain` with the exchanges. Flipping all sensors cannot be told from flipping all drives: the explanation
+    with fewer flips is named, and the sentence says so where both have equally many.
     """
 
     name = "polarity"
 
-    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        comparison = compare(_pairs(kept))
-        if comparison is None:
-            why = "no model was given" if expectation.response is None else "too few driven samples"
+    def conclude(self, campaign: Campaign, comparison: Comparison | None, faults: Faults | None, why: str
+                 ) -> list[Finding]:
+        if comparison is None or faults is None:
             x = np.arange(len(campaign.y_names))
             picture = Picture(
                 "Polarity of each sensor",
                 "sensor number",
-                "correlation [-]",
+                "agreement [-]",
                 (Series("not known", x, 0.0 * x, "points"),),
             )
             return [
                 Finding(
                     self.name,
-                    "ok" if expectation.response is None else "note",
+                    "ok" if why.startswith("no model") else "note",
                     f"Polarity was not compared with a model ({why}).",
                     picture=picture,
                 )
             ]
-        limit = MARGIN + 5 * comparison.standard
-        faults = explain(comparison, limit)
-        p, q, r, c = faults.p, faults.q, faults.r, faults.c
-        row = np.diag(comparison.rows(q, c)[:, p])
-        column = np.diag(comparison.columns(p, r)[:, q])
+        r, c = faults.r, faults.c
         picture = Picture(
-            "Correlation of each channel with its expected response",
-            "sensors, then drives",
-            "correlation [-]",
-            (
-                Series("sensors", np.arange(len(p)), row, "bars"),
-                Series("drives", len(p) + np.arange(len(q)), column, "bars"),
-            ),
-            (Limit("opposite sign", -limit),),
-            x_names=(*campaign.y_names, *campaign.u_names),
+            "Agreement of each sensor with the model, with the sign that it has",
+            "sensor",
+            "agreement [-]",
+            (Series("sensors", np.arange(len(r)), r * faults.other, "bars"),),
+            (Limit("opposite sign", -comparison.settings.least_agreement),),
+            x_names=campaign.y_names,
         )
-        found = []
         both = np.count_nonzero(r < 0) + np.count_nonzero(c < 0)
-        total = len(r) + np.count_nonzero(comparison.measured.G.any(axis=(0, 1)))
+        total = len(r) + np.count_nonzero(comparison.moving)
         doubt = " It could as well be that all the other channels are flipped." if 2 * both == total else ""
-        for flipped, correlation, names, what in (
-            (r, np.abs(row), campaign.y_names, "Sensor"),
-            (c, np.abs(column), campaign.u_names, "Drive"),
-        ):
-            for k in np.flatnonzero(flipped < 0):
-                severity: Severity = "stop"
-                found.append(
-                    Finding(
-                        self.name,
-                        severity,
-                        f"{what} {names[k]!r} has the opposite sign of the model (correlation {-correlation[k]:.2f}"
-                        " where +1 is expected). Its leads are exchanged, or the model's axis points the other way;"
-                        f" exchange them or flip the channel's sign.{doubt}",
-                        (names[k],),
-                        value=float(-correlation[k]),
-                        limit=-limit,
-                        picture=picture,
-                    )
-                )
+        said = [
+            (campaign.y_names[k], "Sensor", -float(faults.other[k]),
+             f"agreement {-faults.other[k]:.2f} where +1 is expected")
+            for k in np.flatnonzero(r < 0)
+        ] + [
+            (campaign.u_names[k], "Drive", faults.columns[k][1] - faults.columns[k][2],
+             f"sensor {campaign.y_names[faults.columns[k][0]]!r} agrees by {faults.columns[k][2]:.2f} with it flipped,"
+             f" by {faults.columns[k][1]:.2f} as it is")
+            for k in map(int, np.flatnonzero(c < 0))
+        ]
+        found = [
+            Finding(
+                self.name,
+                "stop",
+                f"{what} {name!r} has the opposite sign of the model ({how}). Its leads are exchanged, or the model's"
+                f" axis points the other way; exchange them or flip the channel's sign.{doubt}",
+                (name,),
+                value=value,
+                limit=-comparison.settings.least_agreement,
+                picture=picture,
+            )
+            for name, what, value, how in said
+        ]
         if not found:
             found.append(
                 Finding(
                     self.name,
-                    "ok",
-                    f"All signs agree with the model (lowest correlation {np.abs(row).min():.2f} among sensors).",
-                    value=float(np.abs(row).min()),
-                    limit=limit,
+                    "note" if faults.doubtful else "ok",
+                    "Signs were not told, for model and records agree too little." if faults.doubtful else
+                    f"All signs agree with the model (lowest agreement {faults.other.min():.2f} among sensors).",
+                    value=float(faults.other.min()),
+                    limit=comparison.settings.least_agreement,
                     picture=picture,
                 )
             )
@@ -305,13 +332,14 @@ def _copy_picture(kept: list[_Kept]) -> Picture:
     )
 
 
-def _picture(c: np.ndarray, names: tuple[str, ...], what: str, limit: float) -> Picture:
+def _picture(a: np.ndarray, names: tuple[str, ...], limit: float) -> Picture:
     x = np.arange(len(names))
-    others = np.max(np.where(np.eye(len(c), dtype=bool), -np.inf, c), axis=1) if len(c) > 1 else np.zeros(1)
+    others = np.max(np.where(np.eye(len(a), dtype=bool), -np.inf, a), axis=1) if len(a) > 1 else np.zeros(1)
     return Picture(
-        f"{what}s against the model",
-        what.lower(),
-        "correlation [-]",
-        (Series("own expected response", x, np.diag(c), "points"), Series("best other", x, others, "points")),
+        "Sensors against the model",
+        "sensor",
+        "agreement [-]",
+        (Series("own expected response", x, np.diag(a), "points"), Series("best other", x, others, "points")),
+        (Limit("least that proves anything", limit),),
         x_names=tuple(names),
     )

@@ -227,7 +227,7 @@ def _excess(seen: Excerpt) -> np.ndarray | None:
     estimate = h1([of])
     if estimate is None:
         return None
-    n_u = int(moving.sum())
+    n_u = estimate.rank
     level = FALSE_ALARM / estimate.coherence.size
     chance = stats.beta.isf(level, n_u, estimate.dof)
     ratio = estimate.coherence / np.maximum(1 - estimate.coherence, 1e-12)

@@ -126,6 +126,16 @@ def quoted(names: tuple[str, ...] | list[str], most: int = 4) -> str:
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
+def times(ratio: float, most: float = 1000.0) -> str:
+    """"3.1 times", or "over 1000 times": larger numbers tell nobody more."""
+    return f"over {most:g} times" if ratio > most else f"{ratio:.1f} times" if ratio < 100 else f"{ratio:.0f} times"
+
+
+def percent(part: float) -> str:
+    """"0.12 %", "12 %", "230 %" or "over 1000 %"."""
+    return "over 1000 %" if part > 10 else f"{100 * part:.0f} %" if part >= 0.1 else f"{100 * part:.2g} %"
+
+
 def thinned(x: np.ndarray, y: np.ndarray, most: int = 2000) -> tuple[np.ndarray, np.ndarray]:
     """At most about `most` points of a curve for a plot, keeping smallest and largest of each bin."""
     if len(x) <= most:

@@ -3,6 +3,10 @@
 G = S_yu inv(S_uu) over Hann segments with half overlap (Bendat and Piersol, Random Data, 4th ed., 2010, chapter 7).
 Of a periodic record the mean of its periods is taken, after the first, and segments wrap around its end, so that
 a period that repeats is not counted as new data.
+
+Voltages that always move together (six logical axes played through eight drives, one axis after the other) span fewer
+directions than there are drives. Only these directions are estimated: with the rows of V an orthonormal basis of them,
+u = V^T a, G V^T is estimated from a, and what is called G is (G V^T) V, which is zero across them.
 """
 
 from __future__ import annotations
@@ -20,6 +24,10 @@ MOST_SAMPLES = 1 << 16
 OVERLAP = 1 / 1.056
 # Lines whose input power is below this part of the largest count as not driven.
 DRIVEN = 1e-3
+# Power of a direction of the voltages by the strongest one's, below which it is not excited; each at equal r.m.s.
+DIRECTION = 1e-6
+# The same at a single line, by the line's own strongest direction.
+AT_LINE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,23 +53,25 @@ class Spectra:
         mask[:2] = False
         return mask
 
-    def active(self) -> np.ndarray:
-        """(n_u,) inputs that move."""
-        power = np.sum(np.abs(self.U[:, 2:]) ** 2, axis=(0, 1))
-        return power > 1e-12 * np.max(power, initial=0.0)
-
 
 @dataclass(frozen=True, eq=False)
 class H1:
-    """f (n,) Hz, G (n, n_y, n_u), noise (n, n_y) residual power, gram (n, n_u, n_u) sum over segments of U* U^T,
-    coherence (n, n_y) multiple, dof complex degrees of freedom of the noise."""
+    """f (n,) Hz, G (n, n_y, n_u), noise (n, n_y) residual power, covariance (n, n_u, n_u) of a row of G by the noise
+    there, coherence (n, n_y) multiple, dof complex degrees of freedom of the noise, basis (n_u, rank) orthonormal
+    directions of u that are excited."""
 
     f: np.ndarray
     G: np.ndarray
     noise: np.ndarray
-    gram: np.ndarray
+    covariance: np.ndarray
     coherence: np.ndarray
     dof: int
+    basis: np.ndarray
+
+    @property
+    def rank(self) -> int:
+        """How many directions of u are excited."""
+        return self.basis.shape[1]
 
 
 def usable(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, bool]:
@@ -96,33 +106,51 @@ def spectra(u: np.ndarray, y: np.ndarray, rate_Hz: float, length: int, wrap: boo
     return Spectra(np.fft.rfftfreq(length, 1 / rate_Hz), cut(u), cut(y))
 
 
+def directions(U: np.ndarray) -> np.ndarray:
+    """(n_u, rank) orthonormal basis of the real span of voltages U (..., n_u): what is at least `DIRECTION` of it."""
+    flat = U.reshape(-1, U.shape[-1])
+    gram = np.real(flat.conj().T @ flat)
+    size = np.sqrt(np.diag(gram))
+    moves = size > np.sqrt(1e-12) * np.max(size, initial=0.0)
+    scale = np.where(moves, size, 1.0)
+    power, V = np.linalg.eigh(np.where(np.outer(moves, moves), gram / np.outer(scale, scale), 0.0))
+    found = scale[:, None] * V[:, power > DIRECTION * np.max(power, initial=0.0)] * moves[:, None]
+    return np.asarray(np.linalg.qr(found)[0])
+
+
 def h1(of: list[Spectra]) -> H1 | None:
     """Over the segments of some records of equal segment length; None where there are too few for the inputs.
 
-    Inputs that do not move have a zero column. Lines that are not driven are left out.
+    Inputs that do not move have a zero column. Lines are left out that are not driven, or not in every direction in
+    which the others are.
     """
     U, Y = np.concatenate([s.U for s in of]), np.concatenate([s.Y for s in of])
     joint = Spectra(of[0].f, U, Y)
-    keep, active = joint.driven(), joint.active()
-    K, n_u = joint.count, int(active.sum())
-    if n_u == 0 or 2 * n_u + 4 > K or not keep.any():
+    keep = joint.driven()
+    if not keep.any():
         return None
-    U, Y = U[:, keep][:, :, active], Y[:, keep]
-    gram = np.einsum("kfi,kfj->fij", U.conj(), U)
-    # A slight ridge keeps inputs that move together from dividing by zero.
-    ridge = 1e-9 * np.trace(gram, axis1=1, axis2=2).real[:, None, None] * np.eye(n_u)
-    solved = np.linalg.solve(gram + ridge, np.einsum("kfi,kfj->fij", U.conj(), Y))
-    residual = Y - np.einsum("kfi,fij->kfj", U, solved)
-    dof = K - n_u
+    basis = directions(U[:, keep])
+    K, rank = joint.count, basis.shape[1]
+    if rank == 0 or 2 * rank + 4 > K:
+        return None
+    reduced = U @ basis
+    gram = np.einsum("kfi,kfj->fij", reduced.conj(), reduced)
+    power = np.linalg.eigvalsh(gram)
+    keep &= power[:, 0] > AT_LINE * power[:, -1]
+    if not keep.any():
+        return None
+    reduced, Y, gram = reduced[:, keep], Y[:, keep], gram[keep]
+    inverse = np.linalg.inv(gram)
+    solved = inverse @ np.einsum("kfi,kfj->fij", reduced.conj(), Y)
+    residual = Y - np.einsum("kfi,fij->kfj", reduced, solved)
+    dof = K - rank
     noise = np.sum(np.abs(residual) ** 2, axis=0) / len(U) * K / dof
     total = np.sum(np.abs(Y) ** 2, axis=0)
     coherence = 1 - np.sum(np.abs(residual) ** 2, axis=0) / np.where(total > 0, total, 1.0)
     coherence[total == 0] = 0.0
-    G = np.zeros((int(keep.sum()), Y.shape[2], len(active)), complex)
-    G[:, :, active] = np.swapaxes(solved, 1, 2)
-    full = np.zeros((len(G), len(active), len(active)), complex)
-    full[:, np.ix_(active, active)[0], np.ix_(active, active)[1]] = gram * (K / len(U) if len(U) else 1.0)
-    return H1(joint.f[keep], G, noise, full, np.clip(coherence, 0.0, 1.0), dof)
+    G = np.swapaxes(solved, 1, 2) @ basis.T
+    covariance = basis @ inverse @ basis.T * (len(U) / K)
+    return H1(joint.f[keep], G, noise, covariance, np.clip(coherence, 0.0, 1.0), dof, basis)
 
 
 def octaves(f: np.ndarray) -> list[np.ndarray]:

@@ -9,7 +9,17 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
+from avis_ctrl.measurement.gates.finding import (
+    FALSE_ALARM,
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Series,
+    percent,
+    quoted,
+    times,
+)
 
 # Lines over which the noise level is averaged, and lines looked at: those that carry most of the power.
 SMOOTH = 9
@@ -99,8 +109,8 @@ class Periodicity(Gate):
                         self.name,
                         "warning",
                         f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s:"
-                        f" {quoted(bad)} still differ by {np.sqrt(k.T[drop - 1].max()):.1f} times the noise,"
-                        f" {100 * k.relative[drop - 1].max():.2g} % of the signal. The rig drifts, or the transient is"
+                        f" {quoted(bad)} still differ by {times(float(np.sqrt(k.T[drop - 1].max())))} the noise,"
+                        f" {percent(k.relative[drop - 1].max())} of the signal. The rig drifts, or the transient is"
                         " longer than the record. Wait longer before recording, or look for drift.",
                         bad,
                         (k.record,),
@@ -158,7 +168,7 @@ class Periodicity(Gate):
             self.name,
             "warning",
             f"Record {k.record} drifts: over its last {len(k.T) // 2} periods of {k.period_s:g} s {quoted(names)}"
-            f" change by {100 * drift[bad].max():.2g} % of the signal, steadily ({T[bad].max():.1f} times the noise"
+            f" change by {percent(drift[bad].max())} of the signal, steadily ({times(float(T[bad].max()))} the noise"
             f" power, by chance up to {limit:.2f}). The rig drifts, or the transient is longer than the record. Wait"
             " longer before recording, or look for what changes.",
             names,

@@ -18,11 +18,16 @@ from avis_ctrl.measurement.gates.finding import (
     Picture,
     Series,
     Severity,
+    percent,
     quoted,
 )
 from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, octaves, segment_length, spectra, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
+# Directions of the voltages count as common to two records down to this cosine of the angle between them.
+COMMON = 1 - 1e-6
+# T beyond this many times its limit is said in words: the number tells nobody anything.
+TOLD = 20.0
 # Differences below these parts of the response are not worth a note, or a warning.
 NOTABLE, LARGE = 0.01, 0.05
 # Noise of the comparison above this part of the response hides changes that matter.
@@ -49,13 +54,15 @@ class _Kept:
 @dataclass(frozen=True, eq=False)
 class Difference:
     """Of two records (or levels): T (n_y,) mean |difference|^2 by variance in the octave that
-    stands out most, divided by what chance gives at 1 % (limit 1), relative (n_y,) difference there, free of noise."""
+    stands out most, divided by what chance gives at 1 % (limit 1), relative (n_y,) difference there, free of noise,
+    band_Hz (n_y, 2) where that is."""
 
     a: str
     b: str
     T: np.ndarray
     limit: float
     relative: np.ndarray
+    band_Hz: np.ndarray
     f: np.ndarray
     by_line: np.ndarray
     noise: float
@@ -149,8 +156,8 @@ class Repeatability(_Records):
                         self.name,
                         severity,
                         f"{d.b.capitalize()} does not repeat {d.a}: {quoted(names)} differ by up to"
-                        f" {100 * d.relative[bad].max():.2g} % of the response, {d.T[bad].max():.1f} times what chance"
-                        " gives at 1 %. The rig drifted or was changed in between; treat its"
+                        f" {percent(d.relative[bad].max())} of the response, {beyond_chance(d.T[bad].max())}. The rig"
+                        " drifted or was changed in between; treat its"
                         " parameters as uncertain by as much, or use one of the two.",
                         names,
                         (d.a, d.b),
@@ -203,15 +210,14 @@ class LevelDependence(_Records):
             if bad.any():
                 names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
                 severity: Severity = "warning" if d.relative[bad].max() > LARGE else "note"
-                j = int(np.argmax(np.where(bad, d.relative, 0)))
-                at = d.f[int(np.argmax(d.by_line[:, j]))]
+                low, high = d.band_Hz[int(np.argmax(np.where(bad, d.relative, 0)))]
                 found.append(
                     Finding(
                         self.name,
                         severity,
                         f"The response depends on the level: from {d.a} to {d.b} {quoted(names)} change by up to"
-                        f" {100 * d.relative[bad].max():.2g} % (most near {at:.3g} Hz), {d.T[bad].max():.1f} times what"
-                        " chance gives at 1 %: nonlinearity. Identify at the level of use, and"
+                        f" {percent(d.relative[bad].max())} (most from {low:.3g} to {high:.3g} Hz),"
+                        f" {beyond_chance(d.T[bad].max())}: nonlinearity. Identify at the level of use, and"
                         " carry the difference as uncertainty.",
                         names,
                         (),
@@ -283,10 +289,11 @@ def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Dif
     keep = driven > 1e-3 * driven.max()
     power = np.abs(D) ** 2
     by_line = np.sqrt(power / np.maximum(size, 1e-300))
-    T, relative = _by_band(
+    T, relative, band = _by_band(
         f[keep], (power / variance)[keep], (power - variance)[keep], size[keep], 1, min(a.dof, b.dof), level
     )
-    return Difference(*names, T, 1.0, relative, f[keep], by_line[keep], _noise(f[keep], variance[keep], size[keep]))
+    noise = _noise(f[keep], variance[keep], size[keep])
+    return Difference(*names, T, 1.0, relative, band, f[keep], by_line[keep], noise)
 
 
 def _noise(f: np.ndarray, spread: np.ndarray, size: np.ndarray) -> float:
@@ -298,18 +305,20 @@ def _noise(f: np.ndarray, spread: np.ndarray, size: np.ndarray) -> float:
 
 def _by_band(
     f: np.ndarray, ratio: np.ndarray, excess: np.ndarray, size: np.ndarray, n_u: int, dof: int, level: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """(n_y,) of the octave that stands out most: mean ratio by the limit of F(n_u L, dof L), and relative excess."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n_y,) of the octave that stands out most: mean ratio by the limit of F(n_u L, dof L), relative excess, and its
+    ends (n_y, 2)."""
     bands = octaves(f)
-    T, relative = np.zeros(ratio.shape[1]), np.zeros(ratio.shape[1])
+    T, relative, ends = (np.zeros((ratio.shape[1], *more)) for more in ((), (), (2,)))
     for band in bands:
         lines = int(band.sum())
         limit = float(stats.f.isf(level / len(bands), n_u * lines, dof * lines))
         here = ratio[band].mean(axis=0) / limit
         part = np.sqrt(np.maximum(excess[band].sum(axis=0), 0) / np.maximum(size[band].sum(axis=0), 1e-300))
         relative = np.where(here > T, part, relative)
+        ends[here > T] = f[band][[0, -1]]
         T = np.maximum(T, here)
-    return T, relative
+    return T, relative, ends
 
 
 def _by_h1(a: Spectra | None, b: Spectra | None, level: float, names: tuple[str, str]) -> Difference | None:
@@ -322,20 +331,30 @@ def _compare(a: H1 | None, b: H1 | None, level: float, names: tuple[str, str]) -
     if a is None or b is None:
         return None
     f, ia, ib = np.intersect1d(a.f, b.f, return_indices=True)
-    active = a.G.any(axis=(0, 1)) & b.G.any(axis=(0, 1))
     ia, ib, f = ia[::2], ib[::2], f[::2]
-    if not len(f) or not active.any():
+    common = _common(a.basis, b.basis)
+    rank = common.shape[1]
+    if not len(f) or not rank:
         return None
-    # Columns that only one of the two drives cannot be compared.
-    pick = np.ix_(np.arange(len(f)), np.flatnonzero(active), np.flatnonzero(active))
-    Va, Vb = (np.linalg.pinv(of.gram[index], hermitian=True)[pick] for of, index in ((a, ia), (b, ib)))
-    D = (b.G[ib] - a.G[ia])[:, :, active]
+    Ga, Gb = (of.G[index] @ common for of, index in ((a, ia), (b, ib)))
+    Va, Vb = (common.T @ of.covariance[index] @ common for of, index in ((a, ia), (b, ib)))
+    D = Gb - Ga
     V = a.noise[ia][:, :, None, None] * Va[:, None] + b.noise[ib][:, :, None, None] * Vb[:, None]
-    n_u = int(active.sum())
-    ridge = 1e-12 * np.trace(V, axis1=2, axis2=3).real[..., None, None] * np.eye(n_u) + 1e-300 * np.eye(n_u)
-    solved = np.linalg.solve(V + ridge, D[..., None])[..., 0]
-    ratio = np.real(np.einsum("fyi,fyi->fy", D.conj(), solved)) / n_u
+    V += 1e-12 * np.trace(V, axis1=2, axis2=3).real[..., None, None] * np.eye(rank) + 1e-300 * np.eye(rank)
+    ratio = np.real(np.einsum("fyi,fyi->fy", D.conj(), np.linalg.solve(V, D[..., None])[..., 0])) / rank
     spread = np.trace(V, axis1=2, axis2=3).real
-    size, power = np.sum(np.abs(a.G[ia][:, :, active]) ** 2, axis=2), np.sum(np.abs(D) ** 2, axis=2)
-    T, relative = _by_band(f, ratio, power - spread, size, n_u, min(a.dof, b.dof), level)
-    return Difference(*names, T, 1.0, relative, f, np.sqrt(power / np.maximum(size, 1e-300)), _noise(f, spread, size))
+    size, power = np.sum(np.abs(Ga) ** 2, axis=2), np.sum(np.abs(D) ** 2, axis=2)
+    T, relative, band = _by_band(f, ratio, power - spread, size, rank, min(a.dof, b.dof), level)
+    by_line = np.sqrt(power / np.maximum(size, 1e-300))
+    return Difference(*names, T, 1.0, relative, band, f, by_line, _noise(f, spread, size))
+
+
+def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(n_u, m) orthonormal basis of the directions that two records share: others cannot be compared."""
+    left, cosine, _ = np.linalg.svd(a.T @ b, full_matrices=False)
+    return np.asarray(a @ left[:, cosine > COMMON])
+
+
+def beyond_chance(T: float) -> str:
+    """In words, how far a statistic is beyond its limit at 1 %."""
+    return "far beyond chance" if T > TOLD else f"{T:.1f} times what chance gives at 1 %"

@@ -199,7 +199,7 @@ class Coherence(Gate):
                     picture=Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ()),
                 )
             ]
-        n_u = int(np.count_nonzero(best.G.any(axis=(0, 1))))
+        n_u = best.rank
         free = best.coherence - (1 - best.coherence) * n_u / best.dof
         bands = thirds(best.f)
         middle = np.array([np.sqrt(best.f[b][0] * best.f[b][-1]) for b in bands])
@@ -333,7 +333,7 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None]:
     estimate = h1([spectra(u, y, rate, segment_length(len(u), n_u), wrap)])
     if estimate is None:
         return np.zeros(0), None
-    free = np.maximum(estimate.coherence - (1 - estimate.coherence) * n_u / estimate.dof, 0.0)
+    free = np.maximum(estimate.coherence - (1 - estimate.coherence) * estimate.rank / estimate.dof, 0.0)
     return estimate.f, free / np.maximum(1 - free, 1e-12)
 
 

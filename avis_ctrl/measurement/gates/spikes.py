@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series
+from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series, times
 
 # Cubic through the two neighbours on either side: x0 - (4 (x-1 + x1) - (x-2 + x2)) / 6, and what a spike of 1 leaves.
 SHAPE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6
@@ -110,9 +110,9 @@ class Spikes(Gate):
             self.name,
             "warning",
             f"Channel {k.channel!r} of record {k.record} has {many} far outside the neighbours, at {k.at_s:.6g} s"
-            f" (sample {k.sample}): {k.value:.4g} {unit} where the neighbours lead to {k.expected:.4g}, {k.ratio:.3g}"
-            f" times the usual departure (limit {FACTOR:g}): an electrical disturbance or a faulty conversion. Look at"
-            " cables and grounding; repeat the record, or replace the sample by what its neighbours lead to.",
+            f" (sample {k.sample}): {k.value:.4g} {unit} where the neighbours lead to {k.expected:.4g},"
+            f" {times(k.ratio)} the usual departure (limit {FACTOR:g}): an electrical disturbance or a faulty"
+            " conversion. Look at cables and grounding; repeat the record, or replace the sample by what its neighbours lead to.",
             (k.channel,),
             (k.record,),
             k.ratio,

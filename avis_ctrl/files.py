@@ -1,0 +1,139 @@
+"""The one place where files are written: each is whole or absent, also when the disk fills or the process is killed."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+from avis_ctrl.errors import AvisError, ComputationError, InputError
+
+# The disk refuses, not the place: exit code 3.
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """A file to write (and read) that takes its name only when all of it is on the disk.
+
+    It has no name until then where the system allows that (it vanishes with the process), otherwise a hidden one beside
+    the target. What was there before stays as it was until the end, and where anything is raised.
+
+    Raises
+    ------
+    InputError : a place that cannot be written, or something there that is no regular file (a folder, a device).
+    ComputationError : the disk refuses.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError("cannot be written (it is there and no regular file)", file=path)
+        file, name = _opened(path)
+    except OSError as error:
+        raise _refused(path, error) from None
+    try:
+        with file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+            name = name or _named(file, path)
+        os.chmod(name, 0o666 & ~_mask())  # a temporary file is its owner's alone
+        os.replace(name, path)
+    except OSError as error:
+        raise _refused(path, error) from None
+    finally:
+        if name is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(name)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file so that nobody ever sees half of it. Raises as `whole_file` does."""
+    with whole_file(path) as file:
+        file.write(content)
+
+
+def write_together(folder: Path, contents: Mapping[str, bytes], old: Iterable[Path] = ()) -> list[Path]:
+    """Write several files of a folder, all of them or none; in their order, so that the last one says it is complete.
+
+    All are on the disk under a hidden name before the first takes its place and `old` ones go: a full disk leaves the
+    results that were there before.
+
+    Parameters
+    ----------
+    contents : by name, which may hold folders: "controllers/mu.json".
+    old : files that go, where they are there and not written again: an old report beside new results would lie.
+
+    Raises
+    ------
+    ComputationError : the disk refuses.
+    """
+    try:
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".new.", ignore_cleanup_errors=True) as hidden:
+            for name, content in contents.items():
+                made = Path(hidden) / name
+                made.parent.mkdir(parents=True, exist_ok=True)
+                write_whole(made, content)
+            for path in old:
+                path.unlink(missing_ok=True)
+            for name in contents:
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(Path(hidden) / name, folder / name)
+    except OSError as error:
+        raise not_written(folder, error) from None
+    except ComputationError as error:
+        raise ComputationError(f"{folder} was not written; what was there before is untouched", cause=error.cause,
+                               next_step=error.next_step) from None
+    return [folder / name for name in contents]
+
+
+def not_written(path: Path, error: OSError) -> ComputationError:
+    return ComputationError(f"{path} was not written; what was there before is untouched",
+                            cause=str(error.strerror or error),
+                            next_step="free some space or choose another place with --out")
+
+
+def _refused(path: Path, error: OSError) -> AvisError:
+    if error.errno in FULL:
+        return not_written(path, error)
+    return InputError(f"cannot be written ({error.strerror or error})", file=path)
+
+
+def _opened(path: Path) -> tuple[BinaryIO, str | None]:
+    """A file in the folder of `path`, and its name where it has one."""
+    if hasattr(os, "O_TMPFILE"):
+        with contextlib.suppress(OSError):  # some file systems (NFS, old overlays) refuse files without a name
+            return open(os.open(path.parent, os.O_TMPFILE | os.O_RDWR, 0o600), "w+b"), None
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    return open(descriptor, "w+b"), name
+
+
+def _named(file: BinaryIO, path: Path) -> str:
+    """A hidden name beside the target for a file without one; its copy where the system gives it none."""
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with open(descriptor, "wb") as copy:
+            try:
+                # Only a name that is free can be linked to: beside the one that was just found to be so.
+                os.link(f"/proc/self/fd/{file.fileno()}", f"{name}.", follow_symlinks=True)
+                os.replace(f"{name}.", name)
+            except OSError:
+                file.seek(0)
+                shutil.copyfileobj(file, copy)
+                copy.flush()
+                os.fsync(copy.fileno())
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(name)
+        raise
+    return name
+
+
+def _mask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,90 @@
+"""HDF5 files that are written whole or not at all, on a disk that may fill.
+
+The HDF5 library does not survive a disk that refuses while a file is closed: it reports the refusal, forgets to free
+the file, and falls over it when Python ends (a segmentation fault, seen with HDF5 2.0). So it is given a file that
+never refuses, and the refusal is told once HDF5 has let go of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+
+from avis_ctrl.files import whole_file
+
+# Pieces up to this size [bytes] may be structure, which HDF5 reads again; chunks of data are larger and are not.
+STRUCTURE = 1 << 16
+
+
+class PatientFile:
+    """What h5py takes for a file: bytes go to a descriptor, after its first refusal nowhere.
+
+    refused : the disk's first refusal. After it small pieces stay in memory, so that HDF5 finds its structure again.
+    """
+
+    def __init__(self, descriptor: int):
+        self.descriptor, self.at, self.end = descriptor, 0, 0
+        self.refused: OSError | None = None
+        self.kept: dict[int, bytes] = {}
+
+    def write(self, data: bytes) -> int:
+        view = memoryview(data).cast("B")
+        done = 0
+        try:
+            while self.refused is None and done < len(view):
+                done += os.pwrite(self.descriptor, view[done:], self.at + done)
+        except OSError as error:
+            self.refused = error
+        if self.refused is not None and len(view) <= STRUCTURE:
+            self.kept[self.at] = bytes(view)
+        self.at += len(view)
+        self.end = max(self.end, self.at)
+        return len(view)
+
+    def read(self, size: int) -> bytes:
+        found = bytearray(size)
+        of_disk = os.pread(self.descriptor, size, self.at)
+        found[:len(of_disk)] = of_disk
+        for start, piece in self.kept.items():
+            low, high = max(start, self.at), min(start + len(piece), self.at + size)
+            if low < high:
+                found[low - self.at:high - self.at] = piece[low - start:high - start]
+        self.at += size
+        return bytes(found)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self.at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self.at, os.SEEK_END: self.end}[whence]
+        return self.at
+
+    def tell(self) -> int:
+        return self.at
+
+    def truncate(self, size: int) -> int:
+        try:
+            os.ftruncate(self.descriptor, size)
+        except OSError as error:
+            self.refused = self.refused or error
+        self.end = size
+        return size
+
+    def flush(self) -> None:
+        """The descriptor has no buffer."""
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[h5py.File]:
+    """A new HDF5 file that takes its name only when it is complete. Raises as `whole_file` does."""
+    with whole_file(path) as raw:
+        patient = PatientFile(raw.fileno())
+        try:
+            with h5py.File(patient, "w", track_order=True) as file:
+                yield file
+        except Exception:
+            if patient.refused is None:
+                raise
+        if patient.refused is not None:
+            raise patient.refused
