@@ -19,8 +19,8 @@ from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
 from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.operators import mount_geometry
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.identification.campaign_fit import Portion
 from avis_ctrl.identification.large_motion import second_order
+from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction import model_inputs
 from avis_ctrl.identification.response import N_Q
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource

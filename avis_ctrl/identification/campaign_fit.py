@@ -12,9 +12,11 @@ import scipy.fft
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, Prior, fit
 from avis_ctrl.identification.noise import relative_noise, residual_noise
+from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.second_order import chosen_turning, terms, without
 from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
-from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
+from avis_ctrl.measurement.campaign import Campaign, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import noise_covariance
 
@@ -95,19 +97,6 @@ def divided(record: RecordSource) -> tuple[Portion, Portion]:
     if h.period_samples and h.periods >= 2:
         at = max(round(2 * h.periods / 3), 1) * h.period_samples
     return Portion(record, 0, at), Portion(record, at, h.samples)
-
-
-class Portion(RecordSource):
-    """Samples start .. stop of another record, still where they lie."""
-
-    def __init__(self, whole: RecordSource, start: int, stop: int):
-        h = whole.header
-        self.whole, self.start, self.stop = whole, start, stop
-        self.header = replace(h, samples=stop - start, start_s=h.start_s + start / h.sample_rate_Hz)
-
-    def load(self, start: int = 0, stop: int | None = None) -> Record:
-        stop = self.header.samples if stop is None else stop
-        return self.whole.load(self.start + start, self.start + stop)
 
 
 def excited_band(campaign: Campaign) -> tuple[float, float]:
@@ -253,11 +242,29 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     first = found
     if isinstance(campaign, FrequencyResponse) or not blocks[0].transient:
         return CampaignFit(found, first, band_Hz, (*notes, *_bounds(found)), model)
+    turning, added = chosen_turning(campaign, blocks, found.model)
+    found = fit(replace(found.model, turning=turning), without(blocks, added), priors, seed=seed)
+    if progress:
+        progress(f"second-order terms of the table's rotations: {found.iterations} iterations")
+    notes.append(f"{turning.sentence}: {_share(blocks, added)}")
+    first = replace(found, starts=first.starts)
     for k in range(reweights):
-        found = fit(found.model, residual_noise(found.residuals, model=found.model), priors, seed=seed)
+        weighed = residual_noise(found.residuals, model=found.model)
+        if k == reweights - 1:
+            added = terms(campaign, blocks, found.model)
+            weighed = [replace(block, Y=one.Y) for block, one in
+                       zip(weighed, without(blocks, [one[0] for one in added]), strict=True)]
+        found = fit(found.model, weighed, priors, seed=seed)
         if progress:
             progress(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
     return CampaignFit(replace(found, starts=first.starts), first, band_Hz, (*notes, *_bounds(found)), model, known)
+
+
+def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:
+    """How much of the outputs second-order terms are."""
+    share = [np.linalg.norm(one, axis=(0, 2)) / np.linalg.norm(block.Y, axis=(0, 2)) for block, one in
+             zip(blocks, added, strict=True)]
+    return f"up to {100 * float(np.max(share)):.2g} % of a sensor's reading in a record"
 
 
 def _bounds(found: LikelihoodFit) -> tuple[str, ...]:

@@ -102,7 +102,8 @@ def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,
     bank = replace(model.sensors, names=(*model.sensors.names, *(one.name for one in sensors)),
                    sensitivity=np.concatenate([model.sensors.sensitivity, np.full(len(sensors), gain)]))
     return ChangedModel(rig, model.names, bank, (*model.actuators, *(one.name for one in actuators)), model.period_s,
-                        model.delay_s, model.amplifier_corner_Hz, tuple(masses), tuple(sensors), tuple(actuators))
+                        model.delay_s, model.amplifier_corner_Hz, model.turning, tuple(masses), tuple(sensors),
+                        tuple(actuators))
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,7 +61,8 @@ def second_order(rig: Rig, q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, sens
     q, q_dot, u = (np.ascontiguousarray(one, float) for one in (q, q_dot, u))
     q_ddot, turned = _along(q, q_dot, u, arrays)
     large = q_ddot @ eom.M.T + q_dot @ eom.C.T + q @ eom.K.T - u @ eom.T.T
-    return large, turned, _turned_readings(q, q_ddot, *sensors_of(rig, sensors))
+    place, direction = sensors_of(rig, sensors)
+    return large, turned, _turned_readings(q, q_dot, q_ddot, place, direction)
 
 
 @njit(cache=True)
@@ -75,10 +76,11 @@ def _along(q, q_dot, u, arrays):
     return acceleration, turned
 
 
-def _turned_readings(q: np.ndarray, q_ddot: np.ndarray, place: np.ndarray, direction: np.ndarray) -> np.ndarray:
+@njit(cache=True)
+def _turned_readings(q, q_dot, q_ddot, place, direction):
     out = np.empty((len(q), len(place)))
     for k in range(len(q)):
-        turned_reading(out[k], q[k], q_ddot[k], place, direction)
+        turned_reading(out[k], q[k], q_dot[k], q_ddot[k], place, direction)
     return out
 
 
@@ -101,15 +103,24 @@ def turned_force(out, q, u, arrays):
 
 
 @njit(cache=True)
-def turned_reading(out, q, q_ddot, place, direction):
-    """out (n_y,): acceleration that sensors read beside their own when their axes turn by the payload's rotation."""
+def turned_reading(out, q, q_dot, q_ddot, place, direction):
+    """out (n_y,): acceleration that sensors read beside the linear one when they ride on the payload: their axes turn
+    by its rotation, and their places move with its square (3-2-1 angles, as `rigs.nonlinear` has them)."""
+    a, v, w = q[3:], q_dot[3:], q_ddot[3:]
+    # Second derivatives of the products of angles in the rotation matrix.
+    s11, s22, s33 = 2 * (w[0] * a[0] + v[0] ** 2), 2 * (w[1] * a[1] + v[1] ** 2), 2 * (w[2] * a[2] + v[2] ** 2)
+    s12 = w[0] * a[1] + 2 * v[0] * v[1] + a[0] * w[1]
+    s13 = w[0] * a[2] + 2 * v[0] * v[2] + a[0] * w[2]
+    s23 = w[1] * a[2] + 2 * v[1] * v[2] + a[1] * w[2]
     for k in range(place.shape[0]):
         p, d = place[k], direction[k]
         a0 = q_ddot[0] + q_ddot[4] * p[2] - q_ddot[5] * p[1]
         a1 = q_ddot[1] + q_ddot[5] * p[0] - q_ddot[3] * p[2]
         a2 = q_ddot[2] + q_ddot[3] * p[1] - q_ddot[4] * p[0]
         out[k] = ((q[4] * d[2] - q[5] * d[1]) * a0 + (q[5] * d[0] - q[3] * d[2]) * a1
-                  + (q[3] * d[1] - q[4] * d[0]) * a2)
+                  + (q[3] * d[1] - q[4] * d[0]) * a2
+                  + d[0] * (s12 * p[1] + s13 * p[2] - (s22 + s33) / 2 * p[0])
+                  + d[1] * (s23 * p[2] - (s11 + s33) / 2 * p[1]) - d[2] * (s11 + s22) / 2 * p[2])
 
 
 class March(NamedTuple):
@@ -174,7 +185,7 @@ def march(drive, volts, floor, x, before, started, table, arrays, states, beside
                 more += table.inverse[i, j] * force[j]
             beside[k, i] = true[i] - linear[i] + table.motors * more
             total[i] = linear[i] + beside[k, i]
-        turned_reading(read, q, total, table.place, table.direction)
+        turned_reading(read, q, q_dot, total, table.place, table.direction)
         for i in range(n_e - 6):
             beside[k, 6 + i] = table.sensors * read[i]
         for i in range(N):

@@ -295,6 +295,33 @@ def _block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, *
     return e, J, Residual(block, plain - transient, white / np.sqrt(2), transient)
 
 
+def added_terms(model: ResponseModel, blocks: Sequence[SpectralBlock], columns: Sequence[np.ndarray]
+                ) -> tuple[np.ndarray, np.ndarray]:
+    """H (k, k) and g (k,) with chi2 = chi2_0 + s^T H s - 2 g^T s for outputs that hold s times k known terms beside the
+    model's, the parameters moved along to where chi2 is least (to first order) and the transients taken out.
+
+    columns : (k, n, n_y, m) of each block. Raises InputError for blocks without noise.
+    """
+    n_p, k = len(model.names), len(columns[0])
+    H, g = np.zeros((n_p + k, n_p + k)), np.zeros(n_p + k)
+    scale = model.scales()
+    for block, of in zip(blocks, columns, strict=True):
+        L = whitener(block)
+        e, J, _ = _block_residual(model, block, L, derivative=True)
+        c = as_real(whitened(L, of))
+        if block.transient:
+            T = as_real(np.moveaxis(whitened(L, transient_columns(block, model)[0]), -1, 0))
+            Q, _ = span(T.T)
+            c = c - (c @ Q) @ Q.T
+        rows = np.concatenate([J * scale[:, None], c])
+        H += rows @ rows.T
+        g += rows @ e
+    size = np.sqrt(np.maximum(np.diag(H)[:n_p], np.finfo(float).tiny))
+    inner = np.linalg.pinv(H[:n_p, :n_p] / np.outer(size, size), rcond=1e-11, hermitian=True)
+    across = H[n_p:, :n_p] / size
+    return H[n_p:, n_p:] - across @ inner @ across.T, g[n_p:] - across @ inner @ (g[:n_p] / size)
+
+
 def whitener(block: SpectralBlock) -> np.ndarray:
     """(n, 1 or m, n_y, n_y) sqrt(2) inv(chol(C)), with the correction for a covariance that was itself estimated.
 

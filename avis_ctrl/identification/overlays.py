@@ -8,7 +8,8 @@ import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification import model_error
-from avis_ctrl.identification.campaign_fit import LONGEST_PIECE, Portion
+from avis_ctrl.identification.campaign_fit import LONGEST_PIECE
+from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.identification.spread import kept_axes
 from avis_ctrl.measurement.campaign import Campaign

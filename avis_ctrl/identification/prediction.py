@@ -120,11 +120,13 @@ class Predictor:
         chain = model.sensors.chain
         first = 15 + (0 if chain is None else chain.nstates) * len(model.sensors.names) if corner else -1
         body = la.solve(m.M, np.hstack([-m.K, -m.C, m.K_floor[:, :3], m.T, m.C_floor[:, :3]]))
-        parts = (np.ascontiguousarray(one) for one in (body[:, :15], body[:, 15:15 + n_u], body[:, 15 + n_u:]))
-        return March(np.ascontiguousarray(self.Phi), held, rising, *parts, first,
+        of_x, of_volts, of_floor = (np.ascontiguousarray(one) for one in
+                                    (body[:, :15], body[:, 15:15 + n_u], body[:, 15 + n_u:]))
+        place, direction = sensors_of(model.rig, model.sensors.names)
+        return March(np.ascontiguousarray(self.Phi), held, rising, of_x, of_volts, of_floor, first,
                      np.array([known.index(name) for name in model.actuators], np.int64),
-                     np.ascontiguousarray(la.inv(m.M)), *sensors_of(model.rig, model.sensors.names),
-                     float(model.turning.motors), float(model.turning.sensors))
+                     np.ascontiguousarray(la.inv(m.M)), place, direction, float(model.turning.motors),
+                     float(model.turning.sensors))
 
     def _step(self, fraction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Over a fraction of a period: e^(A h), and what a constant and a rising unit line add."""

@@ -36,6 +36,7 @@ class SpectralBlock:
     transient : the ends of a record leave a transient in it, which the fit takes out (m = 1).
     kind : records of one kind share their noise.
     shared : lines whose errors go together; the information of so many is that of one.
+    start_s, samples : of the record's part that it is of: its begin on the campaign's clock, and its length.
     """
 
     name: str
@@ -47,6 +48,8 @@ class SpectralBlock:
     transient: bool = False
     kind: str = ""
     shared: float = 1.0
+    start_s: float = 0.0
+    samples: int = 0
 
     def __post_init__(self) -> None:
         n, m = len(self.omega), self.U.shape[-1]
@@ -100,7 +103,8 @@ def record_block(record: Record, model: ResponseModel, band_Hz: tuple[float, flo
         raise InputError(f"the record has {', '.join(h.y_names)}", field=f"record {h.name}: y names", value=missing)
     Y = spectrum(record.y)[:, [h.y_names.index(name) for name in model.sensors.names]]
     kind = "floor measured" if record.floor is not None else "floor not measured"
-    return SpectralBlock(h.name, 2 * np.pi * frequency[keep], U[:, :, None], Y[:, :, None], transient=True, kind=kind)
+    return SpectralBlock(h.name, 2 * np.pi * frequency[keep], U[:, :, None], Y[:, :, None], transient=True, kind=kind,
+                         start_s=h.start_s, samples=h.samples)
 
 
 def response_block(measured: FrequencyResponse, model: ResponseModel, name: str = "frequency response"

@@ -14,13 +14,15 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
-from avis_ctrl.identification.campaign_fit import LONGEST_PIECE, CampaignFit, Portion, measured_noise
+from avis_ctrl.identification.campaign_fit import LONGEST_PIECE, CampaignFit, measured_noise
 from avis_ctrl.identification.modes import MeasuredModes, ModeRow, measured_modes, mode_table
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.overlays import ResponseOverlay, measured_response, overlay
+from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction import predict
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.second_order import terms, without
 from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
 from avis_ctrl.identification.whiteness import Whiteness, whiteness
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
@@ -170,7 +172,10 @@ def _blocks(found: CampaignFit, held_out: Campaign | FrequencyResponse
                 blocks.append((block, piece if whole else None))
     if not blocks:
         raise InputError("expected a record that drives an actuator, or one with the floor measured", field="held out")
-    return blocks
+    # Against the model by frequency, which is linear, stands what is linear in the records.
+    raw = [block for block, _ in blocks]
+    linear = without(raw, [one[0] for one in terms(held_out, raw, model)])
+    return [(block, record) for block, (_, record) in zip(linear, blocks, strict=True)]
 
 
 def _with_noise(found: CampaignFit, fitted: Campaign | FrequencyResponse, block: SpectralBlock

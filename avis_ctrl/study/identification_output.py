@@ -13,6 +13,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
+from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
 from avis_ctrl.identification.prediction import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, ranges
@@ -96,6 +97,7 @@ def result_dict(found: Identification) -> dict[str, Any]:
         "gates": [{"gate": f.gate, "severity": f.severity, "sentence": f.sentence, "channels": list(f.channels),
                    "records": list(f.records)} for f in found.findings],
         "unit_of_y": found.model.sensors.unit, "amplifier_corner_Hz": found.model.amplifier_corner_Hz,
+        "turning": found.model.turning._asdict(),
         "provenance": dict(found.provenance), "seconds": found.seconds}
 
 
@@ -108,8 +110,8 @@ def write_identification(found: Identification, folder: Path, html: bytes | None
                           [folder / name for name in FILES])
 
 
-def read_identified(folder: Path) -> tuple[Rig, float | None]:
-    """Rig of an identification's folder, and the corner of its amplifiers.
+def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:
+    """Rig of an identification's folder, the corner of its amplifiers, and what turns with the payload.
 
     Raises InputError where the folder holds no identification, or half of one.
     """
@@ -124,20 +126,27 @@ def read_identified(folder: Path) -> tuple[Rig, float | None]:
     if not isinstance(result, dict) or result.get("format") != "avis-identification":
         raise InputError("expected the result of avis identify", file=path, field="format",
                          value=result.get("format") if isinstance(result, dict) else type(result).__name__)
-    return load_rig(folder / RIG_FILE, bool(result.get("loaded"))), result.get("amplifier_corner_Hz")
+    turning = result.get("turning", AS_SIMULATED._asdict())
+    try:
+        turns = Turning(float(turning["motors"]), float(turning["sensors"]))
+    except (KeyError, TypeError, ValueError):
+        raise InputError("expected numbers motors and sensors", file=path, field="turning", value=turning) from None
+    return load_rig(folder / RIG_FILE, bool(result.get("loaded"))), result.get("amplifier_corner_Hz"), turns
 
 
 def write_predictions(folder: Path, campaign: Campaign, out: Path,
                       progress: Callable[[str], None] = lambda text: None) -> None:
-    """/records/NN/y of a campaign, simulated from its u and floor alone, in the unit of its y.
+    """/records/NN/y of a campaign, simulated from its u and floor alone, in the unit of its y, with the second-order
+    terms of the table's rotations.
 
     Raises
     ------
     InputError : a folder or campaign that does not fit, a place that cannot be written.
     ComputationError : the disk refuses.
     """
-    rig, corner = read_identified(folder)
-    model = ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner)
+    rig, corner, turning = read_identified(folder)
+    model = replace(ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner),
+                    turning=turning)
     limits = _converter_limits(rig) if campaign.y_unit == "V" else None
     with replacing(out) as file:
         file.attrs.update({"format": "avis-prediction", "version": 1, "rig": rig.name})
@@ -151,7 +160,7 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
             data = group.create_dataset("y", (h.samples, len(h.y_names)), np.float64)
             data.attrs.update({"names": np.array(h.y_names, dtype=object).astype("S"), "unit": h.y_unit})
             group.attrs["sample_rate_Hz"] = h.sample_rate_Hz
-            predictor, done = Predictor(model), 0
+            predictor, done = Predictor(model, large_motion=True), 0
             for start, stop in ranges(h.samples, PIECE):
                 u, floor = model_inputs(model, record.load(start, stop))
                 y = predictor.read(u[done - start:], None if floor is None else floor[done - start:])

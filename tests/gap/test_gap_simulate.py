@@ -12,7 +12,7 @@ from avis_ctrl.gap.effects.base import Effect, EffectParameter, library
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.simulate import motion_of, simulate
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
-from avis_ctrl.identification.campaign_fit import Portion
+from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction import Predictor
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader

@@ -1,5 +1,7 @@
 """The maximum likelihood fit against known truths, a general optimiser, and the statistics that it claims."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from exact import floor_velocity, multisine, record
@@ -8,7 +10,6 @@ from scipy.stats import chi2 as chi2_law
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification import campaign_fit
-from avis_ctrl.identification.campaign_fit import averaged
 from avis_ctrl.identification.maximum_likelihood import fit
 from avis_ctrl.identification.noise import relative_noise, residual_noise
 from avis_ctrl.identification.response import ResponseModel
@@ -137,20 +138,20 @@ def test_a_parameter_at_its_bound_leaves_the_others_at_their_optimum(avis):
     assert met >= 2
 
 
-def test_averaged_records_are_independent_from_line_to_line(avis, monkeypatch):
-    """Too many lines are averaged into responses, whose errors the fit takes as independent."""
-    monkeypatch.setattr(campaign_fit, "MOST_LINES", 0)
-    rng, model = np.random.default_rng(12), ResponseModel.of(avis, ["mass"])
-    records = []
-    for k in range(3):
-        u = 0.3 * rng.normal(size=(60_000, 8))
-        records.append(record(avis, u, np.zeros((len(u), 3)), rng, name=f"{k:02d}", excitation="noise"))
-    block = response_block(averaged(Campaign("avis", tuple(records)), (10.0, 60.0)), model)
-    error = block.Y - model.driven(block.omega, block.U, False).Y
-    white = np.linalg.solve(np.linalg.cholesky(block.noise[:, 0]), error)
-    correlation = np.abs(np.vdot(white[:-1], white[1:])) / np.linalg.norm(white) ** 2
-    assert len(block.omega) > 100
-    assert correlation < 4 / np.sqrt(white.size)
+def test_of_too_many_lines_some_driven_ones_are_fitted(avis, monkeypatch):
+    """A multisine of two periods has every other line driven; of 200 of these 100 are drawn, and told."""
+    model = ResponseModel.of(avis, ["mass"])
+    rng = np.random.default_rng(12)
+    u = multisine(rng, 0.3, 5000, 2, (10.0, 29.9))
+    one = record(avis, u, np.zeros((len(u), 3)), rng, period_s=5.0)
+    campaign = Campaign("avis", (one, replace(one, header=replace(one.header, name="01"))))
+    monkeypatch.setattr(campaign_fit, "MOST_LINES", 100)
+    blocks, said = campaign_fit.campaign_blocks(campaign, model, (10.0, 30.0))
+    assert [len(block.omega) for block in blocks] == [50, 50] and "100 of 400 lines" in said[0]
+    lines = np.rint(blocks[0].omega * 10 / (2 * np.pi)).astype(int)
+    assert np.all(lines % 2 == 0) and np.all(np.diff(lines) > 0)
+    monkeypatch.setattr(campaign_fit, "MOST_LINES", 1000)
+    assert len(campaign_fit.campaign_blocks(campaign, model, (10.0, 30.0))[0][0].omega) == 201
 
 
 def test_records_of_a_rig_with_floor_motion(avis):

@@ -15,7 +15,7 @@ def test_against_the_exact_discretisation():
     rng, rig = np.random.default_rng(1), load_rig("avis")
     u = multisine(rng, 0.3, period=4000, periods=2)
     measured = record(rig, u, np.zeros((len(u), 3)), rng, noise_V=0.0, quantised=False)
-    assert np.allclose(predict(ResponseModel.of(rig, ()), measured), measured.y, atol=1e-12)
+    assert np.allclose(predict(ResponseModel.of(rig, ()), measured, large_motion=False), measured.y, atol=1e-12)
 
 
 def test_floor_motion_of_a_record():

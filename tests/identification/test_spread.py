@@ -53,6 +53,38 @@ def test_the_largest_singular_value_in_closed_form(rng):
         assert np.allclose(largest_singular_value(L), np.linalg.svd(L, compute_uv=False)[:, 0], rtol=1e-12)
 
 
+@pytest.mark.parametrize("played", ["axes", "without a drive"])
+def test_drives_that_are_not_played_apart_leave_the_spread_of_what_they_do_together(model, played, rng):
+    """Of a response that is known along six axes, or of seven drives, alone; whatever it says of the rest is noise."""
+    A, _ = kept_axes(model.rig, KEEP, model.actuators, model.sensors.names)
+    f = np.geomspace(0.5, 60, 12)
+    L = 0.1 * np.array([[0.3, -0.2], [0.1, 0.4]])
+    T = model.matrices.T
+    # Whatever makes the forces of the kept axes makes L of them, too.
+    error = np.eye(8) + np.linalg.pinv(T) @ T @ A @ L @ np.linalg.pinv(T @ A) @ T
+    measured = exact(model, model.response(2 * np.pi * f)[:, :, :8] @ error, f)
+    if played == "axes":
+        span = np.linalg.svd(np.linalg.pinv(T))[0][:, :6]
+        junk = rng.normal(size=(12, 6, 8)) @ (np.eye(8) - span @ span.T)
+        measured = replace(measured, value=measured.value + junk, gram=np.array([span @ span.T] * 12, complex))
+    else:
+        measured = replace(measured, value=measured.value[:, :, 1:], gram=measured.gram[:, 1:, 1:],
+                           inputs=measured.inputs[1:])
+    spread = frf_spread(measured, model, KEEP, (0.9,))
+    assert np.allclose(spread.measured, np.linalg.norm(L, ord=2), rtol=1e-6) and len(spread.frequency_Hz) == 12
+
+
+def test_axes_that_no_record_pushes_are_named(model):
+    """Vertical drives alone push no x."""
+    f, up = np.geomspace(0.5, 60, 4), [1, 3, 5, 7]
+    measured = exact(model, model.response(2 * np.pi * f)[:, :, :8], f)
+    measured = replace(measured, value=measured.value[:, :, up], gram=measured.gram[:, up][:, :, up],
+                       inputs=tuple(model.actuators[k] for k in up))
+    frf_spread(measured, model, KEEP, (0.9,))
+    with pytest.raises(InputError, match=r"'x'\].*push along each"):
+        frf_spread(measured, model, ("x", "z"), (0.9,))
+
+
 @pytest.mark.parametrize("keep", [("z",), ("z", "phi_x"), ("x", "y", "phi_z")])
 def test_a_known_error_of_the_axes_forces_is_found_as_it_is(model, keep, rng):
     """Drives coupled by I + A L T give the input-multiplicative error L exactly, at every frequency."""
@@ -122,8 +154,8 @@ def test_what_is_refused(model):
         frf_spread(full, model).bound(0.999)
     with pytest.raises(InputError, match="unit"):
         frf_spread(replace(full, output_unit="m"), model)
-    fewer = FrequencyResponse(f, full.value[:, :, :7], full.noise, full.gram[:, :7, :7], full.inputs[:7], full.outputs)
-    with pytest.raises(InputError, match="Az4 missing"):
+    fewer = FrequencyResponse(f, full.value[:, :5], full.noise[:, :5, :5], full.gram, full.inputs, full.outputs[:5])
+    with pytest.raises(InputError, match="Sz3 missing"):
         frf_spread(fewer, model)
 
 

@@ -10,12 +10,13 @@ from scipy import stats
 from scipy.signal import dlsim
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.identification.campaign_fit import Portion, fit_campaign
+from avis_ctrl.identification.campaign_fit import fit_campaign
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.modes import measured_modes, mode_table, model_modes
 from avis_ctrl.identification.noise import residual_noise
 from avis_ctrl.identification.overlays import overlay
 from avis_ctrl.identification.parameter_sets import default_parameters
+from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block

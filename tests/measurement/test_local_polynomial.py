@@ -319,6 +319,29 @@ def test_inputs_that_cannot_be_told_apart_are_named(rng):
         local_polynomial(campaign([(u, system.simulate(u))], RATE), inputs=("u1", "u3"))
 
 
+def test_inputs_that_depend_on_each_other_tell_what_they_span(rng):
+    """u3 = 2 u1: the response to u1 + 2 u3 and to u2 is that of two inputs, so is the noise; the rest is unknown."""
+    system = Modal(rng, 2, 3, [25.0, 50.0], 0.3, RATE)
+    two = rng.standard_normal((4000, 2))
+    u = np.column_stack([two, 2 * two[:, 0]])
+    y = system.simulate(u) + 0.05 * rng.standard_normal((4000, 2))
+    V = np.array([[1.0, 0.0], [0.0, 1.0], [2.0, 0.0]])
+    got = local_polynomial(campaign([(u, y)], RATE), band_Hz=(5, 80), partial=True)
+    plain = local_polynomial(campaign([(two, y)], RATE), band_Hz=(5, 80))
+    assert np.array_equal(got.spanned(np.eye(3)).any(axis=0), [False, True, False])
+    assert np.all(np.isinf(got.variance()[:, :, [0, 2]])) and np.all(np.isfinite(got.variance()[:, :, 1]))
+    along = got.along(V, ("one", "two"), "V")
+    assert np.allclose(along.value, plain.value, rtol=1e-6, atol=1e-9)
+    assert np.allclose(along.noise, plain.noise, rtol=1e-6) and got.dof == plain.dof
+    assert np.allclose(along.variance(), plain.variance(), rtol=1e-5)
+    with pytest.raises(InputError, match="play three"):
+        got.along(np.array([[1.0], [0.0], [0.0]]), ("three",), "V")
+    at = np.linspace(10, 75, 20)
+    of_three, of_two = (noise_covariance(campaign([(one, y)], RATE), at, band_Hz=(5, 80)) for one in (u, two))
+    assert np.allclose(of_three.covariance, of_two.covariance, rtol=1e-6)
+    assert np.array_equal(of_three.dof, of_two.dof)
+
+
 def test_an_input_silent_in_part_of_the_band_is_named_with_the_frequencies(rng):
     """u2 has no power above 50 Hz: roundoff there is not an excitation."""
     u = rng.standard_normal((2000, 2))

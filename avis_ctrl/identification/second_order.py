@@ -1,0 +1,96 @@
+"""Second-order terms of large rotations in the spectra of records, for a fit whose model is linear by frequency.
+
+They are what a prediction in time with them differs from one without, at a model's present parameters: small, and
+hardly changed by what a fit still moves. A fit takes them off the records and forms them anew where it ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import scipy.fft
+
+from avis_ctrl.identification.large_motion import Turning
+from avis_ctrl.identification.maximum_likelihood import added_terms
+from avis_ctrl.identification.portion import Portion
+from avis_ctrl.identification.prediction import Predictor, model_inputs
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.measurement.campaign import Campaign, RecordSource, ranges
+
+# Samples that are worked on at once.
+PIECE = 1 << 17
+# Twice the logarithm of the odds, 19 to 1, with which the records have to say that something turns otherwise.
+EVIDENCE = 2 * np.log(19.0)
+
+
+def terms(campaign: Campaign, blocks: Sequence[SpectralBlock], model: ResponseModel,
+          turnings: Sequence[Turning] | None = None) -> list[np.ndarray]:
+    """(k, n, n_y, 1) of each block: the second-order terms of its record, for each of k ways of turning.
+
+    blocks : of the campaign's records, or of pieces of them. turnings : by default the model's own alone.
+    """
+    ways = [model.turning] if turnings is None else list(turnings)
+    found: list[np.ndarray] = [np.zeros(0)] * len(blocks)
+    for record in campaign.records:
+        own = sorted((k for k, block in enumerate(blocks) if block.name == record.header.name),
+                     key=lambda k: blocks[k].start_s)
+        if own:
+            models = [replace(model, turning=way) for way in ways]
+            for k, spectra in zip(own, _of_record(record, [blocks[k] for k in own], models), strict=True):
+                found[k] = spectra
+    return found
+
+
+def _of_record(record: RecordSource, blocks: Sequence[SpectralBlock], models: Sequence[ResponseModel]
+               ) -> list[np.ndarray]:
+    whole = record.whole if isinstance(record, Portion) else record
+    fs, at, found = whole.header.sample_rate_Hz, 0, []
+    predictors = [Predictor(models[0]), *(Predictor(one, large_motion=True) for one in models)]
+    for block in blocks:
+        start = round((block.start_s - whole.header.start_s) * fs)
+        # What lies between two pieces moves the table, too.
+        for first, last in ranges(start - at, PIECE) if start - at > 1 else ():
+            _read(whole, at + first, at + last, predictors)
+        parts = [_read(whole, start + first, start + last, predictors) for first, last in ranges(block.samples, PIECE)]
+        at = start + block.samples
+        y = np.concatenate(parts, axis=1)
+        lines = np.rint(block.omega * block.samples / (2 * np.pi * fs)).astype(int)
+        spectra = scipy.fft.rfft(y - y.mean(axis=1, keepdims=True), axis=1)[:, lines] / np.sqrt(block.samples)
+        found.append(spectra[..., None])
+    return found
+
+
+def _read(whole: RecordSource, start: int, stop: int, predictors: Sequence[Predictor]) -> np.ndarray:
+    """(k, samples, n_y) of each predictor less the first, which is linear."""
+    u, floor = model_inputs(predictors[0].model, whole.load(start, stop))
+    linear, *others = (one.read(u, floor) for one in predictors)
+    return np.array([y - linear for y in others])
+
+
+def without(blocks: Sequence[SpectralBlock], of: Sequence[np.ndarray]) -> list[SpectralBlock]:
+    """Blocks with the terms (n, n_y, 1) of each taken off."""
+    return [replace(block, Y=block.Y - one) for block, one in zip(blocks, of, strict=True)]
+
+
+def chosen_turning(campaign: Campaign, blocks: Sequence[SpectralBlock], model: ResponseModel
+                   ) -> tuple[Turning, list[np.ndarray]]:
+    """What turns with the payload, as blocks with noise have it, and the terms (n, n_y, 1) of each block with that.
+
+    Another way than the model's own is taken where the records say so by 19 to 1.
+    """
+    ways = (Turning(0.0, 0.0), Turning(1.0, 0.0), Turning(0.0, 1.0))
+    parts = terms(campaign, blocks, model, ways)
+    # The terms are linear in both shares, to the order that counts.
+    columns = [np.stack([one[0], one[1] - one[0], one[2] - one[0]]) for one in parts]
+    H, g = added_terms(model, blocks, columns)
+
+    def chi2(way: Turning) -> float:
+        share = np.array([1.0, *way])
+        return float(share @ H @ share - 2 * g @ share)
+    best = min((Turning(a, b) for a in (0.0, 1.0) for b in (0.0, 1.0)), key=chi2)
+    if chi2(model.turning) - chi2(best) < EVIDENCE:
+        best = model.turning
+    return best, [np.tensordot(np.array([1.0, *best]), one, axes=1) for one in columns]
