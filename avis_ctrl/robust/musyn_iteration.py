@@ -2,9 +2,11 @@
 
 Phases in turn: D-K iteration; descent on the H-infinity optimum over the scalings (`gamma_descent`); the same with one
 more order where gamma asks for it ("growth"); then D-K iteration again from the best loop. Each ends where a step gains
-less than `STALL`, the whole where a round of all three gains less than `ROUND`. Only counts end anything, never a
-clock, and nothing depends on the target or on the number of iterations allowed but where the iteration ends: what a
-short run does is the beginning of what a long one does.
+less than `STALL`, the whole where a round of all three gains less than `ROUND`. Other constant scalings are tried once
+("start"): first of all where the controllers to start from do nothing, else in the end.
+
+Only counts end anything, never a clock, and nothing depends on the target or on the number of iterations allowed but
+where the iteration ends: what a short run does is the beginning of what a long one does.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,10 +23,10 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, gain, hinf_norm, lft_lower
 from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, band_of, d_step
 from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
-from avis_ctrl.robust.gamma_descent import descend, grown
+from avis_ctrl.robust.gamma_descent import ScaledProblem, descend, grown
 from avis_ctrl.robust.hinfsyn import Synthesis, hinfsyn
 from avis_ctrl.robust.mu_upper import upper_bound
-from avis_ctrl.robust.musyn_state import DONE, GIVEN, Iteration, Loop, State, analysed
+from avis_ctrl.robust.musyn_state import DONE, GIVEN, NOMINAL, Iteration, Loop, State, analysed
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -36,7 +39,7 @@ FAST = 0.25
 IDLE = 0.01
 # Constant scalings of all uncertainty against performance from which the iteration starts where identity leads nowhere.
 CONSTANTS = tuple(10.0 ** k for k in (-3, -2.5, -2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2, 2.5, 3))
-FOLLOWING = {"D-K": "descent", "descent": "growth", "growth": DONE}
+FOLLOWING = {"D-K": "descent", "descent": "growth", "growth": "start", "start": DONE}
 STOPPED = "stopped by the callback"
 
 
@@ -95,33 +98,49 @@ def _stopped_by(options: Options, row: Iteration) -> bool:
 def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -> tuple[State, bool]:
     """The state with the best of the controllers that the iteration may start from; whether the callback said stop.
 
-    They are the H-infinity controller of the plant as it is, and those given that stabilise it.
+    They are the H-infinity controller of the plant as it is, that of the nominal plant, and those given; the ones that
+    do not stabilise the plant are left out. The nominal one is often the best by far: its loop tells the D-step where
+    the uncertainty is felt by a controller that does its work, while large uncertainty unscaled forbids any work.
     """
     state, failure = State(), None
-    for given in (None, *starts):
+    for kind, make in _candidates(problem, starts, options):
         began = time.monotonic()
         try:
-            loop, points = _start(problem, given, options)
+            loop, points = _start(problem, make())
         except ComputationError as error:
             failure = failure or error
             continue
-        row = Iteration(len(state.history), loop.gamma, loop.mu, loop.K.nstates, 0.0, 0, time.monotonic() - began,
-                        GIVEN if given else "H-infinity")
+        row = Iteration(len(state.history), loop.gamma, loop.mu, loop.K.nstates, 0.0, 0, time.monotonic() - began, kind)
         state = replace(state, history=(*state.history, row))
         if state.best is None or loop.mu < state.best.mu:
             state = replace(state, points=points, last=loop, best=loop, round_mu=loop.mu)
         if _stopped_by(options, row):
             return state, True
-    if state.best is None:
+    if state.best is None or state.points is None:
         assert failure is not None
         raise failure
-    return state, False
+    return replace(state, phase="start" if _at_rest(problem, state.points.omega, state.best.mu) else "D-K"), False
 
 
-def _start(problem: Problem, K: StateSpace | None, options: Options) -> tuple[Loop, PointwiseScalings]:
-    """A controller given, or the H-infinity controller of the plant, with its analysis."""
-    if K is None:
-        K = hinfsyn(problem.P, problem.nmeas, problem.ncon, backoff=options.backoff).K
+def _candidates(problem: Problem, starts: tuple[StateSpace, ...],
+                options: Options) -> list[tuple[str, Callable[[], StateSpace]]]:
+    """Kinds of the controllers to start from, and what makes each."""
+    def optimal(P: StateSpace) -> StateSpace:
+        return hinfsyn(P, problem.nmeas, problem.ncon, backoff=options.backoff).K
+    performance = problem.structure.blocks[-1]
+    n_z, n_w = problem.structure.n_z - performance.cols, problem.structure.n_w - performance.rows
+    made: list[tuple[str, Callable[[], StateSpace]]] = [("H-infinity", lambda: optimal(problem.P))]
+    if n_w:
+        made.append((NOMINAL, lambda: optimal(problem.P.select(slice(n_z, None), slice(n_w, None)))))
+    return made + [(GIVEN, partial(_itself, K)) for K in starts]
+
+
+def _itself(K: StateSpace) -> StateSpace:
+    return K
+
+
+def _start(problem: Problem, K: StateSpace) -> tuple[Loop, PointwiseScalings]:
+    """A controller to start from with its analysis; ComputationError where it does not stabilise the plant."""
     closed = lft_lower(problem.P, K)
     if not closed.is_stable():
         raise ComputationError("a controller to start from does not stabilise the plant",
@@ -144,11 +163,11 @@ def _no_further(state: State, options: Options) -> str:
     if state.phase == DONE:
         return (f"converged: a round of D-K iteration, descent on gamma and larger orders gains no more than "
                 f"{100 * ROUND:g} %")
-    if state.phase != "D-K" and not options.polish:
+    if state.phase not in ("D-K", "start") and not options.polish:
         return f"D-K iteration stalled: a step gained less than {100 * STALL:g} %"
     if options.target is not None and state.best and state.best.gamma <= options.target:
         return f"target {options.target:g} reached"
-    if sum(row.kind != GIVEN for row in state.history) >= options.max_iterations:
+    if len(_steps(state)) >= options.max_iterations:
         return f"{options.max_iterations} iterations done"
     return ""
 
@@ -164,8 +183,9 @@ class Proposal(NamedTuple):
 def _proposed(problem: Problem, state: State, options: Options) -> Proposal | None:
     """The next scalings; None where the phase has nothing more to offer."""
     assert state.last is not None and state.best is not None and state.points is not None
-    if _stuck_at_rest(problem, state) and (other := _other_constants(problem, state.best.gamma, options)):
-        return other
+    if state.phase == "start":
+        tried = any(row.kind == "start" for row in state.history)
+        return None if tried else _other_constants(problem, state.best.gamma, options)
     if state.phase == "D-K":
         points = replace(state.points, floor=BROAD_FLOOR if _falls_fast(state) else DETAILED_FLOOR)
         try:
@@ -188,28 +208,28 @@ def _proposed(problem: Problem, state: State, options: Options) -> Proposal | No
         return None
 
 
-def _stuck_at_rest(problem: Problem, state: State) -> bool:
-    """Whether the best controller to start from does nothing, and no other scalings were tried.
+def _at_rest(problem: Problem, omega: np.ndarray, mu: float) -> bool:
+    """Whether a controller that reaches this mu does nothing: the plant without control reaches it, too.
 
     With K = 0 the uncertainty of the drives sees no signal and no D is better than another: no D-step leads away.
     """
-    if any(row.kind not in ("H-infinity", GIVEN) for row in state.history):
-        return False
-    assert state.last is not None and state.points is not None
-    at_rest = lft_lower(problem.P, gain(np.zeros((problem.ncon, problem.nmeas)), state.last.K.inputs,
-                                        state.last.K.outputs))
+    P = problem.P
+    at_rest = lft_lower(P, gain(np.zeros((problem.ncon, problem.nmeas)), P.outputs[P.noutputs - problem.nmeas:],
+                                P.inputs[P.ninputs - problem.ncon:]))
     if not at_rest.is_stable():
         return False
-    open_loop = upper_bound(at_rest.frequency_response(state.points.omega)[:, None], problem.structure, 1e-3).beta
-    return state.last.mu > (1 - IDLE) * float(np.max(open_loop))
+    open_loop = upper_bound(at_rest.frequency_response(omega)[:, None], problem.structure, 1e-3).beta
+    return mu > (1 - IDLE) * float(np.max(open_loop))
 
 
 def _other_constants(problem: Problem, gamma: float, options: Options) -> Proposal | None:
     """The constant scalings, alike for all uncertainty, of least H-infinity optimum; None where none is below gamma."""
-    best = None
+    best, scaled = None, ScaledProblem.of(problem.P, problem.nmeas, problem.ncon)
     for d in CONSTANTS:
         scalings = Scalings.uniform(problem.structure, d)
         try:
+            if not scaled.reaches(scalings, (1 - STALL) * gamma):
+                continue
             made = hinfsyn(scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff)
         except ComputationError:
             continue
@@ -220,8 +240,13 @@ def _other_constants(problem: Problem, gamma: float, options: Options) -> Propos
 
 def _falls_fast(state: State) -> bool:
     """Whether the last step lowered mu by more than `FAST`, or none was taken yet."""
-    steps = [row.mu_upper for row in state.history if row.kind != GIVEN]
+    steps = _steps(state)
     return len(steps) < 2 or steps[-1] < (1 - FAST) * steps[-2]
+
+
+def _steps(state: State) -> list[float]:
+    """mu after each K-step of the scaled plant; the other controllers to start from do not count."""
+    return [row.mu_upper for row in state.history if row.kind not in (NOMINAL, GIVEN)]
 
 
 def _next_grid(state: State, closed_loop: StateSpace) -> np.ndarray:
@@ -237,15 +262,25 @@ def _recorded(problem: Problem, state: State, loop: Loop, row: Iteration, points
     gained = 1 - loop.mu / state.best.mu
     state = replace(state, points=points, last=loop, best=loop if gained > 0 else state.best,
                     history=(*state.history, row))
+    if state.phase == "start":
+        return _new_round(problem, state) if gained > 0 else _moved_on(problem, state)
     return state if gained > STALL else _moved_on(problem, state)
 
 
 def _moved_on(problem: Problem, state: State) -> State:
-    """The state in the next phase; after the last one a new round from the best loop, where this one gained enough."""
+    """The state in the next phase; after growth a new round from the best loop, where this one gained enough."""
+    assert state.best is not None
+    if state.phase == "start" and len(_steps(state)) <= 1:
+        # No other scalings are better than those to start from.
+        return replace(state, phase="D-K")
+    if state.phase == "growth" and state.best.mu <= (1 - ROUND) * state.round_mu:
+        return _new_round(problem, state)
+    return replace(state, phase=FOLLOWING[state.phase])
+
+
+def _new_round(problem: Problem, state: State) -> State:
+    """D-K iteration from the best loop."""
     assert state.best is not None and state.last is not None and state.points is not None
-    phase = FOLLOWING[state.phase]
-    if phase != DONE or state.best.mu > (1 - ROUND) * state.round_mu:
-        return replace(state, phase=phase)
     points = state.points
     if state.last is not state.best:
         points = analysed(problem.P, state.best.K, problem.structure, points.omega)

@@ -17,6 +17,7 @@ FORMAT = "avis-musyn"
 VERSION = 1
 DONE = "done"
 GIVEN = "given"
+NOMINAL = "nominal"
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,9 @@ class Iteration:
     mu_upper : largest upper bound of complex mu over the frequency grid.
     order : states of K; d_order : sum of the orders of the scalings that K was made with.
     d_fit_error : what those realised scalings cost against the best ones at each frequency, relative.
-    kind : how the scalings were made: "H-infinity" (identity), "given" (a controller that the caller gave to start
-        from), "start" (other constants, where the controllers to start from do nothing), "D-K", "descent" or "growth".
+    kind : how the scalings were made: "H-infinity" (identity), "start" (other constants, where the controllers to start
+        from do nothing), "D-K", "descent" or "growth"; "nominal" is the H-infinity controller of the plant without its
+        uncertainty, "given" one that the caller gave to start from.
     """
 
     iteration: int

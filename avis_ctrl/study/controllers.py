@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from avis_ctrl.robust.musyn import MuSynthesis, musyn
 from avis_ctrl.robust.reduction import reduce_controller, residualise_fast
 from avis_ctrl.study.candidate import Candidate as Candidate
 from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.model import ControllerResult
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.study.skyhooks import CUSTOMARY_CORNERS_HZ as CUSTOMARY_CORNERS_HZ
 from avis_ctrl.study.skyhooks import TUNING_HZ as TUNING_HZ
@@ -41,16 +43,28 @@ def nominal_hinf(design: Design, plant: DesignPlant, rig: Rig) -> Candidate:
     return Candidate("hinf", "H-infinity, nominal", "hinf", made.K, made.notes)
 
 
-def mu_optimal(design: Design, plant: DesignPlant, rig: Rig,
-               callback: Callable[[Any], Any] | None = None) -> tuple[Candidate, MuSynthesis]:
-    """D-K iteration on the whole uncertainty set, then the lowest order that keeps its mu."""
-    P = plant.synthesis
-    asked = design.synthesis
-    # D-K iteration stalls at 1.24 on one plant and reaches 0.88 on another that differs by a per cent.
-    polish = asked.target_mu is not None if asked.polish is None else asked.polish
-    made = musyn(P.P, P.blocks, P.nmeas, P.ncon, callback=callback, target=asked.target_mu, polish=polish,
-                 max_iterations=asked.max_iterations, backoff=asked.backoff_percent / 100,
+def mu_optimal(design: Design, plant: DesignPlant, rig: Rig, callback: Callable[[Any], Any] | None = None,
+               rivals: Sequence[Candidate] = ()) -> tuple[Candidate, MuSynthesis]:
+    """D-K iteration on the whole uncertainty set, then the lowest order that keeps its mu.
+
+    rivals : controllers that the study has made already. The iteration starts from the best of them, and the result is
+        never worse by complex mu; that of the reduced controller is within reduction_cost_percent of it.
+    """
+    P, asked = plant.synthesis, design.synthesis
+    made = musyn(P.P, P.blocks, P.nmeas, P.ncon, callback=callback, target=asked.target_mu,
+                 polish=asked.polish is not False, max_iterations=asked.max_iterations,
+                 backoff=asked.backoff_percent / 100, starts=[one.K for one in rivals if one.K is not None],
                  sample_rate_Hz=rig.sample_rate_Hz)
+    K, note = _reduced(plant, rig, made, asked.reduction_cost_percent / 100)
+    before = tuple(f"before reduction: {one}" for one in made.notes)
+    old = ("synthesis.time_limit_s decides nothing any more: max_iterations and target_mu do",)
+    notes = (made.status, *(old if asked.time_limit_s is not None else ()), *before, note)
+    return Candidate("mu", "mu synthesis", "mu", K, notes), made
+
+
+def _reduced(plant: DesignPlant, rig: Rig, made: MuSynthesis, cost: float) -> tuple[StateSpace, str]:
+    """The controller of lowest order whose complex mu grows by no more than the cost, and a note that says so."""
+    P = plant.synthesis
     blocks = P.all_blocks.complexified()
     omega = reduction_grid(plant, made.omega_peak)
 
@@ -58,12 +72,25 @@ def mu_optimal(design: Design, plant: DesignPlant, rig: Rig,
         return float(np.max(upper_bound(P.closed(K).frequency_response(omega)[:, None], blocks, 1e-3).beta))
     # Poles beyond the Nyquist frequency cannot be implemented; what removing them costs is in the measured figure.
     full, slow = peak_on_grid(made.K), residualise_fast(made.K, np.pi * rig.sample_rate_Hz)
-    harmless = P.closed(slow).is_stable() and peak_on_grid(slow) <= (1 + asked.reduction_cost_percent / 100) * full
-    reduced = reduce_controller(P.P, slow if harmless else made.K, peak_on_grid, asked.reduction_cost_percent / 100)
-    note = (f"reduced from {made.K.nstates} to {reduced.order} states: complex mu on a grid of {omega.size} "
-            f"frequencies from {full:.4f} to {reduced.figure:.4f}")
-    before = tuple(f"before reduction: {one}" for one in made.notes)
-    return Candidate("mu", "mu synthesis", "mu", reduced.K, (made.status, *before, note)), made
+    harmless = P.closed(slow).is_stable() and peak_on_grid(slow) <= (1 + cost) * full
+    reduced = reduce_controller(P.P, slow if harmless else made.K, peak_on_grid, cost)
+    return reduced.K, (f"reduced from {made.K.nstates} to {reduced.order} states: complex mu on a grid of {omega.size} "
+                       f"frequencies from {full:.4f} to {reduced.figure:.4f}")
+
+
+def best_of(mu: ControllerResult, others: Sequence[ControllerResult]) -> ControllerResult:
+    """What a study delivers as its mu controller: of all controllers measured, the one of least mu.
+
+    `mu` itself, or the best of the others under its name where its upper bound over the whole set is smaller; a note
+    then says where the controller comes from. Passive tables (K None) and loops that are not stable do not take part.
+    """
+    stable = [one for one in others if one.K is not None and one.stable and np.isfinite(one.mu.upper)]
+    best = min((mu, *stable), key=lambda one: one.mu.upper if np.isfinite(one.mu.upper) else np.inf)
+    if best is mu:
+        return mu
+    note = (f"this is the controller {best.title!r}: its mu, {best.mu.upper:.4g}, is less than the {mu.mu.upper:.4g} "
+            "that the D-K iteration and the reduction of its order ended with")
+    return replace(best, name=mu.name, title=mu.title, kind=mu.kind, notes=(note, *mu.notes, *best.notes))
 
 
 def reduction_grid(plant: DesignPlant, omega_peak: float) -> np.ndarray:
