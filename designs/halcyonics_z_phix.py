@@ -46,7 +46,7 @@ design = Design(
     transmissibility=asked,
     control_effort=EffortSection(floor_velocity_m_per_s=1.0e-4, bandwidth_Hz=150.0, reduction=30.0),
     floor=FloorSection(velocity_rms_m_per_s=2.0e-5),
-    synthesis=SynthesisSection(max_iterations=8, time_limit_s=60.0, target_mu=0.95),
+    synthesis=SynthesisSection(max_iterations=8, target_mu=0.95),
     simulation=SimulationSection(duration_s=40.0, random_plants=20, seed=1),
     requirement=[
         RequirementSection(quantity="mu_upper", at_most=1.0),

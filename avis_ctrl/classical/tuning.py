@@ -1,18 +1,20 @@
 """Automatic tuning of skyhook loops, so that the comparison with a synthesised controller is fair.
 
-The search runs on frequency responses of sampled plants: closing two scalar loops around a stored response
-costs a 2 x 2 inverse, so that thousands of tunings are tried in seconds. The bound on the worst case is then
-computed by the caller on the whole uncertainty set; worst cases that the samples missed come back as new
-samples (`Scenarios.with_delta`) until the tuning holds.
+The search runs on frequency responses of sampled plants, where closing the loops costs an inverse of the size of the
+axes, and starts from what anyone would try first: critical damping and its neighbours. From the best of them all gains
+and corners are moved together by linear programs in a trust region on the largest singular values, whose slopes are
+known. The bound on the worst case is then computed by the caller on the whole uncertainty set; worst cases that the
+samples missed come back as new samples (`Scenarios.with_delta`, `Scenarios.with_worst`) until the tuning holds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from scipy.optimize import differential_evolution
+import scipy.optimize as so
 
 from avis_ctrl.classical.skyhook import Skyhook
 from avis_ctrl.errors import ComputationError
@@ -37,7 +39,10 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class Scenarios:
-    """Sampled plants as frequency responses: `channels` arrays are (n_samples, n_omega, ...)."""
+    """Sampled plants as frequency responses: `channels` arrays are (n_samples, n_omega, ...).
+
+    plants : how many of the samples, the first ones, are one plant at all frequencies.
+    """
 
     plant: GeneralizedPlant
     omega: np.ndarray
@@ -45,6 +50,7 @@ class Scenarios:
     deltas: np.ndarray
     floor: tuple[str, ...]
     payload: tuple[str, ...]
+    plants: int
 
     @staticmethod
     def sample(plant: GeneralizedPlant, floor: Sequence[str], payload: Sequence[str], omega: np.ndarray,
@@ -60,13 +66,25 @@ class Scenarios:
         for k in range(1, count + 1):
             deltas[k] = _boundary(plant, rng, np.exp(2j * np.pi * k / count))
         chosen = plant.restricted(list(floor), list(payload))
-        return Scenarios(chosen, omega, chosen.P.frequency_response(omega), deltas, tuple(floor), tuple(payload))
+        return Scenarios(chosen, omega, chosen.P.frequency_response(omega), deltas, tuple(floor), tuple(payload),
+                         count + 1)
 
     def with_delta(self, delta: np.ndarray) -> Scenarios:
         """The same with one more sample: a worst case found by a bound, at every frequency alike."""
         more = np.broadcast_to(delta, self.deltas.shape[1:])
-        return Scenarios(self.plant, self.omega, self.responses, np.concatenate([self.deltas, more[None]]), self.floor,
-                         self.payload)
+        at = self.plants
+        return replace(self, deltas=np.concatenate([self.deltas[:at], more[None], self.deltas[at:]]), plants=at + 1)
+
+    def with_worst(self, deltas: np.ndarray) -> Scenarios:
+        """The same with the worst case of each frequency on its own (n_omega, n_w, n_z) as one more sample."""
+        return replace(self, deltas=np.concatenate([self.deltas, deltas[None]]))
+
+    def with_frequencies(self, omega: np.ndarray) -> Scenarios:
+        """The same at more frequencies [rad/s]; a worst case of its own there is that of the nearest one so far."""
+        every = np.union1d(self.omega, omega)
+        nearest = np.argmin(np.abs(np.log(every[:, None] / self.omega)), axis=1)
+        return replace(self, omega=every, responses=self.plant.P.frequency_response(every),
+                       deltas=self.deltas[:, nearest])
 
     def channels(self) -> Channels:
         """Closes Delta around the responses: F_u(P(j omega), Delta) sample by sample."""
@@ -95,46 +113,187 @@ class TuningRange:
     tilt_corner_Hz: tuple[float, float] = (0.005, 1.0)
     roll_off_Hz: tuple[float, float] = (5.0, 400.0)
 
-    def bounds(self) -> list[tuple[float, float]]:
-        """Bounds of the logarithms searched over."""
+    def bounds(self) -> np.ndarray:
+        """Bounds (n, 2) of the logarithms searched over: gains, tilt corner, roll-off."""
         limits = [*([self.gain_factor] * len(self.critical)), self.tilt_corner_Hz, self.roll_off_Hz]
-        return [(float(np.log(low)), float(np.log(high))) for low, high in limits]
+        return np.log(np.array(limits, float))
 
     def skyhook(self, axes: tuple[str, ...], point: np.ndarray) -> Skyhook:
         """The loops at a point of the search."""
         n = len(self.critical)
-        gains = tuple(float(g) for g in np.exp(point[:n]) * np.array(self.critical))
-        return Skyhook(axes, gains, float(np.exp(point[n])), float(np.exp(point[n + 1])))
+        factors = np.clip(np.exp(point[:n]), *self.gain_factor)
+        tilt, roll = np.clip(np.exp(point[n]), *self.tilt_corner_Hz), np.clip(np.exp(point[n + 1]), *self.roll_off_Hz)
+        return Skyhook(axes, tuple(float(g) for g in factors * np.array(self.critical)), float(tilt), float(roll))
+
+    def point(self, gain_factor: float, corners_Hz: tuple[float, float]) -> np.ndarray:
+        """The point with all gains alike, moved into the range where it lies beyond."""
+        bounds = self.bounds()
+        wanted = np.log([*([gain_factor] * len(self.critical)), *corners_Hz])
+        return np.clip(wanted, bounds[:, 0], bounds[:, 1])
+
+
+@dataclass(frozen=True)
+class TuningSettings:
+    """What bounds the search; every budget is a count.
+
+    gain_factors : multiples of critical damping that are starts, next to the table's own rule (1).
+    tilt_corners_Hz, roll_offs_Hz : corners that are starts: customary ones and half a decade to either side.
+    refined : starts that are improved, the best by the measure of the search.
+    steps : linear programs from each start.
+    radius : first trust region, in logarithms (a factor e^0.5 of a gain or corner).
+    converged : gain of a step (relative) below which the next is not worth taking.
+    """
+
+    gain_factors: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0)
+    tilt_corners_Hz: tuple[float, ...] = (0.03, 0.1, 0.3)
+    roll_offs_Hz: tuple[float, ...] = (30.0, 100.0, 300.0)
+    refined: int = 4
+    steps: int = 25
+    radius: float = 0.5
+    converged: float = 1e-3
+
+
+@dataclass(frozen=True)
+class Merit:
+    """What a tuning is judged by, on samples or on the whole set: smaller is better, in this order.
+
+    A tuning that keeps the limit comes before one that does not; among those that do, the transmissibility in the band
+    counts, among those that do not the peak. unstable : half turns of the return difference about the origin.
+    """
+
+    peak: float
+    band: float
+    limit: float
+    unstable: float = 0.0
+
+    @property
+    def meets(self) -> bool:
+        return self.unstable == 0 and self.peak <= self.limit
+
+    def key(self) -> tuple[float, float, float]:
+        return (self.unstable, 0.0, self.band) if self.meets else (self.unstable, 1.0, self.peak)
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """The tunings of some axes on sampled plants, by their largest singular values at each frequency."""
+
+    scenarios: Scenarios
+    axes: tuple[str, ...]
+    search: TuningRange
+    band_Hz: tuple[float, float]
+    settings: TuningSettings = TuningSettings()
+
+    @cached_property
+    def channels(self) -> Channels:
+        return self.scenarios.channels()
+
+    @cached_property
+    def inside(self) -> np.ndarray:
+        """Which frequencies lie in the band (n_omega,)."""
+        low, high = (2 * np.pi * f for f in self.band_Hz)
+        return (self.scenarios.omega >= low * (1 - 1e-9)) & (self.scenarios.omega <= high * (1 + 1e-9))
+
+    def merit(self, point: np.ndarray, limit: float) -> Merit:
+        """A tuning on the samples."""
+        K, _ = self._loops(point)
+        # Unstable loops have finite responses too: the return difference must not circle the origin. A worst case
+        # of each frequency on its own is no plant, and turns say nothing there.
+        plants = self.channels.yu[:self.scenarios.plants]
+        turns = _encirclements(np.linalg.det(np.eye(len(self.axes)) - plants * K[:, None, :]))
+        sigma = _largest_singular_value(self.channels.closed(K))
+        return Merit(float(np.max(sigma)), float(np.max(sigma[:, self.inside])), limit, turns)
+
+    def starts(self) -> list[np.ndarray]:
+        """The classical tunings: multiples of critical damping with customary corners and their neighbours."""
+        asked = self.settings
+        points = [self.search.point(g, (tilt, roll)) for g in asked.gain_factors for tilt in asked.tilt_corners_Hz
+                  for roll in asked.roll_offs_Hz]
+        return list({tuple(np.round(point, 9)): point for point in points}.values())
+
+    def best_starts(self, limit: float, more: Sequence[np.ndarray] = ()) -> list[np.ndarray]:
+        """The starts worth improving, best first; `more` joins them. Those that are not stable come last."""
+        ranked = sorted([*more, *self.starts()], key=lambda point: self.merit(point, limit).key())
+        return ranked[:self.settings.refined]
+
+    def improved(self, point: np.ndarray, limit: float) -> np.ndarray:
+        """Sequential linear programs in a trust region: least peak until it keeps the limit, then least in the band."""
+        bounds, radius = self.search.bounds(), self.settings.radius
+        here = self.merit(point, limit)
+        for _ in range(self.settings.steps):
+            if radius < 1e-3:
+                break
+            values, slopes, in_band = self._linearised(point)
+            low, high = np.maximum(bounds[:, 0] - point, -radius), np.minimum(bounds[:, 1] - point, radius)
+            trial = np.clip(point + _minimax_step(values, slopes, in_band, np.log(limit), low, high),
+                            bounds[:, 0], bounds[:, 1])
+            there = self.merit(trial, limit)
+            if there.key() < here.key():
+                gained = 1.0 if there.meets and not here.meets else 1 - there.key()[2] / here.key()[2]
+                point, here, radius = trial, there, min(2 * radius, 1.0)
+                if gained < self.settings.converged:
+                    break
+            else:
+                radius *= 0.35
+        return point
+
+    def _loops(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """K on the diagonal (n_omega, n_axes), and d log K to the logarithms of both corners (n_omega, 2)."""
+        skyhook, s = self.search.skyhook(self.axes, point), 1j * self.scenarios.omega
+        tilt, roll = 2 * np.pi * skyhook.tilt_corner_Hz, 2 * np.pi * skyhook.roll_off_Hz
+        shape = s / (s + tilt) * roll / (s + roll)
+        return -shape[:, None] * np.array(skyhook.gains), np.stack([-tilt / (s + tilt), s / (s + roll)], axis=1)
+
+    def _linearised(self, point: np.ndarray, reach: float = 0.7) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """log sigma (n,) near the peak or the band's, slopes to the point (n, n_point), and which lie in the band."""
+        K, of_corners = self._loops(point)
+        parts = self.channels
+        S = np.linalg.inv(np.eye(K.shape[-1]) - parts.yu * K[:, None, :])
+        from_floor = S @ parts.yw
+        T = parts.zw + (parts.zu * K[:, None, :]) @ from_floor
+        U, s, Vh = np.linalg.svd(T)
+        log_s, in_band = np.log(np.maximum(s[..., 0], 1e-300)), np.broadcast_to(self.inside, s.shape[:2])
+        near = (log_s > np.max(log_s) - reach) | (in_band & (log_s > np.max(log_s[:, self.inside]) - reach))
+        at = np.nonzero(near)
+        u, v, K_at = U[at][:, :, 0], np.conj(Vh[at][:, 0]), K[at[1]]
+        # dT = P_zu inv(I - K P_yu) dK inv(I - P_yu K) P_yw
+        right = (from_floor[at] @ v[..., None])[..., 0]
+        left = np.conj(u)[:, None, :] @ parts.zu[at]
+        left = (left + (left * K_at[:, None, :]) @ S[at] @ parts.yu[at])[:, 0]
+        by_loop = left * K_at * right / s[at][:, :1]
+        slopes = np.hstack([by_loop.real, (np.sum(by_loop, axis=1)[:, None] * of_corners[at[1]]).real])
+        return log_s[at], slopes, in_band[at]
+
+
+def _minimax_step(values: np.ndarray, slopes: np.ndarray, in_band: np.ndarray, log_limit: float, low: np.ndarray,
+                  high: np.ndarray) -> np.ndarray:
+    """Move between low and high: the least excess over the limit, to first order, and then the least in the band."""
+    n = slopes.shape[1]
+    # Unknowns: the move, the excess of all lines over the limit (at least 0), the level of the band's.
+    excess = np.hstack([slopes, -np.ones((values.size, 1)), np.zeros((values.size, 1))])
+    level = np.hstack([slopes, np.zeros((values.size, 1)), -np.ones((values.size, 1))])[in_band]
+    program = so.linprog(np.r_[np.zeros(n), 100.0, 1.0], A_ub=np.vstack([excess, level]),
+                         b_ub=np.r_[log_limit - values, -values[in_band]],
+                         bounds=[*zip(low, high, strict=True), (0, None), (None, None)], method="highs-ds")
+    return program.x[:n] if program.status == 0 else np.zeros(n)
 
 
 def tune_skyhook(scenarios: Scenarios, axes: tuple[str, ...], search: TuningRange, band_Hz: tuple[float, float],
-                 peak_limit: float, seed: int = 0) -> Skyhook:
+                 peak_limit: float, settings: TuningSettings = TuningSettings()) -> Skyhook:
     """The skyhook with the lowest sampled transmissibility in a band whose sampled peak stays below a limit.
 
     Parameters
     ----------
-    peak_limit : largest singular value allowed at any frequency (a ratio, not dB). Where no tuning keeps it, the
-        excess is weighed ten times as heavily as the transmissibility in the band.
+    peak_limit : largest singular value allowed at any frequency (a ratio, not dB). Where no tuning found keeps it, the
+        one of least peak is returned.
 
     Raises
     ------
-    ComputationError : no stable tuning in the range (the nominal closed loop is tested at the end).
+    ComputationError : no stable tuning was found in the range (the nominal closed loop is tested at the end).
     """
-    channels, omega = scenarios.channels(), scenarios.omega
-    inside = (omega >= 2 * np.pi * band_Hz[0] * (1 - 1e-9)) & (omega <= 2 * np.pi * band_Hz[1] * (1 + 1e-9))
-
-    def cost(point: np.ndarray) -> float:
-        skyhook = search.skyhook(axes, point)
-        shape = skyhook.filter.frequency_response(omega)[:, 0, 0]
-        K = -shape[:, None] * np.array(skyhook.gains)
-        # Unstable loops have finite responses too: the return difference must not circle the origin.
-        turns = _encirclements(np.linalg.det(np.eye(len(axes)) - channels.yu * K[:, None, :]))
-        sigma = _largest_singular_value(channels.closed(K))
-        excess = max(0.0, float(np.max(sigma)) / peak_limit - 1.0)
-        return float(np.max(sigma[:, inside])) + 10.0 * excess + 100.0 * turns
-
-    found = differential_evolution(cost, search.bounds(), seed=seed, popsize=10, maxiter=40, tol=1e-3, polish=False)
-    best = search.skyhook(axes, found.x)
+    task = Search(scenarios, axes, search, band_Hz, settings)
+    found = [task.improved(start, peak_limit) for start in task.best_starts(peak_limit)]
+    best = search.skyhook(axes, min(found, key=lambda point: task.merit(point, peak_limit).key()))
     closed = lft_lower(scenarios.plant.P, best.controller())
     if not closed.is_stable():
         raise ComputationError("no stable skyhook in the range searched",

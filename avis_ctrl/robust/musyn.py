@@ -2,7 +2,7 @@
 
 D-K iteration (Doyle 1985; Zhou, Doyle and Glover 1996, section 11.4) with scalings of automatic order, followed,
 where it stalls, by descent on the H-infinity optimum over the scalings themselves (`gamma_descent`). Where the first
-H-infinity controller does nothing, the iteration starts from other constant scalings (`_stuck_at_rest`).
+H-infinity controller does nothing, the iteration starts from other constant scalings. See `musyn_iteration`.
 
 Real uncertainty is synthesised for as if it were complex, which is conservative: every real perturbation is a
 complex one. What that costs is measured on the final loop, where mu is computed both ways.
@@ -10,41 +10,27 @@ complex one. What that costs is measured on the final loop, where mu is computed
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import StateSpace, gain, hinf_norm, lft_lower
-from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, band_of, d_step, tightened
-from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
-from avis_ctrl.robust.gamma_descent import descend, grown
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
+from avis_ctrl.robust.dstep import tightened
+from avis_ctrl.robust.frequency_grid import frequency_grid
 from avis_ctrl.robust.hinf_plant import as_plant
-from avis_ctrl.robust.hinfsyn import Synthesis, hinfsyn
 from avis_ctrl.robust.mu_peak import mu_peak
-from avis_ctrl.robust.mu_upper import upper_bound
+from avis_ctrl.robust.musyn_iteration import Options, Problem, iterate
 from avis_ctrl.robust.musyn_state import Iteration, Loop, State, analysed
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
-# An iteration that lowers the best gamma by less than this share has stalled.
-STALL = 0.005
-FLAT = 0.001
-# A step that lowers mu by more than this share is followed by another of its kind.
-FAST = 0.25
-# A loop within this share of the plant without control is that of a controller that does nothing.
-IDLE = 0.01
-# Constant scalings of all uncertainty against performance from which the iteration starts where identity leads nowhere.
-STARTS = tuple(10.0 ** k for k in (-3, -2.5, -2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2, 2.5, 3))
 # What the certificate may leave above mu of the final loop.
 TIGHT = 0.003
 NORM_TOLERANCE = 1e-6
-DONE = "done"
-FOLLOWING = {"D-K": "descent", "descent": "growth", "growth": DONE}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,21 +63,10 @@ class MuSynthesis:
     saved_state: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class _Options:
-    target: float | None
-    deadline: float
-    max_iterations: int
-    backoff: float
-    polish: bool
-    max_added_states: int
-    callback: Callable[[Iteration], Any] | None
-
-
 def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: int, *,
           callback: Callable[[Iteration], Any] | None = None, target: float | None = None,
-          time_limit: float | None = None, max_iterations: int = 30, backoff: float = 0.01, polish: bool = True,
-          max_added_states: int | None = None, state: dict[str, Any] | None = None,
+          max_iterations: int = 30, backoff: float = 0.01, polish: bool = True, max_added_states: int | None = None,
+          starts: Sequence[StateSpace] = (), state: dict[str, Any] | None = None,
           sample_rate_Hz: float | None = None) -> MuSynthesis:
     """Controller u = K y of least peak mu.
 
@@ -102,26 +77,32 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     nmeas, ncon : number of measurements y and controls u.
     callback : called with each `Iteration`; returning False or "stop" ends the iteration.
     target : stop once the scaled loop is measured below this (mu is then below it at every frequency).
-    time_limit : seconds after which no further iteration starts.
+    max_iterations : most K-steps, the first H-infinity controller counted. No clock decides anything: the same call
+        gives the same controller on any machine, and more iterations, or a lower target, go on where fewer ended.
     backoff : distance from the H-infinity optimum at which each controller is taken.
-    polish : go on with descent on gamma where D-K iteration stalls (and orders that grow where that pays).
+    polish : go on with descent on gamma where D-K iteration stalls (and orders that grow where that pays), and with
+        D-K iteration after that, until a whole round gains nothing.
     max_added_states : most states that all scalings together may add to the plant.
+    starts : controllers u = K y known already. The iteration starts from the best of them and of the H-infinity
+        controller of P; the result is never worse (in complex mu on the grid) than any that stabilises P.
     state : `saved_state` of an earlier result, to go on from.
     sample_rate_Hz : the controller's fastest pole is compared with half of it, in `notes`.
 
     Raises
     ------
-    InputError : blocks that do not fit P, counts or options that are wrong, a state of another problem.
+    InputError : blocks that do not fit P, counts or options that are wrong, controllers that do not fit, a state of
+        another problem.
     ComputationError : no stabilising controller (the mode is named), or none found.
     """
     P = as_plant(P, nmeas, ncon)
     uncertainty, structure = _structures(P, blocks, nmeas, ncon)
     cap = P.nstates + 20 if max_added_states is None else max_added_states
-    options = _options(target, time_limit, max_iterations, backoff, polish, cap, callback)
-    problem = _Problem(P, structure, nmeas, ncon)
+    options = _options(target, max_iterations, backoff, polish, cap, callback)
+    problem = Problem(P, structure, nmeas, ncon)
+    given = tuple(_named(P, K, nmeas, ncon) for K in starts)
     with threadpool_limits(1, user_api="blas"):
         current = State() if state is None else State.from_dict(state, structure, P, nmeas, ncon)
-        current, status = _iterate(problem, current, options)
+        current, status = iterate(problem, current, given, options)
         return _result(problem, uncertainty, current, status, sample_rate_Hz)
 
 
@@ -141,170 +122,28 @@ def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: 
     return full, full.complexified()
 
 
-def _options(target: float | None, time_limit: float | None, max_iterations: int, backoff: float, polish: bool,
-             cap: int, callback: Callable[[Iteration], Any] | None) -> _Options:
-    for field, value in (("target", target), ("time_limit", time_limit)):
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise InputError("expected a positive number or None", field=field, value=value)
+def _named(P: StateSpace, K: StateSpace, nmeas: int, ncon: int) -> StateSpace:
+    """A controller given, with the plant's names."""
+    if not isinstance(K, StateSpace) or (K.ninputs, K.noutputs) != (nmeas, ncon) or K.dt:
+        raise InputError(f"expected continuous controllers with {nmeas} inputs and {ncon} outputs", field="starts",
+                         value=repr(K))
+    return K.renamed(P.outputs[P.noutputs - nmeas:], P.inputs[P.ninputs - ncon:])
+
+
+def _options(target: float | None, max_iterations: int, backoff: float, polish: bool, cap: int,
+             callback: Callable[[Iteration], Any] | None) -> Options:
+    if target is not None and not (np.isfinite(target) and target > 0):
+        raise InputError("expected a positive number or None", field="target", value=target)
     if int(max_iterations) != max_iterations or max_iterations < 1:
         raise InputError("expected a whole number of at least 1", field="max_iterations", value=max_iterations)
     if not (np.isfinite(backoff) and 0 <= backoff < 1):
         raise InputError("expected a number from 0 to below 1", field="backoff", value=backoff)
     if cap < 0:
         raise InputError("expected a number of at least 0", field="max_added_states", value=cap)
-    deadline = np.inf if time_limit is None else time.monotonic() + time_limit
-    return _Options(target, deadline, int(max_iterations), backoff, polish, int(cap), callback)
+    return Options(target, int(max_iterations), backoff, polish, int(cap), callback)
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    P: StateSpace
-    structure: BlockStructure
-    nmeas: int
-    ncon: int
-
-
-def _iterate(problem: _Problem, state: State, options: _Options) -> tuple[State, str]:
-    """Scalings, K-step and analysis, again and again, until something says stop."""
-    while True:
-        if status := _no_further(state, options):
-            return state, status
-        began = time.monotonic()
-        proposal = _proposed(problem, state, options)
-        synthesis = _k_step(problem, state, proposal, options) if proposal else None
-        if proposal is None or synthesis is None:
-            state = replace(state, phase=FOLLOWING[state.phase])
-            continue
-        scalings, cost, kind = proposal
-        points = analysed(problem.P, synthesis.K, problem.structure, _next_grid(state, synthesis.closed_loop))
-        loop = Loop(synthesis.K, scalings, synthesis.gamma, points.peak)
-        row = Iteration(len(state.history), synthesis.gamma, points.peak, synthesis.K.nstates, cost,
-                        sum(scalings.orders), time.monotonic() - began, kind)
-        state = _recorded(state, loop, row, points)
-        answer = options.callback(row) if options.callback else None
-        if answer is False or answer == "stop":
-            return state, "stopped by the callback"
-
-
-def _k_step(problem: _Problem, state: State, proposal: _Proposal, options: _Options) -> Synthesis | None:
-    """H-infinity controller of the scaled plant; None where scalings, not the plant, make it fail."""
-    try:
-        return hinfsyn(proposal.scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff,
-                       gamma_hint=state.best.gamma if state.best else None)
-    except ComputationError:
-        if state.best is None:
-            raise
-        return None
-
-
-def _no_further(state: State, options: _Options) -> str:
-    """Why no further iteration starts; empty where one does."""
-    if state.phase == DONE:
-        return f"converged: neither D-K iteration nor descent on gamma gains {100 * STALL:g} % more"
-    if state.phase != "D-K" and not options.polish:
-        return f"D-K iteration stalled: a step gained less than {100 * STALL:g} %, or left the scaled loop flat"
-    if options.target is not None and state.best and state.best.gamma <= options.target:
-        return f"target {options.target:g} reached"
-    if len(state.history) >= options.max_iterations:
-        return f"{options.max_iterations} iterations done"
-    if time.monotonic() > options.deadline and state.best:
-        return "time limit reached"
-    return ""
-
-
-class _Proposal(NamedTuple):
-    """Scalings, what their realisation costs against the best at each frequency, and how they were made."""
-
-    scalings: Scalings
-    cost: float
-    kind: str
-
-
-def _proposed(problem: _Problem, state: State, options: _Options) -> _Proposal | None:
-    """The next scalings; None where the phase has nothing more to offer."""
-    if state.last is None or state.best is None or state.points is None:
-        return _Proposal(Scalings.identity(problem.structure), 0.0, "H-infinity")
-    if _stuck_at_rest(problem, state) and (other := _other_start(problem, state.best.gamma, options)):
-        return other
-    if state.phase == "D-K":
-        points = replace(state.points, floor=BROAD_FLOOR if _falls_fast(state) else DETAILED_FLOOR)
-        try:
-            step = d_step(points, lft_lower(problem.P, state.last.K), state.last.scalings,
-                          max_states=options.max_added_states)
-        except np.linalg.LinAlgError:
-            # A loop that no decomposition takes (entries beyond all scale) ends the D-K phase, not the synthesis.
-            return None
-        return _Proposal(step.scalings, step.cost, "D-K")
-    band = band_of(state.points.omega)
-    start = min(state.last, state.best, key=lambda loop: loop.gamma).scalings
-    if state.phase == "growth":
-        larger = grown(problem.P, problem.nmeas, problem.ncon, start, band, options.max_added_states)
-        if larger is None:
-            return None
-        start = larger
-    target = 0.0 if options.target is None else options.target / (1 + options.backoff)
-    try:
-        descent = descend(problem.P, problem.nmeas, problem.ncon, start, band,
-                          stop=lambda gamma: gamma <= target or time.monotonic() > options.deadline)
-    except ComputationError:
-        return None
-    return _Proposal(descent.scalings, 0.0, state.phase)
-
-
-def _stuck_at_rest(problem: _Problem, state: State) -> bool:
-    """Whether the H-infinity controller of the first scalings does nothing, and no other start was tried.
-
-    With K = 0 the uncertainty of the drives sees no signal and no D is better than another: no D-step leads away.
-    """
-    if len(state.history) != 1 or state.last is None or state.points is None:
-        return False
-    at_rest = lft_lower(problem.P, gain(np.zeros((problem.ncon, problem.nmeas)), state.last.K.inputs,
-                                        state.last.K.outputs))
-    if not at_rest.is_stable():
-        return False
-    open_loop = upper_bound(at_rest.frequency_response(state.points.omega)[:, None], problem.structure, 1e-3).beta
-    return state.last.mu > (1 - IDLE) * float(np.max(open_loop))
-
-
-def _other_start(problem: _Problem, gamma: float, options: _Options) -> _Proposal | None:
-    """The constant scalings, alike for all uncertainty, of least H-infinity optimum; None where none is below gamma."""
-    best = None
-    for d in STARTS:
-        scalings = Scalings.uniform(problem.structure, d)
-        try:
-            made = hinfsyn(scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff)
-        except ComputationError:
-            continue
-        if made.gamma < (1 - STALL) * gamma:
-            best, gamma = scalings, made.gamma
-        if time.monotonic() > options.deadline:
-            break
-    return _Proposal(best, 0.0, "start") if best else None
-
-
-def _falls_fast(state: State) -> bool:
-    """Whether the last step lowered mu by more than `FAST`, or none was taken yet."""
-    return len(state.history) < 2 or state.history[-1].mu_upper < (1 - FAST) * state.history[-2].mu_upper
-
-
-def _next_grid(state: State, closed_loop: StateSpace) -> np.ndarray:
-    """Frequencies of the next analysis: those of the last one, denser at its peaks."""
-    if state.points is None:
-        return frequency_grid(closed_loop)
-    return refined_grid(state.points.omega, state.points.mu)
-
-
-def _recorded(state: State, loop: Loop, row: Iteration, points: PointwiseScalings) -> State:
-    """The state after an iteration: the best loop kept, the phase moved on where nothing was gained."""
-    gained = np.inf if state.best is None else 1 - loop.mu / state.best.mu
-    best = loop if gained > 0 else state.best
-    # A loop that fitted scalings have made flat has mu at its bound everywhere: no other D lowers it further.
-    flat = row.kind == "D-K" and loop.gamma < (1 + FLAT) * loop.mu
-    phase = state.phase if gained > STALL and not flat else FOLLOWING[state.phase]
-    return State(phase, points, loop, best, (*state.history, row))
-
-
-def _certificate(problem: _Problem, best: Loop) -> tuple[Scalings, float]:
+def _certificate(problem: Problem, best: Loop) -> tuple[Scalings, float]:
     """Realised scalings that bound mu of a loop at every frequency, and the bound.
 
     Those that K was made with, or others of the least peak where they leave more than `TIGHT` above mu on the grid.
@@ -321,7 +160,7 @@ def _certificate(problem: _Problem, best: Loop) -> tuple[Scalings, float]:
     return min(candidates, key=lambda pair: pair[1])
 
 
-def _result(problem: _Problem, uncertainty: BlockStructure, state: State, status: str,
+def _result(problem: Problem, uncertainty: BlockStructure, state: State, status: str,
             sample_rate_Hz: float | None) -> MuSynthesis:
     """The best controller, with mu of the plant as given measured anew on it."""
     best = state.best

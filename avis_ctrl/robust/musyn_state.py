@@ -15,6 +15,9 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 FORMAT = "avis-musyn"
 VERSION = 1
+DONE = "done"
+GIVEN = "given"
+NOMINAL = "nominal"
 
 
 @dataclass(frozen=True)
@@ -25,8 +28,9 @@ class Iteration:
     mu_upper : largest upper bound of complex mu over the frequency grid.
     order : states of K; d_order : sum of the orders of the scalings that K was made with.
     d_fit_error : what those realised scalings cost against the best ones at each frequency, relative.
-    kind : how the scalings were made: "H-infinity" (identity), "start" (other constants, where the controller of
-        identity does nothing), "D-K", "descent" or "growth".
+    kind : how the scalings were made: "H-infinity" (identity), "start" (other constants, where the controllers to start
+        from do nothing), "D-K", "descent" or "growth"; "nominal" is the H-infinity controller of the plant without its
+        uncertainty, "given" one that the caller gave to start from.
     """
 
     iteration: int
@@ -55,20 +59,25 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Phase ("D-K", "descent", "growth" or "done"), last loop with its analysis, best loop, history."""
+    """Phase ("D-K", "descent", "growth" or "done"), last loop with its analysis, best loop, history.
+
+    round_mu : the least mu when this round of phases began.
+    """
 
     phase: str = "D-K"
     points: PointwiseScalings | None = None
     last: Loop | None = None
     best: Loop | None = None
     history: tuple[Iteration, ...] = ()
+    round_mu: float = np.inf
 
     def as_dict(self, P: StateSpace, nmeas: int, ncon: int) -> dict[str, Any]:
         """JSON form, with the sizes of the problem it belongs to."""
         assert self.last is not None and self.best is not None and self.points is not None
         return {"format": FORMAT, "version": VERSION, "problem": [P.nstates, P.ninputs, P.noutputs, nmeas, ncon],
-                "phase": self.phase, "omega": self.points.omega.tolist(), "last": self.last.as_dict(),
-                "best": self.best.as_dict(), "history": [asdict(row) for row in self.history]}
+                "phase": self.phase, "round_mu": self.round_mu, "omega": self.points.omega.tolist(),
+                "last": self.last.as_dict(), "best": self.best.as_dict(),
+                "history": [asdict(row) for row in self.history]}
 
     @staticmethod
     def from_dict(saved: dict[str, Any], structure: BlockStructure, P: StateSpace, nmeas: int, ncon: int) -> State:
@@ -88,7 +97,8 @@ class State:
         last = loop(saved["last"])
         points = analysed(P, last.K, structure, np.array(saved["omega"], float))
         return State(str(saved["phase"]), points, last, loop(saved["best"]),
-                     tuple(Iteration(**row) for row in saved["history"]))
+                     tuple(Iteration(**row) for row in saved["history"]),
+                     float(saved.get("round_mu", saved["history"][0]["mu_upper"])))
 
 
 def analysed(P: StateSpace, K: StateSpace, structure: BlockStructure, omega: np.ndarray) -> PointwiseScalings:

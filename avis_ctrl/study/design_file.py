@@ -152,13 +152,15 @@ class FloorSection(_Section):
 
 
 class SynthesisSection(_Section):
-    """D-K iteration and what ends it.
+    """D-K iteration and what ends it: counts only, so that the same file gives the same controller on any machine.
 
-    polish : descend on gamma where D-K iteration stalls; by default where it stalls above target_mu.
+    max_iterations : most K-steps. target_mu : end once mu is proved below; without it, go on while mu falls.
+    polish : descend on gamma where D-K iteration stalls; by default yes.
+    time_limit_s : of older files; decides nothing.
     """
 
     max_iterations: Annotated[int, Field(ge=1, le=50)] = 8
-    time_limit_s: Positive = 20.0
+    time_limit_s: Positive | None = None
     backoff_percent: Annotated[float, Field(ge=0, le=50)] = 1.0
     reduction_cost_percent: NotNegative = 1.0
     target_mu: Positive | None = None

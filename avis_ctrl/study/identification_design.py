@@ -48,7 +48,7 @@ _HALCYONICS: dict[str, Any] = _COMMON | {
                          "tolerance_dB": 1.0},
     "control_effort": {"floor_velocity_m_per_s": 1e-4, "bandwidth_Hz": 150.0, "reduction": 30.0},
     "floor": {"velocity_rms_m_per_s": 2e-5},
-    "synthesis": {"max_iterations": 8, "time_limit_s": 60.0, "target_mu": 0.95},
+    "synthesis": {"max_iterations": 8, "target_mu": 0.95},
     "requirement": _AVIS["requirement"]}
 
 

@@ -74,7 +74,7 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
     if spread and any(RESPONSE in name for name, _ in reliefs):
         text += f" {spread}."
     if len(history) > 1 and history[-1].mu_upper < (1 - STILL_FALLING) * history[-2].mu_upper:
-        text += " The D-K iteration ended while mu was still falling: raise synthesis.max_iterations or time_limit_s."
+        text += " The D-K iteration ended while mu was still falling: raise synthesis.max_iterations."
     if better := [c for c in others if c.mu.upper < mu.mu.upper]:
         best = min(better, key=lambda c: c.mu.upper)
         text += f" The controller {best.title!r} has a smaller mu, {best.mu.upper:.3g}: the iteration ended too early."

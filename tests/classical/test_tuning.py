@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from avis_ctrl.classical.skyhook import Skyhook
-from avis_ctrl.classical.tuning import Scenarios, TuningRange, _encirclements, _largest_singular_value, tune_skyhook
+from avis_ctrl.classical.tuning import (
+    Merit,
+    Scenarios,
+    Search,
+    TuningRange,
+    _encirclements,
+    _largest_singular_value,
+    tune_skyhook,
+)
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import lft_lower
 from avis_ctrl.rigs.rig_file import load_rig
@@ -129,7 +137,7 @@ def test_half_turns_count_unstable_poles():
 @pytest.fixture(scope="module")
 def tuned(scenarios, critical) -> tuple[Skyhook, float]:
     limit = 10 ** (4 / 20)
-    return tune_skyhook(scenarios, ("z", "phi_x_edge"), TuningRange(critical), BAND_HZ, limit, seed=1), limit
+    return tune_skyhook(scenarios, ("z", "phi_x_edge"), TuningRange(critical), BAND_HZ, limit), limit
 
 
 def measured(scenarios: Scenarios, skyhook: Skyhook) -> tuple[float, float]:
@@ -170,3 +178,47 @@ def test_tuning_stays_in_its_range(tuned, critical):
 def test_a_range_of_unstable_gains_is_refused(scenarios, critical):
     with pytest.raises(ComputationError, match="largest real part"):
         tune_skyhook(scenarios, ("z", "phi_x_edge"), TuningRange(critical, gain_factor=(300.0, 1000.0)), BAND_HZ, 2.0)
+
+
+def test_slopes_of_the_search_are_those_of_the_singular_values(scenarios, critical):
+    """Against differences of the closed loops' largest singular values, each loop built as a state space."""
+    search = Search(scenarios, ("z", "phi_x_edge"), TuningRange(critical), BAND_HZ)
+    point, h = search.search.point(0.7, (0.2, 60.0)), 1e-5
+
+    def log_sigma(at):
+        K = diagonal(search.search.skyhook(search.axes, at), OMEGA)
+        return np.log(np.linalg.norm(scenarios.channels().closed(K), ord=2, axis=(-2, -1)))
+    values, slopes, in_band = search._linearised(point, reach=np.inf)
+    np.testing.assert_allclose(values, log_sigma(point).ravel(), rtol=1e-9)
+    assert np.array_equal(in_band.reshape(-1, OMEGA.size)[0], [BAND_HZ[0] <= f <= BAND_HZ[1] for f in TUNING_HZ])
+    for k, e in enumerate(np.eye(point.size)):
+        numeric = (log_sigma(point + h * e) - log_sigma(point - h * e)).ravel() / (2 * h)
+        np.testing.assert_allclose(slopes[:, k], numeric, atol=1e-4)
+
+
+def test_tuning_is_no_worse_than_any_start(tuned, scenarios, critical):
+    """The classical tunings with customary corners and their neighbours, judged by the order of `Merit`."""
+    skyhook, limit = tuned
+    search = Search(scenarios, ("z", "phi_x_edge"), TuningRange(critical), BAND_HZ)
+    best = Merit(*measured(scenarios, skyhook), limit).key()
+    starts = search.starts()
+    assert any(np.allclose(start, search.search.point(1.0, (0.1, 100.0))) for start in starts)
+    assert all(best <= search.merit(start, limit).key() for start in starts)
+
+
+def test_merit_puts_the_limit_first():
+    order = [Merit(1.5, 0.5, 1.6), Merit(1.0, 0.7, 1.6), Merit(1.7, 0.1, 1.6), Merit(9.0, 0.1, 1.6),
+             Merit(1.0, 0.1, 1.6, unstable=1.0)]
+    assert sorted(order[::-1], key=Merit.key) == order
+
+
+def test_worst_cases_join_the_samples(plant, scenarios, rng):
+    """One of each frequency is kept by frequency, also at frequencies that join later; it is no plant."""
+    blocks = plant.full.blocks
+    deltas = np.stack([blocks.random(rng) for _ in OMEGA])
+    more = scenarios.with_worst(deltas).with_frequencies(OMEGA[3] * np.array([0.999, 1.001]))
+    assert more.plants == scenarios.plants == len(more.deltas) - 1
+    at = np.flatnonzero(np.isclose(more.omega, OMEGA[3], rtol=2e-3))
+    assert at.size == 3
+    assert all(np.array_equal(more.deltas[-1, k], deltas[3]) for k in at)
+    np.testing.assert_allclose(more.channels().yu[:-1, at[1]], scenarios.channels().yu[:, 3], rtol=1e-9)

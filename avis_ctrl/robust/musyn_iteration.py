@@ -1,0 +1,287 @@
+"""The iteration of a mu synthesis: which scalings come next, the K-step, the analysis, and when it ends.
+
+Phases in turn: D-K iteration; descent on the H-infinity optimum over the scalings (`gamma_descent`); the same with one
+more order where gamma asks for it ("growth"); then D-K iteration again from the best loop. Each ends where a step gains
+less than `STALL`, the whole where a round of all three gains less than `ROUND`. Other constant scalings are tried once
+("start"): first of all where the controllers to start from do nothing, else in the end.
+
+Only counts end anything, never a clock, and nothing depends on the target or on the number of iterations allowed but
+where the iteration ends: what a short run does is the beginning of what a long one does.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.lti import StateSpace, gain, hinf_norm, lft_lower
+from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, band_of, d_step
+from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
+from avis_ctrl.robust.gamma_descent import ScaledProblem, descend, grown
+from avis_ctrl.robust.hinfsyn import Synthesis, hinfsyn
+from avis_ctrl.robust.mu_upper import upper_bound
+from avis_ctrl.robust.musyn_state import DONE, GIVEN, NOMINAL, Iteration, Loop, State, analysed
+from avis_ctrl.robust.scalings import Scalings
+from avis_ctrl.uncertainty.blocks import BlockStructure
+
+# A step that lowers the best mu by less than this share has stalled; a round of all phases that gains less ends it.
+STALL = 0.005
+ROUND = 0.002
+# A step that lowers mu by more than this share is followed by another of its kind.
+FAST = 0.25
+# A loop within this share of the plant without control is that of a controller that does nothing.
+IDLE = 0.01
+# Constant scalings of all uncertainty against performance from which the iteration starts where identity leads nowhere.
+CONSTANTS = tuple(10.0 ** k for k in (-3, -2.5, -2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2, 2.5, 3))
+FOLLOWING = {"D-K": "descent", "descent": "growth", "growth": "start", "start": DONE}
+STOPPED = "stopped by the callback"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the caller of `musyn` asked for."""
+
+    target: float | None
+    max_iterations: int
+    backoff: float
+    polish: bool
+    max_added_states: int
+    callback: Callable[[Iteration], Any] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """P (w_delta, w, u -> z_delta, z, y) and its blocks as the synthesis sees them: complex, performance last."""
+
+    P: StateSpace
+    structure: BlockStructure
+    nmeas: int
+    ncon: int
+
+
+def iterate(problem: Problem, state: State, starts: tuple[StateSpace, ...], options: Options) -> tuple[State, str]:
+    """The H-infinity controller and the ones given, then scalings, K-step and analysis until something says stop."""
+    if not state.history:
+        state, stopped = _first(problem, starts, options)
+        if stopped:
+            return state, STOPPED
+    while True:
+        if status := _no_further(state, options):
+            return state, status
+        began = time.monotonic()
+        proposal = _proposed(problem, state, options)
+        synthesis = _k_step(problem, state, proposal, options) if proposal else None
+        if proposal is None or synthesis is None:
+            state = _moved_on(problem, state)
+            continue
+        scalings, cost, kind = proposal
+        points = analysed(problem.P, synthesis.K, problem.structure, _next_grid(state, synthesis.closed_loop))
+        loop = Loop(synthesis.K, scalings, synthesis.gamma, points.peak)
+        row = Iteration(len(state.history), synthesis.gamma, points.peak, synthesis.K.nstates, cost,
+                        sum(scalings.orders), time.monotonic() - began, kind)
+        state = _recorded(problem, state, loop, row, points)
+        if _stopped_by(options, row):
+            return state, STOPPED
+
+
+def _stopped_by(options: Options, row: Iteration) -> bool:
+    answer = options.callback(row) if options.callback else None
+    return answer is False or answer == "stop"
+
+
+def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -> tuple[State, bool]:
+    """The state with the best of the controllers that the iteration may start from; whether the callback said stop.
+
+    They are the H-infinity controller of the plant as it is, that of the nominal plant, and those given; the ones that
+    do not stabilise the plant are left out. The nominal one is often the best by far: its loop tells the D-step where
+    the uncertainty is felt by a controller that does its work, while large uncertainty unscaled forbids any work.
+    """
+    state, failure = State(), None
+    for kind, make in _candidates(problem, starts, options):
+        began = time.monotonic()
+        try:
+            loop, points = _start(problem, make())
+        except ComputationError as error:
+            failure = failure or error
+            continue
+        row = Iteration(len(state.history), loop.gamma, loop.mu, loop.K.nstates, 0.0, 0, time.monotonic() - began, kind)
+        state = replace(state, history=(*state.history, row))
+        if state.best is None or loop.mu < state.best.mu:
+            state = replace(state, points=points, last=loop, best=loop, round_mu=loop.mu)
+        if _stopped_by(options, row):
+            return state, True
+    if state.best is None or state.points is None:
+        assert failure is not None
+        raise failure
+    return replace(state, phase="start" if _at_rest(problem, state.points.omega, state.best.mu) else "D-K"), False
+
+
+def _candidates(problem: Problem, starts: tuple[StateSpace, ...],
+                options: Options) -> list[tuple[str, Callable[[], StateSpace]]]:
+    """Kinds of the controllers to start from, and what makes each."""
+    def optimal(P: StateSpace) -> StateSpace:
+        return hinfsyn(P, problem.nmeas, problem.ncon, backoff=options.backoff).K
+    performance = problem.structure.blocks[-1]
+    n_z, n_w = problem.structure.n_z - performance.cols, problem.structure.n_w - performance.rows
+    made: list[tuple[str, Callable[[], StateSpace]]] = [("H-infinity", lambda: optimal(problem.P))]
+    if n_w:
+        made.append((NOMINAL, lambda: optimal(problem.P.select(slice(n_z, None), slice(n_w, None)))))
+    return made + [(GIVEN, partial(_itself, K)) for K in starts]
+
+
+def _itself(K: StateSpace) -> StateSpace:
+    return K
+
+
+def _start(problem: Problem, K: StateSpace) -> tuple[Loop, PointwiseScalings]:
+    """A controller to start from with its analysis; ComputationError where it does not stabilise the plant."""
+    closed = lft_lower(problem.P, K)
+    if not closed.is_stable():
+        raise ComputationError("a controller to start from does not stabilise the plant",
+                               measured=f"largest real part of a pole {np.max(closed.poles().real):.3g} rad/s")
+    points = analysed(problem.P, K, problem.structure, frequency_grid(closed))
+    return Loop(K, Scalings.identity(problem.structure), hinf_norm(closed).gain, points.peak), points
+
+
+def _k_step(problem: Problem, state: State, proposal: Proposal, options: Options) -> Synthesis | None:
+    """H-infinity controller of the scaled plant; None where scalings, not the plant, make it fail."""
+    try:
+        return hinfsyn(proposal.scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff,
+                       gamma_hint=state.best.gamma if state.best else None)
+    except ComputationError:
+        return None
+
+
+def _no_further(state: State, options: Options) -> str:
+    """Why no further iteration starts; empty where one does."""
+    if state.phase == DONE:
+        return (f"converged: a round of D-K iteration, descent on gamma and larger orders gains no more than "
+                f"{100 * ROUND:g} %")
+    if state.phase not in ("D-K", "start") and not options.polish:
+        return f"D-K iteration stalled: a step gained less than {100 * STALL:g} %"
+    if options.target is not None and state.best and state.best.gamma <= options.target:
+        return f"target {options.target:g} reached"
+    if len(_steps(state)) >= options.max_iterations:
+        return f"{options.max_iterations} iterations done"
+    return ""
+
+
+class Proposal(NamedTuple):
+    """Scalings, what their realisation costs against the best at each frequency, and how they were made."""
+
+    scalings: Scalings
+    cost: float
+    kind: str
+
+
+def _proposed(problem: Problem, state: State, options: Options) -> Proposal | None:
+    """The next scalings; None where the phase has nothing more to offer."""
+    assert state.last is not None and state.best is not None and state.points is not None
+    if state.phase == "start":
+        tried = any(row.kind == "start" for row in state.history)
+        return None if tried else _other_constants(problem, state.best.gamma, options)
+    if state.phase == "D-K":
+        points = replace(state.points, floor=BROAD_FLOOR if _falls_fast(state) else DETAILED_FLOOR)
+        try:
+            step = d_step(points, lft_lower(problem.P, state.last.K), state.last.scalings,
+                          max_states=options.max_added_states)
+        except np.linalg.LinAlgError:
+            # A loop that no decomposition takes (entries beyond all scale) ends the D-K phase, not the synthesis.
+            return None
+        return Proposal(step.scalings, step.cost, "D-K")
+    band = band_of(state.points.omega)
+    start = min(state.last, state.best, key=lambda loop: loop.gamma).scalings
+    if state.phase == "growth":
+        larger = grown(problem.P, problem.nmeas, problem.ncon, start, band, options.max_added_states)
+        if larger is None:
+            return None
+        start = larger
+    try:
+        return Proposal(descend(problem.P, problem.nmeas, problem.ncon, start, band).scalings, 0.0, state.phase)
+    except ComputationError:
+        return None
+
+
+def _at_rest(problem: Problem, omega: np.ndarray, mu: float) -> bool:
+    """Whether a controller that reaches this mu does nothing: the plant without control reaches it, too.
+
+    With K = 0 the uncertainty of the drives sees no signal and no D is better than another: no D-step leads away.
+    """
+    P = problem.P
+    at_rest = lft_lower(P, gain(np.zeros((problem.ncon, problem.nmeas)), P.outputs[P.noutputs - problem.nmeas:],
+                                P.inputs[P.ninputs - problem.ncon:]))
+    if not at_rest.is_stable():
+        return False
+    open_loop = upper_bound(at_rest.frequency_response(omega)[:, None], problem.structure, 1e-3).beta
+    return mu > (1 - IDLE) * float(np.max(open_loop))
+
+
+def _other_constants(problem: Problem, gamma: float, options: Options) -> Proposal | None:
+    """The constant scalings, alike for all uncertainty, of least H-infinity optimum; None where none is below gamma."""
+    best, scaled = None, ScaledProblem.of(problem.P, problem.nmeas, problem.ncon)
+    for d in CONSTANTS:
+        scalings = Scalings.uniform(problem.structure, d)
+        try:
+            if not scaled.reaches(scalings, (1 - STALL) * gamma):
+                continue
+            made = hinfsyn(scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff)
+        except ComputationError:
+            continue
+        if made.gamma < (1 - STALL) * gamma:
+            best, gamma = scalings, made.gamma
+    return Proposal(best, 0.0, "start") if best else None
+
+
+def _falls_fast(state: State) -> bool:
+    """Whether the last step lowered mu by more than `FAST`, or none was taken yet."""
+    steps = _steps(state)
+    return len(steps) < 2 or steps[-1] < (1 - FAST) * steps[-2]
+
+
+def _steps(state: State) -> list[float]:
+    """mu after each K-step of the scaled plant; the other controllers to start from do not count."""
+    return [row.mu_upper for row in state.history if row.kind not in (NOMINAL, GIVEN)]
+
+
+def _next_grid(state: State, closed_loop: StateSpace) -> np.ndarray:
+    """Frequencies of the next analysis: those of the last one, denser at its peaks."""
+    if state.points is None:
+        return frequency_grid(closed_loop)
+    return refined_grid(state.points.omega, state.points.mu)
+
+
+def _recorded(problem: Problem, state: State, loop: Loop, row: Iteration, points: PointwiseScalings) -> State:
+    """The state after an iteration: the best loop kept, the phase moved on where nothing was gained."""
+    assert state.best is not None
+    gained = 1 - loop.mu / state.best.mu
+    state = replace(state, points=points, last=loop, best=loop if gained > 0 else state.best,
+                    history=(*state.history, row))
+    if state.phase == "start":
+        return _new_round(problem, state) if gained > 0 else _moved_on(problem, state)
+    return state if gained > STALL else _moved_on(problem, state)
+
+
+def _moved_on(problem: Problem, state: State) -> State:
+    """The state in the next phase; after growth a new round from the best loop, where this one gained enough."""
+    assert state.best is not None
+    if state.phase == "start" and len(_steps(state)) <= 1:
+        # No other scalings are better than those to start from.
+        return replace(state, phase="D-K")
+    if state.phase == "growth" and state.best.mu <= (1 - ROUND) * state.round_mu:
+        return _new_round(problem, state)
+    return replace(state, phase=FOLLOWING[state.phase])
+
+
+def _new_round(problem: Problem, state: State) -> State:
+    """D-K iteration from the best loop."""
+    assert state.best is not None and state.last is not None and state.points is not None
+    points = state.points
+    if state.last is not state.best:
+        points = analysed(problem.P, state.best.K, problem.structure, points.omega)
+    return replace(state, phase="D-K", points=points, last=state.best, round_mu=state.best.mu)

@@ -1,0 +1,209 @@
+"""The baselines of a study: skyhook loops by the classical rule, and tuned for the worst case of the uncertainty set.
+
+A rival that loses by bad tuning makes the comparison worthless. So the classical tunings are starts of the search and
+take part to its end, and what decides between two tunings is the bound over the whole set that the report shows, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.classical.skyhook import Skyhook, critical_damping
+from avis_ctrl.classical.tuning import Merit, Scenarios, Search, TuningRange
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.robust.mu_gain import worst_gain
+from avis_ctrl.robust.mu_peak import MuPeak, worst_case_gain
+from avis_ctrl.study.analysis import SLACK
+from avis_ctrl.study.candidate import Candidate
+from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.plant import DesignPlant
+
+# Tilt corner well below the table's modes, roll-off well above its loops' band.
+CUSTOMARY_CORNERS_HZ = (0.1, 100.0)
+TUNING_HZ = np.concatenate([np.geomspace(0.1, 5.0, 20), np.geomspace(5.5, 200.0, 44), [300.0, 400.0]])
+
+
+@dataclass(frozen=True)
+class SkyhookSettings:
+    """What bounds the search for the worst case; every budget is a count.
+
+    samples : plants on the boundary of the set that the search begins with.
+    rounds : how often the worst case of the best tuning joins the samples, at most.
+    agreement : share by which a worst case may be above the samples' before it joins them.
+    room : share of the limit at which the search aims, so that the worst case ends below the limit and not at it.
+    certified : tunings, beside the classical one, whose bound over the whole set is computed; where one is above the
+        limit its worst case and frequency join the samples for the next.
+    beside : frequencies that join with the worst one, as factors: a peak is not missed by a hair.
+    ascents, ascent_steps : effort of the search for a worst case at each frequency.
+    """
+
+    samples: int = 16
+    rounds: int = 12
+    agreement: float = 0.01
+    room: float = 0.99
+    certified: int = 5
+    beside: tuple[float, ...] = (0.95, 0.98, 0.99, 1.0, 1.01, 1.02, 1.05)
+    ascents: int = 2
+    ascent_steps: int = 12
+
+
+def classical_skyhook(plant: DesignPlant, rig: Rig, design: Design) -> Candidate:
+    """Critical damping of each axis taken alone, with customary corners."""
+    loops = classical_loops(plant, rig, design)
+    return Candidate("skyhook_classical", "skyhook, critical damping", "skyhook", loops.controller(),
+                     (in_words(loops),))
+
+
+def classical_loops(plant: DesignPlant, rig: Rig, design: Design) -> Skyhook:
+    """The loops of `classical_skyhook`."""
+    return Skyhook(plant.axes, critical_gains(rig, design.keep), *CUSTOMARY_CORNERS_HZ)
+
+
+def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: float,
+                  settings: SkyhookSettings = SkyhookSettings()) -> Candidate:
+    """The best skyhook found: among those whose worst-case peak keeps the limit the one of least worst-case
+    transmissibility in the band; where none keeps it the one of least worst-case peak, and a note says so.
+
+    Never worse, by the bounds over the whole set, than critical damping with customary corners.
+
+    Raises
+    ------
+    ComputationError : no tuning looked at, the classical ones included, is stable on the nominal plant.
+    """
+    contest = _Contest(plant, design, peak_limit, settings)
+    classical = classical_loops(plant, rig, design)
+    ranked = [(contest.certified(classical)[0], classical)]
+    task, target = contest.search(rig), settings.room * peak_limit
+    points = [task.search.point(1.0, CUSTOMARY_CORNERS_HZ)]
+    for _ in range(settings.certified):
+        found, points, task = contest.tuned(task, points, target)
+        loops = task.search.skyhook(plant.axes, found)
+        bound, worst = contest.certified(loops)
+        ranked.append((bound, loops))
+        if bound.meets or worst is None:
+            break
+        task = contest.learned(task, worst)
+        # What the bound still stands above the worst case found: the search has to stay below the limit by as much.
+        missed = contest.worst(task, found)[0].peak / bound.peak if np.isfinite(bound.peak) else 1.0
+        target = settings.room * peak_limit * min(1.0, missed)
+    best, loops = min(ranked, key=lambda one: one[0].key())
+    if best.unstable:
+        raise ComputationError("no skyhook in the range searched is stable on the nominal plant",
+                               measured=f"gains from {task.search.gain_factor[0]:g} to {task.search.gain_factor[1]:g} "
+                                        "of critical damping tried",
+                               cause="the phase of sensors and delay turns damping into its opposite",
+                               next_step="other corners in [skyhook], or sensors that see lower frequencies")
+    notes = [in_words(loops)]
+    if loops is classical:
+        notes.append("critical damping with customary corners: no tuning found is better over the whole set")
+    if not best.meets:
+        reached = (f"of those found this one has the least, {_decibel(best.peak):+.2f} dB" if np.isfinite(best.peak)
+                   else "none found is proved stable for the whole set")
+        notes.append(f"no skyhook found keeps the worst-case peak at {_decibel(peak_limit):+.2f} dB: {reached}")
+    return Candidate("skyhook", "skyhook, tuned", "skyhook", loops.controller(), tuple(notes))
+
+
+@dataclass(frozen=True, eq=False)
+class _Contest:
+    """What all tunings of a plant are judged by."""
+
+    plant: DesignPlant
+    design: Design
+    peak_limit: float
+    settings: SkyhookSettings
+
+    @property
+    def band_Hz(self) -> tuple[float, float]:
+        low, high = self.design.transmissibility.band_Hz
+        return low, high
+
+    def search(self, rig: Rig) -> Search:
+        """The search over the design's range on sampled plants."""
+        asked, plant = self.design.skyhook, self.plant
+        scenarios = Scenarios.sample(plant.full, plant.floor_velocities, plant.velocities, 2 * np.pi * TUNING_HZ,
+                                     self.settings.samples, self.design.simulation.seed)
+        search = TuningRange(critical_gains(rig, self.design.keep), tilt_corner_Hz=_pair(asked.tilt_corner_Hz),
+                             roll_off_Hz=_pair(asked.roll_off_Hz))
+        return Search(scenarios, plant.axes, search, self.band_Hz)
+
+    def tuned(self, task: Search, points: Sequence[np.ndarray],
+              target: float) -> tuple[np.ndarray, list[np.ndarray], Search]:
+        """The best tuning by the worst case at each frequency; the points known, and the search with its worst cases.
+
+        Each round improves the points on the samples; the worst case of the best one joins the samples, until it is no
+        worse than they said.
+        """
+        judged: list[tuple[Merit, np.ndarray]] = []
+        for _ in range(self.settings.rounds):
+            points = [task.improved(point, target) for point in task.best_starts(target, points)]
+            best = min(points, key=lambda point: task.merit(point, target).key())
+            said, (true, deltas) = task.merit(best, target), self.worst(task, best)
+            judged.append((true, best))
+            figure = "band" if true.meets else "peak"
+            if deltas is None or getattr(true, figure) <= (1 + self.settings.agreement) * getattr(said, figure):
+                break
+            task = replace(task, scenarios=task.scenarios.with_worst(deltas))
+        return min(judged, key=lambda one: one[0].key())[1], list(points), task
+
+    def worst(self, task: Search, point: np.ndarray) -> tuple[Merit, np.ndarray | None]:
+        """The worst case found at each frequency, which is a lower bound, and its perturbations (n_omega, n_w, n_z)."""
+        motion = task.scenarios.plant
+        closed = motion.closed(task.search.skyhook(task.axes, point).controller())
+        if not closed.is_stable():
+            return Merit(np.inf, np.inf, self.peak_limit, 1.0), None
+        found = worst_gain(closed.frequency_response(task.scenarios.omega), motion.blocks, count=self.settings.ascents,
+                           iterations=self.settings.ascent_steps)
+        return Merit(float(np.max(found.gain)), float(np.max(found.gain[task.inside])), self.peak_limit), found.delta
+
+    def learned(self, task: Search, worst: MuPeak) -> Search:
+        """The search with the worst case of a bound among its samples, and its frequency among theirs."""
+        scenarios = task.scenarios
+        if np.isfinite(worst.omega) and worst.omega > 0:
+            scenarios = scenarios.with_frequencies(worst.omega * np.array(self.settings.beside))
+        if worst.delta is not None:
+            n_w, n_z = scenarios.deltas.shape[2:]
+            scenarios = scenarios.with_worst(np.broadcast_to(worst.delta[:n_w, :n_z], scenarios.deltas.shape[1:]))
+        return replace(task, scenarios=scenarios)
+
+    def certified(self, loops: Skyhook) -> tuple[Merit, MuPeak | None]:
+        """The bounds over the whole set, as the report computes them, and the one of the peak.
+
+        That of the band is computed only where the peak keeps the limit: elsewhere it decides nothing.
+        """
+        plant = self.plant
+        motion = plant.full.restricted(plant.floor_velocities, plant.velocities)
+        closed = motion.closed(loops.controller())
+        if not closed.is_stable():
+            return Merit(np.inf, np.inf, self.peak_limit, 1.0), None
+        worst = worst_case_gain(closed, motion.blocks, slack=SLACK)
+        if worst.upper > self.peak_limit:
+            return Merit(worst.upper, np.inf, self.peak_limit), worst
+        low, high = self.band_Hz
+        band = worst_case_gain(closed, motion.blocks, band=(2 * np.pi * low, 2 * np.pi * high), slack=SLACK)
+        return Merit(worst.upper, band.upper, self.peak_limit), worst
+
+
+def critical_gains(rig: Rig, axes: Sequence[str]) -> tuple[float, ...]:
+    """Classical gains [N s/m] of some axes, rotations at the edge."""
+    equations = rig.equations_of_motion()
+    kept = [equations.coordinates.index(name) for name in axes]
+    scale = np.array([1.0 / rig.edge_m ** 2 if name.startswith("phi") else 1.0 for name in axes])
+    return tuple(critical_damping(*(np.diag(X)[kept] * scale for X in (equations.M, equations.K, equations.C))))
+
+
+def in_words(loops: Skyhook) -> str:
+    """Gains and corners of the loops."""
+    gains = ", ".join(f"{axis} {gain:.4g} N s/m" for axis, gain in zip(loops.axes, loops.gains, strict=True))
+    return f"gains {gains}; tilt corner {loops.tilt_corner_Hz:.3g} Hz, roll-off {loops.roll_off_Hz:.3g} Hz"
+
+
+def _pair(limits: list[float]) -> tuple[float, float]:
+    return limits[0], limits[1]
+
+
+def _decibel(value: float) -> float:
+    return 20.0 * float(np.log10(value))

@@ -1,0 +1,100 @@
+"""What is compared and delivered: the tuned skyhook against classical ones, the mu controller against its rivals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avis_ctrl.classical.skyhook import Skyhook
+from avis_ctrl.lti import gain
+from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.robust.mu_peak import worst_case_gain
+from avis_ctrl.study.analysis import analyse
+from avis_ctrl.study.candidate import Candidate
+from avis_ctrl.study.controllers import best_of, mu_optimal
+from avis_ctrl.study.design_file import Design, read_study
+from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.study.sampling import random_perturbations
+from avis_ctrl.study.skyhooks import classical_skyhook, critical_gains, tuned_skyhook
+
+DESIGN = Path(__file__).resolve().parents[2] / "designs" / "avis_z_phix.toml"
+LIMIT = 10 ** (3.0 / 20)
+
+
+@pytest.fixture(scope="module")
+def one_axis() -> tuple[Design, DesignPlant]:
+    """z alone; mass and the stiffness of one isolator uncertain, no chains."""
+    design, _ = read_study(DESIGN)
+    uncertainty = design.uncertainty.model_copy(update={
+        "parameters_percent": {"mass": 10.0, "isolator1.k_z": 15.0}, "actuator_chains": None})
+    synthesis = design.synthesis.model_copy(update={"max_iterations": 1, "time_limit_s": 1e-3})
+    design = design.model_copy(update={"keep": ["z"], "uncertainty": uncertainty, "synthesis": synthesis})
+    return design, build_plant(design, load_rig("avis"))
+
+
+def bounds(design: Design, plant: DesignPlant, K) -> tuple[float, float]:
+    """Worst-case transmissibility over all frequencies and in the band, over the whole set."""
+    closed = plant.full.restricted(plant.floor_velocities, plant.velocities).closed(K)
+    band = tuple(2 * np.pi * f for f in design.transmissibility.band_Hz)
+    return (worst_case_gain(closed, plant.full.blocks, slack=5e-3).upper,
+            worst_case_gain(closed, plant.full.blocks, band=band, slack=5e-3).upper)
+
+
+def test_tuned_skyhook_loses_to_no_classical_one(one_axis):
+    """Multiples of critical damping, customary and other corners: none that keeps the limit is lower in the band."""
+    design, plant = one_axis
+    tuned = tuned_skyhook(plant, load_rig("avis"), design, LIMIT)
+    peak, band = bounds(design, plant, tuned.K)
+    assert peak <= LIMIT
+    assert not any("no skyhook found" in note for note in tuned.notes)
+    critical, = critical_gains(load_rig("avis"), ["z"])
+    met = 0
+    for factor, (tilt, roll) in product((0.5, 1.0, 2.0), ((0.1, 100.0), (0.03, 30.0))):
+        other = bounds(design, plant, Skyhook(plant.axes, (factor * critical,), tilt, roll).controller())
+        met += other[0] <= LIMIT
+        assert other[0] > LIMIT or band <= 1.005 * other[1]
+    assert met > 2
+
+
+def test_a_limit_out_of_reach_is_said_and_the_least_peak_is_taken(one_axis):
+    """The payload follows the floor at low frequency: no loop keeps a peak of -1 dB."""
+    design, plant = one_axis
+    tuned = tuned_skyhook(plant, load_rig("avis"), design, 10 ** (-1.0 / 20))
+    assert any("no skyhook found keeps the worst-case peak at -1.00 dB" in note for note in tuned.notes)
+    peak, _ = bounds(design, plant, tuned.K)
+    assert 1.0 <= peak <= bounds(design, plant, classical_skyhook(plant, load_rig("avis"), design).K)[0]
+
+
+def test_mu_controller_is_never_worse_than_a_rival(one_axis):
+    """A rival that the iteration starts from is kept; the old time limit decides nothing, and a note says so."""
+    design, plant = one_axis
+    rig = load_rig("avis")
+    _, alone = mu_optimal(design, plant, rig)
+    assert len(alone.history) == 2  # H-infinity, nominal: not one of them was cut off after a millisecond
+    longer = design.model_copy(update={"synthesis": design.synthesis.model_copy(update={"max_iterations": 3})})
+    better, _ = mu_optimal(longer, plant, rig)
+    kept, made = mu_optimal(design, plant, rig, rivals=[better, Candidate("passive", "passive", "passive", None)])
+    assert any("time_limit_s decides nothing" in note for note in kept.notes)
+    assert made.history[-1].kind == "given"
+    assert made.history[-1].mu_upper < min(row.mu_upper for row in alone.history)
+    assert made.mu_upper_complex <= alone.mu_upper_complex
+
+
+def test_best_of_delivers_the_controller_of_least_mu(one_axis):
+    design, plant = one_axis
+    samples = random_perturbations(plant, 2, 1)
+    classical = classical_skyhook(plant, load_rig("avis"), design)
+    rival = analyse(design, plant, classical.K, classical.name, classical.title, classical.kind, samples)
+    weak = analyse(design, plant, gain([[-1.0]], classical.K.inputs, classical.K.outputs), "mu", "mu synthesis", "mu",
+                   samples, ("12 iterations done",))
+    assert rival.mu.upper < weak.mu.upper
+    assert best_of(rival, [weak]) is rival
+    delivered = best_of(weak, [replace(rival, K=None, mu=replace(rival.mu, upper=0.0)), rival])
+    assert (delivered.name, delivered.kind, delivered.mu, delivered.K) == ("mu", "mu", rival.mu, rival.K)
+    assert "skyhook, critical damping" in delivered.notes[0] and "12 iterations done" in delivered.notes
+    unstable = replace(rival, stable=False)
+    assert best_of(weak, [unstable]) is weak
