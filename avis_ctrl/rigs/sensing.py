@@ -44,7 +44,8 @@ class Filter:
     leading: float = 1.0
 
     def system(self) -> StateSpace:
-        return cascade(np.array(self.zeros), np.array(self.poles), self.leading)
+        zeros, poles = (np.real_if_close(np.array(roots, complex)) for roots in (self.zeros, self.poles))
+        return cascade(zeros, poles, self.leading)
 
     @property
     def is_one(self) -> bool:

@@ -81,16 +81,16 @@ def digital_controller(loop: SampledLoop) -> StateSpace:
 def loop_axes(rig: Rig, axes: Sequence[str], loops: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Allocation (n_u, n) and decoding (n, n_s) of the controlled axes and of those under loops of their own.
 
-    Where drives and sensors reach all of them, the axes leave each other alone. Where they do not, those of the
-    controller are as it was designed for, whatever else is controlled.
+    Where drives and sensors reach all six, the axes leave each other alone. Where they do not, those of the
+    controller are as it was designed for, whatever else is controlled, and each loop's are as if it were alone.
     """
     whole = (*axes, *loops)
     together = actuator_axes(rig, whole), sensor_axes(rig, whole)
-    if not axes or not loops or (_small(together[0].leftover) and _small(together[1].leftover)
-                                 and np.all(together[1].inertial)):
+    if not loops or (_small(together[0].leftover) and _small(together[1].leftover) and np.all(together[1].inertial)):
         return together[0].allocation, together[1].decoding
-    parts = [(actuator_axes(rig, part), sensor_axes(rig, part)) for part in (tuple(axes), tuple(loops))]
-    return np.hstack([one.allocation for one, _ in parts]), np.vstack([one.decoding for _, one in parts])
+    parts = [part for part in (tuple(axes), *((one,) for one in loops)) if part]
+    return (np.hstack([actuator_axes(rig, part).allocation for part in parts]),
+            np.vstack([sensor_axes(rig, part).decoding for part in parts]))
 
 
 def _small(leftover: np.ndarray) -> bool:
