@@ -90,7 +90,7 @@ class AvisTable(Rig):
 
     @property
     def drive_limit_V(self) -> float:
-        return self.limit_V
+        return float(max(self.drive_limits_V()))
 
     @cached_property
     def all_drives(self) -> tuple[Drive, ...]:
@@ -100,7 +100,7 @@ class AvisTable(Rig):
         return (*motors, *self.drives)
 
     def drive_limits_V(self) -> np.ndarray:
-        return np.array([min(self.limit_V, drive.limit_V or self.limit_V) for drive in self.all_drives])
+        return np.array([drive.limit_V or self.limit_V for drive in self.all_drives])
 
     @property
     def sample_rate_Hz(self) -> float:

@@ -298,7 +298,8 @@ class Halcyonics(Rig):
         noise = white_rms(acc.noise_m_per_s2_rtHz, acc.sensitivity_Vs2_per_m, acc.sample_rate_Hz)
         pole = complex(-2 * np.pi * acc.low_corner_Hz)
         return tuple(Sensor(f"acc_{name}", _triple(axes[name][0]), _triple(axes[name][1]), "acceleration", (0j,),
-                            (pole,), acc.sensitivity_Vs2_per_m, noise) for name in acc.at)
+                            (pole,), acc.sensitivity_Vs2_per_m, noise, noise_density=acc.noise_m_per_s2_rtHz)
+                     for name in acc.at)
 
     def parameters(self) -> dict[str, Parameter]:
         """Symbols of the source; k_s1..k_s4 by corner (k_s: their mean), e1..e8, load.mass, load.L7, load.Ixx .."""

@@ -16,6 +16,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.converter import Converter, white_density
 from avis_ctrl.rigs.equipment import Acquisition, Ambient
 from avis_ctrl.rigs.geophone import second_order_roots
 
@@ -62,6 +63,7 @@ class Sensor:
     gain : volts per unit of motion in the passband: far above all corners, of a position sensor at rest.
     noise_rms_V : white noise of one sample, before the converter.
     suspension : corner [Hz] and damping ratio of a geophone's own suspension, None for other kinds.
+    noise_density : the same noise as motion in the passband [unit/sqrt(Hz)], where the rig's file states it so.
     """
 
     name: str
@@ -73,6 +75,7 @@ class Sensor:
     gain: float
     noise_rms_V: float
     suspension: tuple[float, float] | None = None
+    noise_density: float | None = None
 
     @property
     def inertial(self) -> bool:
@@ -88,15 +91,25 @@ class Sensor:
     def chain(self, gain: float | None = None) -> StateSpace:
         """Motion -> volts; `gain` in the place of its own where given."""
         size = self.gain if gain is None else gain
-        return cascade(np.array(self.zeros), np.array(self.poles), self.leading * size, "motion", "voltage")
+        zeros, poles = (np.real_if_close(np.array(roots, complex)) for roots in (self.zeros, self.poles))
+        return cascade(zeros, poles, self.leading * size, "motion", "voltage")
 
-    def velocity_noise(self, omega: np.ndarray, rounding_rms_V: float, sample_rate_Hz: float) -> np.ndarray:
-        """(n,) the velocity [m/s/sqrt(Hz)] that would make the same voltage noise; omega > 0."""
+    def motion_density(self, converter: Converter | None, sample_rate_Hz: float) -> float:
+        """One-sided density of noise and rounding as motion in the passband [unit/sqrt(Hz)]."""
+        rounding = converter.noise_density_V_rtHz if converter else 0.0
+        if self.noise_density is not None:
+            return float(np.hypot(self.noise_density, rounding / self.gain))
+        return float(np.hypot(rounding, white_density(self.noise_rms_V, sample_rate_Hz)) / self.gain)
+
+    def as_velocity(self, omega: np.ndarray) -> np.ndarray:
+        """(n,) complex, the chain of unit gain from velocity; omega > 0."""
         s = 1j * np.asarray(omega, float)
-        chain = self.leading * self.gain * np.prod([s - z for z in self.zeros] or [np.ones_like(s)], axis=0)
-        chain = chain / np.prod([s - p for p in self.poles] or [np.ones_like(s)], axis=0)
-        density = np.hypot(self.noise_rms_V, rounding_rms_V) * np.sqrt(2.0 / sample_rate_Hz)
-        return density / np.abs(chain * s ** (ORDER[self.quantity] - 1))
+        chain = self.leading * s ** (ORDER[self.quantity] - 1)
+        for zero in self.zeros:
+            chain = chain * (s - zero)
+        for pole in self.poles:
+            chain = chain / (s - pole)
+        return chain
 
 
 @dataclass(frozen=True)
@@ -143,7 +156,8 @@ class AccelerometerAt:
         gain = self.sensitivity_Vs2_per_m * self.preamplifier_gain
         noise = _noise_rms(self.noise_rms_V, self.noise_m_per_s2_rtHz, gain, acquisition, ambient)
         return Sensor(self.name, self.position, self.direction, "acceleration", (0j,),
-                      (complex(-2 * np.pi * self.low_corner_Hz),), gain, noise)
+                      (complex(-2 * np.pi * self.low_corner_Hz),), gain, noise,
+                      noise_density=self.noise_m_per_s2_rtHz)
 
 
 def white_rms(density: float, gain: float, sample_rate_Hz: float) -> float:
@@ -178,7 +192,8 @@ class PositionSensorAt:
         gain = self.sensitivity_V_per_m * self.preamplifier_gain
         poles = () if self.bandwidth_Hz is None else (complex(-2 * np.pi * self.bandwidth_Hz),)
         noise = _noise_rms(self.noise_rms_V, self.noise_m_rtHz, gain, acquisition, ambient)
-        return Sensor(self.name, self.position, self.direction, "displacement", (), poles, gain, noise)
+        return Sensor(self.name, self.position, self.direction, "displacement", (), poles, gain, noise,
+                      noise_density=self.noise_m_rtHz)
 
 
 Instrument = GeophoneAt | AccelerometerAt | PositionSensorAt

@@ -2,6 +2,11 @@
 
 Built from geometry alone. Appendix A.4 itself is not in the text at hand; these are the kinematic relations that
 section 2.1.1 says it was built from.
+
+Where the channels do not span all six coordinates, the asked axes are made (or read) exactly and the others as little
+as these channels allow; rotations count as displacement, or force, at the edge. Sensors that read motion in space come
+first. Position sensors read the payload against the chassis: they help to tell other coordinates from the asked one,
+and read an axis themselves only where the others do not see it. That axis is then "relative": it moves with the floor.
 """
 
 from __future__ import annotations
@@ -19,15 +24,33 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 RANK_TOLERANCE = 1e-9
 
 
+@dataclass(frozen=True)
+class Reach:
+    """What counts as within reach of a set of channels.
+
+    weakest : share of the strongest combination. Drawings give directions to some 0.005 rad: what channels push or see
+        only by such a tilt, they are not meant to.
+    noise_band_Hz : where the sensors' noise, as velocity, is compared: the band of a table's modes and of its loops.
+    """
+
+    weakest: float = 0.02
+    noise_band_Hz: tuple[float, float] = (1.0, 30.0)
+
+
+REACH = Reach()
+
+
 @dataclass(frozen=True, eq=False)
 class ActuatorAxes:
     """Voltages to generalised forces and back.
 
     matrix : (6, n_u) T, N/V and N m/V, all six coordinates.
     allocation : (n_u, n_axes) V per N or N m: the voltages of least Euclidean norm that make the
-        force asked on `axes` and none on `quiet`.
+        force asked on `axes` and as little as possible on `quiet`.
     condition : condition number of the rows inverted, each scaled to unit length, so that it does
         not depend on units.
+    leftover : (n_quiet, n_axes) force on `quiet` per force on `axes`, moments as forces at the edge; zero where the
+        actuators span all six coordinates.
     """
 
     actuators: tuple[str, ...]
@@ -36,6 +59,7 @@ class ActuatorAxes:
     matrix: np.ndarray
     allocation: np.ndarray
     condition: float
+    leftover: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +67,12 @@ class SensorAxes:
     """Displacements (or velocities) along the sensors to logical coordinates and back.
 
     matrix : (n_s, 6) from q to the sensors.
-    decoding : (n_axes, n_s) least-squares inverse: logical coordinates `axes` from the sensors, blind
-        to `resolved` coordinates that are not asked for.
+    decoding : (n_axes, n_s) least-squares inverse, weighted with the sensors' noise: logical coordinates `axes` from
+        the sensors, as blind as they can be to `resolved` coordinates that are not asked for.
     condition : condition number of the columns inverted, each scaled to unit length.
+    leftover : (n_axes, n_resolved) what is read of `resolved`, rotations at the edge.
+    relative : those of `axes` that are read against the chassis.
+    inertial : (n_s,) which sensors read motion in space.
     """
 
     sensors: tuple[str, ...]
@@ -54,13 +81,16 @@ class SensorAxes:
     matrix: np.ndarray
     decoding: np.ndarray
     condition: float
+    leftover: np.ndarray
+    relative: tuple[str, ...]
+    inertial: np.ndarray
 
 
 def actuator_axes(rig: Rig, axes: Sequence[str] = COORDINATES, actuators: Sequence[str] | None = None,
                   quiet: Sequence[str] | None = None) -> ActuatorAxes:
     """Allocation of forces on `axes` to the actuators (all of them by default).
 
-    quiet : coordinates that must not be pushed; by default all the others.
+    quiet : coordinates that must not be pushed; by default all the others, as far as the actuators can help it.
 
     Raises
     ------
@@ -69,13 +99,15 @@ def actuator_axes(rig: Rig, axes: Sequence[str] = COORDINATES, actuators: Sequen
     """
     eom = rig.equations_of_motion()
     names = eom.actuators if actuators is None else tuple(actuators)
-    columns = _positions(eom.actuators, names, "actuators")
+    T = eom.T[:, _positions(eom.actuators, names, "actuators")]
     wanted = _positions(COORDINATES, axes, "axes")
     still = [name for name in COORDINATES if name not in axes] if quiet is None else list(quiet)
-    rows = wanted + _positions(COORDINATES, still, "quiet")
-    T = eom.T[:, columns]
-    inverse, condition = _inverse(T[rows], rows, f"cannot be pushed independently by the actuators {list(names)}")
-    return ActuatorAxes(names, tuple(axes), tuple(still), T, inverse[:, :len(wanted)], condition)
+    others = _positions(COORDINATES, still, "quiet")
+    inverse, condition = _blind_inverse(T.T, wanted, others, rig.edge_m, quiet is not None,
+                                        f"cannot be pushed independently by the actuators {list(names)}")
+    arms = _arms(rig)
+    leftover = (T[others] @ inverse.T) * arms[wanted] / arms[others][:, None]
+    return ActuatorAxes(names, tuple(axes), tuple(still), T, inverse.T, condition, leftover)
 
 
 def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[str] | None = None,
@@ -83,7 +115,7 @@ def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[s
     """Logical coordinates `axes` from the sensors (all of them by default).
 
     resolved : coordinates besides `axes` that the sensors also have to tell apart; by default all
-        the others.
+        the others, as far as these sensors can.
 
     Raises
     ------
@@ -91,23 +123,157 @@ def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[s
     """
     all_names, matrix = rig.sensor_rows()
     names = all_names if sensors is None else tuple(sensors)
-    H = matrix[_positions(all_names, names, "sensors")]
+    chosen = _positions(all_names, names, "sensors")
+    H, channels = matrix[chosen], [rig.sensors()[k] for k in chosen]
     wanted = _positions(COORDINATES, axes, "axes")
     others = [name for name in COORDINATES if name not in axes] if resolved is None else list(resolved)
-    columns = wanted + _positions(COORDINATES, others, "resolved")
-    inverse, condition = _inverse(H[:, columns].T, columns, f"cannot be told apart by the sensors {list(names)}")
-    return SensorAxes(names, tuple(axes), tuple(others), H, inverse.T[:len(wanted)], condition)
+    columns = _positions(COORDINATES, others, "resolved")
+    inertial, noise = np.array([one.inertial for one in channels]), _noise(rig, chosen)
+    complaint = f"cannot be told apart by the sensors {list(names)}"
+    exact = resolved is not None
+    alone = bool(np.all(inertial))
+    absolute = wanted if alone else _absolute(H[inertial], wanted, rig.edge_m, noise[inertial])
+    relative = [k for k in wanted if k not in absolute]
+    decoding, condition = np.zeros((len(wanted), len(names))), 1.0
+    if absolute and alone:
+        decoding, condition = _blind_inverse(H, wanted, columns, rig.edge_m, exact, complaint, noise)
+    elif absolute:
+        # What position sensors see of the absolute axes holds the floor's motion: unknowns of their own.
+        own = [H[:, k] * inertial for k in absolute]
+        both = [H[:, k] for k in range(6) if k not in absolute]
+        against = [H[:, k] * ~inertial for k in absolute]
+        order = [*absolute, *(k for k in range(6) if k not in absolute), *absolute]
+        rows = [wanted.index(k) for k in absolute]
+        decoding[rows], condition = _blind_inverse(
+            np.array([*own, *both, *against]).T, list(range(len(own))), list(range(len(own), len(order))), rig.edge_m,
+            False, complaint, noise, order)
+    if relative:
+        rows, least = [wanted.index(k) for k in relative], ~inertial
+        part, worse = _blind_inverse(H[least], relative, [k for k in range(6) if k not in relative], rig.edge_m, False,
+                                     complaint, noise[least])
+        decoding[np.array(rows)[:, None], np.flatnonzero(least)] = part
+        condition = max(condition, worse)
+    arms = _arms(rig)
+    leftover = (decoding @ H[:, columns]) * arms[wanted][:, None] / arms[columns]
+    return SensorAxes(names, tuple(axes), tuple(others), H, decoding, condition, leftover,
+                      tuple(COORDINATES[k] for k in relative), inertial)
+
+
+def drivable(rig: Rig) -> tuple[str, ...]:
+    """Coordinates that the actuators can push each by itself; the others stay passive."""
+    return _spanned(rig.equations_of_motion().T.T, rig.edge_m)
+
+
+def sensed(rig: Rig) -> tuple[str, ...]:
+    """Coordinates that the sensors tell from all others, in space or against the chassis."""
+    return _spanned(rig.sensor_rows()[1], rig.edge_m)
+
+
+def _spanned(H: np.ndarray, edge_m: float) -> tuple[str, ...]:
+    """Coordinates within the rows of H (n, 6)."""
+    _, sizes, V = np.linalg.svd(H * _edge_scale(edge_m), full_matrices=False)
+    kept = V[sizes > REACH.weakest * sizes[0]]
+    return tuple(name for k, name in enumerate(COORDINATES)
+                 if np.linalg.norm(kept[:, k]) > 1 - 0.5 * REACH.weakest ** 2)
+
+
+def _absolute(H: np.ndarray, wanted: list[int], edge_m: float, noise: np.ndarray) -> list[int]:
+    """Of the wanted axes those that inertial sensors H (n, 6) read with less of the other coordinates than of them."""
+    found: list[int] = []
+    scale = _edge_scale(edge_m)
+    for k in wanted:
+        asked = [*found, k]
+        others = [j for j in range(6) if j not in asked]
+        try:
+            decoding, _ = _blind_inverse(H, asked, others, edge_m, False, "", noise)
+        except InputError:
+            continue
+        leftover = (decoding @ H[:, others]) / scale[asked][:, None] * scale[others]
+        if np.all(np.linalg.norm(leftover, axis=1) < 1):
+            found = asked
+    return found
+
+
+def _noise(rig: Rig, chosen: list[int]) -> np.ndarray:
+    """(n,) noise of each sensor as velocity, over the largest; ones where all are alike."""
+    omega = 2 * np.pi * np.geomspace(*REACH.noise_band_Hz, 20)
+    all_of, found = rig.sensors(), []
+    for k in chosen:
+        density = all_of[k].motion_density(rig.converter, rig.sample_rate_Hz)
+        found.append(density * np.exp(-np.mean(np.log(np.abs(all_of[k].as_velocity(omega))))))
+    share = np.maximum(np.array(found) / max(*found, np.finfo(float).tiny), 1e-3)
+    return np.ones(len(share)) if np.ptp(share) < 1e-9 else share
+
+
+def _edge_scale(edge_m: float) -> np.ndarray:
+    """(6,) that turn columns by q into columns by displacements, rotations at the edge."""
+    return np.array([1 / edge_m if name.startswith("phi") else 1.0 for name in COORDINATES])
+
+
+def _arms(rig: Rig) -> np.ndarray:
+    return 1 / _edge_scale(rig.edge_m)
+
+
+def _blind_inverse(H: np.ndarray, wanted: list[int], others: list[int], edge_m: float, exact: bool, complaint: str,
+                   noise: np.ndarray | None = None, order: list[int] | None = None) -> tuple[np.ndarray, float]:
+    """D (n_wanted, n) with D H = I on `wanted` and as little as possible on `others`, then of least noise.
+
+    H : (n, m) by coordinates `order` (m,), by default the six. exact : refuse where `others` are not told apart, too.
+    Also returns the condition number of the columns inverted, each scaled to unit length.
+    """
+    order = list(range(6)) if order is None else order
+    scale = _edge_scale(edge_m)[order]
+    columns = wanted + others
+    if len(H) >= len(columns):
+        lengths = np.linalg.norm(H[:, columns] * scale[columns], axis=0)
+        sizes = np.linalg.svd(H[:, columns] * scale[columns], compute_uv=False)
+        if exact or (np.all(lengths > 0) and sizes[-1] > REACH.weakest * sizes[0]):
+            return _weighted(H[:, columns], [order[k] for k in columns], complaint, len(wanted), noise)
+    elif exact:
+        return _weighted(H[:, columns], [order[k] for k in columns], complaint, len(wanted), noise)
+    _require_reach(H * scale, wanted, [order[k] for k in wanted], complaint)
+    # Of the others, what these channels tell from the wanted ones; it is made zero, the rest is left over.
+    own, rest = H[:, wanted] * scale[wanted], H[:, others] * scale[others]
+    basis = np.linalg.qr(own)[0]
+    _, sizes, V = np.linalg.svd(rest - basis @ (basis.T @ rest), full_matrices=False)
+    kept = V[sizes > REACH.weakest * np.linalg.svd(H * scale, compute_uv=False)[0]]
+    told = np.hstack([H[:, wanted], rest @ kept.T])
+    return _weighted(told, [order[k] for k in wanted], complaint, len(wanted), noise)
+
+
+def _require_reach(H: np.ndarray, wanted: list[int], coordinates: list[int], complaint: str) -> None:
+    """Raises InputError where a combination of the wanted columns of H, rotations at the edge, is hardly there."""
+    _, sizes, V = np.linalg.svd(H[:, wanted], full_matrices=True)
+    there = int(np.sum(sizes > REACH.weakest * np.linalg.svd(H, compute_uv=False)[0]))
+    if there < len(wanted):
+        shares = np.linalg.norm(V[there:], axis=0)
+        weak = [COORDINATES[k] for k, share in zip(coordinates, shares, strict=True) if share > 0.1]
+        raise InputError(f"{' and '.join(weak)} {complaint}", field="axes", value=[COORDINATES[k] for k in coordinates])
+
+
+def _weighted(columns: np.ndarray, coordinates: list[int], complaint: str, n_wanted: int, noise: np.ndarray | None
+              ) -> tuple[np.ndarray, float]:
+    """First rows of the left inverse of `columns` (n, m) that is least in the noise (n,), and the condition number."""
+    plain = noise is None or bool(np.all(noise == 1))
+    inverse, condition = _inverse(columns.T, coordinates, complaint)
+    if not plain:
+        assert noise is not None
+        inverse = (np.linalg.pinv(columns / noise[:, None]) / noise).T
+    return inverse.T[:n_wanted], condition
 
 
 def _inverse(rows: np.ndarray, coordinates: list[int], complaint: str) -> tuple[np.ndarray, float]:
-    """Right inverse of least norm of `rows` (n, m), and the condition number of its unit-length rows."""
+    """Right inverse of least norm of `rows` (n, m), and the condition number of its unit-length rows.
+
+    coordinates : of the first rows, the ones that a complaint names.
+    """
     asked = [COORDINATES[k] for k in coordinates]
     lengths = np.linalg.norm(rows, axis=1)
     if np.any(lengths == 0):
         raise InputError(f"{asked[int(np.argmin(lengths))]} {complaint}", field="axes", value=asked)
     left, sizes, _ = np.linalg.svd(rows / lengths[:, None], full_matrices=True)
-    if len(sizes) < len(asked) or sizes[-1] < RANK_TOLERANCE * sizes[0]:
-        weak = [name for name, share in zip(asked, np.abs(left[:, -1]), strict=True) if share > 0.1]
+    if len(sizes) < len(rows) or sizes[-1] < RANK_TOLERANCE * sizes[0]:
+        weak = [name for name, share in zip(asked, np.abs(left[:, -1]), strict=False) if share > 0.1]
         raise InputError(f"{' and '.join(weak)} {complaint}", field="axes", value=asked)
     return np.linalg.pinv(rows), float(sizes[0] / sizes[-1])
 

@@ -11,6 +11,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
 from avis_ctrl.rigs.instruments import FloorSensor, Sensor, Tolerances
 from avis_ctrl.rigs.mounted_body import MountedBody
@@ -56,7 +57,7 @@ class Rig(ABC):
     @property
     @abstractmethod
     def drive_limit_V(self) -> float:
-        """Largest voltage of an actuator that has no limit of its own."""
+        """Largest voltage of an actuator, of all where they differ."""
 
     def drive_limits_V(self) -> np.ndarray:
         """(n_u,) largest voltage of each actuator."""
@@ -95,6 +96,12 @@ class Rig(ABC):
     @abstractmethod
     def sensors(self) -> tuple[Sensor, ...]:
         """Every sensor on the payload, with its place and its dynamics."""
+
+    @property
+    def converter(self) -> Converter | None:
+        """What every sensor's volts are read with; None for unlimited resolution."""
+        a = self.acquisition
+        return Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz) if a else None
 
     def sensor_axes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Position (3,) [m] and unit direction (3,) of each sensor."""

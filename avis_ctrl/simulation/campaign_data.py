@@ -27,7 +27,7 @@ from avis_ctrl.rigs.floor_spectrum import SpectrumModel, realise, shipped_spectr
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_plan import CampaignPlan, RecordPlan
 from avis_ctrl.simulation.loop import SimulationRecord, simulate
-from avis_ctrl.simulation.sampled_loop import SampledLoop, accelerometer_bank, geophone_bank
+from avis_ctrl.simulation.sampled_loop import SampledLoop, rig_bank
 
 # Largest level: the share of the converter's range that the drives' answer may take on the rig as its file has it;
 # the rest is for ambient motion, noise and a table that is not as its file has it.
@@ -92,11 +92,9 @@ def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig
 def open_loop(rig: Rig, plan: CampaignPlan) -> SampledLoop:
     """The rig with its sensors as the plan has them, and no controller."""
     corner = plan.amplifier_corner_Hz
-    if rig.geophones is not None:
-        bank = geophone_bank(rig)
-    else:
-        # The integrator is the controller's and does not act on what is recorded.
-        bank = accelerometer_bank(rig, 1.0)
+    # What the controller does in each channel does not act on what is recorded.
+    bank = replace(rig_bank(rig, 1.0), conditioning=None)
+    if "acceleration" in bank.quantities:
         corner = corner or ACCELEROMETER_AMPLIFIER_HZ
     bank = replace(bank, noise_rms_V=bank.noise_rms_V if plan.sensors.noise else np.zeros(len(bank.chains)),
                    converter=bank.converter if plan.sensors.quantiser else None)
@@ -159,13 +157,14 @@ def _drawn(loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int,
     """The signals of one line of the plan, as large as the drives allow."""
     fs, names = loop.sample_rate_Hz, loop.rig.equations_of_motion().actuators
     low, high = one.band_Hz or plan.band_Hz
+    limit_V = float(loop.limits_V.min())  # all drives are driven alike
     if one.excitation == "noise":
-        return noise(NoiseSettings(names, fs, samples / fs, (low, high), loop.limit_V, None, one.records, seed))
+        return noise(NoiseSettings(names, fs, samples / fs, (low, high), limit_V, None, one.records, seed))
     m = plan.multisine
     if samples < 2 * m.period_s * fs * (1 - 1e-9):
         raise InputError(f"expected at least two periods of {m.period_s:g} s: the first holds the transient",
                          field="duration_s", value=samples / fs)
-    return multisine(MultisineSettings(names, fs, m.period_s, (low, high), loop.limit_V, None, m.lines, m.spacing,
+    return multisine(MultisineSettings(names, fs, m.period_s, (low, high), limit_V, None, m.lines, m.spacing,
                                        m.group, m.scheme, one.records, dealt, None, m.compensate_hold, m.low_crest,
                                        seed))
 

@@ -9,6 +9,7 @@ second-order error in it vanishes, at one evaluation a step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from avis_ctrl.lti.realisation import discretise
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.nonlinear import RigArrays, rig_arrays
+from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES, EquationsOfMotion
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
 
@@ -62,15 +64,37 @@ def digital_controller(loop: SampledLoop) -> StateSpace:
     if not names:  # nothing is controlled, and nothing need be told apart by the sensors
         return gain(np.zeros((loop.n_drives, len(bank.chains))), dt=T)
     arms = lever_arms(rig)[[COORDINATES.index(name) for name in names]]
-    decoding = arms[:, None] * sensor_axes(rig, names).decoding / bank.gain_V
-    # A force F at the edge is a moment of arm times F.
-    allocation = actuator_axes(rig, names).allocation * arms
+    allocation, decoding = loop_axes(rig, loop.axes, tuple(loop.loops))
+    decoding = arms[:, None] * decoding / bank.gain_V
     forces = append(*(sampled(part, T) for part in (loop.K, *loop.loops.values())))
     seen = gain(decoding, dt=T)
-    if bank.conditioning is not None:
+    if len({id(one) for one in bank.filters}) > 1:
+        parts = [gain(1.0, dt=T) if one is None else sampled(one, T) for one in bank.filters]
+        seen = seen @ append(*parts)
+    elif bank.filters[0] is not None:
         # The same filter in every channel commutes with the decoding: one copy an axis is enough.
-        seen = append(*[sampled(bank.conditioning, T)] * len(names)) @ seen
-    return gain(allocation, dt=T) @ forces @ seen
+        seen = append(*[sampled(bank.filters[0], T)] * len(names)) @ seen
+    # A force F at the edge is a moment of arm times F.
+    return gain(allocation * arms, dt=T) @ forces @ seen
+
+
+def loop_axes(rig: Rig, axes: Sequence[str], loops: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Allocation (n_u, n) and decoding (n, n_s) of the controlled axes and of those under loops of their own.
+
+    Where drives and sensors reach all six, the axes leave each other alone. Where they do not, those of the
+    controller are as it was designed for, whatever else is controlled, and each loop's are as if it were alone.
+    """
+    whole = (*axes, *loops)
+    together = actuator_axes(rig, whole), sensor_axes(rig, whole)
+    if not loops or (_small(together[0].leftover) and _small(together[1].leftover) and np.all(together[1].inertial)):
+        return together[0].allocation, together[1].decoding
+    parts = [part for part in (tuple(axes), *((one,) for one in loops)) if part]
+    return (np.hstack([actuator_axes(rig, part).allocation for part in parts]),
+            np.vstack([sensor_axes(rig, part).decoding for part in parts]))
+
+
+def _small(leftover: np.ndarray) -> bool:
+    return bool(np.all(np.abs(leftover) < 1e-9))
 
 
 def linear_part(loop: SampledLoop) -> StateSpace:
@@ -81,7 +105,7 @@ def linear_part(loop: SampledLoop) -> StateSpace:
     """
     eom = loop.plant.mounted_body().equations_of_motion()
     sensor_names, H = loop.plant.sensor_rows()
-    parts = {"table": _table(eom, H, sensor_names, loop.sensors.quantity)}
+    parts = {"table": _table(eom, H, sensor_names, loop.sensors.quantities)}
     # Where drives couple, what leaves an amplifier is not yet what acts.
     made = eom.actuators if loop.drive_coupling is None else tuple(f"{name}_alone" for name in eom.actuators)
     for name, alone, drive in zip(eom.actuators, made, loop.drives(), strict=True):
@@ -97,7 +121,7 @@ def linear_part(loop: SampledLoop) -> StateSpace:
     return connect(parts, inputs, outputs)
 
 
-def _table(eom: EquationsOfMotion, H: np.ndarray, sensors: tuple[str, ...], quantity: str) -> StateSpace:
+def _table(eom: EquationsOfMotion, H: np.ndarray, sensors: tuple[str, ...], quantities: tuple[str, ...]) -> StateSpace:
     """M q'' = -C q' - K q + K_f q_f + C_f q_f' + T u + M excess, with states (q, q', q_f)."""
     n_u, zero, one = len(eom.actuators), np.zeros((N_Q, N_Q)), np.eye(N_Q)
     acceleration_x = la.solve(eom.M, np.hstack([-eom.K, -eom.C, eom.K_floor]))
@@ -107,10 +131,13 @@ def _table(eom: EquationsOfMotion, H: np.ndarray, sensors: tuple[str, ...], quan
     floor_e = np.hstack([np.zeros((N_Q, n_u)), one, zero])
     A = np.vstack([velocity_x, acceleration_x, np.zeros((N_Q, 3 * N_Q))])
     B = np.vstack([np.zeros_like(excess), acceleration_e + excess, floor_e])
-    felt_x, felt_e = ((velocity_x, np.zeros_like(excess)) if quantity == "velocity"
-                      else (acceleration_x, acceleration_e + excess))
-    C = np.vstack([acceleration_x, velocity_x, H @ felt_x])
-    D = np.vstack([acceleration_e, np.zeros_like(excess), H @ felt_e])
+    none = np.zeros_like(excess)
+    felt = {"velocity": (velocity_x, none), "acceleration": (acceleration_x, acceleration_e + excess),
+            "displacement": (np.hstack([one, zero, -one]), none)}
+    seen = {kind: (H @ by_x, H @ by_e) for kind, (by_x, by_e) in felt.items()}
+    motion_x, motion_e = (np.array([seen[kind][part][k] for k, kind in enumerate(quantities)]) for part in (0, 1))
+    C = np.vstack([acceleration_x, velocity_x, motion_x])
+    D = np.vstack([acceleration_e, none, motion_e])
     inputs = (*eom.actuators, *(f"floor_{c}_dot" for c in COORDINATES), *(f"excess_{c}" for c in COORDINATES))
     outputs = (*(f"{c}_ddot" for c in COORDINATES), *(f"{c}_dot" for c in COORDINATES),
                *(f"{name}_motion" for name in sensors))

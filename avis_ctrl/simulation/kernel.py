@@ -121,7 +121,7 @@ def _demand(work, step, drive, limit_V, demanded_row):
     slot = (step + delay) % (delay + 1)
     for i in range(n_u):
         demanded_row[i] = work.controlled[n_c + i] + drive[i]
-        work.line[slot, i] = min(max(demanded_row[i], -limit_V), limit_V)
+        work.line[slot, i] = min(max(demanded_row[i], -limit_V[i]), limit_V[i])
         if delay == 0:
             work.u[i] = work.line[slot, i]
 
@@ -154,8 +154,9 @@ def run(arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, ad
     """Steps through the control periods; returns how many were completed when the table left its range, or all.
 
     floor : (n + 1, 6) floor velocity at the samples; noise : (n, n_s) V; drive : (n, n_u) V on top of the controller's.
-    substeps : steps a period. nonlinear : the table's; acceleration : what the sensors see, which needs N first.
-    adc : (lsb, lower, upper) V, lsb = 0 for none. far : (m, rad) beyond which the table has diverged.
+    substeps : steps a period. nonlinear : the table's; acceleration : whether sensors see it, which needs N first.
+    adc : (lsb, lower, upper) V, lsb = 0 for none. limit_V : (n_u,) of the drives. far : (m, rad) beyond
+    which the table has diverged.
     """
     delay, step = work.line.shape[0] - 1, 0
     for k in range(floor.shape[0] - 1):

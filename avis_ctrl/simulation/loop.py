@@ -46,7 +46,7 @@ class SimulationRecord:
 
     @cached_property
     def clipped_dac(self) -> int:
-        return int(np.count_nonzero(np.abs(self.demanded) > self.loop.limit_V))
+        return int(np.count_nonzero(np.abs(self.demanded) > self.loop.limits_V))
 
     @cached_property
     def clipped_adc(self) -> int:
@@ -113,7 +113,7 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
     arrays = step_arrays(loop, extra_substeps)
     work = kernel.workspace(arrays, state, loop.delay_substeps * extra_substeps)
     done = kernel.run(arrays, work, floor, noise, drive, loop.substeps * extra_substeps, nonlinear,
-                      loop.sensors.quantity == "acceleration", adc, loop.limit_V, STOPS, records)
+                      "acceleration" in loop.sensors.quantities, adc, loop.limits_V, STOPS, records)
     kept = slice(min(settle, done - 1), done)
     q, q_dot, volts, demanded, sensed = (record[kept].copy() for record in records)
     time = (np.arange(samples)[kept] - settle) * loop.period_s

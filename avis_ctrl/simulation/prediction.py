@@ -18,6 +18,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.instruments import ORDER
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.discrete import digital_controller
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
@@ -120,10 +121,13 @@ def _image(loop: SampledLoop, image: np.ndarray) -> list[np.ndarray]:
                              acting * drive[:, None, :]], axis=2)
     velocity = np.linalg.solve(dynamic, pushed)
     _, H = loop.plant.sensor_rows()
-    sensed = H @ velocity * _diagonal(loop.sensors.chains, image)[:, :, None]
-    if loop.sensors.quantity == "acceleration":
-        sensed = sensed * s
     n = len(COORDINATES)
+    # Position sensors read against the chassis, which moves as the floor does, held as it is.
+    moved = H @ velocity
+    against = np.array([kind == "displacement" for kind in loop.sensors.quantities])
+    moved[:, against, :n] -= H[against] * (sinc ** 2)[:, None, None]
+    power = np.array([ORDER[kind] - 1 for kind in loop.sensors.quantities])
+    sensed = moved * s ** power[:, None] * _diagonal(loop.sensors.chains, image)[:, :, None]
     return [velocity[:, :, :n], velocity[:, :, n:], sensed[:, :, :n], sensed[:, :, n:]]
 
 

@@ -21,9 +21,10 @@ from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.rigs.converter import Converter, require_positive
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel
-from avis_ctrl.rigs.geophone import Accelerometer, CompensationFilter, Geophone, SensorChain
+from avis_ctrl.rigs.instruments import ORDER
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.rigs.sensing import conditioning
 
 # Finer steps than this per control period would be needed to place the delay: a sign of a mistyped delay.
 MAX_SUBSTEPS = 20
@@ -37,26 +38,30 @@ class SensorBank:
 
     Attributes
     ----------
-    quantity : what a chain takes in, "velocity" [m/s] or "acceleration" [m/s^2].
+    quantity : what the chains take in, "velocity" [m/s] or "acceleration" [m/s^2] of the payload in space, or
+        "displacement" [m] of the payload against the chassis; one for all, or one a sensor.
     chains : one system a sensor, to volts.
     gain_V : (n_s,) volts per unit of motion in the passband; the controller divides by it.
     noise_rms_V : (n_s,) white noise of one sample, before the converter.
     converter : None for unlimited resolution.
     conditioning : done by the controller in each channel after division by the gain (an accelerometer's
-        integrator); None for nothing.
+        integrator), one for all or one a sensor; None for nothing.
     """
 
-    quantity: str
+    quantity: str | tuple[str, ...]
     chains: tuple[StateSpace, ...]
     gain_V: np.ndarray
     noise_rms_V: np.ndarray
     converter: Converter | None = None
-    conditioning: StateSpace | None = None
+    conditioning: StateSpace | tuple[StateSpace | None, ...] | None = None
 
     def __post_init__(self) -> None:
-        if self.quantity not in ("velocity", "acceleration"):
-            raise InputError("velocity or acceleration", field="quantity", value=self.quantity)
         n = len(self.chains)
+        if len(self.quantities) != n or not set(self.quantities) <= set(ORDER):
+            raise InputError(f"velocity, acceleration or displacement, of each of {n} sensors", field="quantity",
+                             value=self.quantity)
+        if len(self.filters) != n:
+            raise InputError(f"one filter or {n}", field="conditioning", value=len(self.filters))
         for name in ("gain_V", "noise_rms_V"):
             values = np.array(np.broadcast_to(getattr(self, name), (n,)), dtype=float)
             if not np.all(np.isfinite(values)) or np.any(values < 0):
@@ -64,37 +69,53 @@ class SensorBank:
             object.__setattr__(self, name, values)
 
     @property
+    def quantities(self) -> tuple[str, ...]:
+        """What each chain takes in."""
+        return (self.quantity,) * len(self.chains) if isinstance(self.quantity, str) else tuple(self.quantity)
+
+    @property
+    def filters(self) -> tuple[StateSpace | None, ...]:
+        """The conditioning of each channel."""
+        alike = self.conditioning is None or isinstance(self.conditioning, StateSpace)
+        return (self.conditioning,) * len(self.chains) if alike else self.conditioning  # type: ignore
+
+    @property
     def white_variance_V2(self) -> np.ndarray:
         """(n_s,) variance of one sample: noise, and rounding as if white, true where signal or noise moves by codes."""
         return self.noise_rms_V ** 2 + (self.converter.noise_rms_V ** 2 if self.converter else 0.0)
 
 
+def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
+    """The sensors of a rig as its file says, and what the controller does in each channel (`rigs.sensing`).
+
+    integrator_corner_Hz : leak of the accelerometers' integrators.
+    """
+    sensors, filters = rig.sensors(), conditioning(rig, integrator_corner_Hz)
+    systems = {one: None if one.is_one else one.system() for one in filters}
+    made = tuple(systems[one] for one in filters)
+    kinds = tuple(one.quantity for one in sensors)
+    # Alike sensors share one chain object.
+    chains = {one: one.chain() for one in dict.fromkeys(replace(each, name="", position=(0.0, 0.0, 0.0),
+                                                                direction=(0.0, 0.0, 1.0)) for each in sensors)}
+    return SensorBank(kinds[0] if len(set(kinds)) == 1 else kinds,
+                      tuple(chains[replace(one, name="", position=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0))]
+                            for one in sensors),
+                      np.array([one.gain for one in sensors]), np.array([one.noise_rms_V for one in sensors]),
+                      rig.converter, made[0] if len(set(filters)) == 1 else made)
+
+
 def geophone_bank(rig: Rig) -> SensorBank:
-    """The rig's geophones with compensation filter, preamplifier, ambient noise and converter, as its file says."""
-    if rig.geophones is None or rig.acquisition is None:
+    """The sensors of a rig without accelerometers. Raises InputError where it has some."""
+    if any(one.quantity == "acceleration" for one in rig.sensors()) or rig.converter is None:
         raise InputError("the rig has no geophones with a converter", field="geophones")
-    g, a = rig.geophones, rig.acquisition
-    converter = Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz)
-    compensation = CompensationFilter(g.suspension_Hz, g.suspension_damping, g.compensated_Hz, g.compensated_damping)
-    noise = rig.ambient.sensor_noise_rms_V if rig.ambient else 0.0
-    chains = [SensorChain(Geophone(g.suspension_Hz, g.suspension_damping, sensitivity), compensation,
-                          g.preamplifier_gain, converter, noise) for sensitivity in g.sensitivity_Vs_per_m]
-    return SensorBank("velocity", tuple(chain.system() for chain in chains),
-                      np.array([chain.passband_gain_Vs_per_m for chain in chains]),
-                      np.full(len(chains), noise), converter)
+    return rig_bank(rig, 1.0)
 
 
 def accelerometer_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
-    """The rig's accelerometers, integrated to velocity by the controller: 1 / (s + 2 pi corner)."""
-    if rig.accelerometers is None:
+    """The sensors of a rig with accelerometers. Raises InputError where it has none."""
+    if all(one.quantity != "acceleration" for one in rig.sensors()):
         raise InputError("the rig has no accelerometers", field="accelerometers")
-    a, n = rig.accelerometers, len(rig.accelerometers.at)
-    sensor = Accelerometer(a.sensitivity_Vs2_per_m, a.low_corner_Hz, a.noise_m_per_s2_rtHz)
-    # Noise limited to half the sample rate: variance = density^2 fs / 2.
-    rms = float(sensor.noise_density(np.array([1.0]))[0]) * np.sqrt(a.sample_rate_Hz / 2)
-    leak = cascade([], [-2 * np.pi * integrator_corner_Hz], 1.0)
-    return SensorBank("acceleration", (sensor.system(),) * n, np.full(n, a.sensitivity_Vs2_per_m), np.full(n, rms),
-                      None, leak)
+    return rig_bank(rig, integrator_corner_Hz)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +138,8 @@ class SampledLoop:
     drive_coupling : volts of all drives to volts that act (I + what couples them), behind amplifiers and errors;
         None where each drive acts by itself.
     amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
-    sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage.
+    sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage. The rig's
+        drives each have their own limit; another limit_V is for all.
 
     Raises
     ------
@@ -176,7 +198,7 @@ class SampledLoop:
         if self.drive_coupling is not None and self.drive_coupling.D.shape != (self.n_drives,) * 2:
             raise InputError(f"a system of {self.n_drives} inputs and outputs", field="drive_coupling",
                              value=self.drive_coupling.D.shape)
-        if self.sensors.quantity == "acceleration" and any(drive.D[0, 0] for drive in self.drives()):
+        if "acceleration" in self.sensors.quantities and any(drive.D[0, 0] for drive in self.drives()):
             # Acceleration would jump with the voltage, at the very instant of the next sample.
             raise InputError("a corner for the amplifiers: accelerometers need drives without direct feedthrough",
                              field="amplifier_corner_Hz", value=self.amplifier_corner_Hz)
@@ -188,6 +210,13 @@ class SampledLoop:
     @property
     def period_s(self) -> float:
         return 1.0 / self.sample_rate_Hz
+
+    @property
+    def limits_V(self) -> np.ndarray:
+        """(n_u,) largest voltage of each drive."""
+        if self.limit_V == self.rig.drive_limit_V:
+            return self.rig.drive_limits_V()
+        return np.full(self.n_drives, self.limit_V)
 
     @property
     def delay_substeps(self) -> int:

@@ -133,7 +133,7 @@ def site_response(plant: DesignPlant, full: StateSpace, controlled: bool, band_H
     floor = plant.floor.asd(frequency, "velocity")
     outputs = [*plant.velocities, *plant.volts]
     from_floor = full.select(outputs, plant.floor_velocities).frequency_response(omega)
-    from_noise = full.select(outputs, [f"noise_{a}" for a in plant.axes]).frequency_response(omega)
+    from_noise = full.select(outputs, list(plant.noises)).frequency_response(omega)
     # Directions of the floor and the sensors are independent of each other.
     by_floor = np.linalg.norm(from_floor, axis=2) * floor[:, None]
     by_noise = np.linalg.norm(from_noise, axis=2) * plant.floor_density

@@ -19,11 +19,11 @@ from avis_ctrl.lti.connect import summing_junction
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.rigs.actuator import pade_delay
-from avis_ctrl.rigs.converter import Converter, white_density
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel, shipped_spectrum
-from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
+from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.rigs.sensing import NoiseGroup, Sensing, sensing
 from avis_ctrl.study.design_file import ChainUncertainty, Design
 from avis_ctrl.study.identified_uncertainty import RESPONSE, InDesign, in_design
 from avis_ctrl.uncertainty.blocks import ComplexFull
@@ -48,7 +48,9 @@ class DesignPlant:
     allocation : (n_actuators, n_axes) volts per newton on each axis (edge force for rotations).
     decoding : (n_axes, n_sensors) axis velocity (edge velocity) from the sensors' velocities.
     sensor_chain : velocity -> seen velocity of one axis, unit passband gain.
-    sensor_noise : unit white noise density -> noise of one sensor as velocity [m/s/sqrt(Hz)].
+    sensor_noise : unit white noise density -> noise of one sensor as velocity [m/s/sqrt(Hz)]; where the sensors are of
+        several kinds, of the first.
+    noises : inputs of the sensors' noise. relative : axes whose velocity is seen against the chassis.
     floor_density : mean velocity density of the floor [m/s/sqrt(Hz)]: the unit of the noise inputs.
     floor : spectrum of the floor's motion, each kept axis alike.
     weights : the weighting filters by name, with their meaning, for the report.
@@ -69,6 +71,8 @@ class DesignPlant:
     floor: SpectrumModel
     weights: dict[str, Weight]
     identified: InDesign | None = None
+    noises: tuple[str, ...] = ()
+    relative: tuple[str, ...] = ()
 
     @property
     def floor_velocities(self) -> list[str]:
@@ -101,11 +105,13 @@ def build_plant(design: Design, rig: Rig) -> DesignPlant:
     matrix = allocation.allocation * lever
     used = [k for k in range(len(allocation.actuators)) if np.any(np.abs(matrix[k]) > 1e-9 * np.abs(matrix).max())]
     actuators = tuple(allocation.actuators[k] for k in used)
-    decoder = sensor_axes(rig, design.keep)
+    seen = sensing(rig, design.keep, design.loop.integrator_corner_Hz)
+    decoder = seen.decoder
     decoding = decoder.decoding * lever[:, None]
+    # What each sensor sees of the kept axes, rotations at the edge.
+    rows = decoder.matrix[:, [COORDINATES.index(name) for name in design.keep]] / lever
 
     diagram = Diagram()
-    chain, noise = sensor_chain(design, rig)
     weights: dict[str, Weight] = {}
     _rig_part(diagram, uncertain, actuators)
     _actuator_side(diagram, design, rig, axes, actuators, matrix[used], weights, identified)
@@ -113,21 +119,22 @@ def build_plant(design: Design, rig: Rig) -> DesignPlant:
     low, high = design.floor.band_Hz
     reference = floor.rms(low, high) / np.sqrt(high - low)
     errors = design.uncertainty.sensor_chains
-    _sensor_side(diagram, axes, chain, noise, decoding, reference, errors is not None)
+    noises = _sensor_side(diagram, axes, seen, decoding, rows, reference, errors is not None)
     if errors is not None:
-        # What each sensor sees of the kept axes, rotations at the edge.
-        rows = decoder.matrix[:, [COORDINATES.index(name) for name in design.keep]] / lever
         _sensor_errors(diagram, errors, axes, decoder.sensors, rows, decoding, weights)
-    _performance(diagram, design, rig, axes, matrix[used], weights)
-    w = [*(f"floor_{a}_dot" for a in axes), *(f"noise_{a}" for a in axes), *(f"force_{a}" for a in axes)]
+    limits = rig.drive_limits_V()[used]
+    _performance(diagram, design, rig, axes, matrix[used] * (rig.drive_limit_V / limits)[:, None], weights)
+    w = [*(f"floor_{a}_dot" for a in axes), *noises, *(f"force_{a}" for a in axes)]
     weighted = [*(f"e_{a}" for a in axes), *(f"effort_{a}" for a in axes)]
     compliance = [f"compliance_{a}" for a in axes] if design.compliance else []
     physical = [*(f"{a}_dot" for a in axes), *(f"{a}_rel" for a in axes), *(f"{n}_command" for n in actuators)]
     u, y = [f"command_{a}" for a in axes], [f"seen_{a}_dot" for a in axes]
     full = diagram.plant(w, [*weighted, *compliance, *physical], u, y)
-    asked = w if design.compliance else w[:2 * len(axes)]
+    asked = w if design.compliance else w[:len(axes) + len(noises)]
     return DesignPlant(full, full.restricted(asked, [*weighted, *compliance]), uncertain, axes, actuators,
-                       decoder.sensors, matrix[used], decoding, chain, noise, reference, floor, weights, identified)
+                       decoder.sensors, matrix[used], decoding, seen.chain, seen.noise[0].shape, reference, floor,
+                       weights, identified, tuple(noises), tuple(
+                           axis for axis, name in zip(axes, design.keep, strict=True) if name in seen.relative))
 
 
 def _identified(design: Design, rig: Rig) -> InDesign | None:
@@ -249,51 +256,80 @@ def _chains(diagram: Diagram, uncertainty: ChainUncertainty | None, names: tuple
         diagram.uncertain(ComplexFull(1, 1, label), [f"w:{label}"], [f"z:{label}"])
 
 
-def sensor_chain(design: Design, rig: Rig) -> tuple[StateSpace, StateSpace]:
-    """Velocity -> seen velocity, and unit white noise density -> noise of one sensor as velocity [m/s/sqrt(Hz)].
-
-    Geophones see velocity above the compensated corner. Accelerometers are integrated with a leak, so that what
-    the controller sees is a velocity too, with one corner from the charge amplifier and one from the leak.
-    """
-    if rig.geophones is not None:
-        if rig.acquisition is None:
-            raise InputError("geophones need the rig file's [acquisition] section", field="acquisition")
-        g, a = rig.geophones, rig.acquisition
-        corner, damping = 2 * np.pi * g.compensated_Hz, g.compensated_damping
-        poles = np.roots([1.0, 2 * damping * corner, corner ** 2])
-        volts = g.preamplifier_gain * min(g.sensitivity_Vs_per_m)
-        rounding = Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz).noise_density_V_rtHz
-        ambient = rig.ambient.sensor_noise_rms_V if rig.ambient else 0.0
-        density = float(np.hypot(rounding, white_density(ambient, a.sample_rate_Hz)) / volts)
-        return cascade(np.zeros(2), poles, 1.0), gain([[density]])
-    if rig.accelerometers is None:
-        raise InputError("the rig file has no sensors", field="geophones")
-    acc, leak = rig.accelerometers, 2 * np.pi * design.loop.integrator_corner_Hz
-    chain = cascade(np.zeros(2), [-2 * np.pi * acc.low_corner_Hz, -leak], 1.0)
-    # The integrated noise falls as 1/s up to the clock, and is white above, where sampling folds it back.
-    nyquist = np.pi * acc.sample_rate_Hz
-    return chain, cascade([-nyquist], [-leak], acc.noise_m_per_s2_rtHz / nyquist)
-
-
-def _sensor_side(diagram: Diagram, axes: tuple[str, ...], chain: StateSpace, noise: StateSpace,
-                 decoding: np.ndarray, reference: float, uncertain: bool) -> None:
-    """Sensor chains of the logical axes (alike, so that decoding and chain commute) and their noise.
+def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decoding: np.ndarray, rows: np.ndarray,
+                 reference: float, uncertain: bool) -> list[str]:
+    """Sensor chains of the logical axes (alike, so that decoding and chain commute) and their noise; its inputs.
 
     One unit of noise is what accompanies 1 m/s of floor velocity: sensor density over floor density.
     """
-    mix = np.linalg.cholesky(decoding @ decoding.T) / reference
-    for axis in axes:
-        diagram.add(f"sensor chain {axis}", chain.renamed([f"{axis}_dot"], [f"clean_{axis}_dot"]), "sensor")
-        diagram.add(f"noise {axis}", noise.renamed([f"mixed_noise_{axis}"], [f"sensor_noise_{axis}"]), "weight")
-        terms = [f"clean_{axis}_dot", f"sensor_noise_{axis}", *([f"chain_error_{axis}"] if uncertain else [])]
+    groups = [_Noise.of(axes, seen.noise[k], decoding, reference, k) for k in range(len(seen.noise))]
+    inertial = seen.decoder.inertial
+    # What the decoding makes of motion in space and of motion against the chassis.
+    by_velocity, by_relative = decoding[:, inertial] @ rows[inertial], decoding[:, ~inertial] @ rows[~inertial]
+    for k, axis in enumerate(axes):
+        both = ((by_velocity[k], "dot", seen.chain, f"sensor chain {axis}", f"{axis}_in_space"),
+                (by_relative[k], "rel", seen.relative_chain, f"position chain {axis}", f"{axis}_against_chassis"))
+        ways = [one for one in both if np.any(np.abs(one[0]) > 1e-9)]
+        clean = f"clean_{axis}_dot"
+        for row, of, chain, label, made in ways:
+            assert chain is not None
+            _chain_of(diagram, axes, k, row, of, chain, label, clean if len(ways) == 1 else made)
+        if len(ways) > 1:
+            diagram.add(f"motion sum {axis}", summing_junction(clean, [made for *_, made in ways]), "sum")
+        own = [one for one in groups if axis in one.axes]
+        for one in own:
+            one.add(diagram, axis)
+        terms = [clean, *(f"sensor_noise_{axis}{one.tag}" for one in own),
+                 *([f"chain_error_{axis}"] if uncertain else [])]
         diagram.add(f"sum {axis}", summing_junction(f"seen_{axis}_dot", terms), "sum")
-        diagram.means(f"clean_{axis}_dot", "velocity as the sensors' band shows it", "m/s")
+        diagram.means(clean, "velocity as the sensors' band shows it", "m/s")
         diagram.means(f"seen_{axis}_dot", "measured velocity", "m/s")
-        diagram.means(f"mixed_noise_{axis}", "noise of the sensors that make this axis, before its filter", "1")
-        diagram.means(f"noise_{axis}", "sensor noise that accompanies 1 m/s of floor velocity", "1")
-        diagram.means(f"sensor_noise_{axis}", "sensor noise as velocity", "m/s")
-    diagram.add("noise mixing", gain(mix, [f"noise_{a}" for a in axes], [f"mixed_noise_{a}" for a in axes]),
-                "allocation")
+    for one in groups:
+        diagram.add(f"noise mixing{one.tag}", gain(one.mix, one.inputs, [f"mixed_{name}" for name in one.inputs]),
+                    "allocation")
+    return [name for one in groups for name in one.inputs]
+
+
+def _chain_of(diagram: Diagram, axes: tuple[str, ...], k: int, row: np.ndarray, of: str, chain: StateSpace, label: str,
+              made: str) -> None:
+    """The common chain of an axis' channels, on what their decoding makes of the motion: row (n_axes,)."""
+    read = f"{axes[k]}_{of}"
+    if np.max(np.abs(row - np.eye(len(axes))[k])) > 1e-9:
+        felt = [a for a in range(len(axes)) if abs(row[a]) > 1e-9]
+        read = f"{made}_motion"
+        diagram.add(f"motion of {label}", gain(row[None, felt], [f"{axes[a]}_{of}" for a in felt], [read]), "sum")
+        diagram.means(read, "motion along the sensors that make this axis", "m/s" if of == "dot" else "m")
+    diagram.add(label, chain.renamed([read], [made]), "sensor")
+    diagram.means(made, "velocity as the sensors' band shows it", "m/s")
+
+
+@dataclass(frozen=True, eq=False)
+class _Noise:
+    """Noise of one kind of sensors, mixed as the decoding mixes it, of the axes that they make."""
+
+    shape: StateSpace
+    axes: tuple[str, ...]
+    mix: np.ndarray
+    tag: str
+
+    @staticmethod
+    def of(axes: tuple[str, ...], group: NoiseGroup, decoding: np.ndarray, reference: float, number: int) -> _Noise:
+        own = decoding * group.share
+        served = [k for k in range(len(axes)) if np.any(np.abs(own[k]) > 1e-9)]
+        mix = np.linalg.cholesky(own[served] @ own[served].T) / reference
+        return _Noise(group.shape, tuple(axes[k] for k in served), mix, f"_{number + 1}" if number else "")
+
+    @property
+    def inputs(self) -> list[str]:
+        return [f"noise_{axis}{self.tag}" for axis in self.axes]
+
+    def add(self, diagram: Diagram, axis: str) -> None:
+        """The noise of one axis."""
+        name = f"{axis}{self.tag}"
+        diagram.add(f"noise {name}", self.shape.renamed([f"mixed_noise_{name}"], [f"sensor_noise_{name}"]), "weight")
+        diagram.means(f"mixed_noise_{name}", "noise of the sensors that make this axis, before its filter", "1")
+        diagram.means(f"noise_{name}", "sensor noise that accompanies 1 m/s of floor velocity", "1")
+        diagram.means(f"sensor_noise_{name}", "sensor noise as velocity", "m/s")
 
 
 def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty, axes: tuple[str, ...], sensors: tuple[str, ...],

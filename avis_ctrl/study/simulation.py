@@ -18,7 +18,7 @@ from avis_ctrl.simulation.campaign import check_designs
 from avis_ctrl.simulation.culprit import find_culprit
 from avis_ctrl.simulation.discrete import digital_controller
 from avis_ctrl.simulation.prediction import predict_transmissibility_6dof
-from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, accelerometer_bank, geophone_bank
+from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, rig_bank
 from avis_ctrl.study.companions import Companions, design_companions, until_stable
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.identified_uncertainty import RESPONSE
@@ -79,9 +79,8 @@ def six_dof_check(design: Design, rig: Rig, plant: DesignPlant, result: Controll
 
 
 def sensor_bank(design: Design, rig: Rig) -> SensorBank:
-    """The rig's geophones, or its accelerometers with the design's integrator."""
-    return geophone_bank(rig) if rig.geophones is not None else accelerometer_bank(
-        rig, design.loop.integrator_corner_Hz)
+    """The rig's sensors, conditioned with the design's integrator."""
+    return rig_bank(rig, design.loop.integrator_corner_Hz)
 
 
 def floor_by_coordinate(design: Design, rig: Rig, spectrum: SpectrumModel) -> dict[str, SpectrumModel]:

@@ -2,6 +2,7 @@
 
 import copy
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,9 +61,10 @@ def test_each_sensor_has_its_own_dynamics():
     for (quantity, sensor), response in expected.items():
         assert sensor.quantity == quantity
         assert np.allclose(sensor.chain().frequency_response(omega)[:, 0, 0], response, rtol=1e-9)
-        seen = sensor.noise_rms_V * np.sqrt(2 / 1000.0) / np.abs(
-            response * s ** {"displacement": -1, "velocity": 0, "acceleration": 1}[quantity])
-        assert np.allclose(sensor.velocity_noise(omega, 0.0, 1000.0), seen, rtol=1e-9)
+        of_velocity = response * s ** {"displacement": -1, "velocity": 0, "acceleration": 1}[quantity]
+        assert np.allclose(sensor.gain * sensor.as_velocity(omega), of_velocity, rtol=1e-9)
+        white = 1e-3 * np.sqrt(2 / 1000.0) / sensor.gain
+        assert replace(sensor, noise_rms_V=1e-3).motion_density(None, 1000.0) == pytest.approx(white)
 
 
 def test_attached_and_placed_channels_are_one_table():

@@ -1,0 +1,175 @@
+"""What a digital controller makes of the sensors of a rig: one velocity an axis, whatever the sensors are.
+
+    volts / gain -> conditioning of each channel -> decoding -> seen velocity of each axis
+
+Decoding adds channels, so that all channels of an axis must look alike. A digital filter brings every sensor that reads
+motion in space to one high-pass of second order on velocity, s^2 / p(s): an accelerometer is integrated with a leak, a
+geophone's corner is moved to that of the others. The corner is the highest that any of them has by itself: no channel
+is amplified below its own; for a lower corner a geophone has its compensation filter in the rig file. Position sensors
+are differentiated: they show the velocity of the payload against the chassis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.statespace import StateSpace, gain
+from avis_ctrl.rigs.instruments import Sensor
+from avis_ctrl.rigs.logical_axes import SensorAxes, sensor_axes
+from avis_ctrl.rigs.rig import Rig
+
+
+@dataclass(frozen=True)
+class SensingSettings:
+    """differentiator_share : corner of the position sensors' differentiator over the clock, 1: as far above the loop's
+    band as the bilinear map leaves it a corner."""
+
+    differentiator_share: float = 0.2
+
+
+SETTINGS = SensingSettings()
+
+
+@dataclass(frozen=True)
+class Filter:
+    """leading * prod(s - z) / prod(s - p), roots in rad/s."""
+
+    zeros: tuple[complex, ...]
+    poles: tuple[complex, ...]
+    leading: float = 1.0
+
+    def system(self) -> StateSpace:
+        zeros, poles = (np.real_if_close(np.array(roots, complex)) for roots in (self.zeros, self.poles))
+        return cascade(zeros, poles, self.leading)
+
+    @property
+    def is_one(self) -> bool:
+        return not self.zeros and not self.poles and self.leading == 1.0
+
+    def over(self, other: Filter) -> Filter:
+        """The quotient, equal roots cancelled."""
+        zeros, poles = _cancelled([*self.zeros, *other.poles], [*self.poles, *other.zeros])
+        return Filter(zeros, poles, self.leading / other.leading)
+
+
+def _cancelled(zeros: list[complex], poles: list[complex]) -> tuple[tuple[complex, ...], tuple[complex, ...]]:
+    left = list(poles)
+    kept = []
+    for zero in zeros:
+        if zero in left:
+            left.remove(zero)
+        else:
+            kept.append(zero)
+    return tuple(kept), tuple(left)
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseGroup:
+    """Sensors whose noise has one shape.
+
+    shape : unit white density -> noise of the noisiest of them as seen velocity [m/s/sqrt(Hz)].
+    share : (n_s,) each sensor's noise over that; zero for sensors of other groups.
+    """
+
+    shape: StateSpace
+    share: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Sensing:
+    """Axes as the controller sees them.
+
+    decoder : from conditioned channels to velocities of `axes`.
+    chain : velocity in space -> seen velocity, unit passband gain.
+    relative_chain : displacement against the chassis [m] -> seen velocity; None for a rig without position sensors.
+    conditioning : each channel's filter, from volts over gain to seen velocity; None for nothing.
+    noise : of the sensors that the axes use.
+    """
+
+    decoder: SensorAxes
+    chain: StateSpace
+    relative_chain: StateSpace | None
+    conditioning: tuple[StateSpace | None, ...]
+    noise: tuple[NoiseGroup, ...]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        return self.decoder.axes
+
+    @property
+    def relative(self) -> tuple[str, ...]:
+        """Axes whose velocity is seen against the chassis, not in space."""
+        return self.decoder.relative
+
+
+def sensing(rig: Rig, axes: Sequence[str], integrator_corner_Hz: float) -> Sensing:
+    """The controller's side of a rig's sensors.
+
+    integrator_corner_Hz : leak of the accelerometers' integrators.
+
+    Raises
+    ------
+    InputError : axes that the sensors cannot tell apart.
+    """
+    decoder, filters = sensor_axes(rig, axes), conditioning(rig, integrator_corner_Hz)
+    target, against = _targets(rig, integrator_corner_Hz)
+    used = np.any(np.abs(decoder.decoding) > 1e-9 * np.abs(decoder.decoding).max(), axis=0)
+    return Sensing(decoder, target.system() if target else gain(1.0), against.system() if against else None,
+                   tuple(None if one.is_one else one.system() for one in filters), _noise(rig, filters, used))
+
+
+def conditioning(rig: Rig, integrator_corner_Hz: float) -> tuple[Filter, ...]:
+    """Of each channel, from volts over gain to seen velocity."""
+    target, against = _targets(rig, integrator_corner_Hz)
+    found = []
+    for one in rig.sensors():
+        asked = target if one.inertial else against
+        assert asked is not None
+        # What is seen is a velocity: of acceleration the chain has one zero at rest more.
+        own = Filter((*one.zeros, 0j) if one.quantity == "acceleration" else one.zeros, one.poles, one.leading)
+        found.append(asked.over(own))
+    return tuple(found)
+
+
+def _targets(rig: Rig, integrator_corner_Hz: float) -> tuple[Filter | None, Filter | None]:
+    """From velocity in space, and from displacement against the chassis, to seen velocity; None without such sensors.
+    """
+    own = [_high_pass(one, integrator_corner_Hz) for one in rig.sensors() if one.inertial]
+    target = max(own, key=lambda poles: float(np.prod(np.abs(poles)))) if own else None
+    against = [one for one in rig.sensors() if not one.inertial]
+    relative = None
+    if against:
+        corner = 2 * np.pi * SETTINGS.differentiator_share * rig.sample_rate_Hz
+        slowest = min((one.poles for one in against), key=lambda poles: abs(poles[0]) if poles else np.inf)
+        poles = (*slowest, complex(-corner))
+        relative = Filter((0j,), poles, float(np.prod(np.abs(poles))))
+    return Filter((0j, 0j), target) if target else None, relative
+
+
+def _high_pass(sensor: Sensor, integrator_corner_Hz: float) -> tuple[complex, ...]:
+    """Poles of the high-pass of second order that a sensor is on velocity, its integrator included."""
+    if sensor.quantity == "velocity":
+        return sensor.poles
+    return (*sensor.poles, complex(-2 * np.pi * integrator_corner_Hz))
+
+
+def _noise(rig: Rig, filters: Sequence[Filter], used: np.ndarray) -> tuple[NoiseGroup, ...]:
+    sensors, groups = rig.sensors(), []
+    density = np.array([one.motion_density(rig.converter, rig.sample_rate_Hz) for one in sensors])
+    # What is integrated falls as 1/s up to half the clock, and is white above, where sampling folds it back.
+    nyquist = np.pi * rig.sample_rate_Hz
+    for one in dict.fromkeys(f for f, in_use in zip(filters, used, strict=True) if in_use):
+        own = np.array([f == one for f in filters]) & used
+        largest = float(density[own].max())
+        excess = len(one.poles) - len(one.zeros)
+        zeros, leading = (*one.zeros, *[complex(-nyquist)] * excess), one.leading * largest / nyquist ** excess
+        shape = gain([[largest]]) if one.is_one else Filter(zeros, one.poles, leading).system()
+        groups.append(NoiseGroup(shape, np.where(own, density / largest if largest else 1.0, 0.0)))
+    if not groups:
+        raise InputError("expected sensors that see the axes", field="sensors", value=[one.name for one in sensors])
+    return tuple(groups)
