@@ -133,7 +133,7 @@ def read_identified(folder: Path) -> tuple[Rig, float | None]:
     if not isinstance(result, dict) or result.get("format") != "avis-identification":
         raise InputError("expected the result of avis identify", file=path, field="format",
                          value=result.get("format") if isinstance(result, dict) else type(result).__name__)
-    return load_rig(folder / RIG_FILE, bool(result.get("loaded"))), result.get("amplifier_corner_Hz")
+    return load_rig(folder / RIG_FILE, bool(result.get("loaded")), check=False), result.get("amplifier_corner_Hz")
 
 
 def write_predictions(folder: Path, campaign: Campaign, out: Path,
