@@ -28,9 +28,9 @@ FOLDERS = ("robust", "uncertainty", "rigs", "identification", "simulation", "mea
 # One replacement a kind of place: an operator by its opposite, a comparison by its neighbour or its negation.
 OPERATORS = (*(f"ReplaceBinaryOperator_{pair}" for pair in ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "Pow_Mul",
                                                               "FloorDiv_Mul", "Mod_Mul")),
-             *(f"ReplaceComparisonOperator_{pair}" for pair in ("Lt_GtE", "Lt_LtE", "LtE_Gt", "LtE_Lt", "Gt_LtE", "Gt_GtE",
-                                                                  "GtE_Lt", "GtE_Gt", "Eq_NotEq", "NotEq_Eq", "Is_IsNot",
-                                                                  "IsNot_Is")),
+             *(f"ReplaceComparisonOperator_{pair}" for pair in (
+                 "Lt_GtE", "Lt_LtE", "LtE_Gt", "LtE_Lt", "Gt_LtE", "Gt_GtE", "GtE_Lt", "GtE_Gt", "Eq_NotEq", "NotEq_Eq",
+                 "Is_IsNot", "IsNot_Is")),
              "ReplaceUnaryOperator_Delete_USub", "ReplaceUnaryOperator_Delete_Not", "AddNot", "ReplaceAndWithOr",
              "ReplaceOrWithAnd")
 SLOWER = 4.0  # times the unchanged run, and a minute: an endless loop is noticed, a busy machine is not
@@ -68,9 +68,9 @@ def tests_run(tree: Path, folder: str, limit_s: float) -> tuple[bool, float, str
     """(a test failed, seconds, the first that did) of a folder's tests in a tree."""
     began = time.monotonic()
     single = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", f"tests/{folder}"]
+    pytest = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider"]
     try:
-        done = subprocess.run(command, cwd=tree, capture_output=True, text=True, timeout=limit_s,
+        done = subprocess.run([*pytest, f"tests/{folder}"], cwd=tree, capture_output=True, text=True, timeout=limit_s,
                               env={**os.environ, **single, "PYTHONPATH": str(tree)})
     except subprocess.TimeoutExpired:
         return True, time.monotonic() - began, "took too long"

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import warnings
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -82,8 +83,21 @@ def _refusal(error: OSError) -> str:
     return f"{where}the system refused: {lines[0]}; next: look at the disk's space and rights"
 
 
+def _say_unusual() -> None:
+    """What is unusual about a rig file is one line, without a place in the source; other warnings stay as they are."""
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *of: Any, **also: Any) -> None:
+        if category.__name__ == "UnusualRig":  # by name: its module is not to be loaded for --help
+            print(f"avis: {message}", file=sys.stderr)
+        else:
+            usual(message, category, *of, **also)
+    warnings.showwarning = show
+
+
 def main() -> None:
     """Entry point: errors of ours end in one line and their exit code."""
+    _say_unusual()
     # Before numpy is loaded: several BLAS threads round differently from one, and are slower on small matrices.
     os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", MKL_NUM_THREADS="1")
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -8,6 +8,7 @@ Whatever is wrong is one `InputError` line that names file, field, value and wha
 from __future__ import annotations
 
 import tomllib
+import warnings
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,6 +30,7 @@ from avis_ctrl.rigs.instruments import (
     Tolerances,
     unit_vector,
 )
+from avis_ctrl.rigs.plausibility import UnusualRig, plausible
 from avis_ctrl.rigs.rig_sections import (
     AmbientSection,
     AvisFile,
@@ -46,24 +48,27 @@ SHIPPED = {"avis": ("avis.toml", False), "halcyonics": ("halcyonics.toml", False
 File = TypeVar("File", bound=BaseModel)
 
 
-def load_rig(path_or_name: str | Path, loaded: bool = False) -> AvisTable | Halcyonics:
+def load_rig(path_or_name: str | Path, loaded: bool = False, check: bool = True) -> AvisTable | Halcyonics:
     """The rig of a file, or a shipped one: "avis", "halcyonics", "halcyonics_loaded".
 
-    `loaded` puts the load of the file's [load] section on the table.
+    `loaded` puts the load of the file's [load] section on the table. `check` holds a file against what tables can be
+    (`plausibility`), a warning `UnusualRig` saying what is rare; not for files that an identification wrote.
 
     Raises
     ------
     InputError : no such file, not TOML, a key that is unknown, missing, of a wrong unit or value,
-        an inertia that no body can have, a load asked for that the file does not have.
+        an inertia that no body can have, a load asked for that the file does not have, values that no table has.
     """
     if str(path_or_name) in SHIPPED:
         filename, with_load = SHIPPED[str(path_or_name)]
         path = Path(__file__).parent / "data" / filename
-        loaded = loaded or with_load
+        loaded, check = loaded or with_load, False
     else:
         path = Path(path_or_name)
     content = _read_toml(path)
     try:
+        if check and (unusual := plausible(content, lambda one: rig_from(one, loaded))):
+            warnings.warn(UnusualRig(f"{path}: {unusual}"), stacklevel=2)
         return rig_from(content, loaded)
     except InputError as error:
         raise error.in_file(path) from None

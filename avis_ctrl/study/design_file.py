@@ -263,8 +263,9 @@ def read_study(path: str | Path) -> tuple[Design, Rig]:
     if design.rig not in SHIPPED and not beside.is_file():
         raise InputError(f"expected a rig file beside the design or one of {', '.join(SHIPPED)}", file=path,
                          field="rig", value=design.rig)
-    rig = load_rig(design.rig if design.rig in SHIPPED else beside, design.loaded)
-    if isinstance(named := design.uncertainty.identified, str):
+    named = design.uncertainty.identified
+    rig = load_rig(design.rig if design.rig in SHIPPED else beside, design.loaded, check=named is None)
+    if isinstance(named, str):
         content = read_uncertainty(path.parent / named)
         design = design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
             update={"identified": content})})

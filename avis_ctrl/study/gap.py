@@ -30,6 +30,7 @@ from avis_ctrl.measurement.gates import Finding, examine
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.gap_design import DesignEffect, design_effect
 from avis_ctrl.study.identification import amplifier_corner, amplifier_words, expectation
+from avis_ctrl.study.plausible_records import records_fit
 from avis_ctrl.study.rig_channels import in_words_of
 from avis_ctrl.study.workers import each
 
@@ -131,6 +132,7 @@ def _gates(measured: Campaign, rig: Rig, options: GapOptions, progress: Progress
     """What the gates say; raises InputError where one stops that `gap` has no name for."""
     progress("gates")
     model = ResponseModel.of(rig, (), measured.y_unit, measured.y_names, measured.u_names)
+    records_fit(measured, model, options.despite_gates, progress)
     findings = examine(measured, expectation(model))
     stops = [one for one in findings if one.severity == "stop" and one.gate not in NAMED_HERE]
     for one in stops:

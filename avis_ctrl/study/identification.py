@@ -40,6 +40,7 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.gates import Expectation, Finding, examine
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
+from avis_ctrl.study.plausible_records import records_fit
 from avis_ctrl.study.rig_channels import in_words_of
 
 Progress = Callable[[str], None]
@@ -205,6 +206,7 @@ def gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options:
         return ()
     kinds = ", ".join(sorted({record.header.excitation for record in measured.records}))
     progress(f"gates: {len(measured.records)} records of {kinds}")
+    records_fit(measured, model, options.despite_gates, progress)
     findings = examine(measured, expectation(model))
     stops = [finding for finding in findings if finding.severity == "stop"]
     raised = stops[0] if stops and not options.despite_gates else None

@@ -131,7 +131,8 @@ def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:
         turns = Turning(float(turning["motors"]), float(turning["sensors"]))
     except (KeyError, TypeError, ValueError):
         raise InputError("expected numbers motors and sensors", file=path, field="turning", value=turning) from None
-    return load_rig(folder / RIG_FILE, bool(result.get("loaded"))), result.get("amplifier_corner_Hz"), turns
+    rig = load_rig(folder / RIG_FILE, bool(result.get("loaded")), check=False)
+    return rig, result.get("amplifier_corner_Hz"), turns
 
 
 def write_predictions(folder: Path, campaign: Campaign, out: Path,

@@ -24,6 +24,7 @@ from avis_ctrl.robust.musyn import MuSynthesis
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.controllers import (
     Candidate,
+    best_of,
     classical_skyhook,
     mu_optimal,
     nominal_hinf,
@@ -88,13 +89,14 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress 
             rivals.append(nominal_hinf(design, plant, rig))
         except ComputationError as error:
             failed.append(FailedController("hinf", "H-infinity, nominal", "hinf", str(error)))
+        rivals.append(classical_skyhook(plant, rig, design))
 
         def shown(row: Any) -> None:
             progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.4f}, peak mu {row.mu_upper:.4f}, "
                      f"order {row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
-        mu, made = mu_optimal(design, plant, rig, shown)
+        mu, made = mu_optimal(design, plant, rig, shown, rivals)
         progress(mu.notes[-1])
-        return [mu, *rivals, classical_skyhook(plant, rig, design), passive()], failed, made
+        return [mu, *rivals, passive()], failed, made
 
 
 def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesis, compared: Compared, seconds: float,
@@ -123,7 +125,8 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
             failed: Sequence[FailedController] = (), progress: Progress = lambda text: None) -> Compared:
     """Bounds of every controller, a skyhook tuned to the worst-case peak of mu, and the simulation of mu.
 
-    On two processes: none needs another but the last two, which need the bounds of mu.
+    On two processes: none needs another but the last two, which need the bounds of all the others, for the best of them
+    is what the study delivers as its mu controller.
 
     Raises
     ------
@@ -131,26 +134,30 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
     """
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     with Workers() as workers:
-        jobs = {c.name: workers.submit(_measured, design, plant, c, samples) for c in candidates}
+        jobs = {workers.submit(_measured, design, plant, c, samples): c.name for c in candidates}
         progress("bounds of every controller over the whole uncertainty set, closed loop of the nonlinear rig")
-        mu = jobs["mu"].result()
+        found: dict[str, ControllerResult | FailedController] = {}
+
+        def gather() -> None:
+            for job in as_completed(jobs):
+                found[jobs[job]] = one = job.result()
+                progress(f"  {one.title}: {one.reason}" if isinstance(one, FailedController)
+                         else f"  done: bounds of {one.title}")
+        gather()
+        mu = found["mu"]
         if isinstance(mu, FailedController):
             raise ComputationError(f"the {mu.title} controller could not be measured: {mu.reason}")
-        progress("  done: bounds of mu synthesis")
+        # The best one found is delivered, whatever its name; the skyhook's limit follows from it.
+        mu = best_of(mu, [one for one in found.values() if isinstance(one, ControllerResult)])
         simulation = workers.submit(simulate_study, design, rig, plant, mu)
-        jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, skyhook_limit(design, mu), samples)
-        found: dict[str, ControllerResult | FailedController] = {}
-        for job in as_completed([*jobs.values(), simulation]):
-            if job is simulation:
-                progress(f"  done: {design.simulation.random_plants + 2} nonlinear plants")
-                continue
-            name = next(name for name, one in jobs.items() if one is job)
-            found[name] = one = job.result()
-            if isinstance(one, FailedController):
-                progress(f"  {one.title}: {one.reason}")
-            elif name != "mu":
-                progress(f"  done: bounds of {one.title}")
+        jobs = {workers.submit(_tuned, design, plant, rig, skyhook_limit(design, mu), samples): "skyhook"}
+        gather()
         loop = simulation.result()
+        progress(f"  done: {design.simulation.random_plants + 2} nonlinear plants")
+        found["mu"] = mu
+        if isinstance(skyhook := found["skyhook"], ControllerResult) and best_of(mu, [skyhook]) is not mu:
+            found["mu"] = mu = best_of(mu, [skyhook])
+            loop = simulate_study(design, rig, plant, mu)
     if isinstance(rest := found["passive"], FailedController):
         raise ComputationError(f"the table without control could not be measured: {rest.reason}")
     every = [*failed, *(one for one in found.values() if isinstance(one, FailedController))]

@@ -1,0 +1,321 @@
+"""Whether a rig file can be that of a table at all, and which slip of a unit would explain that it cannot.
+
+Natural frequencies, sag, damping ratios, mass per area, radii of gyration, reach of the drives, full scale and deafness
+of the sensors, delay and sample rate are computed from the file (`implausible`). Where one is out of range, every
+single slip (`unit_slips`) is undone in turn, and the one that puts everything in range, with the least left that is
+unusual, is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.plausible_ranges import RANGES, PlausibleRanges, Range
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.unit_slips import Entry, G, Place, Slip, apart, dotted, entries, slips
+
+Build = Callable[[dict[str, Any]], Rig]
+Judge = Callable[..., None]
+ALIKE = ("constant_N_per_V", "sensitivity_Vs_per_m", "sensitivity_Vs2_per_m", "sensitivity_V_per_m")
+
+
+@dataclass(frozen=True)
+class SlipCost:
+    """What makes one slip likelier than another, in squared decades beyond what is usual.
+
+    scope : times the square of the steps from one number to a list, a key, a unit in a section, in the file. rank : a
+    step down the list of what people write instead. off_centre : all properties at the ends of what is usual. apart :
+    the slip's numbers a decade from the others of their unit in their section. near : a second field is named beside
+    the first where it is that near. better : part of the cost before, below which an unusual rig is taken for a slip.
+    """
+
+    scope: float = 0.02
+    rank: float = 0.05
+    off_centre: float = 1.0
+    apart: float = 0.1
+    near: float = 0.05
+    better: float = 0.3
+
+
+COST = SlipCost()
+
+
+class UnusualRig(UserWarning):
+    """What a rig file says is possible, but rare: one line."""
+
+
+@dataclass(frozen=True)
+class Property:
+    """A property of the table, judged.
+
+    kind : of the range. refused, unusual : decades beyond what is possible and what is usual, 0 inside. off_centre : of
+    `Range`. words : with number and unit. field, value : of the file, where it is a single key's.
+    """
+
+    kind: str
+    refused: float
+    unusual: float
+    off_centre: float
+    words: str
+    field: str = ""
+    value: Any = None
+
+
+def plausible(content: dict[str, Any], build: Build, ranges: PlausibleRanges = RANGES) -> str:
+    """Holds a file's content against what a table can be; returns one line on what is unusual, empty for nothing.
+
+    Parameters
+    ----------
+    content : of the TOML file. build : makes the rig, and complains of what cannot be one.
+
+    Raises
+    ------
+    InputError : what `build` complains of, with the likely slip of a unit where there is one; values that no table has.
+    """
+    try:
+        rig = build(content)
+    except InputError as error:
+        likely = _likely(content, build, ranges) if _of_numbers(error.value) else []
+        if not likely:
+            raise
+        first, said = likely[0], error.expected
+        if error.field and not error.field.startswith(first.field):
+            said = f"with it {error.field} is refused ({said})"
+        raise InputError(f"{said}; {_asked(likely)}", field=first.field, value=first.value) from None
+    found = judged(content, rig, ranges)
+    odd = sorted((one for one in found if one.unusual > 1e-9), key=lambda one: (-one.refused, -one.unusual))
+    if not odd:
+        return ""
+    refused = odd[0].refused > 0
+    worst = {one.kind: one for one in reversed(odd) if one.refused > 0 or not refused}
+    said = ", ".join([one.words for one in odd if worst.get(one.kind) is one][:2])
+    likely = _likely(content, build, ranges, np.inf if refused else _cost(found))
+    if not refused:
+        hint = f"; {likely[0].field}: {_asked(likely)}" if likely else ""
+        return f"unusual for a table: {said}{hint}"
+    if likely:
+        raise InputError(f"{said}: no table has that; {_asked(likely)}", field=likely[0].field, value=likely[0].value)
+    raise InputError(f"{said}: no table has that, and no single slip of a unit explains it; check the keys' units",
+                     field=odd[0].field or "payload, isolators or drives", value=odd[0].value)
+
+
+def _of_numbers(value: Any) -> bool:
+    values = value if isinstance(value, (list, tuple)) else [value]
+    return bool(len(values)) and all(isinstance(one, (int, float)) and not isinstance(one, bool) for one in values)
+
+
+def _asked(likely: Sequence[Slip]) -> str:
+    first, *others = likely
+    also = "".join(f", or {one.field} = {_shown(one.meant)} ({one.words})" for one in others[:1])
+    return f"did you mean {_shown(first.meant)} ({first.words}){also}?"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(f'{one:g}' for one in value[:3])}{', ...' if len(value) > 3 else ''}]"
+    return f"{value:g}"
+
+
+def _likely(content: dict[str, Any], build: Build, ranges: PlausibleRanges, now: float = np.inf) -> list[Slip]:
+    """Slips that, undone, leave nothing impossible and less that is unusual than `now`: the best, and one as near.
+
+    Single numbers of lists are tried where something is impossible and nothing wider explains it.
+    """
+    found: list[tuple[float, Slip]] = []
+    before, _, _ = _outcome(content, build, ranges)
+    idle: set[Place] = set()
+    for slip in slips(content):
+        if slip.one_of_list and (found or np.isfinite(now)):
+            break
+        if idle.issuperset(entry.place for entry in slip.entries):
+            continue
+        mended = slip.mended(content)
+        odd, refused, cost = _outcome(mended, build, ranges)
+        if odd == before:
+            # What is wrong does not depend on these numbers.
+            idle.update(entry.place for entry in slip.entries)
+        elif not refused and cost <= COST.better * now:
+            cost += COST.scope * slip.scope ** 2 + COST.rank * slip.rank + COST.apart * apart(slip, mended)
+            found.append((cost, slip))
+    if not found:
+        return []
+    found.sort(key=lambda one: one[0])
+    least, best = found[0]
+    places = {entry.place for entry in best.entries}
+    others = [slip for cost, slip in found if cost <= least + COST.near
+              and not places & {entry.place for entry in slip.entries}]
+    return [best, *others[:1]]
+
+
+def _outcome(content: dict[str, Any], build: Build, ranges: PlausibleRanges) -> tuple[tuple[str, ...], bool, float]:
+    """What is odd about a content, in words; whether it is refused; its cost."""
+    try:
+        properties = judged(content, build(content), ranges)
+    except (InputError, ArithmeticError, np.linalg.LinAlgError) as error:
+        return (str(error),), True, np.inf
+    refused = tuple(one.words for one in properties if one.refused)
+    unusual = tuple(one.words for one in properties if one.unusual > 1e-9)
+    return refused or unusual, bool(refused), _cost(properties)
+
+
+def _cost(properties: Sequence[Property]) -> float:
+    of_table = [one.off_centre for one in properties if not one.field]
+    return sum(one.unusual ** 2 for one in properties) + COST.off_centre * float(np.mean(np.square(of_table)))
+
+
+def judged(content: dict[str, Any], rig: Rig, ranges: PlausibleRanges = RANGES) -> list[Property]:
+    """Every property of a rig that is held against a range."""
+    found: list[Property] = []
+
+    def judge(kind: str, value: float, words: str, field: str = "", of: Range | None = None) -> None:
+        if not np.isfinite(value) or value <= 0:
+            return
+        within: Range = of or getattr(ranges, kind)
+        refused, unusual = within.beyond(value)
+        if unusual > 1e-9:
+            words = f"{words} ({_expected(within, refused > 0)})"
+        found.append(Property(kind, refused, unusual, within.off_centre(value), words, field, value if field else None))
+    numbers = list(entries(content))
+    _single_keys(numbers, ranges, judge)
+    eom, body = rig.equations_of_motion(), rig.mounted_body()
+    modes = eom.natural_frequencies()
+    if np.all(modes.frequencies_Hz > 0):
+        _modes(eom, modes, judge)
+        _clock(rig, float(modes.frequencies_Hz[-1]), judge)
+    places = np.array([mount.position for mount in body.mounts])
+    centre = places.mean(axis=0)
+    radius = float(np.max(np.linalg.norm((places - centre)[:, :2], axis=1)))
+    if radius > 0:
+        _shape(rig, body, centre, radius, judge)
+    _drives(rig, eom, radius, judge)
+    _alike(numbers, body, judge)
+    _hearing(content, judge)
+    return found
+
+
+def _expected(of: Range, refused: bool) -> str:
+    low, high = (of.lowest, of.highest) if refused else (of.low, of.high)
+    unit = f" {of.unit}" if of.unit else ""
+    return f"expected at most {high:g}{unit}" if low == 0 else f"expected {low:g} to {high:g}{unit}"
+
+
+def _single_keys(numbers: Sequence[Entry], ranges: PlausibleRanges, judge: Judge) -> None:
+    for entry in numbers:
+        if (of := ranges.keys.get(entry.key)) is not None:
+            judge(entry.key, abs(entry.value), f"{entry.value:g} {of.unit}".rstrip(), dotted(entry.place), of)
+
+
+def _modes(eom: Any, modes: Any, judge: Judge) -> None:
+    f = modes.frequencies_Hz
+    said = f"natural frequencies {f[0]:.3g} to {f[-1]:.3g} Hz"
+    judge("slowest_Hz", f[0], said)
+    judge("mode_Hz", f[0], said)
+    judge("mode_Hz", f[-1], said)
+    judge("spread", f[-1] / f[0], f"{said}, {f[-1] / f[0]:.3g} times apart")
+    rises = modes.shapes[2] ** 2 * np.diag(eom.M)[2]
+    vertical = f[rises > 0.2]
+    if len(vertical):
+        sag = G / (2 * np.pi * vertical[0]) ** 2
+        judge("sag_m", sag, f"a static sag of {sag:.2g} m")
+    damping = np.diag(modes.shapes.T @ eom.C @ modes.shapes) / (4 * np.pi * f)
+    for zeta in (np.min(damping), np.max(damping)):
+        judge("damping", zeta, f"a damping ratio of {zeta:.2g}")
+
+
+def _shape(rig: Rig, body: Any, centre: np.ndarray, radius: float, judge: Judge) -> None:
+    slab = body.mass / (np.pi * radius ** 2)
+    judge("slab_kg_per_m2", slab, f"{slab:.3g} kg on each m^2 between the mounts")
+    for J in np.linalg.eigvalsh(body.inertia):
+        r = np.sqrt(max(J, 0.0) / body.mass)
+        judge("gyration", r / radius, f"a radius of gyration of {r:.3g} m, {r / radius:.2g} times the mounts' "
+                                           f"distance from their centre of {radius:.3g} m")
+    away = float(np.linalg.norm(body.centre_of_mass - centre))
+    judge("mounts_height", away / radius, f"a centre of mass {away:.3g} m from the mounts' centre, {away / radius:.2g}"
+                                               " times their radius")
+    near = np.median([np.linalg.norm(mount.position - centre) for mount in body.mounts])
+    for name, place in rig.points().items():
+        distance = float(np.linalg.norm(place.position - centre)) / max(near, 1e-12)
+        judge("outlier", distance, f"{name} {distance:.2g} times as far from the centre as the mounts")
+
+
+def _drives(rig: Rig, eom: Any, radius: float, judge: Judge) -> None:
+    mass = float(eom.M[0, 0])
+    force = np.abs(eom.T[:3]).sum(axis=1) * rig.drive_limit_V
+    stiffness = np.diag(eom.K)[:3]
+    driven = np.flatnonzero(force > 1e-9 * np.max(force, initial=0.0))
+    if not len(driven):
+        return
+    k = driven[int(np.argmax(force[driven] / mass))]
+    a, travel = force[k] / mass, force[k] / stiffness[k]
+    together = f"all drives together, {force[k]:.3g} N at {rig.drive_limit_V:g} V,"
+    judge("acceleration", a, f"{together} accelerate the payload by {a:.2g} m/s^2")
+    judge("travel_m", travel, f"{together} move it by {travel:.2g} m")
+    if radius > 0:
+        judge("travel_share", travel / radius, f"{together} move it by {travel:.2g} m, {travel / radius:.2g} times "
+                                                    "the mounts' radius")
+
+
+def _alike(numbers: Sequence[Entry], body: Any, judge: Judge) -> None:
+    for kind in ("stiffness", "damping"):
+        values = np.array([np.diag(getattr(mount, kind)) for mount in body.mounts])
+        for axis, column in zip("xyz", values.T, strict=True):
+            _unequal(column, [f"{kind} of {mount.name} along {axis}" for mount in body.mounts], judge)
+    for key in ALIKE:
+        of_key = [entry for entry in numbers if entry.key == key]
+        _unequal(np.array([entry.value for entry in of_key]), [dotted(entry.place) for entry in of_key], judge)
+
+
+def _unequal(values: np.ndarray, names: list[str], judge: Judge) -> None:
+    """Entries against the median of those that are not zero, where there are three of them."""
+    there = np.abs(values) > 1e-9 * np.max(np.abs(values), initial=0.0)
+    if np.count_nonzero(there) < 3:
+        return
+    middle = float(np.median(np.abs(values[there])))
+    for value, name in zip(values[there], (n for n, t in zip(names, there, strict=True) if t), strict=True):
+        share = abs(value) / middle
+        judge("unequal", share, f"{name} of {value:.3g} is {share:.2g} times that of the others")
+
+
+def _clock(rig: Rig, f: float, judge: Judge) -> None:
+    judge("samples_per_cycle", rig.sample_rate_Hz / f, f"{rig.sample_rate_Hz / f:.2g} samples in a cycle of the "
+                                                            f"fastest mode, {f:.3g} Hz")
+    judge("delay_cycles", rig.loop_delay_s * f, f"a loop delay of {rig.loop_delay_s:g} s, {rig.loop_delay_s * f:.2g} "
+          f"cycles of the fastest mode and {rig.loop_delay_s * rig.sample_rate_Hz:.3g} samples")
+
+
+def _hearing(content: dict[str, Any], judge: Judge) -> None:
+    """Sensors of velocity against converter, noise and floor."""
+    def of(section: str, key: str) -> float | None:
+        part = content.get(section)
+        value = part.get(key) if isinstance(part, dict) else None
+        return float(value) if isinstance(value, (int, float)) and value > 0 else None
+    full = of("acquisition", "adc_range_V")
+    bits = of("acquisition", "adc_bits") or 16
+    noise = of("ambient", "sensor_noise_rms_V") or 0.0
+    floor = of("ambient", "floor_velocity_rms_m_per_s")
+    for name, gain in _velocity_sensors(content):
+        if full is not None:
+            judge("full_scale_m_per_s", full / gain, f"a full scale of {full / gain:.2g} m/s of {name}")
+        if full is not None and floor is not None:
+            share = floor * gain / full
+            judge("floor_share", share, f"the floor alone, {floor:.2g} m/s, fills {share:.2g} of the converter at "
+                                             f"{name}")
+            own = max(noise, full * 2.0 ** (1 - bits) / np.sqrt(12)) / gain
+            judge("deaf", own / floor, f"noise of {name}, {own:.2g} m/s, {own / floor:.3g} times the floor's motion")
+
+
+def _velocity_sensors(content: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Name and volts per m/s of every geophone: one section of lists, or one table each."""
+    together = content.get("geophones")
+    parts: list[Any] = content.get("geophone") or []
+    if isinstance(together, dict):
+        gain = together.get("preamplifier_gain", 1.0)
+        for name, value in zip(together["names"], together["sensitivity_Vs_per_m"], strict=True):
+            yield name, value * gain
+    for part in parts:
+        yield part["name"], part["sensitivity_Vs_per_m"] * part.get("preamplifier_gain", 1.0)

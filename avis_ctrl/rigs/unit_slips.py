@@ -1,0 +1,177 @@
+"""The numbers of a rig file with the units of their keys, and what a slip of the unit makes of them."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+G = 9.80665
+INCH = 0.0254
+KILO = 1e3
+# Unit at the end of a key, with what people write instead: (factor to the key's unit, the unit that was meant). The
+# first ones are the likeliest. A key without a unit is a ratio.
+UNITS: dict[str, tuple[tuple[float, str], ...]] = {
+    "_kgm2": ((1e-4, "kg cm^2"), (1e-6, "kg mm^2"), (1e-9, "g mm^2"), (1e-7, "g cm^2"), (KILO, "t m^2"),
+              (1e-3, "g m^2")),
+    "_kg": ((1e-3, "g"), (KILO, "t"), (1e-6, "mg")),
+    "_Nm_per_rad": ((KILO, "kN m/rad"), (1e-3, "N mm/rad"), (180 / np.pi, "N m/deg")),
+    "_Nms_per_rad": ((KILO, "kN m s/rad"), (1e-3, "N mm s/rad"), (180 / np.pi, "N m s/deg")),
+    "_Ns_per_m": ((KILO, "N s/mm"), (1e-3, "mN s/m"), (1e6, "N s/um")),
+    "_N_per_m": ((KILO, "N/mm"), (1e-3, "mN/m"), (1e6, "N/um"), (175.127, "lbf/in")),
+    "_N_per_V": ((KILO, "kN/V"), (1e-3, "mN/V"), (1e-6, "uN/V")),
+    "_rms_m_per_s": ((1e-3, "mm/s"), (1e-6, "um/s"), (1e-9, "nm/s"), (INCH, "in/s")),
+    "_m_per_s2_rtHz": ((1e-6, "um/s^2"), (1e-6 * G, "ug"), (1e-3, "mm/s^2"), (1e-9 * G, "ng"), (1e-9, "nm/s^2")),
+    "_m_rtHz": ((1e-9, "nm"), (1e-12, "pm"), (1e-6, "um"), (1e-3, "mm")),
+    "_Vs2_per_m": ((1e-3, "mV s^2/m"), (1e-3 / G, "mV/g"), (KILO, "V per mm/s^2"), (1 / G, "V/g")),
+    "_Vs_per_m": ((KILO, "V per mm/s"), (1e-3, "mV s/m"), (1 / INCH, "V per in/s")),
+    "_V_per_m": ((KILO, "V/mm"), (1e-3, "mV/m"), (1e6, "V/um")),
+    "_V": ((1e-3, "mV"), (1e-6, "uV"), (KILO, "kV")),
+    "_Hz": ((KILO, "kHz"), (1 / (2 * np.pi), "rad/s"), (1e-3, "mHz"), (1e6, "MHz")),
+    "_s": ((1e-3, "ms"), (1e-6, "us"), (1e-9, "ns")),
+    "_m": ((1e-3, "mm"), (1e-2, "cm"), (INCH, "in"), (1e-6, "um")),
+}
+RATIOS = {"suspension_damping": ((1e-2, "per cent"),), "compensated_damping": ((1e-2, "per cent"),),
+          "preamplifier_gain": ((1e-3, "a thousand times too large"), (KILO, "a thousand times too small"))}
+# Sections that hold no property of the table.
+APART = ("tolerances",)
+
+Place = tuple[str | int, ...]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One number of a file: where it stands, its key, its value."""
+
+    place: Place
+    key: str
+    value: float
+
+
+@dataclass(frozen=True)
+class Slip:
+    """Numbers that were all given in another unit than their key's.
+
+    field, value : as a message names them. factor : to the key's unit. unit : that was likely meant. rank : position
+    among the slips of that key, the likeliest first. scope : 0 one number, 1 a list, 2 a key, 3 a unit in a section,
+    4 a unit in the whole file.
+    """
+
+    field: str
+    value: Any
+    entries: tuple[Entry, ...]
+    factor: float
+    unit: str
+    rank: int
+    scope: int
+
+    def mended(self, content: dict[str, Any]) -> dict[str, Any]:
+        """A copy of the content without the slip."""
+        made = copy.deepcopy(content)
+        for entry in self.entries:
+            *parents, last = entry.place
+            target: Any = made
+            for part in parents:
+                target = target[part]
+            target[last] = entry.value * self.factor
+        return made
+
+    @property
+    def one_of_list(self) -> bool:
+        return self.scope == 0 and isinstance(self.entries[0].place[-1], int)
+
+    @property
+    def words(self) -> str:
+        """given in g; a thousand times too large."""
+        return self.unit if self.unit.startswith("a ") else f"given in {self.unit}"
+
+    @property
+    def meant(self) -> Any:
+        """The value in the key's unit, to five digits."""
+        if isinstance(self.value, list):
+            return [float(f"{one * self.factor:.5g}") for one in self.value]
+        return float(f"{self.value * self.factor:.5g}")
+
+
+def entries(content: Any, place: Place = (), key: str = "") -> Iterator[Entry]:
+    """Every number with a unit, in the order of the file."""
+    if isinstance(content, dict):
+        for name, part in content.items():
+            if name not in APART:
+                yield from entries(part, (*place, name), str(name))
+    elif isinstance(content, list):
+        for k, part in enumerate(content):
+            yield from entries(part, (*place, k), key)
+    elif isinstance(content, (int, float)) and not isinstance(content, bool) and unit_of(key):
+        yield Entry(place, key, float(content))
+
+
+@cache
+def unit_of(key: str) -> str:
+    """End of the key that states the unit, or the key of a ratio; empty for none."""
+    if key in RATIOS:
+        return key
+    return next((ending for ending in UNITS if key.endswith(ending)), "")
+
+
+def slips(content: dict[str, Any]) -> Iterator[Slip]:
+    """Every single slip that a person may have made: of one number, a list, a key, a unit in a section or the file.
+
+    Single numbers of lists come last.
+    """
+    found = [entry for entry in entries(content) if entry.value]
+    groups: dict[tuple[Any, ...], list[Entry]] = {}
+    for entry in found:
+        numbered = [k for k, part in enumerate(entry.place) if isinstance(part, int)]
+        plain = tuple(part for part in entry.place if not isinstance(part, int))
+        of_list = entry.place[:-1] if numbered and numbered[-1] == len(entry.place) - 1 else entry.place
+        for scope, name in enumerate((entry.place, of_list, plain, (plain[0], unit_of(entry.key)),
+                                      (unit_of(entry.key),))):
+            groups.setdefault((scope, name), []).append(entry)
+    seen: set[tuple[Place, ...]] = set()
+    listed = {entry.place for entry in found if isinstance(entry.place[-1], int)}
+    for (scope, name), members in sorted(groups.items(), key=lambda item: (item[0][1] in listed, item[0][0])):
+        places = tuple(entry.place for entry in members)
+        if places in seen:
+            continue
+        seen.add(places)
+        ending = unit_of(members[0].key)
+        for rank, (factor, unit) in enumerate(RATIOS.get(ending) or UNITS[ending]):
+            field, value = _named(scope, name, members)
+            yield Slip(field, value, tuple(members), factor, unit, rank, scope)
+
+
+def _named(scope: int, name: tuple[Any, ...], members: list[Entry]) -> tuple[str, Any]:
+    values = [float(f"{entry.value:.6g}") for entry in members]
+    if len(set(values)) == 1:
+        values = values[:1]
+    if scope == 0:
+        return dotted(members[0].place), values[0]
+    if scope in (1, 2):
+        shown = values if scope == 1 or len(values) <= 6 else values[:3]
+        return dotted(name), shown if len(shown) > 1 else shown[0]
+    keys = list(dict.fromkeys(dotted(tuple(part for part in entry.place if not isinstance(part, int)))
+                              for entry in members))
+    shown_keys = ", ".join(keys[:3]) + (", ..." if len(keys) > 3 else "")
+    return shown_keys, values[:3] if len(values) > 1 else values[0]
+
+
+def dotted(place: Place) -> str:
+    """("isolator", 1, "position_m", 0) as isolator[2].position_m[1], counted from 1."""
+    return "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
+
+
+def apart(slip: Slip, mended: dict[str, Any]) -> float:
+    """Mean squared decades of the slip's numbers, mended, from the median of the others of their unit and section."""
+    there = {entry.place for entry in slip.entries}
+    first = slip.entries[0]
+    others = [abs(entry.value) for entry in entries(mended) if entry.place not in there and entry.value
+              and entry.place[0] == first.place[0] and unit_of(entry.key) == unit_of(first.key)]
+    if not others:
+        return 0.0
+    middle = np.median(others)
+    return float(np.mean([np.log10(abs(entry.value * slip.factor) / middle) ** 2 for entry in slip.entries]))
