@@ -161,12 +161,10 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
             data = group.create_dataset("y", (h.samples, len(h.y_names)), np.float64)
             data.attrs.update({"names": np.array(h.y_names, dtype=object).astype("S"), "unit": h.y_unit})
             group.attrs["sample_rate_Hz"] = h.sample_rate_Hz
-            predictor, done = Predictor(model, large_motion=True), 0
+            predictor = Predictor(model, large_motion=True)
             for start, stop in ranges(h.samples, PIECE):
-                u, floor = model_inputs(model, record.load(start, stop))
-                y = predictor.read(u[done - start:], None if floor is None else floor[done - start:])
-                data[done:stop] = y if limits is None else np.clip(y, *limits)
-                done = stop
+                y = predictor.read(*model_inputs(model, record.load(start, stop)))
+                data[start:stop] = y if limits is None else np.clip(y, *limits)
 
 
 def _converter_limits(rig: Rig) -> tuple[float, float] | None:

@@ -392,3 +392,18 @@ def test_wrong_input_is_named():
         realise_delta([[1j]], 0.0, [C()])
     with pytest.raises(ComputationError, match="rank one"):
         realise_delta(np.eye(2), 1.0, [F(2)])
+
+
+@pytest.mark.parametrize("band_Hz", [(0.2, 2.0), (2.0, 4.9), (0.9, 1.1)])
+def test_a_band_of_a_sampled_system_is_in_its_own_frequencies(band_Hz):
+    """Two resonances, 1 and 3 Hz at 10 Hz: the frequency axis is bent by 30 % at 3 Hz. Against a dense grid."""
+    modes = [tf([0.1 * w], [1.0, 0.02 * w, w * w], [f"u{k}"], [f"y{k}"])
+             for k, w in enumerate(2 * np.pi * np.array([1.0, 3.0]))]
+    N = discretise(append(*modes), 0.1, "tustin").scaled(left=np.array([[1.0, 0.5], [0.3, 2.0]]))
+    low, high = (2 * np.pi * f for f in band_Hz)
+    found = mu_peak(N, [F(2)], band=(low, high))
+    omega = np.linspace(low, high, 20001)
+    sigma = np.linalg.norm(N.frequency_response(omega), ord=2, axis=(1, 2))
+    assert found.guaranteed and sigma.max() <= found.upper <= 1.01 * sigma.max()
+    assert found.omega == pytest.approx(omega[np.argmax(sigma)], rel=2e-3)
+    assert np.all((found.frequencies >= low * (1 - 1e-9)) & (found.frequencies <= high * (1 + 1e-9)))

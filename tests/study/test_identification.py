@@ -73,6 +73,19 @@ def test_files_and_predictions(rehearsal, found, tmp_path):
     assert np.all(left < 0.02)
 
 
+def test_a_long_record_is_predicted_piece_by_piece_as_in_one(rehearsal, found, tmp_path, monkeypatch):
+    """Against an independent march over all samples at once: each piece goes on where the last one stopped."""
+    write_identification(found, tmp_path)
+    one = rehearsal.campaign.only(("02",))
+    write_predictions(tmp_path, one, tmp_path / "whole.h5")
+    monkeypatch.setattr("avis_ctrl.study.identification_output.PIECE", 3001)
+    write_predictions(tmp_path, one, tmp_path / "pieces.h5")
+    with h5py.File(tmp_path / "whole.h5") as whole, h5py.File(tmp_path / "pieces.h5") as pieces:
+        y, again = whole["records/02/y"][:], pieces["records/02/y"][:]
+    assert len(y) == 20000 and np.ptp(y[15000:]) > 0.1
+    assert np.allclose(again, y, rtol=0, atol=1e-9 * np.ptp(y))
+
+
 def test_frequency_responses_serve_as_well_as_records(rehearsal):
     """The campaign reduced to frequency responses: a third of the lines is held out."""
     rig = load_rig("avis")

@@ -64,6 +64,13 @@ def test_where_the_declared_uncertainty_is_larger_it_is_the_weight():
     assert np.allclose(weight.magnitude(OMEGA), declared.magnitude(OMEGA), rtol=1e-6)
 
 
+def test_the_fit_reaches_a_decade_beyond_the_data_or_a_declared_crossover():
+    data = np.full(OMEGA.size, 1e-3)
+    for crossover_Hz, high_Hz in ((2.0, 600.0), (300.0, 3000.0)):
+        grid = IdentifiedSpread(OMEGA, data, NeglectedDynamics(0.1, crossover_Hz, 4.0)).grid
+        assert grid[[0, -1]] / (2 * np.pi) == pytest.approx([0.05, high_Hz])
+
+
 @pytest.mark.parametrize(("changes", "field"), [
     ({"data": np.zeros(OMEGA.size)}, "data"), ({"data": np.full(OMEGA.size, np.nan)}, "data"),
     ({"data": np.ones(3)}, "data"), ({"omega": OMEGA[::-1]}, "omega"), ({"factor": 0.0}, "factor"),
