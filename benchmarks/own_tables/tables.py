@@ -99,7 +99,7 @@ def four_vertical() -> Table:
         for i, (x, y) in enumerate(corners, 1)
     )
     J = np.diag([2.47, 4.33, 6.67])
-    return Table("four_vertical", 80.0, J, (0.0, 0.0, 0.0), mounts, drives, sensors, 1000.0, 14, 10.0, 0.001, 5e-6)
+    return Table("four_vertical", 80.0, J, (0.0, 0.0, 0.0), mounts, drives, sensors, 1000.0, 14, 10.0, 0.001, 2e-6)
 
 
 def twelve_sensors() -> Table:
