@@ -309,6 +309,8 @@ def describe(table: Table) -> str:
         lines.append(f"{group} = [")
         for item in getattr(table, group):
             entries = {k: v for k, v in vars(item).items() if v is not None and k != "frame"}
+            if entries.get("compensated_Hz") is None:
+                entries.pop("compensated_damping", None)
             kind = f'kind = "{type(item).__name__}", ' if group == "sensors" else ""
             lines.append("  {" + kind + ", ".join(f"{k} = {_toml(v)}" for k, v in entries.items()) + "},")
         lines.append("]")
