@@ -99,7 +99,7 @@ def four_vertical() -> Table:
         for i, (x, y) in enumerate(corners, 1)
     )
     J = np.diag([2.47, 4.33, 6.67])
-    return Table("four_vertical", 80.0, J, (0.0, 0.0, 0.0), mounts, drives, sensors, 1000.0, 14, 10.0, 0.001, 5e-6)
+    return Table("four_vertical", 80.0, J, (0.0, 0.0, 0.0), mounts, drives, sensors, 1000.0, 14, 10.0, 0.001, 2e-6)
 
 
 def twelve_sensors() -> Table:
@@ -309,6 +309,8 @@ def describe(table: Table) -> str:
         lines.append(f"{group} = [")
         for item in getattr(table, group):
             entries = {k: v for k, v in vars(item).items() if v is not None and k != "frame"}
+            if entries.get("compensated_Hz") is None:
+                entries.pop("compensated_damping", None)
             kind = f'kind = "{type(item).__name__}", ' if group == "sensors" else ""
             lines.append("  {" + kind + ", ".join(f"{k} = {_toml(v)}" for k, v in entries.items()) + "},")
         lines.append("]")
