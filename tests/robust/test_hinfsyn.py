@@ -304,6 +304,25 @@ class TestUse:
         assert result.fastest_pole == pytest.approx(np.max(np.abs(result.K.poles())))
         assert "too fast" in result.notes[-1]
 
+    @pytest.mark.parametrize("hidden", ["unreached", "unseen"])
+    def test_hidden_stable_states_do_not_matter(self, rng, hidden):
+        """States that no input reaches, or no output sees, with the plant's own lightly damped poles: the brackets
+        of the plant with and without them are of one and the same optimum."""
+        plain = random_plant(rng, 4, 3, 3, 1, 1)
+        A = la.block_diag([[0, 1], [-1, -2e-5]], [[0, 30], [-30, -2e-3]])
+        plain = StateSpace(A, plain.B, plain.C, plain.D)
+        links = rng.standard_normal((4, 4))
+        both = np.block([[A, links], [0 * A, A]]) if hidden == "unreached" else np.block([[A, 0 * A], [links, A]])
+        zeros = np.zeros((4, 4))
+        B = np.vstack([plain.B, zeros if hidden == "unreached" else rng.standard_normal((4, 4))])
+        C = np.hstack([plain.C, zeros if hidden == "unseen" else rng.standard_normal((4, 4))])
+        T = la.qr(rng.standard_normal((8, 8)))[0]
+        P = StateSpace(both, B, C, plain.D).similar(T)
+        found, expected = hinfsyn(P, 1, 1), hinfsyn(plain, 1, 1)
+        np.testing.assert_allclose(found.gamma_optimal_bounds, expected.gamma_optimal_bounds, rtol=2e-3)
+        assert found.status is expected.status is Status.OPTIMAL and found.K.nstates <= 4
+        check(P, 1, 1, found)
+
     def test_pole_that_comes_from_the_formulas_is_left_out(self):
         """The central controller's fourth pole grows as 1 / backoff (437 rad/s at 1 %, 3900 at 0.1 %; the plant's
         fastest is 20), and the loop of 1 % does not need it: the others are below 40."""
