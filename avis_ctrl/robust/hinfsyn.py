@@ -133,7 +133,8 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
 def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
     """The central controller at a given gamma, without a search: for iterations that know what they want.
 
-    ComputationError where that gamma cannot be reached, with the condition that fails.
+    ComputationError where that gamma cannot be reached, with the condition that fails, or where the closed loop is
+    measured not to keep it.
     """
     P = as_plant(P, nmeas, ncon)
     if not (np.isfinite(gamma) and gamma > 0):
@@ -148,6 +149,11 @@ def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
         raise ComputationError(f"no controller reaches gamma = {gamma:.6g}", cause=test.reason,
                                measured=f"rho(XY)/gamma^2 = {test.coupling:.4g}", next_step="ask for a larger gamma")
     result = problem.measured(central_controller(form, test))
+    if result.gamma > gamma * (1 + LOOP_ACCURACY):
+        raise ComputationError(f"the controller for gamma = {gamma:.6g} was not confirmed",
+                               measured=f"closed-loop norm {result.gamma:.6g}",
+                               cause="gamma too near the optimum for double precision, or a badly scaled plant",
+                               next_step="ask for a larger gamma")
     return replace(result, gamma_optimal_bounds=(0.0, gamma), status=Status.SUBOPTIMAL, notes=notes)
 
 
