@@ -17,6 +17,8 @@ from avis_ctrl.lti.statespace import StateSpace
 
 # Angle from the imaginary axis within which an eigenvalue of the Hamiltonian is looked at as a crossing.
 NEAR_AXIS = 3e-2
+# Where a peak that no crossing contradicts is looked at once more, as multiples of its frequency.
+NEIGHBOURHOOD = np.geomspace(0.5, 2.0, 101)
 
 
 class PeakGain(NamedTuple):
@@ -54,7 +56,12 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
     for _ in range(60):
         crossings = _level_crossings(balanced, (1.0 + tolerance) * level)
         if crossings.size == 0:
-            return PeakGain(level, omega)
+            # Over many decades of poles round-off can hide the crossings of a flat peak: look around it.
+            omega_near, near = _best(system, omega * NEIGHBOURHOOD) if 0 < omega < np.inf else (omega, level)
+            if near <= (1.0 + tolerance) * level:
+                return PeakGain(near, omega_near) if near > level else PeakGain(level, omega)
+            omega, level = omega_near, near
+            continue
         edges = np.unique(np.concatenate([[0.0], crossings]))
         points = np.concatenate([edges, (edges[:-1] + edges[1:]) / 2, np.sqrt(edges[:-1] * edges[1:])])
         new_omega, new_level = _best(system, points)

@@ -192,7 +192,7 @@ class _Search:
     def prove(self, tolerance: float) -> None:
         """Look for a provable failure where the last one was in doubt, by halving; few steps, each costs a test."""
         unproved = self.failed
-        for _ in range(12):
+        for _ in range(6):
             if unproved - self.lower <= tolerance * unproved:
                 return
             middle = np.sqrt(self.lower * unproved) if self.lower > 0.1 * unproved else unproved / 3

@@ -2,10 +2,10 @@
 
 The optimum is bracketed by the two-Riccati test; the controller is taken at most `backoff` above it. As gamma falls
 to its optimum, I - X Y / gamma^2 or an inverse of X or Y becomes singular, and poles of the central controller go to
-infinity as 1 / backoff: in the limit they are a gain (Safonov, Limebeer and Chiang, Int. J. Control 50, 1989). Poles
-far beyond the plant's are therefore replaced by their gain, in a controller nearer to the optimum where that is nearly
-exact, if the loop is then measured to keep the target of the back-off. Every figure reported is measured on the closed
-loop of the plant as it was given, before any scaling or regularisation.
+infinity as 1 / backoff: in the limit they are a gain (Safonov, Limebeer and Chiang, Int. J. Control 50, 1989). Where
+asked for, poles far beyond the plant's are therefore replaced by their gain, in a controller nearer to the optimum
+where that is nearly exact, if the loop is then measured to keep the target of the back-off. Every figure reported is
+measured on the closed loop of the plant as it was given, before any scaling or regularisation.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Synthesis:
 
 def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: float = 1e-3,
             method: Literal["riccati", "lmi"] = "riccati", sample_rate_Hz: float | None = None,
-            gamma_hint: float | None = None) -> Synthesis:
+            gamma_hint: float | None = None, far_poles: Literal["kept", "gain"] = "kept") -> Synthesis:
     """H-infinity optimal controller, `backoff` above the optimum.
 
     Parameters
@@ -100,6 +100,8 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
         on the optimum; the controller then comes from the Riccati formulas at the gamma which the LMI found.
     sample_rate_Hz : the rate at which the controller is to run; its fastest pole is compared with half of it.
     gamma_hint : a gamma expected to be near the optimum; shortens the search.
+    far_poles : "kept", or "gain": controller poles far beyond the plant's are replaced by their gain where the measured
+        loop keeps the target of the back-off (said in `notes`). D-K iteration wants the central controller itself.
 
     Raises
     ------
@@ -107,7 +109,7 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     ComputationError : a mode that cannot be stabilised (named), or no gamma that can be reached.
     """
     P = as_plant(P, nmeas, ncon)
-    _check_options(backoff, tolerance, method, gamma_hint)
+    _check_options(backoff, tolerance, method, gamma_hint, far_poles)
     problem = _Problem.of(P, nmeas, ncon)
     form, bracket, notes = problem.solve(tolerance, gamma_hint)
     status = Status.REGULARISED if notes else Status.OPTIMAL
@@ -117,7 +119,8 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
 
         optimum = lmi_gamma(P, nmeas, ncon)
         bounds = optimum.lower, optimum.upper
-    result, raised = problem.realise(form, bounds[1] if not notes else bracket.upper.gamma, backoff)
+    result, raised = problem.realise(form, bounds[1] if not notes else bracket.upper.gamma, backoff,
+                                     far_poles == "gain")
     if notes and method != "lmi":
         # Extra channels only add to the problem: what fails with them may be possible without.
         bounds = pointwise_bound(problem.plant).gamma, result.gamma
@@ -133,7 +136,8 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
 def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
     """The central controller at a given gamma, without a search: for iterations that know what they want.
 
-    ComputationError where that gamma cannot be reached, with the condition that fails.
+    ComputationError where that gamma cannot be reached, with the condition that fails, or where the closed loop is
+    measured not to keep it.
     """
     P = as_plant(P, nmeas, ncon)
     if not (np.isfinite(gamma) and gamma > 0):
@@ -148,6 +152,11 @@ def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
         raise ComputationError(f"no controller reaches gamma = {gamma:.6g}", cause=test.reason,
                                measured=f"rho(XY)/gamma^2 = {test.coupling:.4g}", next_step="ask for a larger gamma")
     result = problem.measured(central_controller(form, test))
+    if result.gamma > gamma * (1 + LOOP_ACCURACY):
+        raise ComputationError(f"the controller for gamma = {gamma:.6g} was not confirmed",
+                               measured=f"closed-loop norm {result.gamma:.6g}",
+                               cause="gamma too near the optimum for double precision, or a badly scaled plant",
+                               next_step="ask for a larger gamma")
     return replace(result, gamma_optimal_bounds=(0.0, gamma), status=Status.SUBOPTIMAL, notes=notes)
 
 
@@ -221,7 +230,7 @@ class _Problem:
                 failure = error
         raise failure
 
-    def realise(self, form: NormalForm, gamma: float, backoff: float) -> tuple[Synthesis, str]:
+    def realise(self, form: NormalForm, gamma: float, backoff: float, slow: bool) -> tuple[Synthesis, str]:
         """The first controller above the optimum whose measured closed loop keeps its promise."""
         best: Synthesis | None = None
         for k in range(12):
@@ -238,7 +247,7 @@ class _Problem:
                 best = result
             if result.gamma <= target * (1 + 1e-5):
                 said = f"the back-off was raised from {100 * backoff:.3g} % to {100 * margin:.3g} %" if k else ""
-                return self._slower(form, result, gamma, target), said
+                return self._slower(form, result, gamma, target) if slow else result, said
         if best is None or not np.isfinite(best.gamma):
             raise ComputationError("no controller's closed loop was measured to be stable",
                                    measured=f"gamma from {gamma:.4g} upwards tried",
@@ -297,13 +306,15 @@ def _consistent(bounds: tuple[float, float], reached: float, tolerance: float, s
     return (lower, upper), status, notes
 
 
-def _check_options(backoff: float, tolerance: float, method: str, gamma_hint: float | None) -> None:
+def _check_options(backoff: float, tolerance: float, method: str, gamma_hint: float | None, far_poles: str) -> None:
     if not (np.isfinite(backoff) and backoff >= 0):
         raise InputError("expected a number of at least 0, such as 0.01", field="backoff", value=backoff)
     if not 1e-8 <= tolerance < 1:
         raise InputError("expected a relative width from 1e-8 to 1", field="tolerance", value=tolerance)
     if method not in ("riccati", "lmi"):
         raise InputError("expected 'riccati' or 'lmi'", field="method", value=method)
+    if far_poles not in ("kept", "gain"):
+        raise InputError("expected 'kept' or 'gain'", field="far_poles", value=far_poles)
     if gamma_hint is not None and not (np.isfinite(gamma_hint) and gamma_hint > 0):
         raise InputError("expected a positive number or None", field="gamma_hint", value=gamma_hint)
 

@@ -29,6 +29,8 @@ from avis_ctrl.lti.norms import symplectic_scale
 
 AXIS_TOLERANCE = 1e-10
 LAGRANGIAN_TOLERANCE = 1e-6
+# A negative eigenvalue of X below this share of the largest is not looked at further.
+CLEARLY = 1e-10
 # Round-off of the residual in units of what each of its terms rounds to.
 ROUND_OFF = 8 * np.finfo(float).eps
 INACCURATE = "the Hamiltonian is too badly conditioned for its stable subspace"
@@ -78,9 +80,11 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolutio
     if np.min(np.abs(np.diag(lu))) < 1e-15:
         return RiccatiSolution(None, False, "the Riccati solution is infinite")
     X = la.lu_solve((lu, piv), X2.T).T
-    X = (X + X.T) / 2 / np.outer(scale, scale)
-    # Round-off in the subspace shows in the asymmetry: a negative value of that size proves nothing.
-    if lowest >= -max(1e-13 * n, 10 * asymmetry):
+    X = (X + X.T) / 2
+    values = la.eigvalsh(X)
+    X = X / np.outer(scale, scale)
+    # X1' X2 is small where X1 is (X near infinity), and X where its states' units are large: both must be clear.
+    if lowest >= -1e-13 * n and values[0] >= -CLEARLY * values[-1]:
         return RiccatiSolution(X, True)
     indefinite = _negative_beyond_error(H, U[:, :n])
     return RiccatiSolution(X, not indefinite, doubtful=not indefinite)

@@ -233,7 +233,7 @@ class TestRefusals:
             hinfsyn(random_plant(rng, 2, 2, 2, 1, 1), nmeas, ncon)
 
     @pytest.mark.parametrize("options", [{"backoff": -1}, {"tolerance": 0}, {"method": "magic"},
-                                         {"gamma_hint": np.nan}, {"sample_rate_Hz": -5.0}])
+                                         {"gamma_hint": np.nan}, {"far_poles": "slow"}, {"sample_rate_Hz": -5.0}])
     def test_wrong_options(self, rng, options):
         with pytest.raises(InputError, match=next(iter(options))):
             hinfsyn(random_plant(rng, 2, 2, 2, 1, 1), 1, 1, **options)
@@ -304,16 +304,36 @@ class TestUse:
         assert result.fastest_pole == pytest.approx(np.max(np.abs(result.K.poles())))
         assert "too fast" in result.notes[-1]
 
+    @pytest.mark.parametrize("hidden", ["unreached", "unseen"])
+    def test_hidden_stable_states_do_not_matter(self, rng, hidden):
+        """States that no input reaches, or no output sees, with the plant's own lightly damped poles: the brackets
+        of the plant with and without them are of one and the same optimum."""
+        plain = random_plant(rng, 4, 3, 3, 1, 1)
+        A = la.block_diag([[0, 1], [-1, -2e-5]], [[0, 30], [-30, -2e-3]])
+        plain = StateSpace(A, plain.B, plain.C, plain.D)
+        links = rng.standard_normal((4, 4))
+        both = np.block([[A, links], [0 * A, A]]) if hidden == "unreached" else np.block([[A, 0 * A], [links, A]])
+        zeros = np.zeros((4, 4))
+        B = np.vstack([plain.B, zeros if hidden == "unreached" else rng.standard_normal((4, 4))])
+        C = np.hstack([plain.C, zeros if hidden == "unseen" else rng.standard_normal((4, 4))])
+        T = la.qr(rng.standard_normal((8, 8)))[0]
+        P = StateSpace(both, B, C, plain.D).similar(T)
+        found, expected = hinfsyn(P, 1, 1), hinfsyn(plain, 1, 1)
+        np.testing.assert_allclose(found.gamma_optimal_bounds, expected.gamma_optimal_bounds, rtol=2e-3)
+        assert found.status is expected.status is Status.OPTIMAL and found.K.nstates <= 4
+        check(P, 1, 1, found)
+
     def test_pole_that_comes_from_the_formulas_is_left_out(self):
         """The central controller's fourth pole grows as 1 / backoff (437 rad/s at 1 %, 3900 at 0.1 %; the plant's
         fastest is 20), and the loop of 1 % does not need it: the others are below 40."""
         P = mixed_sensitivity(([1 / 1.5, 10.0], [1, 1e-3]))
-        result = hinfsyn(P, 1, 1)
+        result = hinfsyn(P, 1, 1, far_poles="gain")
+        assert hinfsyn(P, 1, 1).fastest_pole > 400
         assert result.K.nstates == 3 and result.fastest_pole < 40 and "replaced by their gain" in result.notes[0]
         check(P, 1, 1, result)
         assert result.fastest_pole == pytest.approx(np.max(np.abs(result.K.poles())), rel=1e-6)
         # A controller whose own poles are no faster than that of the plant is the central one.
-        slow = hinfsyn(P, 1, 1, backoff=0.2)
+        slow = hinfsyn(P, 1, 1, backoff=0.2, far_poles="gain")
         assert slow.K.nstates == 4 and not slow.notes
         check(P, 1, 1, slow, 0.2)
 

@@ -8,7 +8,7 @@ import scipy.linalg as la
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from avis_ctrl.robust.riccati import ON_AXIS, solve_riccati
+from avis_ctrl.robust.riccati import ON_AXIS, refined, solve_riccati
 
 
 def residual(A, R, Q, X):
@@ -41,6 +41,34 @@ def test_negative_solution_is_seen():
     found = solve_riccati(np.array([[1.0]]), np.array([[0.5]]), np.array([[1.0]]))
     assert found.X is not None and not found.semidefinite
     assert found.X[0, 0] == pytest.approx(-(2 + np.sqrt(2)))
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-6, -1e-4])
+def test_refined_solution_holds_the_exact_one_between_its_bounds(error):
+    """The scalar equation above, from a start that is off by a relative error."""
+    a, gamma = -2.0, 1.5
+    exact = 1 / (np.sqrt(a * a + 1 - 1 / gamma ** 2) - a)
+    X, E = refined(np.array([[a]]), np.array([[gamma ** -2 - 1]]), np.eye(1), np.array([[exact * (1 + error)]]))
+    assert abs(X[0, 0] - exact) <= max(E[0, 0], 4e-16 * exact)
+    # Newton's method is quadratic: what is left is the square of the error, and round-off.
+    assert 0 < E[0, 0] < 1e-14 + exact * error ** 2
+
+
+def test_singular_solution_is_not_called_indefinite():
+    """X vanishes on stable modes that the cost does not see, however they are mixed with the others: the block
+    that is left is the scalar equation above, positive for gamma = 1.5 and negative for R = 1/2."""
+    rng = np.random.default_rng(0)
+    for r, a, positive in ((1.5 ** -2 - 1, -2.0, True), (0.5, 1.0, False)):
+        for _ in range(10):
+            hidden = -np.diag(10.0 ** rng.uniform(-3, 1, 6))
+            A = np.block([[np.array([[a]]), np.zeros((1, 6))], [rng.standard_normal((6, 1)), hidden]])
+            R, Q = np.zeros((7, 7)), np.zeros((7, 7))
+            R[0, 0], Q[0, 0] = r, 1.0
+            R[1:, 1:] = -np.eye(6)
+            T = rng.standard_normal((7, 7)) * 10.0 ** rng.uniform(-3, 3, 7)
+            inverse = la.inv(T)
+            found = solve_riccati(inverse @ A @ T, inverse @ R @ inverse.T, T.T @ Q @ T)
+            assert found.X is not None and found.semidefinite == positive
 
 
 def test_no_solution_when_the_gain_is_below_the_norm():
