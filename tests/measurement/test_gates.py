@@ -16,16 +16,21 @@ from gates_rig import (
     changed,
     everywhere,
     known,
+    measured,
     multisine_campaign,
     noise_campaign,
+    record,
     response_of,
 )
+from scipy import signal
 
+from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates import GATES, examine
 from avis_ctrl.measurement.gates.channel_map import ChannelMap
 from avis_ctrl.measurement.gates.examine import after_missing_samples
 from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.finding import Finding
+from avis_ctrl.measurement.gates.missing_samples import MissingSamples
 
 SEVERE = ("warning", "stop")
 
@@ -249,6 +254,59 @@ def test_every_flipped_channel_is_named(which, k):
 
     found = channel_alarms(everywhere(SHORT, flip), known())
     assert [(f.gate, f.channels) for f in found] == [("polarity", ((Y_NAMES if which == "y" else U_NAMES)[k],))]
+
+
+@pytest.mark.parametrize("late", [4, 8, 15])
+def test_a_delay_is_no_channel_fault(late):
+    """A loop that is later than the model's by some milliseconds, at noise: the channels are what they are called."""
+    slow = everywhere(noise_campaign(5, 12000), lambda u, y: (u, np.vstack([np.zeros((late, 6)), y[:-late]])))
+    assert not channel_alarms(slow, known())
+
+
+def test_one_late_channel_is_named_but_does_not_stop():
+    def delayed(u, y):
+        y[:, 3] = np.concatenate([np.zeros(30), y[:-30, 3]])
+        return u, y
+
+    (said,) = channel_alarms(everywhere(SHORT, delayed), known())
+    assert (said.severity, said.channels) == ("warning", ("Sz2",)) and "20 ms late" in said.sentence
+
+
+def one_axis_after_the_other(levels=(0.2, 0.1), samples=6000):
+    """Six patterns over the eight drives, one in each record, at two levels."""
+    rng = np.random.default_rng(8)
+    sos = signal.butter(4, [1, 60], "bandpass", fs=RATE, output="sos")
+    patterns = rng.standard_normal((6, 8))
+    records = []
+    for k in range(6):
+        one = signal.sosfilt(sos, rng.standard_normal(samples))
+        u = levels[k % 2] * np.outer(one / one.std(), patterns[k] / np.abs(patterns[k]).max())
+        records.append(record(f"{k:02d}", u, measured(rng, u), "noise", levels[k % 2], 10.0 * k))
+    return Campaign("avis", tuple(records))
+
+
+def test_one_axis_after_the_other_is_no_change_of_the_response():
+    """The records excite different directions: nothing of them can be compared, and no number is made of that."""
+    assert not gates(alarms(one_axis_after_the_other())) & {"repeatability", "level dependence", "missing samples"}
+
+
+def test_drives_exchanged_under_logical_axes_are_named():
+    def exchange(u, y):
+        u[:, [0, 3]] = u[:, [3, 0]]
+        return u, y
+
+    found = channel_alarms(everywhere(one_axis_after_the_other(), exchange), known())
+    assert [(f.gate, set(f.channels)) for f in found] == [("channel order", {"Ay1", "Az2"})]
+
+
+def test_a_swept_sine_lacks_no_samples():
+    """Its delay changes with the frequency, and so with time."""
+    rng, t = np.random.default_rng(9), np.arange(8000) / RATE
+    u = 0.1 * np.outer(np.sin(2 * np.pi * (1 * t + 59 / 16 * t**2)), np.eye(8)[1])
+    whole = record("00", u, measured(rng, u), "noise", 0.07, 0.0)
+    gate = MissingSamples()
+    (said,) = gate.conclude([gate.look(excerpt(whole), known())], Campaign("avis", (whole,)), known())
+    assert said.severity == "ok", said.sentence
 
 
 def test_parameter_errors_are_no_channel_faults():

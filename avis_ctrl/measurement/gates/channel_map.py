@@ -10,7 +10,7 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.channel_faults import Comparison, Faults, compare, cycle_of, explain
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Response, Series, quoted
-from avis_ctrl.measurement.gates.h1 import Spectra, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.h1 import Spectra, directions, segment_length, spectra, usable
 
 # Two channels are one where their difference is below this part of either, after scaling.
 COPY = 1e-3
@@ -18,10 +18,15 @@ COPY = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
+    """u (samples, n_u), y and what the model expects of it (samples, n_y) of a driven record; wrap: of one period."""
+
     record: str
-    measured: Spectra | None
-    expected: Spectra | None
     copies: list[tuple[int, int, float, float]]
+    rate: float = 0.0
+    wrap: bool = False
+    u: np.ndarray | None = None
+    y: np.ndarray | None = None
+    model: np.ndarray | None = None
 
 
 class ChannelMap(Gate):
@@ -51,17 +56,14 @@ class ChannelMap(Gate):
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
         copies = _copies(seen)
         if not seen.driven:
-            return _Kept(seen.header.name, None, None, copies)
+            return _Kept(seen.header.name, copies)
         u, y, wrap = usable(seen)
-        length = segment_length(len(u), int(np.count_nonzero(np.ptp(u, axis=0))))
         rate = seen.header.sample_rate_Hz
-        measured = spectra(u, y, rate, length, wrap)
         if expectation.response is None:
-            return _Kept(seen.header.name, measured, None, copies)
+            return _Kept(seen.header.name, copies)
         model = predicted(expectation.response, u, rate, seen.header.u_names, wrap)
         order = _order(seen.header.y_names, expectation.y_names, model.shape[1])
-        expected = None if order is None else spectra(u, model[:, order], rate, length, wrap)
-        return _Kept(seen.header.name, measured, expected, copies)
+        return _Kept(seen.header.name, copies, rate, wrap, u, y, None if order is None else model[:, order])
 
 
 class ChannelOrder:
@@ -292,7 +294,15 @@ def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str,
 
 
 def _pairs(kept: list[_Kept]) -> list[tuple[Spectra, Spectra]]:
-    return [(k.measured, k.expected) for k in kept if k.measured is not None and k.expected is not None]
+    """Measured and expected spectra, of segments as long as all records together allow: records of one axis after the
+    other are short, but many."""
+    held = [(k, k.u, k.y, k.model) for k in kept if k.u is not None and k.y is not None and k.model is not None]
+    if not held:
+        return []
+    rank = directions(np.concatenate([u - u.mean(axis=0) for _, u, _, _ in held])).shape[1]
+    shortest, samples = min(len(u) for _, u, _, _ in held), sum(len(u) for _, u, _, _ in held)
+    length = min(segment_length(samples, rank), 1 << int(np.log2(max(16, shortest))))
+    return [(spectra(u, y, k.rate, length, k.wrap), spectra(u, m, k.rate, length, k.wrap)) for k, u, y, m in held]
 
 
 def _order(names: tuple[str, ...], expected: tuple[str, ...] | None, rows: int) -> list[int] | None:

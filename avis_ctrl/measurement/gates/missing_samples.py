@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -19,6 +20,9 @@ BLOCK = 16
 JUMP = 0.5
 # Delays are looked for up to so many samples either way.
 LONGEST_DELAY = 64
+# What undoing a step takes at least off the residual, mean logarithm: a tenth of its power, where steps that come from
+# a sine's sweep or from a model's delay over frequency put some on it.
+EXPLAINS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +31,7 @@ class _Kept:
     block: tuple[int, int, int] | None
     t: np.ndarray
     delay: np.ndarray
+    stepped: list[np.ndarray]
     clock: np.ndarray | None
 
 
@@ -37,9 +42,10 @@ class MissingSamples(Gate):
     the driven lines, weighted by the residual; the largest step between means of the segments before and after any
     instant is
     tested (Student's t with the segments' own scatter, 1 % shared over instants, records and the three estimates of H1;
-    few segments), and must exceed half a sample. Where rows were lost from u and y together, a periodic u shows it:
-    each
-    period is compared with the first by circular correlation, exactly, for u is commanded.
+    few segments), must exceed half a sample, and must explain the record: with the step undone the residual of H1 falls
+    by a tenth. (In a swept sine the delay changes with the frequency, and so with time.) Where rows were lost from u
+    and y together, a periodic u shows it: each period is compared with the first by circular correlation, exactly, for
+    u is commanded.
     A repeated block is 16 or more rows equal in every channel of y to earlier ones, not a whole number of periods away
     where the record is periodic; noise in one channel alone makes that impossible by chance.
     """
@@ -48,7 +54,10 @@ class MissingSamples(Gate):
 
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
         t, delay = delays(seen)
-        return _Kept(seen.header, repeated_block(seen.first.y, seen.header.period_samples), t, delay, _clock(seen))
+        stepped = [one for one in delay if (step := delay_step(one, FALSE_ALARM)) is not None
+                   and JUMP < abs(step[1]) <= LONGEST_DELAY and explained(seen, t, *step) > EXPLAINS]
+        block = repeated_block(seen.first.y, seen.header.period_samples)
+        return _Kept(seen.header, block, t, delay, stepped, _clock(seen))
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         found = self._overlaps(kept)
@@ -87,7 +96,7 @@ class MissingSamples(Gate):
                         picture,
                     )
                 )
-            step = largest_step(k.delay, level)
+            step = largest_step(k.stepped, level)
             if step is not None and abs(step[1]) > JUMP:
                 at, size = step
                 found.append(
@@ -188,7 +197,31 @@ def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
     return np.asarray(d)
 
 
-def largest_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:
+def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
+    """By how much the residual of H1 falls where a step of the delay is undone; mean logarithm over lines and channels.
+
+    The step is of `size` samples, at t[where] or half a segment before or after: rows are put in, or taken out. Below
+    zero where a sine sweeps: each frequency comes once, and any delay is as good as any other.
+    """
+    rate, n_u = seen.header.sample_rate_Hz, int(np.count_nonzero(np.ptp(seen.first.u, axis=0)))
+    u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
+    count, length = max(1, round(abs(size))), segment_length(len(u), n_u)
+    before = h1([spectra(u, y, rate, length, wrap=False)])
+    most = -np.inf
+    for instant in t[max(0, where - 1) : where + 2] - seen.first.header.start_s:
+        at = min(max(round(instant * rate), 0), len(y) - count - 1)
+        if size < 0:
+            whole = np.concatenate([y[:at], np.repeat(y[at : at + 1], count, axis=0), y[at:]])[: len(y)]
+        else:
+            whole = np.concatenate([y[:at], y[at + count :], np.repeat(y[-1:], count, axis=0)])
+        after = h1([spectra(u, whole, rate, length, wrap=False)])
+        if before is not None and after is not None:
+            noise, left = np.maximum(before.noise, 1e-300), np.maximum(after.noise, 1e-300)
+            most = max(most, float(np.mean(np.log(noise / left))))
+    return most
+
+
+def largest_step(delay: Iterable[np.ndarray], level: float) -> tuple[int, float] | None:
     """The largest significant step among the estimates (m, K) of the delay; None where none is."""
     steps = [step for one in delay if (step := delay_step(one, level)) is not None]
     return max(steps, key=lambda step: abs(step[1]), default=None)
@@ -206,10 +239,11 @@ def delay_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:
         sigma = max(float(np.median(scatter)), 1e-6)
         # 1.57: variance of a median by that of a mean; 1.5: half-overlapping segments are not quite independent.
         t = abs(size) / (sigma * np.sqrt(1.57 * 1.5 * (1 / len(a) + 1 / len(b))))
-        p = float(stats.t.sf(t, max(n // 2 - 2, 2)) * 2)
-        if best is None or p < best[0] or (p == best[0] and abs(size) > abs(best[2])):
-            best = p, k, size
-    return None if best is None or best[0] > level else (best[1], best[2])
+        if best is None or t > best[0]:
+            best = float(t), k, size
+    if best is None or 2 * stats.t.sf(best[0], max(n // 2 - 2, 2)) > level:
+        return None
+    return best[1], best[2]
 
 
 def repeated_block(y: np.ndarray, period: int | None) -> tuple[int, int, int] | None:
