@@ -1,7 +1,7 @@
 """Second-order terms of large rotations: against the simulator, an independent table, and what a fit finds of them."""
 
+import itertools
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def test_a_prediction_is_what_the_closed_loop_simulation_has_without_a_controlle
     assert off(Predictor(model, large_motion=True).read(u, floor[:n, :3]), exact) < 1e-6
     assert off(Predictor(model).read(u, floor[:n, :3]), exact) > 1e-4
     parts, cuts = Predictor(model, large_motion=True), [0, 1, 300, n]
-    found = np.vstack([parts.read(u[a:b]) for a, b in pairwise(cuts)])
+    found = np.vstack([parts.read(u[a:b]) for a, b in itertools.pairwise(cuts)])
     assert np.allclose(found, Predictor(model, large_motion=True).read(u), rtol=0, atol=1e-12)
 
 

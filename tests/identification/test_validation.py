@@ -25,6 +25,9 @@ from avis_ctrl.identification.whiteness import whiteness
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
+from avis_ctrl.simulation.campaign_data import open_loop
+from avis_ctrl.simulation.loop import simulate
+from avis_ctrl.study.campaign_plan import plan_from_table
 
 BAND = (0.5, 30.0)
 
@@ -86,12 +89,18 @@ def test_errors_in_time_and_by_frequency_agree(checked):
 
 
 def test_the_prediction_in_time_is_that_of_scipy(found, records, checked):
-    """The identified rig by matrix exponentials and scipy's discrete simulation, error without a filter."""
+    """The identified rig by matrix exponentials and scipy's discrete simulation, and what the simulator of closed loops
+    has beside its linear table; error without a filter."""
     held = records[4]
     A, B, C, _ = discrete_avis(found.fit.model.rig)
     u = np.vstack([np.zeros((1, 8)), held.u[:-1]])
     _, y, _ = dlsim((A, B[:, :8], C, np.zeros((6, 8)), 1e-3), u)
-    e = held.y - y
+    plan = plan_from_table({"ambient": {"velocity_rms_m_per_s": 0.0}, "record": [{"excitation": "rest"}]})
+    loop = open_loop(found.fit.model.rig, plan)
+    loop = replace(loop, sensors=replace(loop.sensors, noise_rms_V=np.zeros(6)))
+    table, linear = (simulate(loop, 20.0, settle_s=0.0, nonlinear=one, floor=np.zeros((20_001, 6)), drive=held.u).sensed
+                     for one in (True, False))
+    e = held.y - y - (table - linear)
     assert np.allclose(np.std(e, axis=0) / np.std(held.y, axis=0), checked.held_out[0].nrms_time_whole, rtol=1e-5)
 
 
