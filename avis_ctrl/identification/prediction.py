@@ -6,13 +6,14 @@ with its sensor chains is exact (Van Loan 1978); a delay that is no whole number
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.response import FLOOR, ResponseModel
+from avis_ctrl.identification.response import FLOOR, ResponseModel, SensorModel
 from avis_ctrl.measurement.campaign import Record
 
 
@@ -29,11 +30,11 @@ def continuous(model: ResponseModel) -> Continuous:
     """States q, q', displacement of the floor, and those of each sensor's chain (and of each amplifier)."""
     m, n_u, rows = model.matrices, len(model.actuators), model.matrices.R
     body = la.solve(m.M, np.hstack([-m.K, -m.C, m.K_floor[:, :3], m.T, m.C_floor[:, :3]]))
-    chain, gains = model.sensors.chain, model.sensors.sensitivity
-    n_c, n_y = (0 if chain is None else chain.nstates), len(rows)
+    sensors, gains = model.sensors, model.sensors.sensitivity
+    n_y, own = len(rows), chain_states(sensors)
     corner = 2 * np.pi * model.amplifier_corner_Hz if model.amplifier_corner_Hz else None
     n_a = n_u if corner else 0
-    n, size = 15, 15 + n_c * n_y + n_a
+    size = 15 + own[-1].stop - own[0].start + n_a if own else 15 + n_a
     amplifiers, volts = slice(size - n_a, size), slice(0, n_u)
     A, B = np.zeros((size, size)), np.zeros((size, n_u + 3))
     A[:6, 6:12], A[6:12, :15] = np.eye(6), body[:, :15]
@@ -44,22 +45,30 @@ def continuous(model: ResponseModel) -> Continuous:
     else:
         B[6:12, volts] = body[:, 15:15 + n_u]
     # The motion that the sensors take in, along their axes.
-    motion = {"displacement": (np.eye(size)[:6], np.zeros((6, n_u + 3))),
-              "velocity": (np.eye(size)[6:12], np.zeros((6, n_u + 3))),
-              "acceleration": (A[6:12], B[6:12])}[model.sensors.motion]
-    seen_x, seen_e = rows @ motion[0], rows @ motion[1]
-    if chain is None:
-        return Continuous(A, B, gains[:, None] * seen_x, gains[:, None] * seen_e)
+    none = np.zeros((6, n_u + 3))
+    motion = {"displacement": (np.eye(size)[:6], none), "velocity": (np.eye(size)[6:12], none),
+              "acceleration": (A[6:12].copy(), B[6:12].copy())}
     C, D = np.zeros((n_y, size)), np.zeros((n_y, n_u + 3))
-    for k in range(n_y):
-        own = slice(n + n_c * k, n + n_c * (k + 1))
-        A[own, own] = chain.A
-        A[own] += np.outer(chain.B[:, 0], seen_x[k])
-        B[own] += np.outer(chain.B[:, 0], seen_e[k])
-        C[k] = gains[k] * chain.D[0, 0] * seen_x[k]
-        C[k, own] += gains[k] * chain.C[0]
-        D[k] = gains[k] * chain.D[0, 0] * seen_e[k]
+    for k, (chain, part) in enumerate(zip(sensors.chains, own, strict=True)):
+        seen_x, seen_e = (rows[k] @ one for one in motion[sensors.motions[k]])
+        if sensors.relative[k]:
+            seen_x[12:15] -= rows[k, :3]
+        through = 1.0
+        if chain is not None:
+            A[part, part] = chain.A
+            A[part] += np.outer(chain.B[:, 0], seen_x)
+            B[part] += np.outer(chain.B[:, 0], seen_e)
+            C[k, part] += gains[k] * chain.C[0]
+            through = chain.D[0, 0]
+        C[k] += gains[k] * through * seen_x
+        D[k] = gains[k] * through * seen_e
     return Continuous(A, B, C, D)
+
+
+def chain_states(sensors: SensorModel) -> list[slice]:
+    """Of each sensor's chain, behind the 15 states of the table."""
+    ends = 15 + np.cumsum([0, *(0 if chain is None else chain.nstates for chain in sensors.chains)])
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
 class Predictor:
