@@ -38,7 +38,9 @@ class LineResponse:
     samples, padded : of a record, without and with silence. omega : (n,) rad/s of the lines kept, from zero on.
     compliance : (n, n_q, n_q) inverse dynamic stiffness. rows : (1 or n, n_y, n_q) what each sensor sees of x, and
         sense : (n, n_y) its chain, sensitivity included.
-    volts : (n, n_u) commanded to acting volts. alias : (n, n_u) of volts, alias_map : (n_y, n_u) what sampling folds.
+    volts : (n, n_u) commanded to acting volts. alias_drive : (1 or n, n_u) of volts, alias_map : (n_y, n_u) and
+        alias : (n, n_y) what sampling folds. against : (n_y, 6) rows of sensors that read against the chassis, zero for
+        the others.
     floor : (n, n_q, 3) force, chassis : (n, 6, 3) displacement by velocity of the floor. recoil : (n, 6, n_q) or None,
         displacement of the chassis towards the payload by x.
     T : (n_q, n_u). G, G_c : (n_g, n_q) and (n_g, 6), deflection by x and chassis.
@@ -53,7 +55,9 @@ class LineResponse:
     sense: np.ndarray
     volts: np.ndarray
     alias: np.ndarray
+    alias_drive: np.ndarray
     alias_map: np.ndarray
+    against: np.ndarray
     floor: np.ndarray
     chassis: np.ndarray
     recoil: np.ndarray | None
@@ -82,17 +86,22 @@ class LineResponse:
 
     def deflection(self, x: np.ndarray, floor: np.ndarray | None) -> np.ndarray:
         """(n, n_g) payload less chassis at the mounts; floor velocity in time."""
-        d = x @ self.G.T
-        if self.recoil is not None:
-            d = d + (self.recoil @ x[:, :, None])[:, :, 0] @ self.G_c.T
-        if floor is not None:
-            d = d - (self.chassis @ self.spectrum(floor)[:, :, None])[:, :, 0] @ self.G_c.T
-        return d
+        return self._less_chassis(x @ self.G.T, self.G_c, x, floor)
 
-    def sensed(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """(n, n_y) y of a motion x; the aliases are those of volts u (samples, n_u)."""
+    def _less_chassis(self, moved: np.ndarray, rows: np.ndarray, x: np.ndarray, floor: np.ndarray | None) -> np.ndarray:
+        """moved (n, m) less the chassis' motion along rows (m, 6)."""
+        if self.recoil is not None:
+            moved = moved + (self.recoil @ x[:, :, None])[:, :, 0] @ rows.T
+        if floor is not None:
+            moved = moved - (self.chassis @ self.spectrum(floor)[:, :, None])[:, :, 0] @ rows.T
+        return moved
+
+    def sensed(self, x: np.ndarray, u: np.ndarray, floor: np.ndarray | None = None) -> np.ndarray:
+        """(n, n_y) y of a motion x; the aliases are those of volts u (samples, n_u); floor velocity in time."""
         seen = x @ self.rows[0].T if len(self.rows) == 1 else (self.rows @ x[:, :, None])[:, :, 0]
-        return self.sense * seen + (self.alias * self.spectrum(u)) @ self.alias_map.T
+        if np.any(self.against):
+            seen = self._less_chassis(seen, self.against, x, floor)
+        return self.sense * seen + self.alias * ((self.alias_drive * self.spectrum(u)) @ self.alias_map.T)
 
     def read_beside(self, acceleration: np.ndarray) -> np.ndarray:
         """(n, n_y) y of an acceleration (samples, n_y) along the sensors that no motion of x shows."""
@@ -147,7 +156,8 @@ def _formed(model: TableModel, samples: int, padded: int, sample_rate_Hz: float)
     gain = (first.ops.base.sensors.sensitivity * first.ops.sensor_gain)[:, None]
     alias_map = gain * (mat.R @ np.linalg.inv(mat.M) @ mat.T)
     return LineResponse(samples, padded, sample_rate_Hz, omega, made["compliance"], made["rows"], made["sense"],
-                        made["volts"], made["alias"], alias_map, made["floor"], made["chassis"],
+                        made["volts"], made["alias"], made["alias_drive"], alias_map,
+                        mat.R * first.ops.base.sensors.relative[:, None], made["floor"], made["chassis"],
                         made.get("recoil"), first.T.real, first.G, first.ops.mounts.chassis)
 
 
@@ -159,7 +169,7 @@ def _lines(made: Assembled) -> dict[str, np.ndarray]:
     found = {"compliance": made.inverse, "rows": made.rows,
              "sense": ops.sense * ops.base.sensors.sensitivity * ops.sensor_gain,
              "volts": np.broadcast_to(made.volts, (n, len(ops.base.actuators))),
-             "alias": made.folded[:, None] * ops.drive, "floor": made.floor_force(w), "chassis": made.follow(w)}
+             "alias": made.folded, "alias_drive": ops.drive, "floor": made.floor_force(w), "chassis": made.follow(w)}
     if ops.recoil is not None:
         found["recoil"] = np.zeros((n, N_Q, made.n_q), complex)
         found["recoil"][:, :, :N_Q] = ops.recoil @ ops.borne(made.M)

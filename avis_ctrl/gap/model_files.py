@@ -173,8 +173,7 @@ def _made(file: ModelFile) -> TableModel:
     except (ValueError, RecursionError) as error:
         raise InputError(f"expected the text of a rig file; {' '.join(str(error).split())}", field="rig") from None
     sensors = sensor_model(rig, file.unit, file.sensors)
-    sensors = type(sensors)(sensors.names, sensors.motion, sensors.chain, np.array(file.sensitivity), sensors.unit,
-                            sensors.sensitivity_unit, sensors.transient_poles)
+    sensors = replace(sensors, sensitivity=np.array(file.sensitivity))
     base = ResponseModel(rig, tuple(file.free), sensors, tuple(file.actuators), file.period_s, file.delay_s,
                          file.amplifier_corner_Hz)
     model = TableModel(base)

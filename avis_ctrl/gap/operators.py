@@ -19,11 +19,9 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.identification.response import N_Q, ResponseModel
-from avis_ctrl.identification.sampling import aliases, hold
+from avis_ctrl.identification.sampling import hold
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import point_map
-
-POWER = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +128,7 @@ class Operators:
         self.internal_omega, self.internal_damping = np.full(n_g, np.inf), np.zeros(n_g)
         self.payload_share = np.full(n_g, 0.5)
         self.rows = base.matrices.R[None]
-        sense = chain_response(base, self.omega) * self.s ** POWER[base.sensors.motion]
-        self.sense = np.repeat(sense[:, None], len(base.sensors.names), axis=1)
+        self.sense = chain_response(base, self.omega).copy()
         self.sensor_gain = np.ones(len(base.sensors.names))
         self.drive = np.ones((1, len(base.actuators)), complex)
         self.delay_s, self.amplifier_corner_Hz = base.delay_s, base.amplifier_corner_Hz
@@ -158,19 +155,19 @@ class Operators:
             self.extra_floor = F if self.extra_floor is None else self.extra_floor + F
 
     def volts(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n, n_u) commanded volts to acting ones, and (n,) their aliases."""
+        """(n, n_u) commanded volts to acting ones, and (n, n_y) their aliases in each sensor."""
         base, corner = self.base, self.amplifier_corner_Hz
-        key = ("volts", base.period_s, self.delay_s, base.sensors.motion, corner, base._passband(), *_of(self.omega))
+        key = ("volts", base.period_s, self.delay_s, _sensors_of(base), corner, *_of(self.omega))
         known = _kept.get(key)
         if known is None:
             if base.period_s:
                 a = hold(self.omega, base.period_s, self.delay_s)
-                folded = aliases(self.omega, base.period_s, self.delay_s, base.sensors.motion, corner)
+                folded = base.sensors.folded(self.omega, base.period_s, self.delay_s, corner)
             else:
-                a, folded = np.exp(-1j * self.omega * self.delay_s), np.zeros(len(self.omega), complex)
+                a, folded = np.exp(-1j * self.omega * self.delay_s), np.zeros((len(self.omega), 1), complex)
             if corner:
                 a = a / (1 + self.s / (2 * np.pi * corner))
-            known = _keep(key, (a, folded * base._passband()))
+            known = _keep(key, (a, folded))
         a, folded = known
         return a[:, None] * self.drive, folded
 
@@ -191,14 +188,19 @@ def _keep(key: tuple, value: Any) -> Any:
     return value
 
 
+def _sensors_of(base: ResponseModel) -> tuple:
+    """What tells the chains of sensors apart."""
+    known = {id(chain): b"" if chain is None else b"".join(part.tobytes() for part in (chain.A, chain.B, chain.C,
+                                                                                       chain.D))
+             for chain in base.sensors.chains}
+    return base.sensors.motions, tuple(known[id(chain)] for chain in base.sensors.chains)
+
+
 def chain_response(base: ResponseModel, omega: np.ndarray) -> np.ndarray:
-    """(n,) of the sensors' chain of unit sensitivity."""
-    chain = base.sensors.chain
-    if chain is None:
-        return np.ones(len(omega), complex)
-    key = ("chain", chain.A.tobytes(), chain.B.tobytes(), chain.C.tobytes(), chain.D.tobytes(), *_of(omega))
+    """(n, n_y) of each sensor's chain of unit sensitivity, from displacement; not to be written to."""
+    key = ("chain", _sensors_of(base), *_of(omega))
     known = _kept.get(key)
-    return _keep(key, chain.frequency_response(omega)[:, 0, 0]) if known is None else known
+    return _keep(key, base.sensors.sense(omega)) if known is None else known
 
 
 _geometry: list[tuple[Rig, MountGeometry]] = []

@@ -104,7 +104,7 @@ def _in_time(record: Record, linear: TableModel) -> tuple[np.ndarray, np.ndarray
     if not rows or not deflection.size:  # nothing measured, or a rig without mounts of their own
         return u, deflection, np.zeros((0, 0))
     seen = np.array([name in h.y_names for name in linear.sensors.names])
-    left = record.y[:, rows] - lines.in_time(lines.sensed(x, u))[:, seen]
+    left = record.y[:, rows] - lines.in_time(lines.sensed(x, u, floor))[:, seen]
     left = left - left.mean(0)
     if np.any(left):
         deflection = deflection + _unmodelled(left, lines, seen)

@@ -78,7 +78,7 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
     still = with_large_motion({"": record}, model)[""] if _has_large_motion(effects) else record
     pushing = [one for one in effects if one.effect.force(still, one.place, one.by_name) is not None]
     if not pushing or not len(lines.G):  # a rig without mounts of its own has no motion by which forces could act
-        return Simulated(lines.in_time(lines.sensed(x, acting)), lines.in_time(lines.deflection(x, floor)))
+        return Simulated(lines.in_time(lines.sensed(x, acting, floor)), lines.in_time(lines.deflection(x, floor)))
     return _with_forces(model, lines, replace(record, volts=acting), x, floor, pushing)
 
 
@@ -157,7 +157,7 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x
         defect = float(np.sqrt(np.mean(((left + missing) @ answer.shape.T) ** 2))) / size
         if defect <= DEFECT:
             z = answer.whole(push + slow)
-            y = lines.sensed(x + z[:, :answer.n_x], record.volts)
+            y = lines.sensed(x + z[:, :answer.n_x], record.volts, floor)
             if weak:
                 y += lines.read_beside(reading)
             return Simulated(lines.in_time(y), lines.in_time(linear + z @ answer.shape.T), passes, defect)

@@ -366,7 +366,7 @@ class _Drive:
         commanded = U[:, :n_u]
         self.volts = made.volts[:, :, None] * commanded
         self.w = U[:, n_u:n_u + 3] / s
-        self.folded = made.folded[:, None, None] * commanded * ops.drive[:, :, None]
+        self.folded, self.alias = commanded * ops.drive[:, :, None], made.folded[:, :, None]
         total = made.T @ self.volts
         if np.any(self.w):
             total = total + made.floor_force(self.w)
@@ -386,8 +386,10 @@ def _gain(made: Assembled) -> np.ndarray:
 def _read(made: Assembled, x: np.ndarray, drive: _Drive) -> np.ndarray:
     """(n, n_y, m) of a motion x; aliases pass the chain far above its corners."""
     mat = made.ops.base.matrices
-    alias = (mat.R @ np.linalg.inv(mat.M) @ mat.T) @ drive.folded
+    alias = drive.alias * ((mat.R @ np.linalg.inv(mat.M) @ mat.T) @ drive.folded)
     moved = made.rows @ x
+    if np.any(against := made.ops.base.sensors.relative):
+        moved = moved - (against[:, None] * mat.R) @ made.chassis(x, drive.w)
     if drive.reading is not None:
         moved = moved + drive.reading
     Y = _gain(made) * (made.ops.sense[:, :, None] * moved + alias)
@@ -400,7 +402,7 @@ class _Answer:
     def __init__(self, made: Assembled, acting: Acting):
         ops, drive = made.ops, _Drive(made, acting)
         self.made, self.s, self.inner = made, ops.s[:, None, None], acting.inner
-        self.volts, self.w, self.folded = drive.volts, drive.w, drive.folded
+        self.volts, self.w, self.folded, self.alias = drive.volts, drive.w, drive.folded, drive.alias
         self.x = made.inverse @ drive.total
         self.Minv = np.linalg.inv(ops.base.matrices.M)
         self.sense, self.gain = ops.sense[:, :, None], _gain(made)
@@ -447,17 +449,17 @@ class _Answer:
         changed = np.zeros_like(self.Y)
         if np.any(d.T[j]):
             push[:, :N_Q] += d.T[j] @ self.volts
-            changed += self.gain * (mat.R @ self.Minv @ d.T[j] @ self.folded)
+            changed += self.gain * self.alias * (mat.R @ self.Minv @ d.T[j] @ self.folded)
         if np.any(d.M[j]):
             inertia = s ** 2 * (d.M[j] @ q)
             push[:, :N_Q] -= inertia
             if made.ops.recoil is not None:
                 moved = made.ops.mounts.chassis @ (made.ops.recoil @ inertia)
                 push -= made.G.T @ (made.z_pf[:, :, None] * moved)
-            changed -= self.gain * (mat.R @ self.Minv @ d.M[j] @ folded_q)
+            changed -= self.gain * self.alias * (mat.R @ self.Minv @ d.M[j] @ folded_q)
         if np.any(d.K[j]) or np.any(d.C[j]):
             floor = made.follow(self.w)
             push[:, :N_Q] += d.K_floor[j] @ floor + d.C_floor[j] @ (s * floor) - (d.K[j] + s * d.C[j]) @ q
         if np.any(d.R[j]):
-            changed += self.gain * (self.sense * (d.R[j] @ q) + d.R[j] @ folded_q)
+            changed += self.gain * (self.sense * (d.R[j] @ q) + self.alias * (d.R[j] @ folded_q))
         return left @ push + changed

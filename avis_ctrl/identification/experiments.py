@@ -76,8 +76,7 @@ class ChangedModel(ResponseModel):
 
     def _plain(self) -> ResponseModel:
         n_y, n_u = len(self.more_sensors), len(self.more_actuators)
-        sensors = replace(self.sensors, names=self.sensors.names[:len(self.sensors.names) - n_y],
-                          sensitivity=self.sensors.sensitivity[:len(self.sensors.sensitivity) - n_y])
+        sensors = self.sensors.picked(range(len(self.sensors.names) - n_y))
         names = tuple(name for name in self.names if name in self.rig.parameters())
         return ResponseModel(self.rig, names, sensors, self.actuators[:len(self.actuators) - n_u], self.period_s,
                              self.delay_s, self.amplifier_corner_Hz)
@@ -98,8 +97,12 @@ def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,
     if unknown := [name for name in (shifts or {}) if name not in known]:
         raise InputError(f"expected parameters of the rig {model.rig.name}", field="shifts", value=unknown)
     rig = model.rig.with_parameters({name: known[name].value + shift for name, shift in (shifts or {}).items()})
-    gain = float(np.mean(model.sensors.sensitivity)) if len(model.sensors.sensitivity) else 1.0
-    bank = replace(model.sensors, names=(*model.sensors.names, *(one.name for one in sensors)),
+    own = len(model.sensors.names)
+    # Of the kind of the first, with the mean sensitivity of that kind.
+    gain = float(np.mean([value for value, motion in zip(model.sensors.sensitivity, model.sensors.motions, strict=True)
+                          if motion == model.sensors.motions[0]]))
+    bank = replace(model.sensors.picked([*range(own), *([0] * len(sensors))]),
+                   names=(*model.sensors.names, *(one.name for one in sensors)),
                    sensitivity=np.concatenate([model.sensors.sensitivity, np.full(len(sensors), gain)]))
     return ChangedModel(rig, model.names, bank, (*model.actuators, *(one.name for one in actuators)), model.period_s,
                         model.delay_s, model.amplifier_corner_Hz, model.turning, tuple(masses), tuple(sensors),
@@ -110,12 +113,12 @@ def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,
 class Noise:
     """Noise of a record on a line, for spectra scaled by 1/sqrt(samples).
 
-    sensor_V : r.m.s. of each channel, white, converter included. floor_m_per_s : r.m.s. of the floor that was not
-    measured, each direction, over 0.5-60 Hz. measured : (omega, covariance (n, n_y, n_y)) from a campaign, in place of
-    both. assumed : what no file said, in words.
+    sensor_V : r.m.s. of each channel (n_y,), or one for all, white, converter included. floor_m_per_s : r.m.s. of the
+    floor that was not measured, each direction, over 0.5-60 Hz. measured : (omega, covariance (n, n_y, n_y)) from a
+    campaign, in place of both. assumed : what no file said, in words.
     """
 
-    sensor_V: float
+    sensor_V: float | np.ndarray
     floor_m_per_s: float = 0.0
     measured: tuple[np.ndarray, np.ndarray] | None = None
     assumed: str = ""
@@ -125,7 +128,10 @@ class Noise:
         n_y = len(model.sensors.names)
         if self.measured is not None:
             return self._interpolated(omega, n_y)
-        C = np.broadcast_to(self.sensor_V ** 2 * np.eye(n_y, dtype=complex), (len(omega), n_y, n_y)).copy()
+        white = np.atleast_1d(self.sensor_V) ** 2
+        if len(white) < n_y:
+            white = np.concatenate([white, np.full(n_y - len(white), np.median(white))])
+        C = np.broadcast_to(white * np.eye(n_y, dtype=complex), (len(omega), n_y, n_y)).copy()
         if self.floor_m_per_s and not floor_known:
             U = np.zeros((len(omega), len(model.inputs), 3), complex)
             U[:, -3:] = np.eye(3)
@@ -151,19 +157,18 @@ class Noise:
 
 
 def site_noise(model: ResponseModel) -> Noise:
-    """From the rig's file: ambient floor, sensor noise, converter steps; for accelerometers their own noise."""
+    """From the rig's file: ambient floor, each sensor's noise, converter steps."""
     rig = model.rig
-    if model.sensors.unit == "V" and rig.ambient is not None and rig.acquisition is not None:
-        step = 2 * rig.acquisition.adc_range_V / 2 ** rig.acquisition.adc_bits
-        sigma = float(np.hypot(rig.ambient.sensor_noise_rms_V, step / np.sqrt(12)))
-        return Noise(sigma, rig.ambient.floor_velocity_rms_m_per_s)
-    if model.sensors.motion == "acceleration" and rig.accelerometers is not None:
-        density = rig.accelerometers.noise_m_per_s2_rtHz * float(np.mean(np.abs(model.sensors.sensitivity)))
-        floor = rig.ambient.floor_velocity_rms_m_per_s if rig.ambient else 2e-6
-        assumed = "" if rig.ambient else "the rig's file has no [ambient]: a floor of 2e-6 m/s r.m.s. is assumed"
-        return Noise(density * np.sqrt(rig.sample_rate_Hz / 2), floor, assumed=assumed)
-    raise InputError("expected a rig file with [ambient] and [acquisition], or the noise of a campaign", field="noise",
-                     value=rig.name)
+    own = {one.name: one.noise_rms_V for one in rig.sensors()}
+    noise = np.array([own.get(name, np.nan) for name in model.sensors.names])
+    if model.sensors.unit != "V" or not np.any(noise > 0):
+        raise InputError("expected volts of a rig file that states its sensors' noise, or the noise of a campaign",
+                         field="noise", value=rig.name)
+    noise[np.isnan(noise)] = np.nanmedian(noise)
+    rounding = rig.converter.noise_rms_V if rig.converter else 0.0
+    floor = rig.ambient.floor_velocity_rms_m_per_s if rig.ambient else 2e-6
+    assumed = "" if rig.ambient else "the rig's file has no [ambient]: a floor of 2e-6 m/s r.m.s. is assumed"
+    return Noise(np.hypot(noise, rounding), floor, assumed=assumed)
 
 
 def campaign_noise(blocks: Sequence[SpectralBlock]) -> Noise:

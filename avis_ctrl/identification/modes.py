@@ -18,7 +18,7 @@ Kaufman's Jacobian). Masses, stiffnesses and geometry do not enter, but for the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -165,6 +165,7 @@ def measured_modes(blocks: Sequence[SpectralBlock], model: ResponseModel) -> Mea
     ComputationError : too few lines for free residues, or a search that ends at no oscillating modes.
     """
     start = model_modes(model)
+    model, blocks = _of_one_kind(model, blocks)
     low, high = REACH[0] * start.frequency_Hz[0], REACH[1] * start.frequency_Hz[-1]
     kept: list[SpectralBlock] = []
     for block in blocks:
@@ -187,6 +188,22 @@ def measured_modes(blocks: Sequence[SpectralBlock], model: ResponseModel) -> Mea
     covariance = problem.covariance(tuple(best.x)) * max(misfit, 1.0) * np.outer(scale, scale)
     f = np.concatenate([block.omega for block in kept]) / (2 * np.pi)
     return MeasuredModes(frequency, damping, covariance, float(misfit), f.size, (float(f.min()), float(f.max())))
+
+
+def _of_one_kind(model: ResponseModel, blocks: Sequence[SpectralBlock]) -> tuple[ResponseModel, list[SpectralBlock]]:
+    """The outputs of the largest group of sensors with one chain, those that read motion in space first."""
+    sensors = model.sensors
+    if sensors.alike:
+        return model, list(blocks)
+    kinds = list(zip(sensors.relative.tolist(), sensors.motions, map(id, sensors.chains), strict=True))
+    best = max(dict.fromkeys(kinds), key=lambda kind: (not kind[0], kinds.count(kind)))
+    own = [k for k, kind in enumerate(kinds) if kind == best]
+    chosen = replace(sensors.picked(own), relative=np.zeros(len(own), bool))
+    free = tuple(name for name in model.names if not name.startswith("sensor.")
+                 or name.removeprefix("sensor.") in chosen.names)
+    return replace(model, names=free, sensors=chosen), [
+        replace(block, Y=block.Y[:, own], noise=None if block.noise is None else block.noise[:, own][:, :, own])
+        for block in blocks]
 
 
 class _Poles:
@@ -256,9 +273,7 @@ def _rows(block: SpectralBlock, model: ResponseModel, driven: np.ndarray) -> tup
     n, n_y, m = block.Y.shape
     omega, n_u = np.tile(block.omega, m), len(model.actuators)
     s = 1j * omega
-    power = {"displacement": 0, "velocity": 1, "acceleration": 2}[model.sensors.motion]
-    chain = s ** power * (1.0 if model.sensors.chain is None
-                          else model.sensors.chain.frequency_response(omega)[:, 0, 0])
+    chain = model.sensors.sense(omega)[:, 0]
     if model.period_s:
         drive = hold(omega, model.period_s, model.delay_s)
         folded = aliases(omega, model.period_s, model.delay_s, model.sensors.motion, model.amplifier_corner_Hz)
@@ -274,7 +289,7 @@ def _rows(block: SpectralBlock, model: ResponseModel, driven: np.ndarray) -> tup
     sigma = np.sqrt(np.real(np.einsum("kii->ki", noise)))
     impulse, own = np.zeros((m * n, 0), complex), np.zeros((m * n, 0), complex)
     if block.transient:
-        impulse, own = chain[:, None], model.chain_transients(s)
+        impulse, own = chain[:, None], model.chain_transients(s)[0]
     return (omega, np.moveaxis(block.Y, (1, 2), (0, 1)).reshape(n_y, m * n), np.sqrt(2) / sigma.T,
             noise / (sigma[:, :, None] * sigma[:, None, :]), inputs, impulse, folded[:, None] * U[:, volts], own)
 

@@ -8,6 +8,7 @@ from one sample to the next, as the simulator does it (`simulation.kernel`).
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.large_motion import March, arrays_of, march, march_linear, sensors_of
-from avis_ctrl.identification.response import FLOOR, ResponseModel
+from avis_ctrl.identification.response import FLOOR, ResponseModel, SensorModel
 from avis_ctrl.measurement.campaign import Record
 
 
@@ -36,49 +37,63 @@ def continuous(model: ResponseModel, beside: bool = False) -> Continuous:
     """
     m, n_u, rows = model.matrices, len(model.actuators), model.matrices.R
     body = la.solve(m.M, np.hstack([-m.K, -m.C, m.K_floor[:, :3], m.T, m.C_floor[:, :3]]))
-    chain, gains = model.sensors.chain, model.sensors.sensitivity
-    n_c, n_y = (0 if chain is None else chain.nstates), len(rows)
+    sensors, gains = model.sensors, model.sensors.sensitivity
+    n_y, own = len(rows), chain_states(sensors)
     corner = 2 * np.pi * model.amplifier_corner_Hz if model.amplifier_corner_Hz else None
     n_a = n_u if corner else 0
-    n, plain = 15, 15 + n_c * n_y + n_a
-    integrations = {"displacement": 2, "velocity": 1, "acceleration": 0}[model.sensors.motion] if beside else 0
-    size, n_in, n_e = plain + integrations * n_y, n_u + 3, 6 + n_y if beside else 0
+    plain = (own[-1].stop if own else 15) + n_a
+    integrators = integrator_states(sensors, plain) if beside else [slice(plain, plain)] * n_y
+    size, n_in, n_e = max(plain, *(one.stop for one in integrators)), n_u + 3, 6 + n_y if beside else 0
     amplifiers, volts = slice(plain - n_a, plain), slice(0, n_u)
     A, B = np.zeros((size, size)), np.zeros((size, n_in + n_e))
     A[:6, 6:12], A[6:12, :15] = np.eye(6), body[:, :15]
     B[6:12, n_u:n_in], B[12:15, n_u:n_in] = body[:, 15 + n_u:], np.eye(3)
     if beside:
         B[6:12, n_in:n_in + 6] = np.eye(6)
-    if integrations:
-        # The last of a sensor's integrators is the motion that its chain takes in.
-        A[plain:plain + (integrations - 1) * n_y, plain + n_y:] = np.eye((integrations - 1) * n_y)
-        B[size - n_y:, n_in + 6:] = np.eye(n_y)
     if corner:
         A[6:12, amplifiers] = body[:, 15:15 + n_u]
         A[amplifiers, amplifiers], B[amplifiers, volts] = -corner * np.eye(n_u), corner * np.eye(n_u)
     else:
         B[6:12, volts] = body[:, 15:15 + n_u]
     # The motion that the sensors take in, along their axes.
-    motion = {"displacement": (np.eye(size)[:6], np.zeros((6, n_in + n_e))),
-              "velocity": (np.eye(size)[6:12], np.zeros((6, n_in + n_e))),
-              "acceleration": (A[6:12], B[6:12])}[model.sensors.motion]
-    seen_x, seen_e = rows @ motion[0], rows @ motion[1]
-    if integrations:
-        seen_x[:, plain:plain + n_y] += np.eye(n_y)
-    elif beside:
-        seen_e[:, n_in + 6:] += np.eye(n_y)
-    if chain is None:
-        return Continuous(A, B, gains[:, None] * seen_x, gains[:, None] * seen_e)
+    none = np.zeros((6, n_in + n_e))
+    motion = {"displacement": (np.eye(size)[:6], none), "velocity": (np.eye(size)[6:12], none),
+              "acceleration": (A[6:12].copy(), B[6:12].copy())}
     C, D = np.zeros((n_y, size)), np.zeros((n_y, n_in + n_e))
-    for k in range(n_y):
-        own = slice(n + n_c * k, n + n_c * (k + 1))
-        A[own, own] = chain.A
-        A[own] += np.outer(chain.B[:, 0], seen_x[k])
-        B[own] += np.outer(chain.B[:, 0], seen_e[k])
-        C[k] = gains[k] * chain.D[0, 0] * seen_x[k]
-        C[k, own] += gains[k] * chain.C[0]
-        D[k] = gains[k] * chain.D[0, 0] * seen_e[k]
+    for k, (chain, part, added) in enumerate(zip(sensors.chains, own, integrators, strict=True)):
+        seen_x, seen_e = (rows[k] @ one for one in motion[sensors.motions[k]])
+        if sensors.relative[k]:
+            seen_x[12:15] -= rows[k, :3]
+        if added.stop > added.start:
+            # The first of a sensor's integrators is the motion that its chain takes in, the last reads e.
+            A[added, added] = np.eye(added.stop - added.start, k=1)
+            B[added.stop - 1, n_in + 6 + k] = 1.0
+            seen_x[added.start] += 1.0
+        elif beside:
+            seen_e[n_in + 6 + k] += 1.0
+        through = 1.0
+        if chain is not None:
+            A[part, part] = chain.A
+            A[part] += np.outer(chain.B[:, 0], seen_x)
+            B[part] += np.outer(chain.B[:, 0], seen_e)
+            C[k, part] += gains[k] * chain.C[0]
+            through = chain.D[0, 0]
+        C[k] += gains[k] * through * seen_x
+        D[k] = gains[k] * through * seen_e
     return Continuous(A, B, C, D)
+
+
+def chain_states(sensors: SensorModel) -> list[slice]:
+    """Of each sensor's chain, behind the 15 states of the table."""
+    ends = 15 + np.cumsum([0, *(0 if chain is None else chain.nstates for chain in sensors.chains)])
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
+
+
+def integrator_states(sensors: SensorModel, first: int) -> list[slice]:
+    """Of each sensor, those that make its motion of an acceleration, from index `first` on."""
+    ends = first + np.cumsum([0, *({"displacement": 2, "velocity": 1, "acceleration": 0}[one]
+                                   for one in sensors.motions)])
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
 class Predictor:
@@ -117,8 +132,7 @@ class Predictor:
         model, m = self.model, self.model.matrices
         n_u, corner = len(model.actuators), model.amplifier_corner_Hz
         known = [one.name for one in model.rig.mounted_body().actuators]
-        chain = model.sensors.chain
-        first = 15 + (0 if chain is None else chain.nstates) * len(model.sensors.names) if corner else -1
+        first = chain_states(model.sensors)[-1].stop if corner else -1
         body = la.solve(m.M, np.hstack([-m.K, -m.C, m.K_floor[:, :3], m.T, m.C_floor[:, :3]]))
         of_x, of_volts, of_floor = (np.ascontiguousarray(one) for one in
                                     (body[:, :15], body[:, 15:15 + n_u], body[:, 15 + n_u:]))

@@ -20,7 +20,6 @@ import scipy.signal as signal
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Record
-from avis_ctrl.rigs.geophone import second_order_roots
 from avis_ctrl.rigs.rig import Rig
 
 
@@ -65,17 +64,17 @@ def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str, undo_chain: bo
         return SensorInverse(motion, none, poles, one)
     if unit != "V":
         raise InputError("expected V, m, m/s or m/s^2", field="unit of y", value=unit)
-    if (g := rig.geophones) is not None:
-        index = [names.index(name) for name in y_names]
-        gain = np.array(g.sensitivity_Vs_per_m)[index] * g.preamplifier_gain
-        corner = second_order_roots(g.compensated_Hz, g.compensated_damping)
-        return SensorInverse("velocity", *((corner, np.zeros(2, complex)) if undo_chain else (none, none)), gain)
-    if (acc := rig.accelerometers) is not None:
-        # s S / (s + w) on acceleration: velocity is (s + w) / (S s^2) of the voltage.
-        corner = np.array([-2 * np.pi * acc.low_corner_Hz], complex) if undo_chain else none
-        poles = np.zeros(2 if undo_chain else 1, complex)
-        return SensorInverse("velocity", corner, poles, acc.sensitivity_Vs2_per_m * one)
-    raise InputError("the rig file describes no sensors that make volts", field="geophones, accelerometers")
+    sensors = [one for name in y_names for one in rig.sensors() if one.name == name]
+    kinds = {(one.quantity, one.zeros, one.poles) for one in sensors}
+    if len(kinds) != 1 or not sensors[0].inertial:
+        raise InputError("expected geophones or accelerometers of one kind; the filter undoes one chain",
+                         field="y names", value=list(y_names))
+    gain = np.array([one.gain for one in sensors])
+    chain = np.array(sensors[0].poles, complex) if undo_chain else none
+    # Velocity is the voltage over the chain: of an accelerometer its zero at rest and the integration.
+    at_rest = len(sensors[0].zeros) if undo_chain else 0
+    integration = 1 if sensors[0].quantity == "acceleration" else 0
+    return SensorInverse("velocity", chain, np.zeros(at_rest + integration, complex), gain)
 
 
 def prefilter(record: Record, inverse: SensorInverse, delay_s: float, corner_Hz: float = 1.0, order: int = 6,

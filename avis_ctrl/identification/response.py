@@ -1,12 +1,13 @@
 """Frequency response of a rig as its records see it, with its derivative by every parameter.
 
-    y = s(w) R (jw)^p { inv(D) F  [u; v_floor; transient] + aliases inv(M) T u },    D = K + jw C - w^2 M
-    F = [ T h(w) a(w),  (K_f + jw C_f) E / jw,  I, jw I ]
+    y = s(w) (jw)^p R { inv(D) F  [u; v_floor; transient] - r E v_floor / jw } + aliases R inv(M) T u
+    D = K + jw C - w^2 M,    F = [ T h(w) a(w),  (K_f + jw C_f) E / jw,  I, jw I ]
 
 R picks the motion along each sensor, s is its chain (geophone, compensation, preamplifier), p the derivative that it
-senses, h hold and delay, a the amplifiers, E the three translations of the floor. The last two blocks of F carry the
-transient of a record that does not start and end alike: whatever momentum and displacement it starts with acts as an
-impulse and a step (real vectors, unknown, found along with the parameters).
+senses, each its own, h hold and delay, a the amplifiers, E the three translations of the floor, r one for what is
+read against the chassis and zero otherwise. The last two blocks of F carry the transient of a record that does not
+start and end alike: whatever momentum and displacement it starts with acts as an impulse and a step (real vectors,
+unknown, found along with the parameters).
 
 Derivatives are analytic: d inv(D)F = inv(D) (dF - dD inv(D) F), with dM, dC, dK, dT of the rig's matrices. These are
 polynomials of at most second degree in each parameter, for which a central difference is exact at any step.
@@ -25,8 +26,6 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
 from avis_ctrl.identification.sampling import Motion, aliases, hold
 from avis_ctrl.lti.statespace import StateSpace
-from avis_ctrl.rigs.converter import Converter
-from avis_ctrl.rigs.geophone import Accelerometer, CompensationFilter, Geophone, SensorChain
 from avis_ctrl.rigs.rig import Parameter, Rig
 
 if TYPE_CHECKING:
@@ -42,19 +41,69 @@ LOWEST = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SensorModel:
-    """Sensors of a rig: names, what motion each chain takes in, and the chain (unit sensitivity), as a common system.
+    """Sensors of a rig: names, what motion each chain takes in, and the chain (unit sensitivity).
 
-    chain is None for an ideal sensor. sensitivity : (n_y,) unit of y per unit of motion, in the passband.
-    transient_poles : polynomial coefficients (ascending) of the chain's denominator, [1] without a chain.
+    motions, chains, poles, sensitivity_units : one a sensor. chain None for an ideal sensor; poles the coefficients
+    (ascending) of the chain's denominator, [1] without a chain. sensitivity : (n_y,) unit of y per unit of motion, in
+    the passband. relative : (n_y,) which read the payload against the chassis.
     """
 
     names: tuple[str, ...]
-    motion: Motion
-    chain: StateSpace | None
+    motions: tuple[Motion, ...]
+    chains: tuple[StateSpace | None, ...]
     sensitivity: np.ndarray
     unit: str
-    sensitivity_unit: str
-    transient_poles: tuple[float, ...] = (1.0,)
+    sensitivity_units: tuple[str, ...]
+    poles: tuple[tuple[float, ...], ...]
+    relative: np.ndarray
+
+    def picked(self, index: Sequence[int]) -> SensorModel:
+        """The sensors at `index` (from the first), in that order; an index may come again."""
+        def of(values: tuple) -> tuple:
+            return tuple(values[k] for k in index)
+        return SensorModel(of(self.names), of(self.motions), of(self.chains), self.sensitivity[list(index)], self.unit,
+                           of(self.sensitivity_units), of(self.poles), self.relative[list(index)])
+
+    @property
+    def alike(self) -> bool:
+        """Whether all sensors have one chain on one kind of motion, in space."""
+        return len({*zip(self.motions, map(id, self.chains), strict=True)}) == 1 and not np.any(self.relative)
+
+    def _common(self) -> int:
+        if not self.alike:
+            raise InputError("expected sensors of one kind, with one chain", field="sensors", value=list(self.motions))
+        return 0
+
+    @property
+    def motion(self) -> Motion:
+        """That of all sensors. Raises InputError where they differ."""
+        return self.motions[self._common()]
+
+    @property
+    def chain(self) -> StateSpace | None:
+        """That of all sensors. Raises InputError where they differ."""
+        return self.chains[self._common()]
+
+    @property
+    def transient_poles(self) -> tuple[float, ...]:
+        """Those of all sensors. Raises InputError where they differ."""
+        return self.poles[self._common()]
+
+    def sense(self, omega: np.ndarray) -> np.ndarray:
+        """(n, n_y) from displacement to y of unit sensitivity."""
+        s, known = 1j * np.asarray(omega, float), {}
+        for chain, motion in zip(self.chains, self.motions, strict=True):
+            if (id(chain), motion) not in known:
+                response = 1.0 if chain is None else chain.frequency_response(omega)[:, 0, 0]
+                known[id(chain), motion] = response * s ** _POWER[motion]
+        return np.stack([known[id(chain), motion] for chain, motion in zip(self.chains, self.motions, strict=True)],
+                        axis=1)
+
+    def folded(self, omega: np.ndarray, period_s: float, delay_s: float, corner_Hz: float | None) -> np.ndarray:
+        """(n, n_y) `aliases` of each sensor's motion, which pass its chain far above its corners."""
+        own = {motion: aliases(omega, period_s, delay_s, motion, corner_Hz) for motion in dict.fromkeys(self.motions)}
+        passband = [1.0 if chain is None else float(chain.D[0, 0]) for chain in self.chains]
+        return np.stack([own[motion] * gain for motion, gain in zip(self.motions, passband, strict=True)], axis=1)
 
 
 def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) -> SensorModel:
@@ -62,31 +111,27 @@ def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) 
 
     Raises
     ------
-    InputError : a unit that is none of these, a rig without sensors, names that it does not have.
+    InputError : a unit that is none of these, names that it does not have.
     """
     known, _ = rig.sensor_rows()
     chosen = tuple(names) if names is not None else known
     if missing := [name for name in chosen if name not in known]:
         raise InputError(f"the sensors of the rig {rig.name} are {', '.join(known)}", field="y names", value=missing)
-    index = [known.index(name) for name in chosen]
+    n = len(chosen)
     if unit in MOTION_OF_UNIT:
-        return SensorModel(chosen, MOTION_OF_UNIT[unit], None, np.ones(len(chosen)), unit, f"{unit} per {unit}")
+        return SensorModel(chosen, (MOTION_OF_UNIT[unit],) * n, (None,) * n, np.ones(n), unit,
+                           (f"{unit} per {unit}",) * n, ((1.0,),) * n, np.zeros(n, bool))
     if unit != "V":
         raise InputError(f"expected V, {', '.join(MOTION_OF_UNIT)}", field="unit of y", value=unit)
-    if rig.geophones is not None and rig.acquisition is not None:
-        g, a = rig.geophones, rig.acquisition
-        corners = CompensationFilter(g.suspension_Hz, g.suspension_damping, g.compensated_Hz, g.compensated_damping)
-        converter = Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz)
-        chain = SensorChain(Geophone(g.suspension_Hz, g.suspension_damping, 1.0), corners, 1.0, converter)
-        gain = np.array(g.sensitivity_Vs_per_m)[index] * g.preamplifier_gain
-        poles = np.real(np.poly(corners.poles()))[::-1]
-        return SensorModel(chosen, "velocity", chain.system(), gain, "V", "V s/m", tuple(poles))
-    if rig.accelerometers is not None:
-        acc = rig.accelerometers
-        system = Accelerometer(1.0, acc.low_corner_Hz, 0.0).system()
-        return SensorModel(chosen, "acceleration", system, np.full(len(chosen), acc.sensitivity_Vs2_per_m), "V",
-                           "V s^2/m", (2 * np.pi * acc.low_corner_Hz, 1.0))
-    raise InputError("the rig file describes no sensors", field="geophones, accelerometers")
+    sensors = [rig.sensors()[known.index(name)] for name in chosen]
+    # Alike sensors share one chain object, whose response is computed once.
+    systems = {(one.zeros, one.poles, one.quantity): one.chain(1.0) for one in sensors}
+    units = {"velocity": "V s/m", "acceleration": "V s^2/m", "displacement": "V/m"}
+    return SensorModel(chosen, tuple(one.quantity for one in sensors),
+                       tuple(systems[one.zeros, one.poles, one.quantity] for one in sensors),
+                       np.array([one.gain for one in sensors]), "V", tuple(units[one.quantity] for one in sensors),
+                       tuple(tuple(np.atleast_1d(np.real(np.poly(one.poles)))[::-1].tolist()) for one in sensors),
+                       np.array([not one.inertial for one in sensors]))
 
 
 class Matrices(NamedTuple):
@@ -163,8 +208,9 @@ class ResponseModel:
     def all_parameters(self) -> dict[str, Parameter]:
         """Every parameter that could be free."""
         found = dict(self.rig.parameters())
-        for name, value in zip(self.sensors.names, self.sensors.sensitivity, strict=True):
-            found[f"sensor.{name}"] = Parameter(float(value), self.sensors.sensitivity_unit, f"sensitivity of {name}")
+        for name, value, unit in zip(self.sensors.names, self.sensors.sensitivity, self.sensors.sensitivity_units,
+                                     strict=True):
+            found[f"sensor.{name}"] = Parameter(float(value), unit, f"sensitivity of {name}")
         found["loop_delay_s"] = Parameter(self.delay_s, "s", "delay from the sample to the actuator voltage")
         return found
 
@@ -258,16 +304,21 @@ class ResponseModel:
 
     def sensor_transients(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y, n_t): `chain_transients` of each sensor."""
-        n_y = len(self.sensors.names)
-        one = self.chain_transients(1j * omega)
-        return (one[:, None, :, None] * np.eye(n_y)[:, None, :]).reshape(len(omega), n_y, -1)
+        n_y, each = len(self.sensors.names), self.chain_transients(1j * omega)
+        parts = []
+        for k, own in enumerate(each):
+            parts.append(np.zeros((len(omega), n_y, own.shape[1]), complex))
+            parts[-1][:, k] = own
+        return np.concatenate(parts, axis=2)
 
-    def chain_transients(self, s: np.ndarray) -> np.ndarray:
-        """(n, k): what the ends of a record leave in a sensor by itself: the states of its chain, and a constant and a
-        slope in frequency, which hold the aliases of all others; s (n,) j omega."""
-        poles = np.asarray(self.sensors.transient_poles)
-        states = (s ** k / np.polyval(poles[::-1], s) for k in range(len(poles) - 1))
-        return np.stack([*states, np.ones(len(s)), s], axis=-1)
+    def chain_transients(self, s: np.ndarray) -> list[np.ndarray]:
+        """(n, k) of each sensor: what the ends of a record leave in it by itself: the states of its chain, and a
+        constant and a slope in frequency, which hold the aliases of all others; s (n,) j omega."""
+        known = {}
+        for poles in dict.fromkeys(self.sensors.poles):
+            states = (s ** k / np.polyval(np.asarray(poles)[::-1], s) for k in range(len(poles) - 1))
+            known[poles] = np.stack([*states, np.ones(len(s)), s], axis=-1)
+        return [known[poles] for poles in self.sensors.poles]
 
     def inner_transients(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y, 0): y by initial states beside those of body and sensors, of which this model has none."""
@@ -289,21 +340,23 @@ class ResponseModel:
             force = force + U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
         inverse = np.linalg.inv(D)
         q = inverse @ force
-        out = self._chain(omega) * s ** _POWER[self.sensors.motion]
-        folded = alias * volts * self._passband()
+        out = self.sensors.sense(omega)[:, :, None]
         S = self.sensors.sensitivity[:, None]
         Minv = np.linalg.inv(mat.M)
+        moved = mat.R @ q
+        if np.any(self.sensors.relative):
+            moved = moved - (mat.R[:, :3] * self.sensors.relative[:, None]) @ (floor / s)
         # Aliases pass the chain far above its corners.
-        seen = out * (mat.R @ q) + mat.R @ Minv @ mat.T @ folded
+        seen = out * moved + alias * (mat.R @ Minv @ mat.T @ volts)
         if not derivative:
             return Driven(S * seen, np.empty(0))
-        return Driven(S * seen, self._derivative(omega, volts, floor, q, inverse, out, folded, seen, mat, Minv, a))
+        return Driven(S * seen, self._derivative(omega, volts, floor, q, inverse, out, alias, seen, mat, Minv, a))
 
-    def _derivative(self, omega, volts, floor, q, inverse, out, folded, seen, mat, Minv, a) -> np.ndarray:
+    def _derivative(self, omega, volts, floor, q, inverse, out, alias, seen, mat, Minv, a) -> np.ndarray:
         s, d = 1j * omega[:, None, None], self.derivative_matrices
         S = self.sensors.sensitivity[:, None]
         left = S * out * (mat.R @ inverse)
-        folded_q = Minv @ mat.T @ folded
+        pushed_q = Minv @ mat.T @ volts
         dY = np.zeros((len(self.names), *seen.shape), complex)
         driven = a * volts
         for j, name in enumerate(self.names):
@@ -314,11 +367,12 @@ class ResponseModel:
                 dY[j] = self._delay_derivative(omega, volts, mat, inverse, out, Minv)
             else:
                 dY[j] = left @ _force_derivative(d, j, s, q, driven, floor)
-                folding = _nonzero(d.T[j], lambda X: X @ folded) - _nonzero(d.M[j], lambda X: X @ folded_q)
+                folding = _nonzero(d.T[j], lambda X: X @ volts) - _nonzero(d.M[j], lambda X: X @ pushed_q)
                 if np.ndim(folding):
-                    dY[j] += S * (mat.R @ Minv @ folding)
+                    dY[j] += S * alias * (mat.R @ Minv @ folding)
                 if np.any(d.R[j]):
-                    dY[j] += S * (out * (d.R[j] @ q) + d.R[j] @ folded_q)
+                    moved = d.R[j] @ q - (d.R[j][:, :3] * self.sensors.relative[:, None]) @ (floor / s)
+                    dY[j] += S * (out * moved + alias * (d.R[j] @ pushed_q))
         return dY
 
     def _delay_derivative(self, omega, volts, mat, inverse, out, Minv) -> np.ndarray:
@@ -327,29 +381,21 @@ class ResponseModel:
         a, _ = self._drive(omega)
         earlier, later = max(self.delay_s - step, 0.0), self.delay_s + step
         slope = (replace(self, delay_s=later)._drive(omega)[1]
-                 - replace(self, delay_s=earlier)._drive(omega)[1]) / (later - earlier) * self._passband()
-        moved = out * (mat.R @ inverse @ mat.T @ (-s * a * volts)) + mat.R @ Minv @ mat.T @ (slope * volts)
+                 - replace(self, delay_s=earlier)._drive(omega)[1]) / (later - earlier)
+        moved = out * (mat.R @ inverse @ mat.T @ (-s * a * volts)) + slope * (mat.R @ Minv @ mat.T @ volts)
         return self.sensors.sensitivity[:, None] * moved
 
     def _drive(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Voltage commanded to force divided by T, and the aliases, (n, 1, 1) each."""
+        """Voltage commanded to force divided by T (n, 1, 1), and the aliases of each sensor (n, n_y, 1)."""
+        corner = self.amplifier_corner_Hz
         if self.period_s:
             a = hold(omega, self.period_s, self.delay_s)
-            folded = aliases(omega, self.period_s, self.delay_s, self.sensors.motion, self.amplifier_corner_Hz)
+            folded = self.sensors.folded(omega, self.period_s, self.delay_s, corner)
         else:
-            a, folded = np.exp(-1j * omega * self.delay_s), np.zeros(len(omega), complex)
-        if self.amplifier_corner_Hz:
-            a = a / (1 + 1j * omega / (2 * np.pi * self.amplifier_corner_Hz))
-        return a[:, None, None], folded[:, None, None]
-
-    def _chain(self, omega: np.ndarray) -> np.ndarray:
-        """(n, 1, 1) the sensors' chain of unit sensitivity."""
-        chain = self.sensors.chain
-        return np.ones((len(omega), 1, 1)) if chain is None else chain.frequency_response(omega)
-
-    def _passband(self) -> float:
-        """The chain far above its corners."""
-        return 1.0 if self.sensors.chain is None else float(self.sensors.chain.D[0, 0])
+            a, folded = np.exp(-1j * omega * self.delay_s), np.zeros((len(omega), 1), complex)
+        if corner:
+            a = a / (1 + 1j * omega / (2 * np.pi * corner))
+        return a[:, None, None], folded[:, :, None]
 
 
 def positive(name: str) -> bool:

@@ -75,6 +75,8 @@ def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError("expected a whole number, 0 or more", field="seed", value=seed)
     loop = open_loop(rig, plan).with_plant("truth", truth)
+    if truth is not None and truth.sensors() != rig.sensors():
+        loop = replace(loop, sensors=replace(loop.sensors, chains=rig_bank(truth, 1.0).chains))
     ambient = _ambient(rig, plan)
     planned = list(_signals(loop, plan, seed))
     records, notes, start_s = [], _assumptions(loop, plan, seed, ambient), 0.0
@@ -221,7 +223,9 @@ def _record(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: Spect
     measured = None
     if plan.floor_sensor.recorded:
         draw = _rng(*seed, _FLOOR_SENSOR).standard_normal((samples, 3))
-        measured = run.floor_dot[:, :3] + plan.floor_sensor.noise_rms_m_per_s * draw
+        own = {one.axis: one.noise_rms_m_per_s for one in loop.rig.floor_sensors if plan.sensors.noise}
+        rms = np.array([np.hypot(plan.floor_sensor.noise_rms_m_per_s, own.get(axis, 0.0)) for axis in "xyz"])
+        measured = run.floor_dot[:, :3] + rms * draw
     return Record(header, run.demanded, y, measured), _levels(header, run, y)
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.rigs.avis import INERTIA, AvisTable
 from avis_ctrl.rigs.halcyonics import Halcyonics
+from avis_ctrl.rigs.instruments import Triple, unit_vector
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -29,7 +32,7 @@ class Rehearsal:
     """A campaign and, beside it and nowhere in it, the truth.
 
     truth : the table that moved. true_values : the parameters that were changed, by flat name.
-    factors : true over file's value of each.
+    factors : true over file's value of each whose value in the file is not zero.
     """
 
     campaign: Campaign
@@ -49,13 +52,15 @@ def rehearse(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | N
     old, new = rig.parameters(), truth.parameters()
     changed = {name: new[name].value for name in old if new[name].value != old[name].value}
     campaign = simulate_campaign(rig, plan, seed, truth=truth, progress=progress)
-    return Rehearsal(campaign, truth, changed, {name: value / old[name].value for name, value in changed.items()})
+    return Rehearsal(campaign, truth, changed, {name: value / old[name].value for name, value in changed.items()
+                                            if old[name].value})
 
 
 def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.0, seed: int = 1) -> Rig:
     """Stiffness, mass and inertia within +-percent, damping within +-damping_percent; independent uniform draws.
 
-    Products of inertia, positions, actuators, sensors and the inertia of a load stay as they are; of a spring-suspended
+    Products of inertia, positions, actuators and sensors are off as the rig file's [tolerances] say, normal draws
+    (`within_tolerances`), and stay as they are where it has none. The inertia of a load stays; of a spring-suspended
     table masses too, which a scale tells, and with a load on it the plate's inertia.
 
     Raises
@@ -78,6 +83,8 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
                    for (name, width), draw in zip(spread.items(), draws, strict=True) if width}
         try:
             truth = rig.with_parameters(changes)
+            if isinstance(truth, AvisTable) and rig.tolerances is not None and changes:
+                truth = within_tolerances(truth, rng)
             rig_from(tomllib.loads(rig_toml(truth)), loaded=getattr(rig, "load", None) is not None)
         except InputError as error:
             refused = error
@@ -85,3 +92,44 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
             return truth
     raise InputError(f"{ATTEMPTS} draws gave no body that can exist; the last: {refused}", field="perturb_percent",
                      value=percent)
+
+
+def within_tolerances(rig: AvisTable, rng: np.random.Generator) -> AvisTable:
+    """The table off by normal draws of its file's [tolerances], one standard deviation each.
+
+    Corners and damping of geophones stay: in a rig file a compensation filter fits its geophone. Motors and geophones
+    of the isolators move with these and keep their axes.
+    """
+    t = rig.tolerances
+    if t is None:
+        return rig
+
+    def off(percent: float) -> float:
+        return 1 + percent / 100 * float(rng.standard_normal())
+
+    def placed(position: Triple, direction: Triple) -> dict[str, Triple]:
+        moved = np.add(position, t.place_m * rng.standard_normal(3))
+        turned = direction + np.cross(t.direction_rad * rng.standard_normal(3), direction)
+        return {"position": _triple(moved), "direction": unit_vector(_triple(turned), "direction")}
+
+    def moved_along(one: Any) -> Any:
+        return replace(one, **placed(one.position, one.direction))
+
+    isolators = tuple(replace(one, position=_triple(np.add(one.position, t.place_m * rng.standard_normal(3))))
+                      for one in rig.isolators)
+    drives, instruments = (tuple(moved_along(one) for one in some) for some in (rig.drives, rig.instruments))
+    moved = replace(rig, isolators=isolators, drives=drives, instruments=instruments)
+    known, changes = moved.parameters(), dict[str, float]()
+    for drive in moved.all_drives:
+        changes[f"actuator.{drive.name}"] = drive.constant_N_per_V * off(t.actuator_gain_percent)
+    for axis in "xyz":
+        changes[f"com_{axis}"] = known[f"com_{axis}"].value + t.centre_of_mass_m * float(rng.standard_normal())
+    for name in INERTIA[3:]:
+        changes[name] = known[name].value + t.product_of_inertia_kgm2 * float(rng.standard_normal())
+    gains = {one.name: one.gain * off(t.sensor_gain_percent) for one in moved.sensors()}
+    return moved.with_parameters(changes).with_sensor_gains(gains)
+
+
+def _triple(values: np.ndarray) -> Triple:
+    x, y, z = np.asarray(values, float).tolist()
+    return x, y, z

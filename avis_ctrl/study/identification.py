@@ -170,7 +170,7 @@ def amplifier_corner(rig: Rig, stated_Hz: float | None) -> float | None:
 
     Without a lag an accelerometer would see a force that jumps at the very moment of its sample.
     """
-    if stated_Hz is None and rig.geophones is None and rig.accelerometers is not None:
+    if stated_Hz is None and any(one.quantity == "acceleration" for one in rig.sensors()):
         return ACCELEROMETER_AMPLIFIER_HZ
     return stated_Hz
 

@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from avis_ctrl.errors import InputError
 from avis_ctrl.identification.campaign_fit import LONGEST_PIECE, driven_inputs, excited_band
 from avis_ctrl.identification.model_error import measured_response
 from avis_ctrl.identification.spread import FrfSpread, frf_spread
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.halcyonics import Halcyonics
+from avis_ctrl.rigs.logical_axes import drivable, sensed
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.study.design_file import ChainUncertainty, Design, design_from_table, read_design
 from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE, UNCERTAINTY_FILE
 from avis_ctrl.study.identified_uncertainty import InDesign, in_design
@@ -150,17 +153,31 @@ def _template(found: Identification, template: Path | Design | None) -> Design:
         return template
     if template is not None:
         return read_design(template)
-    return default_design(found.rig, f"{found.rig.name}, identified: z and phi_x under one controller")
+    keep = " and ".join(default_keep(found.rig))
+    return default_design(found.rig, f"{found.rig.name}, identified: {keep} under one controller")
+
+
+def default_keep(rig: Rig) -> list[str]:
+    """z and phi_x, as far as the drives push and the sensors see them; else the first coordinate that they do.
+
+    Raises InputError where there is none.
+    """
+    reached = [name for name in COORDINATES if name in drivable(rig) and name in sensed(rig)]
+    keep = [name for name in _COMMON["keep"] if name in reached] or reached[:1]
+    if not keep:
+        raise InputError("expected a coordinate that the drives push and the sensors see", field="keep", value=rig.name)
+    return keep
 
 
 def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float] | None = None) -> Design:
-    """Of z and phi_x for this kind of rig, as designs/*.toml have it, to stand beside rig.toml.
+    """Of z and phi_x, or what the rig reaches of them, as designs/*.toml have it for its kind, beside rig.toml.
 
     parameters_percent : ranges of the rig's parameters; by default none, for an identification brings them.
     """
     shape = _AVIS if isinstance(rig, AvisTable) else _HALCYONICS
     uncertainty = shape["uncertainty"] | {"parameters_percent": dict(parameters_percent or {})}
-    return design_from_table(shape | {"title": title, "rig": RIG_FILE, "uncertainty": uncertainty})
+    return design_from_table(shape | {"title": title, "rig": RIG_FILE, "keep": default_keep(rig),
+                                      "uncertainty": uncertainty})
 
 
 def _not_identified(ranges: dict[str, float], content: UncertaintyFile, known: Collection[str]) -> dict[str, float]:

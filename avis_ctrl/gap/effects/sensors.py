@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, register
+from avis_ctrl.rigs.rig import Rig
 
 if TYPE_CHECKING:
     from avis_ctrl.gap.operators import Operators
@@ -25,6 +26,11 @@ def second_order(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarr
 def receptance(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
     """1/(s^2 + 2 zeta w s + w^2), (n,): of a mode of unit mass."""
     return 1 / second_order(s, frequency_Hz, damping)
+
+
+def suspensions(rig: Rig) -> dict[str, tuple[float, float]]:
+    """Corner [Hz] and damping ratio of each geophone's suspension, by name."""
+    return {one.name: one.suspension for one in rig.sensors() if one.suspension is not None}
 
 
 def axis_of(model: TableModel, sensor: str) -> str:
@@ -53,19 +59,16 @@ class GeophoneCorner(_OfSensor):
     confusable = ("sensor_gain",)
 
     def places(self, model: TableModel) -> tuple[str, ...]:
-        return model.sensors.names if model.rig.geophones is not None and model.sensors.unit == "V" else ()
+        known = suspensions(model.rig)
+        return tuple(name for name in model.sensors.names if name in known) if model.sensors.unit == "V" else ()
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        g = model.rig.geophones
-        assert g is not None
-        f, z = g.suspension_Hz, g.suspension_damping
+        f, z = suspensions(model.rig)[place]
         return (EffectParameter("corner_Hz", "Hz", "suspension frequency", f, f / 5, 5 * f, f),
                 EffectParameter("damping", "1", "damping ratio of the suspension", z, z / 5, 5 * z, z))
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        g = ops.base.rig.geophones
-        assert g is not None
-        assumed = second_order(ops.s, g.suspension_Hz, g.suspension_damping)
+        assumed = second_order(ops.s, *suspensions(ops.base.rig)[place])
         ops.sense[:, ops.sensor(place)] *= assumed / second_order(ops.s, values["corner_Hz"], values["damping"])
 
 

@@ -1,0 +1,67 @@
+"""The pages on rig and design files list every key that the readers take, and no other; their examples are read."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import get_args
+
+from pydantic import BaseModel
+
+from avis_ctrl.rigs.rig_file import rig_from
+from avis_ctrl.rigs.rig_sections import AvisFile, HalcyonicsFile
+from avis_ctrl.study.design_file import Design, design_from_table
+
+DOCS = Path(__file__).parents[2] / "docs"
+# "## Isolators: `[payload]`" or "## `[[requirement]]`, a line of ..."
+HEADING = re.compile(r"^## (?:(Isolators|Springs|Either): )?(?:`\[+([\w.]+)\]+`)?.*?$(.*?)(?=^## |\Z)", re.S | re.M)
+
+
+def page(name):
+    text = (DOCS / name).read_text()
+    return tomllib.loads(re.search(r"```toml\n(.*?)```", text, re.S)[1]), text
+
+
+def listed(text, kinds):
+    """Keys by section, out of the first columns of the tables."""
+    found = {}
+    for kind, section, rows in HEADING.findall(text):
+        if kind in kinds:
+            found[section] = set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", rows, re.M))))
+    return found
+
+
+def keys(model, prefix="", top=True):
+    """Keys by section, out of the reader's models; sections inside sections by their dotted name."""
+    found, own = {}, set()
+    for name, field in model.model_fields.items():
+        inner = section_of(field.annotation)
+        if inner is None:
+            own.add(name)
+        else:
+            own |= {name} if top else set()
+            found |= keys(inner, f"{prefix}{name}.", top=False)
+    return {prefix.rstrip("."): own} | found
+
+
+def section_of(annotation):
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation if annotation.__name__ != "UncertaintyFile" else None
+    return next((found for part in get_args(annotation) if (found := section_of(part))), None)
+
+
+def test_the_page_on_rig_files_lists_every_key():
+    example, text = page("rig_file.md")
+    rig = rig_from(example)
+    assert len(rig.all_drives) == 2 and [one.quantity for one in rig.sensors()] == [
+        "velocity", "acceleration", "displacement"]
+    assert listed(text, ("Isolators", "Either")) == keys(AvisFile)
+    assert listed(text, ("Springs", "Either")) == keys(HalcyonicsFile)
+
+
+def test_the_page_on_design_files_lists_every_key():
+    example, text = page("design_file.md")
+    assert design_from_table(example).keep == ["z", "phi_x"]
+    found = listed(text, ("",))
+    sections = {name for name in keys(Design) if name}
+    found[""] |= {name for name in sections if "." not in name}  # the page says a section's name in its heading
+    assert found == keys(Design)
