@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import re
+import subprocess
+import sys
 import tomllib
 import warnings
 from pathlib import Path
@@ -168,3 +170,19 @@ def test_a_file_is_named_and_what_an_identification_wrote_is_not_held_against_it
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert load_rig(path, check=False).mass == 120e3
+
+
+@pytest.mark.parametrize("pattern, changed, said", [
+    (r"mass_kg = \S+", "mass_kg = 120e3", "payload.mass_kg = 120000.0: "),
+    (r"sensitivity_Vs_per_m = .*", "sensitivity_Vs_per_m = [0.03, 0.03, 0.03, 0.03, 0.03, 0.03]",
+     "geophones.sensitivity_Vs_per_m = 0.03: ")])
+def test_every_command_that_reads_a_rig_answers_in_one_line(tmp_path, pattern, changed, said):
+    path, plan = tmp_path / "rig.toml", tmp_path / "plan.toml"
+    path.write_text(re.sub(pattern, changed, (DATA / "avis.toml").read_text(encoding="utf-8")), encoding="utf-8")
+    plan.write_text('title = "p"\nduration_s = 8.0\n[[record]]\nexcitation = "noise"\n', encoding="utf-8")
+    command = ["simulate-campaign", "--rig", str(path), "--plan", str(plan), "--out", str(tmp_path / "c.h5")]
+    done = subprocess.run([sys.executable, "-c", "from avis_ctrl.cli import main; main()", *command], text=True,
+                          capture_output=True, check=False)
+    lines = done.stderr.strip().splitlines()
+    assert done.returncode == 2 and len(lines) == 1 and not (tmp_path / "c.h5").exists(), done.stderr
+    assert lines[0].startswith(f"avis: {path}: {said}") and "did you mean" in lines[0]
