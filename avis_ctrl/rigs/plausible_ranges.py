@@ -97,7 +97,7 @@ class PlausibleRanges:
         "suspension_damping": Range(0.01, 0.1, 3.0, 10.0, "", "a damping ratio, 0.7 as a rule"),
         "compensated_damping": Range(0.01, 0.1, 3.0, 10.0, "", "a damping ratio, 0.7 as a rule"),
         "sensitivity_Vs_per_m": Range(0.3, 3.0, 3e3, 5e4, "V s/m", "geophones have 10 to 400, seismometers 2000"),
-        "sensitivity_Vs2_per_m": Range(2e-3, 5e-3, 50.0, 500.0, "V s^2/m", "100 mV/g are 0.01, 10 V/g are 1"),
+        "sensitivity_Vs2_per_m": Range(2e-3, 5e-3, 200.0, 2e3, "V s^2/m", "100 mV/g are 0.01; 10 V/g, amplified, 100"),
         "sensitivity_V_per_m": Range(1.0, 50.0, 1e8, 1e10, "V/m", "from long inductive to capacitive sensors"),
         "preamplifier_gain": Range(1e-3, 0.05, 1e5, 1e7, "", "of a preamplifier"),
         "noise_m_per_s2_rtHz": Range(1e-11, 1e-9, 1e-2, 0.3, "m/s^2/sqrt(Hz)", "1e-9 to 1e-3 can be bought"),

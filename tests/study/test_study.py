@@ -191,24 +191,29 @@ def test_files_of_a_small_study_follow_the_contract(small, tmp_path):
         assert 20 * np.log10(c.transmissibility.high.max()) <= row["worst_case_peak_transmissibility_dB"] + 1e-6
 
 
-def test_a_failed_rewrite_takes_the_old_result_away(small, tmp_path, monkeypatch):
-    """result.json says that all else is complete: it goes first and comes last."""
+def test_a_failed_rewrite_leaves_the_old_result_whole(small, tmp_path, monkeypatch):
+    """Nothing of a study that could not be written stands beside files of the one before."""
+    from avis_ctrl import files
     from avis_ctrl.errors import ComputationError
-    from avis_ctrl.study import output
 
     design, plant = small
     rig = load_rig("avis")
     result = partial_result(design=design, rig=rig, plant=plant, controllers=(), dk_history=(), requirements=(),
                             provenance={}, seconds=1.0)
     write_study(result, tmp_path)
-    assert (tmp_path / "result.json").exists()
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert tmp_path / "result.json" in before
+    written, real = [], files.write_whole
 
-    def full(path: Path, value: dict) -> None:
-        raise ComputationError("disk full")
-    monkeypatch.setattr(output, "write_json", full)
-    with pytest.raises(ComputationError):
-        write_study(result, tmp_path)
-    assert not (tmp_path / "result.json").exists()
+    def full(path: Path, content: bytes) -> None:
+        if written:
+            raise ComputationError("disk full")
+        written.append(path)
+        real(path, content)
+    monkeypatch.setattr(files, "write_whole", full)
+    with pytest.raises(ComputationError, match="untouched"):
+        write_study(partial_result(**{**vars(result), "seconds": 2.0}), tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_uncertain_parameters_come_in_the_order_of_the_blocks(small):
