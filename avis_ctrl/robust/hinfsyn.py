@@ -36,6 +36,8 @@ from avis_ctrl.robust.riccati import INACCURATE, ON_AXIS
 
 # Relative accuracy to which a closed loop's norm contradicts a bound.
 LOOP_ACCURACY = 1e-5
+# Relative difference from which two computations of gamma say that it is round-off.
+SAME_GAMMA = 1e-2
 # A controller pole this many times the plant's fastest comes from the formulas, not from the plant.
 FAR_BEYOND = 10.0
 # Shares of the back-off at which a controller without them is tried: the smaller, the nearer they are to a gain.
@@ -128,6 +130,8 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
         status, notes = Status.BACKED_OFF, (*notes, raised)
         bounds = bounds[0], max(bounds[1], result.gamma)
     bounds, status, notes = _consistent(bounds, result.gamma, tolerance, status, notes)
+    if status is not Status.OPTIMAL:
+        notes = (*notes, *_doubt_of_gamma(P, result))
     rate = _rate_note(result, sample_rate_Hz)
     return replace(result, gamma_optimal_bounds=(float(bounds[0]), float(bounds[1])), status=status,
                    limited_by=bracket.limited_by, notes=(*notes, *result.notes, *rate))
@@ -284,6 +288,19 @@ class _Problem:
             K = discretise(K, self.P.dt, "tustin")
         closed = lft_lower(self.P, K)
         return Synthesis(K, hinf_norm(closed).gain, (0.0, np.inf), Status.OPTIMAL, closed, fastest, "")
+
+
+def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
+    """A note where the loop's peak, computed from P and K apart, is another: a small difference of large terms."""
+    peak = hinf_norm(result.closed_loop).omega
+    p, k = (one.frequency_response(np.array([peak]))[0] for one in (P, result.K))
+    w, z = P.ninputs - k.shape[0], P.noutputs - k.shape[1]
+    loop = p[:z, :w] + p[:z, w:] @ np.linalg.solve(np.eye(k.shape[0]) - k @ p[z:, w:], k @ p[z:, :w])
+    again = float(np.linalg.norm(loop, 2))
+    if abs(again - result.gamma) <= SAME_GAMMA * result.gamma:
+        return ()
+    return (f"gamma is round-off: {result.gamma:.4g} from the closed loop, {again:.4g} from P and K at the same "
+            f"frequency, a small difference of large terms",)
 
 
 def _widest_gap(poles: np.ndarray, plant_fastest: float) -> float:
