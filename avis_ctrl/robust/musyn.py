@@ -79,7 +79,8 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     target : stop once the scaled loop is measured below this (mu is then below it at every frequency).
     max_iterations : most K-steps, the first H-infinity controller counted. No clock decides anything: the same call
         gives the same controller on any machine, and more iterations, or a lower target, go on where fewer ended.
-    backoff : distance from the H-infinity optimum at which each controller is taken.
+    backoff : relative distance from the H-infinity optimum at which each controller is taken. mu ends about as much
+        above what the scalings allow; the nearer the optimum, the faster the controller's poles.
     polish : go on with descent on gamma where D-K iteration stalls (and orders that grow where that pays), and with
         D-K iteration after that, until a whole round gains nothing.
     max_added_states : most states that all scalings together may add to the plant.

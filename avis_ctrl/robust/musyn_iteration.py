@@ -1,9 +1,10 @@
 """The iteration of a mu synthesis: which scalings come next, the K-step, the analysis, and when it ends.
 
-Phases in turn: D-K iteration; descent on the H-infinity optimum over the scalings (`gamma_descent`); the same with one
-more order where gamma asks for it ("growth"); then D-K iteration again from the best loop. Each ends where a step gains
-less than `STALL`, the whole where a round of all three gains less than `ROUND`. Other constant scalings are tried once
-("start"): first of all where the controllers to start from do nothing, else in the end.
+Phases of a path in turn: D-K iteration; descent on the H-infinity optimum over the scalings (`gamma_descent`); the same
+with one more order where gamma asks for it ("growth"); then D-K iteration again from the best loop. Each ends where a
+step gains less than `STALL`, the whole where a round of all three gains less than `ROUND`. Another path begins, once,
+at the best constant scalings ("start"): first of all where the controllers to start from do nothing, next where a D-K
+step from them leads nowhere, else in the end. The best loop of all paths is kept.
 
 Only counts end anything, never a clock, and nothing depends on the target or on the number of iterations allowed but
 where the iteration ends: what a short run does is the beginning of what a long one does.
@@ -39,7 +40,8 @@ FAST = 0.25
 IDLE = 0.01
 # Constant scalings of all uncertainty against performance from which the iteration starts where identity leads nowhere.
 CONSTANTS = tuple(10.0 ** k for k in (-3, -2.5, -2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2, 2.5, 3))
-FOLLOWING = {"D-K": "descent", "descent": "growth", "growth": "start", "start": DONE}
+FOLLOWING = {"first start": "D-K", "D-K": "descent", "other start": "descent", "descent": "growth",
+             "growth": "last start", "last start": DONE}
 STOPPED = "stopped by the callback"
 
 
@@ -113,13 +115,14 @@ def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -
         row = Iteration(len(state.history), loop.gamma, loop.mu, loop.K.nstates, 0.0, 0, time.monotonic() - began, kind)
         state = replace(state, history=(*state.history, row))
         if state.best is None or loop.mu < state.best.mu:
-            state = replace(state, points=points, last=loop, best=loop, round_mu=loop.mu)
+            state = replace(state, points=points, last=loop, best=loop, path=loop, round_mu=loop.mu)
         if _stopped_by(options, row):
             return state, True
     if state.best is None or state.points is None:
         assert failure is not None
         raise failure
-    return replace(state, phase="start" if _at_rest(problem, state.points.omega, state.best.mu) else "D-K"), False
+    idle = _at_rest(problem, state.points.omega, state.best.mu)
+    return replace(state, phase="first start" if idle else "D-K"), False
 
 
 def _candidates(problem: Problem, starts: tuple[StateSpace, ...],
@@ -153,7 +156,7 @@ def _k_step(problem: Problem, state: State, proposal: Proposal, options: Options
     """H-infinity controller of the scaled plant; None where scalings, not the plant, make it fail."""
     try:
         return hinfsyn(proposal.scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff,
-                       gamma_hint=state.best.gamma if state.best else None)
+                       gamma_hint=state.path.gamma if state.path else None)
     except ComputationError:
         return None
 
@@ -163,7 +166,7 @@ def _no_further(state: State, options: Options) -> str:
     if state.phase == DONE:
         return (f"converged: a round of D-K iteration, descent on gamma and larger orders gains no more than "
                 f"{100 * ROUND:g} %")
-    if state.phase not in ("D-K", "start") and not options.polish:
+    if state.phase in ("descent", "growth", "last start") and not options.polish:
         return f"D-K iteration stalled: a step gained less than {100 * STALL:g} %"
     if options.target is not None and state.best and state.best.gamma <= options.target:
         return f"target {options.target:g} reached"
@@ -182,10 +185,10 @@ class Proposal(NamedTuple):
 
 def _proposed(problem: Problem, state: State, options: Options) -> Proposal | None:
     """The next scalings; None where the phase has nothing more to offer."""
-    assert state.last is not None and state.best is not None and state.points is not None
-    if state.phase == "start":
+    assert state.last is not None and state.path is not None and state.points is not None
+    if "start" in state.phase:
         tried = any(row.kind == "start" for row in state.history)
-        return None if tried else _other_constants(problem, state.best.gamma, options)
+        return None if tried else _other_constants(problem, state.path.gamma, options)
     if state.phase == "D-K":
         points = replace(state.points, floor=BROAD_FLOOR if _falls_fast(state) else DETAILED_FLOOR)
         try:
@@ -196,7 +199,7 @@ def _proposed(problem: Problem, state: State, options: Options) -> Proposal | No
             return None
         return Proposal(step.scalings, step.cost, "D-K")
     band = band_of(state.points.omega)
-    start = min(state.last, state.best, key=lambda loop: loop.gamma).scalings
+    start = min(state.last, state.path, key=lambda loop: loop.gamma).scalings
     if state.phase == "growth":
         larger = grown(problem.P, problem.nmeas, problem.ncon, start, band, options.max_added_states)
         if larger is None:
@@ -239,9 +242,9 @@ def _other_constants(problem: Problem, gamma: float, options: Options) -> Propos
 
 
 def _falls_fast(state: State) -> bool:
-    """Whether the last step lowered mu by more than `FAST`, or none was taken yet."""
+    """Whether the last step lowered mu by more than `FAST`, or none was taken yet on this path."""
     steps = _steps(state)
-    return len(steps) < 2 or steps[-1] < (1 - FAST) * steps[-2]
+    return len(steps) < 2 or state.history[-1].kind == "start" or steps[-1] < (1 - FAST) * steps[-2]
 
 
 def _steps(state: State) -> list[float]:
@@ -257,31 +260,26 @@ def _next_grid(state: State, closed_loop: StateSpace) -> np.ndarray:
 
 
 def _recorded(problem: Problem, state: State, loop: Loop, row: Iteration, points: PointwiseScalings) -> State:
-    """The state after an iteration: the best loop kept, the phase moved on where nothing was gained."""
-    assert state.best is not None
-    gained = 1 - loop.mu / state.best.mu
-    state = replace(state, points=points, last=loop, best=loop if gained > 0 else state.best,
+    """The state after an iteration: the best loops kept, the phase moved on where nothing was gained on this path."""
+    path = state.path
+    assert state.best is not None and path is not None
+    state = replace(state, points=points, last=loop, best=loop if loop.mu < state.best.mu else state.best,
                     history=(*state.history, row))
-    if state.phase == "start":
-        return _new_round(problem, state) if gained > 0 else _moved_on(problem, state)
+    if row.kind == "start":
+        return replace(state, phase="D-K", path=loop, round_mu=loop.mu)
+    gained = 1 - loop.mu / path.mu
+    state = replace(state, path=loop if gained > 0 else path)
     return state if gained > STALL else _moved_on(problem, state)
 
 
 def _moved_on(problem: Problem, state: State) -> State:
-    """The state in the next phase; after growth a new round from the best loop, where this one gained enough."""
-    assert state.best is not None
-    if state.phase == "start" and len(_steps(state)) <= 1:
-        # No other scalings are better than those to start from.
-        return replace(state, phase="D-K")
-    if state.phase == "growth" and state.best.mu <= (1 - ROUND) * state.round_mu:
-        return _new_round(problem, state)
-    return replace(state, phase=FOLLOWING[state.phase])
-
-
-def _new_round(problem: Problem, state: State) -> State:
-    """D-K iteration from the best loop."""
-    assert state.best is not None and state.last is not None and state.points is not None
+    """The state in the next phase; after growth a new round from the path's best loop, where this one gained enough."""
+    assert state.path is not None and state.last is not None and state.points is not None
+    if state.phase == "D-K" and state.path.mu >= state.round_mu:
+        return replace(state, phase="other start")
+    if state.phase != "growth" or state.path.mu > (1 - ROUND) * state.round_mu:
+        return replace(state, phase=FOLLOWING[state.phase])
     points = state.points
-    if state.last is not state.best:
-        points = analysed(problem.P, state.best.K, problem.structure, points.omega)
-    return replace(state, phase="D-K", points=points, last=state.best, round_mu=state.best.mu)
+    if state.last is not state.path:
+        points = analysed(problem.P, state.path.K, problem.structure, points.omega)
+    return replace(state, phase="D-K", points=points, last=state.path, round_mu=state.path.mu)

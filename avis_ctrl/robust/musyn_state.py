@@ -14,7 +14,7 @@ from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 FORMAT = "avis-musyn"
-VERSION = 1
+VERSION = 2
 DONE = "done"
 GIVEN = "given"
 NOMINAL = "nominal"
@@ -59,25 +59,27 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Phase ("D-K", "descent", "growth" or "done"), last loop with its analysis, best loop, history.
+    """Phase (see `musyn_iteration`), last loop with its analysis, best loop, history.
 
-    round_mu : the least mu when this round of phases began.
+    path : the best loop since the iteration began, or began again from other scalings; round_mu : its mu when this
+        round of phases began.
     """
 
     phase: str = "D-K"
     points: PointwiseScalings | None = None
     last: Loop | None = None
     best: Loop | None = None
+    path: Loop | None = None
     history: tuple[Iteration, ...] = ()
     round_mu: float = np.inf
 
     def as_dict(self, P: StateSpace, nmeas: int, ncon: int) -> dict[str, Any]:
         """JSON form, with the sizes of the problem it belongs to."""
-        assert self.last is not None and self.best is not None and self.points is not None
+        assert self.last is not None and self.best is not None and self.path is not None and self.points is not None
         return {"format": FORMAT, "version": VERSION, "problem": [P.nstates, P.ninputs, P.noutputs, nmeas, ncon],
                 "phase": self.phase, "round_mu": self.round_mu, "omega": self.points.omega.tolist(),
                 "last": self.last.as_dict(), "best": self.best.as_dict(),
-                "history": [asdict(row) for row in self.history]}
+                "path": self.path.as_dict(), "history": [asdict(row) for row in self.history]}
 
     @staticmethod
     def from_dict(saved: dict[str, Any], structure: BlockStructure, P: StateSpace, nmeas: int, ncon: int) -> State:
@@ -96,9 +98,9 @@ class State:
                         float(item["gamma"]), float(item["mu"]))
         last = loop(saved["last"])
         points = analysed(P, last.K, structure, np.array(saved["omega"], float))
-        return State(str(saved["phase"]), points, last, loop(saved["best"]),
+        return State(str(saved["phase"]), points, last, loop(saved["best"]), loop(saved["path"]),
                      tuple(Iteration(**row) for row in saved["history"]),
-                     float(saved.get("round_mu", saved["history"][0]["mu_upper"])))
+                     float(saved["round_mu"]))
 
 
 def analysed(P: StateSpace, K: StateSpace, structure: BlockStructure, omega: np.ndarray) -> PointwiseScalings:

@@ -227,7 +227,7 @@ def test_nominal_controller_is_where_large_uncertainty_forbids_the_first_one(lon
     def judged(K):
         return max(mu_upper_slicot(M, structure) for M in lft_lower(P, K).frequency_response(omega))
     assert long_run.history[1].mu_upper == pytest.approx(judged(nominal), rel=0.01)
-    assert long_run.history[0].mu_upper == pytest.approx(judged(hinfsyn(P, 1, 1).K), rel=0.01)
+    assert long_run.history[0].mu_upper == pytest.approx(judged(hinfsyn(P, 1, 1).K), rel=0.02)
     assert judged(nominal) < 0.3 * judged(hinfsyn(P, 1, 1).K)
 
 
