@@ -10,7 +10,7 @@ seconds.
 
 Each campaign is judged as it is, when any stop is false, and once more with one fault put into it. Printed: false stops
 and warnings by gate, with the 95 % bound of Clopper and Pearson, and detections by fault. A hidden converter that clips
-is a fault that the gates may stop at; it is counted apart.
+and samples that were dropped are faults that the gates are to stop at: such campaigns are counted apart.
 """
 
 from __future__ import annotations
@@ -55,11 +55,12 @@ LARGEST = 0.8
 
 @dataclass(frozen=True)
 class Outcome:
-    """of : form, table, effects; stops and warnings as (gate, sentence); fault, and whether it was found."""
+    """of : form, table, effects. faulty : what is hidden is a fault. sound, said : (severity, gate, sentence) of stops
+    and warnings, before and after the fault was put in. found : whether its gate named it."""
 
     seed: int
     of: str
-    clipping: bool
+    faulty: bool
     sound: tuple[tuple[str, str, str], ...]
     fault: str
     found: bool
@@ -128,7 +129,7 @@ def voltages(form: str, rng: np.random.Generator, rate: float, band: tuple[float
 
 
 def truth_campaign(seed: int) -> tuple[Campaign, str, bool]:
-    """From tests/truth: campaign, what it is in words, whether a hidden converter clips."""
+    """From tests/truth: campaign, what it is in words, whether what is hidden is a fault."""
     rng = np.random.default_rng((seed, 1))
     rig = cases.rig()
     rate, form = rig.sample_rate_Hz, str(rng.choice(list(FORMS), p=list(FORMS.values())))
@@ -144,7 +145,7 @@ def truth_campaign(seed: int) -> tuple[Campaign, str, bool]:
     effects = hidden_effects(plant, rng, band, float(levels.max()), 400.0)
     for effect in effects:
         (cases.LIBRARY | cases.OUTSIDE_LIBRARY)[effect.name].apply(plant, effect)
-    clipping = any("range_V" in effect.parameters for effect in effects)
+    faulty = any("range_V" in effect.parameters or effect.name == "dropped_samples" for effect in effects)
     slope, measured, before = float(rng.uniform(0, 1)), bool(rng.random() < 0.5), round(SETTLE_S * rate)
     records, start = [], 0.0
     for k, (shape, level) in enumerate(zip(shapes, levels, strict=True)):
@@ -163,7 +164,7 @@ def truth_campaign(seed: int) -> tuple[Campaign, str, bool]:
         records.append(Record(header, u, y, floor[before:-1, 3:6] if measured else None))
         start += len(u) / rate + float(round(rng.uniform(10, 300)))
     said = ", ".join(f"{e.name} {e.strength}" for e in effects) or "nothing hidden"
-    return Campaign("avis", tuple(records)), f"{form}{', cluttered' if cluttered else ''}: {said}", clipping
+    return Campaign("avis", tuple(records)), f"{form}{', cluttered' if cluttered else ''}: {said}", faulty
 
 
 def own_campaign(seed: int) -> tuple[Campaign, str, bool]:
@@ -290,7 +291,7 @@ def made(seed: int, keep: Path | None) -> tuple[Campaign, str, bool]:
 def judge(seed: int, faults: tuple[str, ...], keep: Path | None) -> Outcome:
     """One campaign, as it is and with a fault."""
     with threadpool_limits(1):
-        campaign, words, clipping = made(seed, keep)
+        campaign, words, faulty = made(seed, keep)
         known: Any = expectation(start_model(campaign, load_rig(campaign.rig), IdentifyOptions()))
         sound = grave(examine(campaign, known))
         fault = faults[seed % len(faults)]
@@ -298,7 +299,7 @@ def judge(seed: int, faults: tuple[str, ...], keep: Path | None) -> Outcome:
         findings = examine(broken, known)
         found = any(f.gate in FAULTS[fault][0] and f.severity in ("warning", "stop") and channels <= set(f.channels)
                     for f in findings)
-        return Outcome(seed, words, clipping, sound, fault, found, grave(findings))
+        return Outcome(seed, words, faulty, sound, fault, found, grave(findings))
 
 
 def bound(k: int, n: int) -> float:
@@ -309,17 +310,18 @@ def bound(k: int, n: int) -> float:
 def report(outcomes: list[Outcome]) -> str:
     """False alarms by gate, detections by fault."""
     n = len(outcomes)
-    lines = [f"{n} sound campaigns: false stops"]
-    plain = [o for o in outcomes if not o.clipping]
+    lines = [f"{n} campaigns; false stops of those without a fault:"]
+    plain = [o for o in outcomes if not o.faulty]
     stopped = [o for o in plain if any(s == "stop" for s, _, _ in o.sound)]
     share, most = len(stopped) / max(len(plain), 1), bound(len(stopped), len(plain))
-    lines.append(f"  any gate          {len(stopped):4d} of {len(plain)}  {100 * share:.2f} % (95 %: below {100 * most:.2f} %)")
+    lines.append(f"  any gate          {len(stopped):4d} of {len(plain)} = {100 * share:.2f} %,"
+                 f" surely (95 %) below {100 * most:.2f} %")
     for severity in ("stop", "warning"):
         count = Counter(gate for o in plain for gate in {g for s, g, _ in o.sound if s == severity})
         lines += [f"  {severity:8s} {gate:18s} {k:4d}" for gate, k in sorted(count.items())]
-    clipped = [o for o in outcomes if o.clipping]
-    told = sum(any(g == "clipping" for _, g, _ in o.sound) for o in clipped)
-    lines.append(f"hidden converter that clips: {len(clipped)} campaigns, stopped at {told}")
+    broken = [o for o in outcomes if o.faulty]
+    told = sum(any(g in ("clipping", "missing samples") for _, g, _ in o.sound) for o in broken)
+    lines.append(f"hidden faults (clipping, dropped samples): {len(broken)} campaigns, named in {told}")
     lines.append("fault                    found of")
     for fault in FAULTS:
         of = [o for o in outcomes if o.fault == fault]

@@ -31,6 +31,7 @@ from avis_ctrl.measurement.gates.examine import after_missing_samples
 from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.finding import Finding
 from avis_ctrl.measurement.gates.missing_samples import MissingSamples
+from avis_ctrl.measurement.gates.repeatability import beyond_chance
 
 SEVERE = ("warning", "stop")
 
@@ -201,6 +202,20 @@ def test_dependence_on_the_level():
     soft = stiffer(-0.05)
     found = alarms(multisine_campaign(4, sims=(soft, soft, Simulator()), same=True))
     assert gates(found) == {"level dependence"}
+
+
+def test_lines_beside_the_band_are_not_compared():
+    """At 121 Hz, where 80 Hz end the band, one level's records hold a line that the drives did not put there."""
+    def beside(u, y):
+        return u, y + 0.02 * (np.abs(u).max() > 0.5) * np.sin(2 * np.pi * 121.0 * np.arange(len(y)) / RATE)[:, None]
+
+    found = alarms(everywhere(noise_campaign(3, 16000, levels=(0.2, 0.05)), beside))
+    assert "level dependence" not in gates(found)
+
+
+@pytest.mark.parametrize(("T", "said"), [(46358975614.2, "far beyond chance"), (3.04, "3.0 times what chance")])
+def test_statistics_are_said_in_words_that_one_can_read(T, said):
+    assert beyond_chance(T).startswith(said)
 
 
 def test_records_of_different_voltages_say_how_little_their_comparison_tells():

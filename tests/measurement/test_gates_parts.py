@@ -17,7 +17,7 @@ from avis_ctrl.measurement.gates.dead_channel import equal_runs
 from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.h1 import Spectra, h1, spectra
 from avis_ctrl.measurement.gates.hum import Hum
-from avis_ctrl.measurement.gates.missing_samples import delay_step, repeated_block
+from avis_ctrl.measurement.gates.missing_samples import delay_step, repeated_block, runs_away
 from avis_ctrl.measurement.gates.periodicity import compared
 from avis_ctrl.measurement.gates.sine_fit import fit_sine, second_order
 
@@ -86,6 +86,13 @@ def test_a_step_of_the_delay_has_its_place_and_size(rng):
     delay[25:] -= 2
     where, size = delay_step(delay, 1e-4)
     assert abs(where - 25) <= 1 and size == pytest.approx(-2, abs=0.2)
+
+
+@pytest.mark.parametrize(("shape", "away"), [(np.linspace(0, 3, 60), True), (3.0 * (np.arange(60) > 20), False)])
+def test_two_clocks_are_no_lost_samples(rng, shape, away):
+    delay = shape + 0.1 * rng.standard_normal(60)
+    where, size = delay_step(delay, 1e-4)
+    assert runs_away(delay, where) == away and size > 1
 
 
 @given(seeds)

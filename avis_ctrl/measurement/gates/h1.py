@@ -58,7 +58,7 @@ class Spectra:
 class H1:
     """f (n,) Hz, G (n, n_y, n_u), noise (n, n_y) residual power, covariance (n, n_u, n_u) of a row of G by the noise
     there, coherence (n, n_y) multiple, dof complex degrees of freedom of the noise, basis (n_u, rank) orthonormal
-    directions of u that are excited."""
+    directions of u that are excited, power (n,) of u."""
 
     f: np.ndarray
     G: np.ndarray
@@ -67,6 +67,7 @@ class H1:
     coherence: np.ndarray
     dof: int
     basis: np.ndarray
+    power: np.ndarray
 
     @property
     def rank(self) -> int:
@@ -150,7 +151,8 @@ def h1(of: list[Spectra]) -> H1 | None:
     coherence[total == 0] = 0.0
     G = np.swapaxes(solved, 1, 2) @ basis.T
     covariance = basis @ inverse @ basis.T * (len(U) / K)
-    return H1(joint.f[keep], G, noise, covariance, np.clip(coherence, 0.0, 1.0), dof, basis)
+    driven = np.sum(np.abs(reduced) ** 2, axis=(0, 2))
+    return H1(joint.f[keep], G, noise, covariance, np.clip(coherence, 0.0, 1.0), dof, basis, driven)
 
 
 def octaves(f: np.ndarray) -> list[np.ndarray]:

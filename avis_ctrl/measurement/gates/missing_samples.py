@@ -43,9 +43,9 @@ class MissingSamples(Gate):
     instant is
     tested (Student's t with the segments' own scatter, 1 % shared over instants, records and the three estimates of H1;
     few segments), must exceed half a sample, and must explain the record: with the step undone the residual of H1 falls
-    by a tenth. (In a swept sine the delay changes with the frequency, and so with time.) Where rows were lost from u
-    and y together, a periodic u shows it: each period is compared with the first by circular correlation, exactly, for
-    u is commanded.
+    by a tenth. (In a swept sine the delay changes with the frequency, and so with time.) A delay that runs away
+    is no step. Where rows were lost from u and y together, a periodic u shows it: each period is compared with the
+    first by circular correlation, exactly, for u is commanded.
     A repeated block is 16 or more rows equal in every channel of y to earlier ones, not a whole number of periods away
     where the record is periodic; noise in one channel alone makes that impossible by chance.
     """
@@ -55,7 +55,8 @@ class MissingSamples(Gate):
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
         t, delay = delays(seen)
         stepped = [one for one in delay if (step := delay_step(one, FALSE_ALARM)) is not None
-                   and JUMP < abs(step[1]) <= LONGEST_DELAY and explained(seen, t, *step) > EXPLAINS]
+                   and JUMP < abs(step[1]) <= LONGEST_DELAY and not runs_away(one, step[0])
+                   and explained(seen, t, *step) > EXPLAINS]
         block = repeated_block(seen.first.y, seen.header.period_samples)
         return _Kept(seen.header, block, t, delay, stepped, _clock(seen))
 
@@ -244,6 +245,14 @@ def delay_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:
     if best is None or 2 * stats.t.sf(best[0], max(n // 2 - 2, 2)) > level:
         return None
     return best[1], best[2]
+
+
+def runs_away(delay: np.ndarray, where: int) -> bool:
+    """A straight line leaves less of the delay than a step at `where`: two clocks that differ, and no lost samples."""
+    x = np.arange(len(delay))
+    line = delay - np.polyval(np.polyfit(x, delay, 1), x)
+    step = delay - np.where(x < where, np.median(delay[:where]), np.median(delay[where:]))
+    return float(np.median(np.abs(line))) < float(np.median(np.abs(step)))
 
 
 def repeated_block(y: np.ndarray, period: int | None) -> tuple[int, int, int] | None:

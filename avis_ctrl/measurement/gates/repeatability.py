@@ -26,6 +26,9 @@ from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
 # Directions of the voltages count as common to two records down to this cosine of the angle between them.
 COMMON = 1 - 1e-6
+# Lines with less than this part of the median power of the driven ones are the skirt of the band: u and y are small
+# there, and differ by what leaks into them.
+EXCITED = 0.03
 # T beyond this many times its limit is said in words: the number tells nobody anything.
 TOLD = 20.0
 # Differences below these parts of the response are not worth a note, or a warning.
@@ -287,6 +290,7 @@ def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Dif
     f = np.fft.rfftfreq(len(a.y), 1 / a.rate)[2:-1:2]
     driven = np.sum(np.abs(windowed(b.u)) ** 2, axis=1)
     keep = driven > 1e-3 * driven.max()
+    keep &= driven > EXCITED * np.median(driven[keep])
     power = np.abs(D) ** 2
     by_line = np.sqrt(power / np.maximum(size, 1e-300))
     T, relative, band = _by_band(
@@ -331,7 +335,8 @@ def _compare(a: H1 | None, b: H1 | None, level: float, names: tuple[str, str]) -
     if a is None or b is None:
         return None
     f, ia, ib = np.intersect1d(a.f, b.f, return_indices=True)
-    ia, ib, f = ia[::2], ib[::2], f[::2]
+    inside = (a.power[ia] > EXCITED * np.median(a.power)) & (b.power[ib] > EXCITED * np.median(b.power))
+    ia, ib, f = ia[inside][::2], ib[inside][::2], f[inside][::2]
     common = _common(a.basis, b.basis)
     rank = common.shape[1]
     if not len(f) or not rank:

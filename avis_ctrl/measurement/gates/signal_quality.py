@@ -30,12 +30,14 @@ NOISE_FACTOR = 3.0
 
 @dataclass(frozen=True, eq=False)
 class _Noise:
-    """f (n,) Hz; snr (n, n_y) signal power by noise power of one period; noise_rms (n_y,); wide: noise at rest."""
+    """f (n,) Hz; snr (n, n_y) signal power by noise power of one period; noise_rms (n_y,); wide: noise at rest;
+    segment_s: of a record that is not periodic, whose segments leak; 0 of a periodic one."""
 
     record: str
     f: np.ndarray
     snr: np.ndarray | None
     noise_rms: np.ndarray | None
+    segment_s: float = 0.0
 
 
 class SignalToNoise(Gate):
@@ -55,18 +57,25 @@ class SignalToNoise(Gate):
     name = "signal to noise"
 
     def look(self, seen: Excerpt, expectation: Expectation) -> _Noise:
-        f, snr = _snr(seen)
-        return _Noise(seen.header.name, f, snr, _high_noise(seen) if expectation.sensor_noise_rms_V else None)
+        f, snr, segment_s = _snr(seen)
+        noise = _high_noise(seen) if expectation.sensor_noise_rms_V else None
+        return _Noise(seen.header.name, f, snr, noise, segment_s)
 
     def conclude(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         found = self._noisy(kept, campaign, expectation)
-        measured = [(k.f, k.snr, k.record) for k in kept if k.snr is not None and len(k.f)]
+        measured = [(k.f, k.snr, k.segment_s) for k in kept if k.snr is not None and len(k.f)]
         if not measured:
             picture = Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ())
             return found or [
                 Finding(self.name, "ok", "No driven record is long enough to part signal from noise.", picture=picture)
             ]
-        f, snr = max(measured, key=lambda m: float(np.median(m[1])))[:2]
+        f, snr, segment_s = max(measured, key=lambda m: float(np.median(m[1])))
+        advice = (
+            f"; it is noise, or leakage of a mode that decays longer than the segments of {segment_s:.3g} s. A periodic"
+            " voltage tells which; more drive helps against noise only."
+            if segment_s
+            else ". Those bands weigh little in a fit; drive them more if they matter."
+        )
         bands = octaves(f)
         dB = np.array([10 * np.log10(np.maximum(snr[band].mean(axis=0), 1e-6)) for band in bands])
         middle = np.array([np.sqrt(f[band][0] * f[band][-1]) for band in bands])
@@ -100,8 +109,7 @@ class SignalToNoise(Gate):
                     Finding(
                         self.name,
                         "note",
-                        f"Channel {name!r} has little signal around {low}. Those bands weigh little in a fit; "
-                        "drive them more if they matter.",
+                        f"Channel {name!r} has little signal around {low}{advice}",
                         (name,),
                         value=float(dB[weakest, j]),
                         limit=LOW_DB,
@@ -311,10 +319,10 @@ def thirds(f: np.ndarray) -> list[np.ndarray]:
     return [place == k for k in np.unique(place)]
 
 
-def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None]:
-    """Driven lines (n,) Hz and signal by noise power (n, n_y)."""
+def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
+    """Driven lines (n,) Hz, signal by noise power (n, n_y), and the length of segments [s] where they leak, else 0."""
     if not seen.driven or seen.header.excitation == "sine":
-        return np.zeros(0), None
+        return np.zeros(0), None, 0.0
     rate = seen.header.sample_rate_Hz
     if seen.periodic and (periods := seen.periods("y")).shape[0] >= 3:
         Y, U = np.fft.rfft(periods[1:], axis=1), np.fft.rfft(seen.periods("u")[1:].mean(axis=0), axis=0)
@@ -327,14 +335,15 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None]:
         noise = _smooth(noise, 9)
         signal = np.maximum(_smooth(np.abs(Y.mean(axis=0)[keep]) ** 2, 9) - noise / P, 0.0)
         f = np.fft.rfftfreq(periods.shape[1], 1 / rate)[keep]
-        return f, signal / np.maximum(noise, 1e-300)
+        return f, signal / np.maximum(noise, 1e-300), 0.0
     u, y, wrap = usable(seen)
     n_u = int(np.count_nonzero(np.ptp(u, axis=0)))
-    estimate = h1([spectra(u, y, rate, segment_length(len(u), n_u), wrap)])
+    length = segment_length(len(u), n_u)
+    estimate = h1([spectra(u, y, rate, length, wrap)])
     if estimate is None:
-        return np.zeros(0), None
+        return np.zeros(0), None, 0.0
     free = np.maximum(estimate.coherence - (1 - estimate.coherence) * estimate.rank / estimate.dof, 0.0)
-    return estimate.f, free / np.maximum(1 - free, 1e-12)
+    return estimate.f, free / np.maximum(1 - free, 1e-12), length / rate
 
 
 def _smooth(a: np.ndarray, width: int) -> np.ndarray:
