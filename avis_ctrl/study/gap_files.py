@@ -191,7 +191,7 @@ def _predicted(model: TableModel, record: Record, clock: tuple[float, float]) ->
     """(samples, n_y) in the model's order."""
     if len(record.u) > MOST_SAMPLES and not model.effects:
         limit = model.rig.drive_limit_V
-        return predict(model.base, replace(record, u=np.clip(record.u, -limit, limit)))
+        return predict(model.base, replace(record, u=np.clip(record.u, -limit, limit)), large_motion=False)
     u, floor = model_inputs(model.base, record)
     h = record.header
     return simulate(model, u, floor, h.sample_rate_Hz, start_s=h.start_s, campaign_s=clock).y

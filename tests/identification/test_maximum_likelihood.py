@@ -17,6 +17,7 @@ from avis_ctrl.identification.spectra import SpectralBlock, record_block, respon
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
+from avis_ctrl.rigs.logical_axes import actuator_axes
 
 MOUNTS = [f"isolator{i}.{kind}_{axis}" for i in (1, 2, 3, 4) for kind in "kc" for axis in "xyz"]
 BODY = ["mass", "J1", "J2", "J3"]
@@ -152,6 +153,23 @@ def test_of_too_many_lines_some_driven_ones_are_fitted(avis, monkeypatch):
     assert np.all(lines % 2 == 0) and np.all(np.diff(lines) > 0)
     monkeypatch.setattr(campaign_fit, "MOST_LINES", 1000)
     assert len(campaign_fit.campaign_blocks(campaign, model, (10.0, 30.0))[0][0].omega) == 201
+
+
+def test_eight_drives_played_along_six_axes_are_fitted_like_any(avis, monkeypatch):
+    """Noise is measured, few lines are enough, and the body is found; no response of each drive is asked for."""
+    true = ResponseModel.of(avis, BODY).at([510.0, 28.0, 43.0, 62.0])
+    rng, axes = np.random.default_rng(15), actuator_axes(avis)
+    records = []
+    for k in range(3):
+        u = multisine(rng, 1.0, 8000, 1, (2.0, 25.0), 6) @ axes.allocation.T
+        u *= 0.3 / np.sqrt(np.mean(u ** 2))
+        records.append(record(true.rig, u, floor_velocity(rng, len(u), 1e-6), rng, name=f"{k:02d}"))
+    monkeypatch.setattr(campaign_fit, "MOST_LINES", 300)
+    found = campaign_fit.fit_campaign(Campaign("avis", tuple(records)), ResponseModel.of(avis, BODY), (2.0, 25.0),
+                                      reweights=1)
+    assert found.measured and any("of 552 lines are fitted" in note for note in found.notes)
+    assert 0.6 < found.first.chi2_per_dof < 1.4
+    assert np.allclose(found.fit.values, true.values, rtol=1e-3)
 
 
 def test_records_of_a_rig_with_floor_motion(avis):
