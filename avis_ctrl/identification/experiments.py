@@ -168,7 +168,8 @@ def site_noise(model: ResponseModel) -> Noise:
     rounding = rig.converter.noise_rms_V if rig.converter else 0.0
     floor = rig.ambient.floor_velocity_rms_m_per_s if rig.ambient else 2e-6
     assumed = "" if rig.ambient else "the rig's file has no [ambient]: a floor of 2e-6 m/s r.m.s. is assumed"
-    return Noise(np.hypot(noise, rounding), floor, assumed=assumed)
+    sensor = np.hypot(noise, rounding)
+    return Noise(float(sensor[0]) if np.ptp(sensor) == 0 else sensor, floor, assumed=assumed)
 
 
 def campaign_noise(blocks: Sequence[SpectralBlock]) -> Noise:

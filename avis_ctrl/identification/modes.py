@@ -202,7 +202,7 @@ def _of_one_kind(model: ResponseModel, blocks: Sequence[SpectralBlock]) -> tuple
     free = tuple(name for name in model.names if not name.startswith("sensor.")
                  or name.removeprefix("sensor.") in chosen.names)
     return replace(model, names=free, sensors=chosen), [
-        replace(block, Y=block.Y[:, own], noise=None if block.noise is None else block.noise[:, own][:, :, own])
+        replace(block, Y=block.Y[:, own], noise=None if block.noise is None else block.noise[..., own, :][..., own])
         for block in blocks]
 
 

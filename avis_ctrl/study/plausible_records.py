@@ -319,5 +319,5 @@ def _sensor_gain(name: str, factor: float, model: ResponseModel) -> tuple[str, o
     k = model.sensors.names.index(name)
     value = float(model.sensors.sensitivity[k])
     return (f"sensitivity of {name}", value,
-            f"only {name} is off: did you mean {value * factor:g} {model.sensors.sensitivity_units[k]} (with preamplifier),"
-            " or are its records in another unit than the others?")
+            f"only {name} is off: did you mean {value * factor:g} {model.sensors.sensitivity_units[k]} (with "
+            "preamplifier), or are its records in another unit than the others?")
