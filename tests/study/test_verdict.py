@@ -1,0 +1,57 @@
+"""The first sentence of a design, and the exit code that goes with it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.simulation.campaign import PlantCheck
+from avis_ctrl.simulation.culprit import Culprit
+from avis_ctrl.study.model import DesignResult, Requirement, Simulated
+from avis_ctrl.study.requirements import judge_loop
+from avis_ctrl.study.verdict import first_sentence, refuse_unstable
+
+CULPRIT = Culprit("nominal", 1.00016, 0.99, 0.16, ("x", "phi_y"), "companions", ("x", "y"))
+
+
+def plant(name: str, radius: float, diverged: bool = False, clipped: int = 0) -> PlantCheck:
+    agrees = SimpleNamespace(agrees=True) if radius < 1 and not diverged else None
+    return PlantCheck(name, diverged, radius, agrees, 1.0, 0.1, 10.0, clipped, 0, {})
+
+
+def result(plants, culprit=None, asked=()) -> DesignResult:
+    check = SimpleNamespace(plants=tuple(plants), duration_s=20.0, false_alarm=0.01)
+    loop = Simulated(None, check, None, 1.0, culprit)
+    rows = (*judge_loop(check), *asked)
+    return DesignResult(*(None,) * 5, rows, None, None, loop, {}, 1.0)
+
+
+def test_an_unstable_loop_comes_before_requirements_that_are_met():
+    met = Requirement("mu", 1.0, 0.895, "", True, "at most")
+    found = result([plant("nominal", 1.00016), plant("random 1", 0.999)], CULPRIT, [met])
+    text = first_sentence(found)
+    assert text.startswith("UNSTABLE: ") and "1 of 2 plants" in text
+    assert "x and phi_y" in text and "0.99 Hz" in text and "loops of x and y" in text
+    with pytest.raises(ComputationError, match="UNSTABLE") as refused:
+        refuse_unstable(found)
+    assert refused.value.exit_code == 3 and refused.value.next_step
+    assert [row.met for row in found.requirements] == [False, True, False, True]
+
+
+@pytest.mark.parametrize("bad", [plant("nominal", 1.0 + 1e-9), plant("nominal", 0.99, diverged=True),
+                                 plant("nominal", np.nan)])
+def test_a_slow_growth_a_divergence_and_a_radius_that_is_no_number_are_all_unstable(bad):
+    found = result([bad], CULPRIT)
+    assert not found.stable and first_sentence(found).startswith("UNSTABLE")
+
+
+def test_stable_loops_count_and_nothing_is_raised():
+    found = result([plant("nominal", 0.9999), plant("random 1", 0.999, clipped=3)])
+    refuse_unstable(found)
+    assert first_sentence(found) == ("1 of 3 requirements is not met: voltages stay within the limits of drives and "
+                                     "converter.")
+    stable, limits, _ = found.requirements
+    assert (stable.value, stable.limit, stable.met) == (2, 2, True) and (limits.value, limits.met) == (1, False)
