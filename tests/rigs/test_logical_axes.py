@@ -1,5 +1,7 @@
 """Actuator and sensor matrices against forces and motions at the places, and least norm against an optimiser."""
 
+from pathlib import Path
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -71,3 +73,28 @@ def test_two_motors_on_a_line_cannot_tell_z_from_the_roll():
     """Az1 and Az2 both stand at y = -0.375: z and phi_x only in the fixed ratio of the arm."""
     with pytest.raises(InputError, match="z and phi_x cannot be pushed independently"):
         actuator_axes(load_rig("avis"), ("z", "phi_x"), ["Az1", "Az2"], quiet=[])
+
+
+def test_five_drives_push_what_is_asked_and_as_little_else_as_they_can():
+    """Leftover of the tripod without one tangential drive, rotations at the edge, against an optimiser."""
+    rig = load_rig(Path(__file__).parents[2] / "designs" / "rigs" / "tripod.toml")
+    five = ["V1", "V2", "H2", "V3", "H3"]
+    found = actuator_axes(rig, ("x", "z"), five)
+    T = found.matrix / np.array([1, 1, 1, *[rig.edge_m] * 3])[:, None]
+    volts = cp.Variable((5, 2))
+    problem = cp.Problem(cp.Minimize(cp.sum_squares(T[[1, 3, 4, 5]] @ volts)), [T[[0, 2]] @ volts == np.eye(2)])
+    problem.solve("CLARABEL")
+    assert np.allclose(T[[0, 2]] @ found.allocation, np.eye(2), atol=1e-12)
+    assert np.sum(found.leftover ** 2) == pytest.approx(problem.value, rel=1e-6) and problem.value > 0.01
+
+
+def test_noisy_sensors_count_less():
+    """Decoding of twelve sensors against generalised least squares with each sensor's noise as velocity, 1 to 30 Hz."""
+    rig = load_rig(Path(__file__).parents[2] / "designs" / "rigs" / "twelve_sensors.toml")
+    omega = 2 * np.pi * np.geomspace(1.0, 30.0, 20)
+    lsb = 20.0 / 2 ** 16
+    sigma = np.array([np.hypot(one.noise_rms_V, lsb / np.sqrt(12)) / one.gain
+                      * np.exp(-np.mean(np.log(np.abs(one.as_velocity(omega))))) for one in rig.sensors()])
+    found = sensor_axes(rig)
+    H = found.matrix / sigma[:, None]
+    assert np.allclose(found.decoding, np.linalg.solve(H.T @ H, H.T) / sigma, atol=1e-9)
