@@ -7,9 +7,9 @@ apart gets a skyhook loop of its own:
 
 Loops are closed one after the other around the sampled table with six degrees of freedom, hold, delay, amplifiers,
 sensor dynamics and the design's own controller included, and once more with all the others closed. Of a grid of
-gains and corners each loop takes the one with the smallest payload velocity r.m.s. under the site's floor motion and
-sensor noise among those that keep a modulus margin (the distance of the Nyquist curve from the critical point) and
-that the neglected dynamics of the drives do not destabilise. Critical damping with customary corners, the classical
+gains and corners each loop takes the one with the smallest payload velocity r.m.s. in the site's band, under floor
+motion and sensor noise, among those that keep a modulus margin (the distance of the Nyquist curve from the critical
+point) and that the neglected dynamics of the drives do not destabilise. Critical damping with customary corners, the classical
 rule, keeps neither with 1 Hz geophones: the geophone's phase lead below its corner turns damping into feeding.
 """
 
@@ -114,7 +114,7 @@ def free_axes(rig: Rig, keep: Sequence[str]) -> tuple[list[str], list[tuple[str,
     return chosen[len(keep):], passive
 
 
-def design_companions(bare: SampledLoop, chain_error: Weight | None = None,
+def design_companions(bare: SampledLoop, chain_error: Weight | None = None, band_Hz: Sequence[float] = (0.5, 60.0),
                       settings: CompanionSettings = CompanionSettings()) -> Companions:
     """Loops for the axes that `bare` does not control.
 
@@ -122,12 +122,14 @@ def design_companions(bare: SampledLoop, chain_error: Weight | None = None,
     ----------
     bare : the design's controller around the nominal rig, `loops` empty.
     chain_error : relative error of the drives' neglected dynamics; None for none.
+    band_Hz : of the r.m.s. velocity that the loops are to lower; below it the floor's slow motion, which no geophone
+        loop can lower, would decide. What the loops add there is limited by the modulus margin.
     """
     rig, T = bare.rig, bare.period_s
     axes, passive = free_axes(rig, bare.axes)
     even = np.geomspace(2 * np.pi * settings.low_Hz, 0.9 * np.pi / T, settings.points)
     omega = np.unique(np.concatenate([even, resonances(rig.equations_of_motion().state_space().poles())]))
-    search = _Search(bare, omega, chain_error, settings)
+    search = _Search(bare, omega, chain_error, band_Hz, settings)
     found: dict[str, Companion] = {}
     for _ in range(settings.passes):
         for axis in axes:
@@ -166,10 +168,11 @@ def until_stable(companions: Companions, plants: Sequence[SampledLoop],
 class _Search:
     """Candidates of one axis at a time, as rank-one changes of a closed sampled loop."""
 
-    def __init__(self, bare: SampledLoop, omega: np.ndarray, chain_error: Weight | None,
+    def __init__(self, bare: SampledLoop, omega: np.ndarray, chain_error: Weight | None, band_Hz: Sequence[float],
                  settings: CompanionSettings):
         self.bare, self.omega, self.settings = bare, omega, settings
         self.open: OpenResponse = open_response(bare, omega)
+        self.judged = (omega >= 2 * np.pi * band_Hz[0]) & (omega <= 2 * np.pi * band_Hz[1])
         self.K = digital_controller(replace(bare, loops={})).frequency_response(omega)
         self.error = chain_error.magnitude(omega) if chain_error is not None else np.zeros(omega.size)
         self.arms = lever_arms(bare.rig)
@@ -188,6 +191,11 @@ class _Search:
     def best(self, axis: str, others: dict[str, Companion]) -> Companion | None:
         """The candidate of least r.m.s. payload velocity that keeps the margins and is stable; None if none does."""
         g, motion, through, seen = self._around(axis, others)
+        # |motion + through k seen|^2 summed over axes and sources, as a quadratic form in the number k.
+        weight = self.sources[:, None, :] ** 2
+        constant = np.sum(np.abs(motion) ** 2 * weight, axis=(1, 2))
+        square = np.sum(np.abs(through) ** 2, axis=(1, 2)) * np.sum(np.abs(seen) ** 2 * weight, axis=(1, 2))
+        mixed = np.sum(np.conj(motion) * (through * seen) * weight, axis=(1, 2))
         rows = []
         for candidate in self._candidates(axis):
             c = candidate.gain * self._filter(candidate)
@@ -195,9 +203,9 @@ class _Search:
             margin = float(np.min(np.abs(returned)))
             if margin < self.settings.modulus_margin or np.max(np.abs(self.error * c * g / returned)) >= 1:
                 continue
-            total = motion + through * (c / returned)[:, None, None] * seen
-            density = np.sum(np.abs(total * self.sources[:, None, :]) ** 2, axis=(1, 2))
-            rows.append((float(np.trapezoid(density, self.omega)), candidate, margin))
+            k = c / returned
+            density = constant + 2 * np.real(k * mixed) + np.abs(k) ** 2 * square
+            rows.append((float(np.trapezoid(density[self.judged], self.omega[self.judged])), candidate, margin))
         for _, candidate, margin in sorted(rows, key=lambda row: row[0]):
             loops = {**{name: one.loop() for name, one in others.items()}, axis: candidate.loop()}
             if spectral_radius(replace(self.bare, loops=loops)) < 1:

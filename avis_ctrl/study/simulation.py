@@ -36,7 +36,7 @@ def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: Control
         bare = bare_loop(design, rig, plant, result.K)
         errors = plant.weights.get("actuator chain *")
         perturbed = list(perturbed_loops(design, rig, plant, result, bare))
-        companions = until_stable(design_companions(bare, errors), [bare, *perturbed])
+        companions = until_stable(design_companions(bare, errors, design.floor.band_Hz), [bare, *perturbed])
         loops = [replace(one, loops=companions.systems()) for one in (bare, *perturbed)]
         check = check_designs(loops, design.simulation.duration_s, design.simulation.seed)
         unstable = [loop for loop, one in zip(loops, check.plants, strict=True) if not one.stable]
@@ -60,7 +60,7 @@ def nominal_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | N
                  companions: Companions | None = None) -> SampledLoop:
     """The design's controller and the loops of the other axes (designed here by default) on the nominal rig."""
     bare = bare_loop(design, rig, plant, K)
-    companions = companions or design_companions(bare, plant.weights.get("actuator chain *"))
+    companions = companions or design_companions(bare, plant.weights.get("actuator chain *"), design.floor.band_Hz)
     return replace(bare, loops=companions.systems())
 
 
