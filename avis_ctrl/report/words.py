@@ -59,7 +59,9 @@ def decibel(gain: float) -> str:
 
 
 def quantity(value: float, unit: str, digits: int = 3) -> str:
-    """A number with its unit; a decibel with its sign."""
+    """A number with its unit; a decibel with its sign, a count as a whole number."""
+    if unit == "plants":
+        return f"{value:.0f} plants"
     if unit == "dB" and not np.isnan(value):
         return "unstable" if np.isposinf(value) else f"{value:+.1f} dB".replace("-", "−")
     return f"{bound(value, digits)} {unit}".strip()
