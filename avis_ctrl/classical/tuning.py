@@ -229,7 +229,7 @@ class Search:
                             bounds[:, 0], bounds[:, 1])
             there = self.merit(trial, limit)
             if there.key() < here.key():
-                gained = 1.0 if there.meets and not here.meets else 1 - there.key()[2] / here.key()[2]
+                gained = 1.0 if there.key()[:2] < here.key()[:2] else 1 - there.key()[2] / here.key()[2]
                 point, here, radius = trial, there, min(2 * radius, 1.0)
                 if gained < self.settings.converged:
                     break

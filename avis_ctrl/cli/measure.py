@@ -43,14 +43,14 @@ def excite(
 
     console = Console(highlight=False)
     table = load_rig(rig)
-    names = table.equations_of_motion().actuators
+    names, limit_V = table.equations_of_motion().actuators, float(table.drive_limits_V().min())
     with Progress(console) as progress:
         progress(f"{kind} for {len(names)} drives, {band_Hz[0]:g} to {band_Hz[1]:g} Hz")
         if kind == "multisine":
-            signals = multisine(MultisineSettings(names, table.sample_rate_Hz, period_s, band_Hz, table.drive_limit_V,
+            signals = multisine(MultisineSettings(names, table.sample_rate_Hz, period_s, band_Hz, limit_V,
                                                   rms_V, lines, scheme=scheme, seed=seed))  # type: ignore[arg-type]
         elif kind == "noise":
-            signals = noise(NoiseSettings(names, table.sample_rate_Hz, period_s, band_Hz, table.drive_limit_V, rms_V,
+            signals = noise(NoiseSettings(names, table.sample_rate_Hz, period_s, band_Hz, limit_V, rms_V,
                                           seed=seed))
         else:
             raise InputError("expected multisine or noise", field="--kind", value=kind)
@@ -65,7 +65,7 @@ def excite(
         shown.add_row(str(k), *(f"{values[k].max():.3g}" for values in (signals.rms_V, signals.peak_V, signals.crest,
                                                                         signals.crest_before)))
     console.print(shown)
-    console.print(f"{out}: {len(signals.u)} records to play; limit {table.drive_limit_V:g} V")
+    console.print(f"{out}: {len(signals.u)} records to play; limit {limit_V:g} V")
 
 
 def simulate_campaign(

@@ -89,7 +89,7 @@ def mount_rows(model: TableModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
 def limited_inputs(model: TableModel, record: Record) -> tuple[np.ndarray, np.ndarray | None]:
     """u (samples, n_u) within the drives' limit and floor, in the model's order."""
     u, floor = model_inputs(model.base, record)
-    limit = model.rig.drive_limit_V
+    limit = model.rig.limits_of(model.actuators)
     return np.clip(u, -limit, limit), floor
 
 

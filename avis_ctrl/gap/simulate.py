@@ -111,7 +111,7 @@ def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tupl
     for field, array in (("u", u), ("floor", floor)):
         if array is not None and not np.all(np.isfinite(array)):
             raise InputError("expected finite numbers", field=field)
-    limit = model.rig.drive_limit_V
+    limit = model.rig.limits_of(model.actuators)
     return np.clip(u, -limit, limit), floor
 
 

@@ -47,8 +47,7 @@ class ExcitedSpace:
             k, d = len(self.driven), len(self.unplayed)
             combinations = "; ".join(_in_words(row, self.driven) for row in self.unplayed)
             said.append(f"the records play {k - d} of the {k} combinations of {', '.join(self.driven)}; not played: "
-                        f"{combinations}. The fit needs no response of each drive by itself; the proportion of their "
-                        "force constants counts as the rig file has it")
+                        f"{combinations}. The fit needs no response of each drive by itself")
         return "; ".join(said)
 
 

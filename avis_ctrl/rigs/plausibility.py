@@ -245,7 +245,7 @@ def _shape(rig: Rig, body: Any, centre: np.ndarray, radius: float, judge: Judge)
 
 def _drives(rig: Rig, eom: Any, radius: float, judge: Judge) -> None:
     mass = float(eom.M[0, 0])
-    force = np.abs(eom.T[:3]).sum(axis=1) * rig.drive_limit_V
+    force = np.abs(eom.T[:3]) @ rig.drive_limits_V()
     stiffness = np.diag(eom.K)[:3]
     driven = np.flatnonzero(force > 1e-9 * np.max(force, initial=0.0))
     if not len(driven):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -62,6 +62,11 @@ class Rig(ABC):
     def drive_limits_V(self) -> np.ndarray:
         """(n_u,) largest voltage of each actuator."""
         return np.full(len(self.equations_of_motion().actuators), self.drive_limit_V)
+
+    def limits_of(self, names: Sequence[str]) -> np.ndarray:
+        """(n,) largest voltage [V] of some actuators by name."""
+        known = dict(zip(self.equations_of_motion().actuators, self.drive_limits_V().tolist(), strict=True))
+        return np.array([known[name] for name in names])
 
     @property
     @abstractmethod

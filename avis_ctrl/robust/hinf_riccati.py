@@ -21,7 +21,7 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, hinf_norm, lft_lower
 from avis_ctrl.robust.hinf_plant import NormalForm, Plant, pointwise
-from avis_ctrl.robust.riccati import refined_balanced, solve_riccati
+from avis_ctrl.robust.riccati import ROUND_OFF, refined_balanced, solve_riccati
 
 # Relative to the open channel w -> z, a gamma below this is round-off.
 ZERO_GAMMA = 1e-9
@@ -79,7 +79,7 @@ def gamma_test(plant: Plant, gamma: float) -> GammaTest:
     solutions = []
     for name, letter, data in (("control", "X", control_riccati), ("filter", "Y", filter_riccati)):
         try:
-            found = solve_riccati(*data(plant, gamma))
+            found = solve_riccati(*data(plant, gamma), rounding(plant if letter == "X" else _dual(plant), gamma))
         except (np.linalg.LinAlgError, ValueError) as error:
             return GammaTest(gamma, False, f"the Riccati equation is singular ({error})")
         if found.X is None:
@@ -108,8 +108,8 @@ def _forbidden(plant: Plant, gamma: float, omega: np.ndarray) -> float:
 
 def _coupled_for_certain(plant: Plant, gamma: float, X: np.ndarray, Y: np.ndarray) -> bool:
     """Whether rho(X Y) is above gamma^2 by more than X and Y, refined, leave it uncertain to first order."""
-    of_x, of_y = (refined_balanced(*data, one) for data, one in ((control_riccati(plant, gamma), X),
-                                                                 (filter_riccati(plant, gamma), Y)))
+    of_x, of_y = (refined_balanced(*control_riccati(one, gamma), solution, rounding(one, gamma))
+                  for one, solution in ((plant, X), (_dual(plant), Y)))
     if of_x is None or of_y is None:
         return False
     (X, E_x), (Y, E_y) = of_x, of_y
@@ -138,7 +138,7 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
 
     ComputationError where even gamma = limit times the start fails.
     """
-    floor, natural = direct_term_bound(plant), _natural_gamma(plant)
+    floor, natural = direct_term_bound(plant), natural_gamma(plant)
     nothing = ZERO_GAMMA * natural
     start = max(hint or natural, floor * (1 + 2 * tolerance), nothing)
     search = _Search(plant, floor)
@@ -301,6 +301,22 @@ def control_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.
     return _difference(P.A, B, K), (quadratic + quadratic.T) / 2, (constant + constant.T) / 2
 
 
+def rounding(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """By how much round-off may have changed the entries of (A, R, Q) of `control_riccati`."""
+    D1, R = _row_terms(P, gamma)
+    B, d, c = np.abs(np.hstack([P.B1, P.B2])), np.abs(D1), np.abs(P.C1)
+    w = P.D11.shape[1]
+    # |R| with its own terms, for it is a difference, too.
+    terms = d.T @ d
+    terms[:w, :w] += gamma ** 2 * np.eye(w)
+    right = np.hstack([d.T @ c, B.T])
+    inverse = np.abs(np.linalg.inv(R))
+    solved = inverse @ (terms @ np.abs(np.linalg.solve(R, np.hstack([D1.T @ P.C1, np.hstack([P.B1, P.B2]).T]))) + right)
+    K, G = solved[:, :P.n], solved[:, P.n:]
+    size = np.abs(P.A) + B @ K, B @ G, c.T @ c + c.T @ d @ K
+    return tuple(ROUND_OFF * one for one in size)
+
+
 def _difference(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     """a - b c with entries that are pure round-off set to zero: a balancing would take them for couplings."""
     result = a - b @ c
@@ -313,6 +329,6 @@ def filter_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.n
     return control_riccati(_dual(P), gamma)
 
 
-def _natural_gamma(plant: Plant) -> float:
+def natural_gamma(plant: Plant) -> float:
     """A first gamma of the right order: the open channel w -> z, off the imaginary axis."""
     return float(plant.size(plant.B1, plant.C1, plant.D11))

@@ -30,7 +30,14 @@ from avis_ctrl.robust.hinf_plant import (
     rank_margins,
     regularised,
 )
-from avis_ctrl.robust.hinf_riccati import ZERO_GAMMA, GammaBracket, central_controller, find_gamma, gamma_test
+from avis_ctrl.robust.hinf_riccati import (
+    ZERO_GAMMA,
+    GammaBracket,
+    central_controller,
+    find_gamma,
+    gamma_test,
+    natural_gamma,
+)
 from avis_ctrl.robust.reduction import residualise_fast
 from avis_ctrl.robust.riccati import INACCURATE, ON_AXIS
 
@@ -129,7 +136,8 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     if raised:
         status, notes = Status.BACKED_OFF, (*notes, raised)
         bounds = bounds[0], max(bounds[1], result.gamma)
-    bounds, status, notes = _consistent(bounds, result.gamma, tolerance, status, notes)
+    zero = 200 * ZERO_GAMMA * natural_gamma(form.plant)
+    bounds, status, notes = _consistent(bounds, result.gamma, tolerance, zero, status, notes)
     if status is not Status.OPTIMAL:
         notes = (*notes, *_doubt_of_gamma(P, result))
     rate = _rate_note(result, sample_rate_Hz)
@@ -311,14 +319,18 @@ def _widest_gap(poles: np.ndarray, plant_fastest: float) -> float:
     return float(np.sqrt(sizes[widest] * sizes[widest + 1]))
 
 
-def _consistent(bounds: tuple[float, float], reached: float, tolerance: float, status: Status,
+def _consistent(bounds: tuple[float, float], reached: float, tolerance: float, zero: float, status: Status,
                 notes: tuple[str, ...]) -> tuple[tuple[float, float], Status, tuple[str, ...]]:
-    """Bounds that do not contradict what was measured, and a status that says so where they are far apart."""
+    """Bounds that do not contradict what was measured, and a status that says so where they are far apart.
+
+    zero : width below which an optimum is zero to working precision.
+    """
     lower, upper = bounds
     if lower > reached * (1 + LOOP_ACCURACY):
         notes = (*notes, f"the lower bound computed, {lower:.6g}, is passed by the measured loop and is not claimed")
         lower = 0.0
-    if status is Status.OPTIMAL and upper - lower > max(2 * tolerance * upper, ZERO_GAMMA * upper) and lower > 0:
+    upper = min(upper, max(reached, lower))
+    if status is Status.OPTIMAL and upper - lower > max(2 * tolerance * upper, zero):
         status = Status.WIDE
     return (lower, upper), status, notes
 

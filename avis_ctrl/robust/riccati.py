@@ -20,6 +20,7 @@ eigenvalues between -1 and 1.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -53,8 +54,12 @@ class RiccatiSolution:
     omega: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
-def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolution:
-    """The stabilising X of A'X + XA + XRX + Q = 0, with R and Q symmetric (n, n)."""
+def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
+                  noise: Sequence[np.ndarray] | None = None) -> RiccatiSolution:
+    """The stabilising X of A'X + XA + XRX + Q = 0, with R and Q symmetric (n, n).
+
+    noise : by how much the entries of A, R and Q may be wrong, where they were themselves computed.
+    """
     n = A.shape[0]
     if n == 0:
         return RiccatiSolution(np.zeros((0, 0)), True)
@@ -86,11 +91,17 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> RiccatiSolutio
     # X1' X2 is small where X1 is (X near infinity), and X where its states' units are large: both must be clear.
     if lowest >= -1e-13 * n and values[0] >= -CLEARLY * values[-1]:
         return RiccatiSolution(X, True)
-    indefinite = _negative_beyond_error(H, U[:, :n])
+    error = None
+    if noise is not None:
+        both = np.outer(scale, scale)
+        a, r, q = noise[0] / scale[:, None] * scale, noise[1] / both, noise[2] * both
+        error = np.block([[a, r], [q, a.T]])
+    indefinite = _negative_beyond_error(H, U[:, :n], error)
     return RiccatiSolution(X, not indefinite, doubtful=not indefinite)
 
 
-def refined(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def refined(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray,
+            noise: Sequence[np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray] | None:
     """X after a step of Newton's method, and E >= 0 with X - E <= true solution <= X + E to first order in round-off.
 
     None where A + R X is not stable or a linear equation is singular.
@@ -101,6 +112,9 @@ def refined(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> tuple
             X = X + la.solve_continuous_lyapunov((A + R @ X).T, -_residual(A, R, Q, X)[0])
             X = (X + X.T) / 2
             residual, rounding = _residual(A, R, Q, X)
+            if noise is not None:
+                x, by_A = np.abs(X), noise[0].T @ np.abs(X)
+                rounding = rounding + by_A + by_A.T + x @ noise[1] @ x + noise[2]
             E = _error(A + R @ X, np.abs(residual) + rounding)
         except (np.linalg.LinAlgError, ValueError):
             return None
@@ -108,11 +122,14 @@ def refined(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> tuple
 
 
 def refined_balanced(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
-                     X: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+                     X: np.ndarray, noise: Sequence[np.ndarray] | None = None
+                     ) -> tuple[np.ndarray, np.ndarray] | None:
     """`refined` in the units of the states in which round-off counts least."""
     d = symplectic_scale(A, R, Q)
     both = np.outer(d, d)
-    found = refined(A / d[:, None] * d, R / both, Q * both, X * both)
+    if noise is not None:
+        noise = noise[0] / d[:, None] * d, noise[1] / both, noise[2] * both
+    found = refined(A / d[:, None] * d, R / both, Q * both, X * both, noise)
     return None if found is None else (found[0] / both, found[1] / both)
 
 
@@ -132,7 +149,7 @@ def _error(closed: np.ndarray, size: np.ndarray) -> np.ndarray | None:
     return E if np.all(np.isfinite(E)) else None
 
 
-def _negative_beyond_error(H: np.ndarray, basis: np.ndarray) -> bool:
+def _negative_beyond_error(H: np.ndarray, basis: np.ndarray, error: np.ndarray | None = None) -> bool:
     """Whether X = X2 inv(X1) has a negative eigenvalue for certain; basis = [X1; X2] of the stable subspace of H."""
     n = basis.shape[1]
     X1, X2 = basis[:n], basis[n:]
@@ -146,7 +163,12 @@ def _negative_beyond_error(H: np.ndarray, basis: np.ndarray) -> bool:
                 X = la.solve(top.T, bottom.T).T
             except (np.linalg.LinAlgError, ValueError):
                 continue
-        found = refined(A, R, Q, (X + X.T) / 2)
+        noise = None
+        if error is not None:
+            # |turn| |error| |turn'|, and nothing where the basis is as it is.
+            size = error if matrix is H else np.abs(turn) @ error @ np.abs(turn).T
+            noise = size[:n, :n], size[:n, n:], size[n:, :n]
+        found = refined(A, R, Q, (X + X.T) / 2, noise)
         if found is None:
             continue
         X, E = found

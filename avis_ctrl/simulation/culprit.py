@@ -25,7 +25,7 @@ class Culprit:
         simulation diverges.
     axes : coordinates that move most in that mode, the largest first, rotations as displacement of the edge.
     kind : "table" (unstable without control), "controller" (the design's controller alone does it), "companions"
-        (loops of the other axes alone do it), "together" (only both).
+        (loops of the other axes alone do it), "together" (only both), "nonlinear" (the linear loop is stable).
     loops : axes of the fewest companion loops without which this plant is stable; empty where there are none such.
     """
 
@@ -39,9 +39,11 @@ class Culprit:
 
     def words(self) -> str:
         """One clause: who, at which frequency, how fast."""
+        if self.kind == "nonlinear":
+            return (f"the nonlinear table leaves its stops, although the linear loop is stable "
+                    f"(plant \"{self.plant}\", spectral radius {self.radius:.6f})")
         how = (f"the motion along {_joined(self.axes)} grows at {self.frequency_Hz:.3g} Hz by a factor of e in "
-               f"{1 / self.growth_per_s:.3g} s" if self.growth_per_s > 0 else
-               "the nonlinear table leaves its stops, although the linear loop is stable")
+               f"{1 / max(self.growth_per_s, 1e-12):.3g} s")
         loops = f"the loop{'s' if len(self.loops) > 1 else ''} of {_joined(self.loops)}"
         who = {"table": "the table itself is unstable without control",
                "controller": "the controller does it, without the other axes' loops too",
@@ -54,8 +56,7 @@ class Culprit:
 
 
 def find_culprit(loop: SampledLoop) -> Culprit:
-    """The cause of the instability of one plant's loop; a stable linear loop has the kind of what diverged nonlinearly.
-    """
+    """The cause of the instability of one plant's loop; none is looked for where the linear loop is stable."""
     values, vectors = la.eig(period_map(loop))
     most = int(np.argmax(np.abs(values)))
     rate = np.log(values[most]) * loop.sample_rate_Hz
@@ -63,7 +64,7 @@ def find_culprit(loop: SampledLoop) -> Culprit:
     order = np.argsort(motion)[::-1]
     axes = tuple(COORDINATES[k] for k in order if motion[k] >= 0.3 * motion[order[0]])
     radius = float(np.abs(values[most]))
-    kind, loops = _who(loop) if radius >= 1 else ("together", ())
+    kind, loops = _who(loop) if radius >= 1 else ("nonlinear", ())
     return Culprit(loop.name, radius, float(abs(rate.imag)) / (2 * np.pi), float(rate.real), axes, kind, loops)
 
 

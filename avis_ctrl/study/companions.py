@@ -125,27 +125,29 @@ def design_companions(bare: SampledLoop, chain_error: Weight | None = None, band
     band_Hz : of the r.m.s. velocity that the loops are to lower; below it the floor's slow motion, which no geophone
         loop can lower, would decide. What the loops add there is limited by the modulus margin.
     """
-    rig, T = bare.rig, bare.period_s
-    axes, passive = free_axes(rig, bare.axes)
-    even = np.geomspace(2 * np.pi * settings.low_Hz, 0.9 * np.pi / T, settings.points)
-    omega = np.unique(np.concatenate([even, resonances(rig.equations_of_motion().state_space().poles())]))
-    search = _Search(bare, omega, chain_error, band_Hz, settings)
+    axes, passive = free_axes(bare.rig, bare.axes)
+    search = _Search(bare, _grid(bare, settings), chain_error, band_Hz, settings)
     found: dict[str, Companion] = {}
     for _ in range(settings.passes):
         for axis in axes:
             others = {name: one for name, one in found.items() if name != axis}
             best = search.best(axis, others)
             found = others if best is None else {**others, axis: best}
-    missing = tuple((axis, "no loop tried keeps the margin") for axis in axes if axis not in found)
-    loops = tuple(replace(found[axis], modulus_margin=search.margin(axis, found)) for axis in axes if axis in found)
-    return Companions(loops, (*passive, *missing))
+    missing = tuple((axis, "no loop tried is stable with its margins") for axis in axes if axis not in found)
+    return search.with_margins(Companions(tuple(found[axis] for axis in axes if axis in found), (*passive, *missing)))
+
+
+def _grid(bare: SampledLoop, settings: CompanionSettings) -> np.ndarray:
+    """(n,) rad/s, the table's resonances among them."""
+    even = np.geomspace(2 * np.pi * settings.low_Hz, 0.9 * np.pi / bare.period_s, settings.points)
+    return np.unique(np.concatenate([even, resonances(bare.rig.equations_of_motion().state_space().poles())]))
 
 
 def until_stable(companions: Companions, plants: Sequence[SampledLoop],
                  settings: CompanionSettings = CompanionSettings()) -> Companions:
     """The same loops with gains lowered until every plant is stable in the linear sampled loop; without them at last.
 
-    plants : the loop of each plant with any companions; theirs are replaced.
+    plants : the loop of each plant with any companions, the nominal one first; theirs are replaced.
     """
     if not companions.loops:
         return companions
@@ -155,11 +157,17 @@ def until_stable(companions: Companions, plants: Sequence[SampledLoop],
         if all(spectral_radius(replace(plant, loops=tried.systems())) < 1 for plant in plants):
             lowered = (f"The gains of the other axes' loops are lowered by {-20 * np.log10(factor):.0f} dB: with more, "
                        "a plant of the uncertainty set is unstable.")
-            return replace(tried, notes=(*tried.notes, lowered)) if step else tried
+            if not step:
+                return tried
+            bare = replace(plants[0], loops={})
+            search = _Search(bare, _grid(bare, settings), None, (0.0, np.inf), settings)
+            return replace(search.with_margins(tried), notes=(*tried.notes, lowered))
     # The loops as designed are kept where none of this helps: the instability is not theirs alone, or not theirs.
     without = [spectral_radius(replace(plant, loops={})) for plant in plants]
     if max(without) < 1:
-        reason = "any loop makes a plant of the uncertainty set unstable"
+        lowest = -20 * settings.shrinks * np.log10(settings.shrink)
+        reason = (f"a plant of the uncertainty set is unstable with the other axes' loops, with gains {lowest:.0f} dB "
+                  "lower, too, and stable without them")
         return Companions((), (*companions.passive, *((one.axis, reason) for one in companions.loops)),
                           companions.notes)
     return companions
@@ -190,7 +198,7 @@ class _Search:
 
     def best(self, axis: str, others: dict[str, Companion]) -> Companion | None:
         """The candidate of least r.m.s. payload velocity that keeps the margins and is stable; None if none does."""
-        g, motion, through, seen = self._around(axis, others)
+        g, motion, through, seen, reach = self._around(axis, others)
         # |motion + through k seen|^2 summed over axes and sources, as a quadratic form in the number k.
         weight = self.sources[:, None, :] ** 2
         constant = np.sum(np.abs(motion) ** 2 * weight, axis=(1, 2))
@@ -201,7 +209,7 @@ class _Search:
             c = candidate.gain * self._filter(candidate)
             returned = 1 - c * g
             margin = float(np.min(np.abs(returned)))
-            if margin < self.settings.modulus_margin or np.max(np.abs(self.error * c * g / returned)) >= 1:
+            if margin < self.settings.modulus_margin or np.max(np.abs(self.error * c * reach / returned)) >= 1:
                 continue
             k = c / returned
             density = constant + 2 * np.real(k * mixed) + np.abs(k) ** 2 * square
@@ -211,6 +219,12 @@ class _Search:
             if spectral_radius(replace(self.bare, loops=loops)) < 1:
                 return replace(candidate, modulus_margin=margin)
         return None
+
+    def with_margins(self, companions: Companions) -> Companions:
+        """The same loops, each with its modulus margin as it is with all the others closed."""
+        found = {one.axis: one for one in companions.loops}
+        return replace(companions, loops=tuple(replace(one, modulus_margin=self.margin(one.axis, found))
+                                               for one in companions.loops))
 
     def margin(self, axis: str, found: dict[str, Companion]) -> float:
         """Least |1 + L| of a loop with all the others closed."""
@@ -241,7 +255,8 @@ class _Search:
         return self._units[axis]
 
     def _around(self, axis: str, others: dict[str, Companion]) -> tuple[np.ndarray, ...]:
-        """What one loop sees with the rest closed: g (n,), motion (n, 6, sources), and the factors of its change."""
+        """What one loop sees with the rest closed: g (n,), motion (n, 6, sources), the factors of its change, and g
+        with the drives' parts of it added in magnitude (n,)."""
         C = self.K + sum((one.gain * self._filter(one)[:, None, None] * self._unit(name)
                           for name, one in others.items()), np.zeros(1))
         G, n_s = self.open, self.K.shape[2]
@@ -257,5 +272,7 @@ class _Search:
         s = np.einsum("fu,fus->fs", a.conj(), unit)
         pushed = closed @ (G.sensed_volts @ a[:, :, None])
         g = np.einsum("fs,fs->f", s, pushed[..., 0])
+        # The drives err each by itself: mu of a matrix of rank one is the sum of its diagonal's magnitudes.
+        reach = np.sum(np.abs(a * (s[:, None, :] @ closed @ G.sensed_volts)[:, 0]), axis=1)
         through = self.arms[:, None] * (G.velocity_volts @ (a[:, :, None] + C @ pushed))
-        return g, motion, through, s[:, None, :] @ sensed
+        return g, motion, through, s[:, None, :] @ sensed, reach

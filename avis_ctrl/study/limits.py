@@ -15,7 +15,6 @@ from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 WORTH_NAMING = 0.02
-STILL_FALLING = 0.05
 # A mu within this share of the table's without control is that of a controller that does nothing.
 IDLE = 0.01
 # From here up the uncertainty of an identified response is named as what to measure better.
@@ -73,8 +72,6 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
             f"With uncertainties {mu.mu.upper:.3g} times smaller and bounds {mu.mu.upper:.3g} times wider it is met.")
     if spread and any(RESPONSE in name for name, _ in reliefs):
         text += f" {spread}."
-    if len(history) > 1 and history[-1].mu_upper < (1 - STILL_FALLING) * history[-2].mu_upper:
-        text += " The D-K iteration ended while mu was still falling: raise synthesis.max_iterations."
     if better := [c for c in others if c.mu.upper < mu.mu.upper]:
         best = min(better, key=lambda c: c.mu.upper)
         text += f" The controller {best.title!r} has a smaller mu, {best.mu.upper:.3g}: the iteration ended too early."

@@ -92,7 +92,7 @@ def sampled_controller_dict(result: DesignResult, loop: Simulated) -> dict[str, 
     return {"format": "avis-sampled-controller", "version": 1, "name": "mu", "sample_rate_Hz": rig.sample_rate_Hz,
             "arithmetic": "float64", "A": K.A, "B": K.B, "C": K.C, "D": K.D, "inputs": sensors, "outputs": drives,
             "input_units": ["V"] * len(sensors), "output_units": ["V"] * len(drives),
-            "limits_V": [rig.drive_limit_V] * len(drives), "delay_samples": loop.delay_samples}
+            "limits_V": rig.drive_limits_V(), "delay_samples": loop.delay_samples}
 
 
 def write_study(result: DesignResult, folder: Path, html: bytes | None = None, pdf: bytes | None = None) -> list[Path]:

@@ -316,7 +316,9 @@ class _Noise:
     def of(axes: tuple[str, ...], group: NoiseGroup, decoding: np.ndarray, reference: float, number: int) -> _Noise:
         own = decoding * group.share
         served = [k for k in range(len(axes)) if np.any(np.abs(own[k]) > 1e-9)]
-        mix = np.linalg.cholesky(own[served] @ own[served].T) / reference
+        # own = L Q: a square root of own own' also where fewer sensors of this kind than axes make it singular.
+        root = np.asarray(np.linalg.qr(own[served].T, mode="r"))
+        mix = (root * np.where(np.diag(root) < 0, -1.0, 1.0)[:, None]).T / reference
         return _Noise(group.shape, tuple(axes[k] for k in served), mix, f"_{number + 1}" if number else "")
 
     @property

@@ -28,6 +28,7 @@ def refuse_unstable(result: DesignResult) -> None:
         return
     kind = result.loop.culprit.kind if result.loop is not None and result.loop.culprit is not None else ""
     steps = {"table": "check the rig file's stiffness, centre of mass and damping",
+             "nonlinear": "look at that plant's voltages (drives at their limit?) and floor motion",
              "controller": "keep the axes that move among those the design controls, or ask for less bandwidth"}
     step = steps.get(kind, "use sensors with a lower corner, or keep these axes in the design")
     raise ComputationError(text.removesuffix("."), next_step=step)

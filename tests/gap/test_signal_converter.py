@@ -112,7 +112,7 @@ def test_repair_puts_the_prediction_beyond_the_limit_and_nowhere_else():
 
 def test_the_drive_is_held_at_its_limit():
     u = np.array([[-14.0, 3.0], [9.0, 10.5]])
-    assert np.array_equal(drive_limited(u, rig()), [[-10.0, 3.0], [9.0, 10.0]])
+    assert np.array_equal(drive_limited(u, np.array([10.0, 10.0])), [[-10.0, 3.0], [9.0, 10.0]])
     made = repair(one_record(np.zeros((4, 6)), np.full((4, 8), 12.0)), rig())
     assert made.drive_clipped == 1.0 and np.all(made.campaign.records[0].load().u == 10.0)
 

@@ -78,7 +78,7 @@ def repair(campaign: Campaign, rig: Rig, predicted: Mapping[str, np.ndarray] | N
             swap = (top & (model > y)) | (bottom & (model < y))
             beyond += np.count_nonzero(swap, axis=0)
             y = np.where(swap, model, y)
-        u = drive_limited(record.u, rig)
+        u = drive_limited(record.u, rig.limits_of(record.header.u_names))
         drive += int(np.count_nonzero(u != record.u))
         driven += u.size
         records.append(replace(record, u=u, y=y))
@@ -86,10 +86,9 @@ def repair(campaign: Campaign, rig: Rig, predicted: Mapping[str, np.ndarray] | N
                     dict(zip(names, (beyond / samples).tolist(), strict=True)), drive / max(driven, 1))
 
 
-def drive_limited(u: np.ndarray, rig: Rig) -> np.ndarray:
-    """u [V] held at the rig's drive limit."""
-    limit = rig.drive_limit_V
-    return u if limit is None else np.clip(u, -limit, limit)
+def drive_limited(u: np.ndarray, limits_V: np.ndarray) -> np.ndarray:
+    """u (samples, n_u) [V] held at each drive's limit."""
+    return np.clip(u, -limits_V, limits_V)
 
 
 def _checked(record: Record, model: np.ndarray) -> np.ndarray:
