@@ -254,10 +254,10 @@ def _drives(rig: Rig, eom: Any, radius: float, judge: Judge) -> None:
     a, travel = force[k] / mass, force[k] / stiffness[k]
     together = f"all drives together, {force[k]:.3g} N at {rig.drive_limit_V:g} V,"
     judge("acceleration", a, f"{together} accelerate the payload by {a:.2g} m/s^2")
-    judge("travel_m", travel, f"{together} move it by {travel:.2g} m")
+    judge("travel_m", travel, f"{together} move the payload by {travel:.2g} m")
     if radius > 0:
-        judge("travel_share", travel / radius, f"{together} move it by {travel:.2g} m, {travel / radius:.2g} times "
-                                                    "the radius on which the mounts stand")
+        judge("travel_share", travel / radius, f"{together} move the payload by {travel:.2g} m, {travel / radius:.2g} "
+                                               "times the radius on which the mounts stand")
 
 
 def _alike(numbers: Sequence[Entry], body: Any, judge: Judge) -> None:
@@ -283,9 +283,10 @@ def _unequal(values: np.ndarray, names: list[str], judge: Judge) -> None:
 
 def _clock(rig: Rig, f: float, judge: Judge) -> None:
     judge("samples_per_cycle", rig.sample_rate_Hz / f, f"{rig.sample_rate_Hz / f:.2g} samples per cycle of the "
-                                                            f"fastest mode ({f:.3g} Hz)")
-    judge("delay_cycles", rig.loop_delay_s * f, f"a loop delay of {rig.loop_delay_s:g} s, {rig.loop_delay_s * f:.2g} "
-          f"cycles of the fastest mode and {rig.loop_delay_s * rig.sample_rate_Hz:.3g} samples")
+                                                            f"fastest mode at {f:.3g} Hz")
+    judge("delay_cycles", rig.loop_delay_s * f, f"a loop delay of {rig.loop_delay_s:g} s "
+          f"({rig.loop_delay_s * rig.sample_rate_Hz:.3g} samples), {rig.loop_delay_s * f:.2g} cycles of the "
+          "fastest mode")
 
 
 def _hearing(content: dict[str, Any], judge: Judge) -> None:

@@ -46,7 +46,7 @@ class Culprit:
         how = (f"the motion along {_joined(self.axes)} grows at {self.frequency_Hz:.3g} Hz with a time constant of "
                f"{1 / self.growth_per_s:.3g} s {at}")
         loops = f"the skyhook loop{'s' if len(self.loops) > 1 else ''} on {_joined(self.loops)}"
-        without = f"without {'them' if len(self.loops) > 1 else 'it'} this plant is stable"
+        without = f"without {'these loops' if len(self.loops) > 1 else 'that loop'} this plant is stable"
         who = {"table": "the table is unstable even without control",
                "controller": "the cause is the controller; this plant is unstable even without the other axes' loops",
                "companions": f"the cause is {loops}; {without}",

@@ -27,8 +27,8 @@ def refuse_unstable(result: DesignResult) -> None:
         return
     kind = result.loop.culprit.kind if result.loop is not None and result.loop.culprit is not None else ""
     steps = {"table": "check the rig file's stiffness, centre of mass and damping",
-             "controller": "put the axes that move under the controller (keep), or ask for less bandwidth"}
-    step = steps.get(kind, "use sensors with a lower corner frequency, or put these axes under the controller (keep)")
+             "controller": "add the axes that move to keep in the design file, or ask for less bandwidth"}
+    step = steps.get(kind, "use sensors with a lower corner frequency, or add these axes to keep in the design file")
     raise ComputationError(text.removesuffix("."), next_step=step)
 
 
