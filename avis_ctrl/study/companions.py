@@ -5,12 +5,12 @@ measure independently gets a skyhook loop, called a companion loop in the code:
 
     F = -g  s/(s + w_tilt)  1/(s/w_roll + 1)  v
 
-The loops are closed one after the other around the sampled table with six degrees of freedom, including hold, delay,
-amplifiers, sensor dynamics and the design's own controller; in a second round each sees all the others closed. Each
-loop takes, from a grid of gains and corners, the pair with the smallest r.m.s. payload velocity under the site's floor
-motion and sensor noise, among those that have the required modulus margin (the distance of the Nyquist curve from the
-critical point) and remain stable with the neglected dynamics of the drives. The classical rule, critical damping with
-the usual corners, fails both tests with 1 Hz geophones: their phase lead below 1 Hz turns damping into excitation.
+Loops are closed one after the other around the sampled table with six degrees of freedom, hold, delay, amplifiers,
+sensor dynamics and the design's own controller included, and once more with all the others closed. Of a grid of
+gains and corners each loop takes the one with the smallest payload velocity r.m.s. under the site's floor motion and
+sensor noise among those that keep a modulus margin (the distance of the Nyquist curve from the critical point) and
+that the neglected dynamics of the drives do not destabilise. Critical damping with customary corners, the classical
+rule, keeps neither with 1 Hz geophones: the geophone's phase lead below its corner turns damping into feeding.
 """
 
 from __future__ import annotations
