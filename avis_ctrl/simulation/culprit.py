@@ -45,7 +45,7 @@ class Culprit:
             return f"the nonlinear simulation diverges although the linear loop is stable {at}"
         how = (f"the motion along {_joined(self.axes)} grows at {self.frequency_Hz:.3g} Hz with a time constant of "
                f"{1 / self.growth_per_s:.3g} s {at}")
-        loops = f"the skyhook loop{'s' if len(self.loops) > 1 else ''} on {_joined(self.loops)}"
+        loops = f"the skyhook loop{'s' if len(self.loops) > 1 else ''} of {_joined(self.loops)}"
         without = f"without {'these loops' if len(self.loops) > 1 else 'that loop'} this plant is stable"
         who = {"table": "the table is unstable even without control",
                "controller": "the cause is the controller; this plant is unstable even without the other axes' loops",
