@@ -1,4 +1,4 @@
-"""The one place where files are written: each is whole or absent, also when the disk fills or the process is killed."""
+"""All files are written here: each is whole or absent, even if the disk fills or the process is killed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from avis_ctrl.errors import AvisError, ComputationError, InputError
 
-# The disk refuses, not the place: exit code 3.
+# The disk is full, or fails: exit code 3.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
@@ -21,17 +21,17 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 def whole_file(path: Path) -> Iterator[BinaryIO]:
     """A file to write (and read) that takes its name only when all of it is on the disk.
 
-    It has no name until then where the system allows that (it vanishes with the process), otherwise a hidden one beside
-    the target. What was there before stays as it was until the end, and where anything is raised.
+    Until then it has no name, if the system allows that (it vanishes with the process), otherwise a hidden name beside
+    the target. An older file stays as it was until the end, or for good if an error is raised.
 
     Raises
     ------
-    InputError : a place that cannot be written, or something there that is no regular file (a folder, a device).
-    ComputationError : the disk refuses.
+    InputError : a path that cannot be written, or that exists and is not a regular file (a folder, a device).
+    ComputationError : the disk is full.
     """
     try:
         if path.exists() and not path.is_file():
-            raise InputError("cannot be written (it is there and no regular file)", file=path)
+            raise InputError("cannot be written (it exists and is not a regular file)", file=path)
         file, name = _opened(path)
     except OSError as error:
         raise _refused(path, error) from None
@@ -60,13 +60,13 @@ def write_whole(path: Path, content: bytes) -> None:
 def write_together(folder: Path, contents: Mapping[str, bytes], old: Iterable[Path] = ()) -> list[Path]:
     """Write several files of a folder, all of them or none; in their order, so that the last one says it is complete.
 
-    All are on the disk under a hidden name before the first takes its place and `old` ones go: a full disk leaves the
-    results that were there before.
+    All are on the disk under hidden names before the first takes its place and `old` ones are removed, so that a full
+    disk leaves the earlier results.
 
     Parameters
     ----------
     contents : by name, which may hold folders: "controllers/mu.json".
-    old : files that go, where they are there and not written again: an old report beside new results would lie.
+    old : files to remove if they exist and are not written again, so that no old report stands beside new results.
 
     Raises
     ------

@@ -221,7 +221,7 @@ def frequencies(*systems: StateSpace, count: int = 300) -> np.ndarray:
 
 def in_doubt(r: Any) -> bool:
     """Whether the synthesis itself says that its gamma is round-off."""
-    return any("gamma is round-off" in note for note in r.notes)
+    return any("gamma is lost in round-off" in note for note in r.notes)
 
 
 def judge_synthesis(P: StateSpace, base: StateSpace, u: int, y: int, r: Any, second: bool) -> list[str]:

@@ -134,10 +134,10 @@ class TuningRange:
 
 @dataclass(frozen=True)
 class TuningSettings:
-    """What bounds the search; every budget is a count.
+    """Limits of the search; every limit is a count, none a time.
 
-    gain_factors : multiples of critical damping that are starts, next to the table's own rule (1).
-    tilt_corners_Hz, roll_offs_Hz : corners that are starts: customary ones and half a decade to either side.
+    gain_factors : multiples of critical damping to start from, besides the classical rule (1).
+    tilt_corners_Hz, roll_offs_Hz : corners to start from: the usual ones and half a decade to either side.
     refined : starts that are improved, the best by the measure of the search.
     steps : linear programs from each start.
     radius : first trust region, in logarithms (a factor e^0.5 of a gain or corner).
@@ -197,7 +197,7 @@ class Search:
     def merit(self, point: np.ndarray, limit: float) -> Merit:
         """A tuning on the samples."""
         K, _ = self._loops(point)
-        # Unstable loops have finite responses too: the return difference must not circle the origin. A worst case
+        # Unstable loops have finite responses too: the return difference must not encircle the origin. A worst case
         # of each frequency on its own is no plant, and turns say nothing there.
         plants = self.channels.yu[:self.scenarios.plants]
         turns = _encirclements(np.linalg.det(np.eye(len(self.axes)) - plants * K[:, None, :]))
@@ -205,7 +205,7 @@ class Search:
         return Merit(float(np.max(sigma)), float(np.max(sigma[:, self.inside])), limit, turns)
 
     def starts(self) -> list[np.ndarray]:
-        """The classical tunings: multiples of critical damping with customary corners and their neighbours."""
+        """The classical tunings: multiples of critical damping with the usual corners and their neighbours."""
         asked = self.settings
         points = [self.search.point(g, (tilt, roll)) for g in asked.gain_factors for tilt in asked.tilt_corners_Hz
                   for roll in asked.roll_offs_Hz]

@@ -77,14 +77,14 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _refusal(error: OSError) -> str:
-    """One line of what the system refused."""
+    """One line for an error of the operating system."""
     where = f"{error.filename}: " if error.filename else ""
     lines = str(error.strerror or error).splitlines() or [type(error).__name__]
-    return f"{where}the system refused: {lines[0]}; next: look at the disk's space and rights"
+    return f"{where}{lines[0]}; next: check free disk space and permissions"
 
 
 def _say_unusual() -> None:
-    """What is unusual about a rig file is one line, without a place in the source; other warnings stay as they are."""
+    """Print warnings about unusual rig files as one line, without the place in the source; leave the others alone."""
     usual = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *of: Any, **also: Any) -> None:
@@ -105,13 +105,13 @@ def main() -> None:
     try:
         # The parser hands back the code of typer.Exit, and 130 after Ctrl-C.
         code = app(standalone_mode=False)
-        sys.stdout.flush()  # where it goes to a file, the disk may refuse what was printed
+        sys.stdout.flush()  # if the output goes to a file, the disk may be full
     except AvisError as error:
         print(f"avis: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
     except OSError as error:
         print(f"avis: {_refusal(error)}", file=sys.stderr)
-        # What cannot be printed is not tried again at the end.
+        # Output that could not be written is not tried again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         sys.exit(ComputationError.exit_code)
     except (KeyboardInterrupt, typer.Abort):

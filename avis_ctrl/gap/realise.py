@@ -34,8 +34,8 @@ FLOOR = ("vx", "vy", "vz")
 _ELSEWHERE = {"com_offset", "product_of_inertia", "geophone_corner", "sensor_gain", "sensor_misalignment",
               "tilt_coupling", "actuator_gain", "actuator_lag", "loop_delay", "base_compliance"}
 # Effects that are nothing in a linear loop about rest.
-_AT_REST = {"cubic_stiffness": "linear at rest: without it", "actuator_saturation": "below its limit: without it"}
-_NOTES = {"contact_friction": "far below its slip: a spring at every motor",
+_AT_REST = {"cubic_stiffness": "linear at rest: left out", "actuator_saturation": "no effect below its limit: left out"}
+_NOTES = {"contact_friction": "motion far below slip: a spring at every motor",
           "structural_damping": "a ladder of passive branches, causal"}
 
 
@@ -62,14 +62,14 @@ class Realised:
 
 
 def not_realised(model: TableModel) -> dict[str, str]:
-    """Labels of effects of which a realisation holds nothing, and why: no loop with it says anything of them."""
+    """Labels of effects that the realisation does not contain, and why; its loops say nothing about them."""
     found = {}
     for one in model.effects:
         name = one.effect.name
         if name in _AT_REST:
             found[one.label] = _AT_REST[name]
         elif not (name in _ELSEWHERE or has_addition(one) or one.effect.rig_changes(model, one.place, one.by_name)):
-            found[one.label] = "it has no realisation in state space and is left out"
+            found[one.label] = "has no realisation in state space: left out"
     return found
 
 

@@ -149,9 +149,9 @@ def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[flo
     quiet = sorted({b.name for b in blocks} - {b.name for b in useful})
     said = [f"records at rest with the floor not measured ({', '.join(quiet)}) tell of the noise only"] if quiet else []
     if crowded:
-        chosen = f", of which {100 * share:.3g} % at random" if share < 1 else ""
-        said.append(f"{sum(len(block.omega) for block in useful)} of {sum(lines):.0f} lines are fitted: those with "
-                    f"drive{chosen}")
+        chosen = f", {100 * share:.3g} % of them drawn at random" if share < 1 else ""
+        said.append(f"{sum(len(block.omega) for block in useful)} of {sum(lines):.0f} lines are fitted: those "
+                    f"that are excited{chosen}")
     return useful, said
 
 
@@ -261,10 +261,10 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
 
 
 def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:
-    """How much of the outputs second-order terms are."""
+    """How large the second-order terms are against the outputs, in words."""
     share = [np.linalg.norm(one, axis=(0, 2)) / np.linalg.norm(block.Y, axis=(0, 2)) for block, one in
              zip(blocks, added, strict=True)]
-    return f"up to {100 * float(np.max(share)):.2g} % of a sensor's reading in a record"
+    return f"they are up to {100 * float(np.max(share)):.2g} % of a sensor's signal in a record"
 
 
 def _bounds(found: LikelihoodFit) -> tuple[str, ...]:

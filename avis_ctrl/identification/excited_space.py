@@ -1,7 +1,7 @@
-"""Which combinations of the drives a campaign plays: six logical axes of a table with eight drives leave two unplayed.
+"""Which combinations of the drives a campaign excites: six logical axes of a table with eight drives leave two out.
 
-A parametric fit needs no response to each drive by itself. What is not played is said, for whatever belongs to it (the
-force constant of one drive, say) counts as known.
+A parametric fit does not need the response to each drive separately. The combinations that are not excited are
+reported, because the parameters that depend on them (a single force constant, say) are taken as known.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ PIECE = 1 << 18
 
 @dataclass(frozen=True, eq=False)
 class ExcitedSpace:
-    """Of the drives (n_u) in a band.
+    """The excited combinations of the drives (n_u) in a band.
 
-    names : of the drives. driven : those that some record plays. unplayed : (d, k) combinations of the k driven ones
-    that no record plays, sparse, the largest entry of each 1.
+    names : of the drives. driven : those that some record excites. unplayed : (d, k) combinations of the k driven ones
+    that no record excites, sparse, the largest entry of each 1.
     """
 
     names: tuple[str, ...]
@@ -33,26 +33,26 @@ class ExcitedSpace:
 
     @property
     def full(self) -> bool:
-        """Whether every driven one is also played apart from the others."""
+        """Whether all combinations of the driven ones are excited."""
         return not len(self.unplayed)
 
     @property
     def sentence(self) -> str:
-        """What is not played, in words; empty where everything is."""
+        """What is not excited, in words; empty if everything is."""
         said = []
         if silent := [name for name in self.names if name not in self.driven]:
-            said.append(f"no record drives {', '.join(silent)}: nothing is known of {_its(silent)} own response, and "
-                        f"what the rig file says of {'them' if len(silent) > 1 else 'it'} counts as exact")
+            said.append(f"no record drives {', '.join(silent)}: {_its(silent)} own response is unknown, and the rig "
+                        f"file's values for {'them' if len(silent) > 1 else 'it'} are taken as exact")
         if not self.full:
             k, d = len(self.driven), len(self.unplayed)
             combinations = "; ".join(_in_words(row, self.driven) for row in self.unplayed)
-            said.append(f"the records play {k - d} of the {k} combinations of {', '.join(self.driven)}; not played: "
-                        f"{combinations}. The fit needs no response of each drive by itself")
+            said.append(f"the records excite {k - d} of {k} independent combinations of {', '.join(self.driven)}; not "
+                        f"excited: {combinations}. The fit does not need the response to each drive separately")
         return "; ".join(said)
 
 
 def excited_space(campaign: Campaign, band_Hz: tuple[float, float]) -> ExcitedSpace:
-    """The combinations of drives that some record plays inside a band."""
+    """The combinations of drives that some record excites inside a band."""
     names = campaign.u_names
     gram = np.zeros((len(names),) * 2)
     for record in campaign.records:

@@ -162,7 +162,7 @@ def site_noise(model: ResponseModel) -> Noise:
     own = {one.name: one.noise_rms_V for one in rig.sensors()}
     noise = np.array([own.get(name, np.nan) for name in model.sensors.names])
     if model.sensors.unit != "V" or not np.any(noise > 0):
-        raise InputError("expected volts of a rig file that states its sensors' noise, or the noise of a campaign",
+        raise InputError("expected y in V and a rig file that states its sensors' noise, or the noise of a campaign",
                          field="noise", value=rig.name)
     noise[np.isnan(noise)] = np.nanmedian(noise)
     rounding = rig.converter.noise_rms_V if rig.converter else 0.0

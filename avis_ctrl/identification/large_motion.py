@@ -1,8 +1,8 @@
-"""What large rotations add to the linear table: second-order terms that are there on any table.
+"""What large rotations add to the linear table: second-order terms that every table has.
 
 The nonlinear table of Rademakers (eqs. 2.1-2.21, `rigs.nonlinear`) less its linearisation, as an acceleration of the
-payload. Whether motors and sensors turn with the payload the source leaves open (its forces act along earth axes, its
-sensors sit on the payload): `Turning` says it of each.
+payload. The source leaves open whether motors and sensors turn with the payload (its forces act along earth axes, its
+sensors sit on the payload): `Turning` states it for each.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class Turning(NamedTuple):
     def sentence(self) -> str:
         """In words."""
         def of(share: float) -> str:
-            return "turn with the table" if share > 0.5 else "stay as they are in space"
-        return (f"second-order terms of the table's rotations are part of the model; in them the motors' axes "
-                f"{of(self.motors)} and the sensors' {of(self.sensors)}")
+            return "turn with the table" if share > 0.5 else "keep their direction in space"
+        return (f"the model includes second-order terms of the table's rotations, in which the motors' axes "
+                f"{of(self.motors)} and the sensors' axes {of(self.sensors)}")
 
 
 AS_SIMULATED = Turning()

@@ -23,7 +23,7 @@ POINTS = 400
 
 @dataclass(frozen=True, eq=False)
 class ResponseOverlay:
-    """From each driven input to each output; where drives were not played apart, from forces along the coordinates.
+    """From each driven input to each output; if the drives were not excited separately, from forces along coordinates.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseMo
 
     Raises
     ------
-    InputError : inputs or outputs that the model does not have; a response that is known along no coordinate.
+    InputError : inputs or outputs that the model does not have; no coordinate along which the response is known.
     """
     if missing := [name for name in measured.inputs if name not in model.inputs]:
         raise InputError(f"the model's inputs are {', '.join(model.inputs)}", field="inputs", value=missing)

@@ -67,7 +67,7 @@ def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str, undo_chain: bo
     sensors = [one for name in y_names for one in rig.sensors() if one.name == name]
     kinds = {(one.quantity, one.zeros, one.poles) for one in sensors}
     if len(kinds) != 1 or not sensors[0].inertial:
-        raise InputError("expected geophones or accelerometers of one kind; the filter undoes one chain",
+        raise InputError("expected geophones or accelerometers of one kind: the filter inverts a single sensor chain",
                          field="y names", value=list(y_names))
     gain = np.array([one.gain for one in sensors])
     chain = np.array(sensors[0].poles, complex) if undo_chain else none

@@ -110,8 +110,8 @@ def frf_spread(measured: FrequencyResponse, model: ResponseModel, keep: Sequence
     model : at the identified parameters.
     confidences : shares of repeated measurements in which a bound holds at a line.
 
-    Where the records do not play every drive by itself, the kept coordinates are pushed by what they do play; lines on
-    which that is not known are left out.
+    If the records do not excite every drive separately, the controlled coordinates are driven by the combinations that
+    they do excite; lines on which these are not known are left out.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def _pushed(measured: FrequencyResponse, model: ResponseModel, A: np.ndarray, ke
         made = np.linalg.norm(T[:, drives] @ own - T @ A, axis=0) < 1e-6 * np.linalg.norm(T @ A, axis=0)
         lines = known(own)
         if not np.all(made) or not np.any(lines):
-            raise InputError("expected records that push along each of them by themselves", field="keep",
+            raise InputError("expected records that excite each of these coordinates separately", field="keep",
                              value=[name for name, one in zip(keep, made, strict=True) if not one] or list(keep))
     return measured.at(lines), own
 

@@ -59,9 +59,9 @@ class AvisTable(Rig):
     inertia : (J1, J2, J3, J12, J13, J23) [kg m^2] about the centre of mass; the last three are the
         entries of the inertia tensor itself, J12 = -integral of x y dm.
     centre_of_mass : [m] from the geometric centre.
-    motors, geophones : in the isolators, with which they move. drives, instruments : at places of their own. All
-        together, in this order, are `all_drives` and `sensors`.
-    limit_V : of drives that have no limit of their own.
+    motors, geophones : in the isolators, at the positions of these. drives, instruments : at positions of their own.
+        `all_drives` and `sensors` are both together, in this order.
+    limit_V : voltage limit of drives that have no limit of their own.
     """
 
     name: str

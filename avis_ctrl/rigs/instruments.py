@@ -2,8 +2,8 @@
 
     motion along the sensor's axis -> zeros and poles of the sensor -> volts at the converter
 
-A geophone reads velocity and an accelerometer acceleration, both in space; a position sensor reads the displacement of
-the payload against the chassis.
+A geophone measures velocity and an accelerometer acceleration, both in space; a position sensor measures the
+displacement of the payload relative to the chassis.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ ORDER: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
 def unit_vector(direction: Triple, field: str) -> Triple:
-    """The direction with length one, as it is where it has that. Raises InputError for a vector without length."""
+    """The direction scaled to length one, unchanged if it has that already. Raises InputError for a zero vector."""
     length = float(np.linalg.norm(direction))
     if not (np.isfinite(length) and length > 0):
-        raise InputError("expected a vector with a length", field=field, value=list(direction))
+        raise InputError("expected a vector that is not zero", field=field, value=list(direction))
     if abs(length - 1.0) <= 1e-12:
         return direction
     x, y, z = (float(part) / length for part in direction)
@@ -57,10 +57,10 @@ class Sensor:
 
     Attributes
     ----------
-    quantity : what it takes in along its axis: "velocity" [m/s] and "acceleration" [m/s^2] of the payload in space,
-        "displacement" [m] of the payload against the chassis.
+    quantity : what it measures along its axis: "velocity" [m/s] and "acceleration" [m/s^2] of the payload in space,
+        "displacement" [m] of the payload relative to the chassis.
     zeros, poles : rad/s, of its chain from there to volts.
-    gain : volts per unit of motion in the passband: far above all corners, of a position sensor at rest.
+    gain : volts per unit of motion in the passband: far above all corners; for a position sensor, at low frequency.
     noise_rms_V : white noise of one sample, before the converter.
     suspension : corner [Hz] and damping ratio of a geophone's own suspension, None for other kinds.
     noise_density : the same noise as motion in the passband [unit/sqrt(Hz)], where the rig's file states it so.
@@ -79,7 +79,7 @@ class Sensor:
 
     @property
     def inertial(self) -> bool:
-        """Whether it reads motion in space, not against the chassis."""
+        """Whether it measures motion in space, not relative to the chassis."""
         return self.quantity != "displacement"
 
     @property
@@ -130,7 +130,7 @@ class GeophoneAt:
     def sensor(self, acquisition: Acquisition, ambient: Ambient | None) -> Sensor:
         corner, damping = self.suspension_Hz, self.suspension_damping
         if self.compensated_Hz is not None and self.compensated_damping is not None:
-            # The filter assumes exactly this suspension: its zeros cancel the geophone's poles on paper.
+            # The filter is assumed to match this suspension exactly: its zeros cancel the geophone's poles.
             corner, damping = self.compensated_Hz, self.compensated_damping
         noise = _noise_rms(self.noise_rms_V, None, 1.0, acquisition, ambient)
         return Sensor(self.name, self.position, self.direction, "velocity", (0j, 0j),
@@ -167,7 +167,7 @@ def white_rms(density: float, gain: float, sample_rate_Hz: float) -> float:
 
 def _noise_rms(rms_V: float | None, density: float | None, gain: float, acquisition: Acquisition,
                ambient: Ambient | None) -> float:
-    """What the file states of a sensor's noise, or else the ambient noise of its channels."""
+    """The noise that the file states for a sensor, or else the ambient noise of the channels."""
     if rms_V is not None:
         return rms_V
     if density is not None:
@@ -200,7 +200,7 @@ Instrument = GeophoneAt | AccelerometerAt | PositionSensorAt
 
 
 def with_gain(instrument: Instrument, gain: float) -> Instrument:
-    """The instrument with other volts per unit of motion behind its preamplifier."""
+    """The instrument with another gain, in volts per unit of motion after its preamplifier."""
     sensitivity = gain / instrument.preamplifier_gain
     if isinstance(instrument, GeophoneAt):
         return replace(instrument, sensitivity_Vs_per_m=sensitivity)
@@ -211,7 +211,7 @@ def with_gain(instrument: Instrument, gain: float) -> Instrument:
 
 @dataclass(frozen=True)
 class FloorSensor:
-    """What a column of floor velocity of a campaign was measured with: along x, y or z of the floor.
+    """The sensor behind a column of floor velocity of a campaign: along x, y or z of the floor.
 
     noise_rms_m_per_s : white noise of one sample, as velocity of the floor.
     """
@@ -223,7 +223,7 @@ class FloorSensor:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """One standard deviation each of what a rig file states; the defaults are those of the contract.
+    """One standard deviation of each value of a rig file.
 
     Places: every coordinate of isolators, drives and sensors. Directions: of every drive and sensor, about both
     normals.

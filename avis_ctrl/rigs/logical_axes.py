@@ -3,10 +3,11 @@
 Built from geometry alone. Appendix A.4 itself is not in the text at hand; these are the kinematic relations that
 section 2.1.1 says it was built from.
 
-Where the channels do not span all six coordinates, the asked axes are made (or read) exactly and the others as little
-as these channels allow; rotations count as displacement, or force, at the edge. Sensors that read motion in space come
-first. Position sensors read the payload against the chassis: they help to tell other coordinates from the asked one,
-and read an axis themselves only where the others do not see it. That axis is then "relative": it moves with the floor.
+If the channels do not span all six coordinates, the requested axes are driven (or measured) exactly and the others as
+little as these channels allow; rotations count as displacement, or force, at the edge. Sensors of motion in space take
+precedence. Position sensors measure the payload relative to the chassis: they help to separate other coordinates from
+the requested one, and measure an axis themselves only if the other sensors cannot. That axis is then "relative": its
+reading includes the motion of the floor.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ RANK_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Reach:
-    """What counts as within reach of a set of channels.
+    """What a set of channels can drive or measure.
 
-    weakest : share of the strongest combination. Drawings give directions to some 0.005 rad: what channels push or see
-        only by such a tilt, they are not meant to.
+    weakest : smallest share of the strongest combination that counts. Drawings give directions to about 0.005 rad; what
+        channels drive or measure only by such a tilt is not intended.
     noise_band_Hz : where the sensors' noise, as velocity, is compared: the band of a table's modes and of its loops.
     """
 
@@ -68,11 +69,11 @@ class SensorAxes:
 
     matrix : (n_s, 6) from q to the sensors.
     decoding : (n_axes, n_s) least-squares inverse, weighted with the sensors' noise: logical coordinates `axes` from
-        the sensors, as blind as they can be to `resolved` coordinates that are not asked for.
+        the sensors, with the least possible sensitivity to `resolved` coordinates that are not requested.
     condition : condition number of the columns inverted, each scaled to unit length.
     leftover : (n_axes, n_resolved) what is read of `resolved`, rotations at the edge.
-    relative : those of `axes` that are read against the chassis.
-    inertial : (n_s,) which sensors read motion in space.
+    relative : those of `axes` that are measured relative to the chassis.
+    inertial : (n_s,) which sensors measure motion in space.
     """
 
     sensors: tuple[str, ...]
@@ -138,7 +139,7 @@ def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[s
     if absolute and alone:
         decoding, condition = _blind_inverse(H, wanted, columns, rig.edge_m, exact, complaint, noise)
     elif absolute:
-        # What position sensors see of the absolute axes holds the floor's motion: unknowns of their own.
+        # Position sensors see the absolute axes minus the floor's motion: unknowns of their own.
         own = [H[:, k] * inertial for k in absolute]
         both = [H[:, k] for k in range(6) if k not in absolute]
         against = [H[:, k] * ~inertial for k in absolute]
@@ -160,12 +161,12 @@ def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[s
 
 
 def drivable(rig: Rig) -> tuple[str, ...]:
-    """Coordinates that the actuators can push each by itself; the others stay passive."""
+    """Coordinates that the actuators can drive independently; the others stay passive."""
     return _spanned(rig.equations_of_motion().T.T, rig.edge_m)
 
 
 def sensed(rig: Rig) -> tuple[str, ...]:
-    """Coordinates that the sensors tell from all others, in space or against the chassis."""
+    """Coordinates that the sensors can separate from all others, in space or relative to the chassis."""
     return _spanned(rig.sensor_rows()[1], rig.edge_m)
 
 

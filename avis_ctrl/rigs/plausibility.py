@@ -1,9 +1,9 @@
-"""Whether a rig file can be that of a table at all, and which slip of a unit would explain that it cannot.
+"""Whether a rig file can describe a table at all, and if not, which unit error would explain it.
 
-Natural frequencies, sag, damping ratios, mass per area, radii of gyration, reach of the drives, full scale and deafness
-of the sensors, delay and sample rate are computed from the file (`implausible`). Where one is out of range, every
-single slip (`unit_slips`) is undone in turn, and the one that puts everything in range, with the least left that is
-unusual, is named.
+Natural frequencies, sag, damping ratios, mass per area, radii of gyration, travel of the drives, full scale and noise
+of the sensors, delay and sample rate are computed from the file (`judged`). If one is out of range, every single unit
+error (`unit_slips`) is undone in turn, and the one that brings everything into range, with the fewest unusual values
+left, is named.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ALIKE = ("constant_N_per_V", "sensitivity_Vs_per_m", "sensitivity_Vs2_per_m", "s
 
 @dataclass(frozen=True)
 class SlipCost:
-    """What makes one slip likelier than another, in squared decades beyond what is usual.
+    """Weights that decide which unit error ("slip") is the likeliest, in squared decades beyond the usual range.
 
     scope : times the square of the steps from one number to a list, a key, a unit in a section, in the file. rank : a
     step down the list of what people write instead. off_centre : all properties at the ends of what is usual. apart :
@@ -46,7 +46,7 @@ COST = SlipCost()
 
 
 class UnusualRig(UserWarning):
-    """What a rig file says is possible, but rare: one line."""
+    """A rig file has a value that is possible but unusual: one line."""
 
 
 @dataclass(frozen=True)
@@ -67,15 +67,15 @@ class Property:
 
 
 def plausible(content: dict[str, Any], build: Build, ranges: PlausibleRanges = RANGES) -> str:
-    """Holds a file's content against what a table can be; returns one line on what is unusual, empty for nothing.
+    """Compare a file's content with the ranges of real tables; return one line on unusual values, empty if none.
 
     Parameters
     ----------
-    content : of the TOML file. build : makes the rig, and complains of what cannot be one.
+    content : of the TOML file. build : makes the rig, and raises InputError if it cannot.
 
     Raises
     ------
-    InputError : what `build` complains of, with the likely slip of a unit where there is one; values that no table has.
+    InputError : that of `build`, with the likely unit error if there is one; values that no table has.
     """
     try:
         rig = build(content)
@@ -85,7 +85,7 @@ def plausible(content: dict[str, Any], build: Build, ranges: PlausibleRanges = R
             raise
         first, said = likely[0], error.expected
         if error.field and not error.field.startswith(first.field):
-            said = f"with it {error.field} is refused ({said})"
+            said = f"it makes {error.field} invalid ({said})"
         raise InputError(f"{said}; {_asked(likely)}", field=first.field, value=first.value) from None
     found = judged(content, rig, ranges)
     odd = sorted((one for one in found if one.unusual > 1e-9), key=lambda one: (-one.refused, -one.unusual))
@@ -100,7 +100,7 @@ def plausible(content: dict[str, Any], build: Build, ranges: PlausibleRanges = R
         return f"unusual for a table: {said}{hint}"
     if likely:
         raise InputError(f"{said}: no table has that; {_asked(likely)}", field=likely[0].field, value=likely[0].value)
-    raise InputError(f"{said}: no table has that, and no single slip of a unit explains it; check the keys' units",
+    raise InputError(f"{said}: no table has that, and no single wrong unit explains it; check the units of the keys",
                      field=odd[0].field or "payload, isolators or drives", value=odd[0].value)
 
 
@@ -216,7 +216,7 @@ def _modes(eom: Any, modes: Any, judge: Judge) -> None:
     judge("slowest_Hz", f[0], said)
     judge("mode_Hz", f[0], said)
     judge("mode_Hz", f[-1], said)
-    judge("spread", f[-1] / f[0], f"{said}, {f[-1] / f[0]:.3g} times apart")
+    judge("spread", f[-1] / f[0], f"{said}, a ratio of {f[-1] / f[0]:.3g}")
     rises = modes.shapes[2] ** 2 * np.diag(eom.M)[2]
     vertical = f[rises > 0.2]
     if len(vertical):
@@ -229,14 +229,14 @@ def _modes(eom: Any, modes: Any, judge: Judge) -> None:
 
 def _shape(rig: Rig, body: Any, centre: np.ndarray, radius: float, judge: Judge) -> None:
     slab = body.mass / (np.pi * radius ** 2)
-    judge("slab_kg_per_m2", slab, f"{slab:.3g} kg on each m^2 between the mounts")
+    judge("slab_kg_per_m2", slab, f"{slab:.3g} kg per m^2 of the area between the mounts")
     for J in np.linalg.eigvalsh(body.inertia):
         r = np.sqrt(max(J, 0.0) / body.mass)
         judge("gyration", r / radius, f"a radius of gyration of {r:.3g} m, {r / radius:.2g} times the mounts' "
-                                           f"distance from their centre of {radius:.3g} m")
+                                           f"distance from their centre ({radius:.3g} m)")
     away = float(np.linalg.norm(body.centre_of_mass - centre))
     judge("mounts_height", away / radius, f"a centre of mass {away:.3g} m from the mounts' centre, {away / radius:.2g}"
-                                               " times their radius")
+                                               " times the radius on which they stand")
     near = np.median([np.linalg.norm(mount.position - centre) for mount in body.mounts])
     for name, place in rig.points().items():
         distance = float(np.linalg.norm(place.position - centre)) / max(near, 1e-12)
@@ -254,10 +254,10 @@ def _drives(rig: Rig, eom: Any, radius: float, judge: Judge) -> None:
     a, travel = force[k] / mass, force[k] / stiffness[k]
     together = f"all drives together, {force[k]:.3g} N at {rig.drive_limit_V:g} V,"
     judge("acceleration", a, f"{together} accelerate the payload by {a:.2g} m/s^2")
-    judge("travel_m", travel, f"{together} move it by {travel:.2g} m")
+    judge("travel_m", travel, f"{together} move the payload by {travel:.2g} m")
     if radius > 0:
-        judge("travel_share", travel / radius, f"{together} move it by {travel:.2g} m, {travel / radius:.2g} times "
-                                                    "the mounts' radius")
+        judge("travel_share", travel / radius, f"{together} move the payload by {travel:.2g} m, {travel / radius:.2g} "
+                                               "times the radius on which the mounts stand")
 
 
 def _alike(numbers: Sequence[Entry], body: Any, judge: Judge) -> None:
@@ -271,25 +271,26 @@ def _alike(numbers: Sequence[Entry], body: Any, judge: Judge) -> None:
 
 
 def _unequal(values: np.ndarray, names: list[str], judge: Judge) -> None:
-    """Entries against the median of those that are not zero, where there are three of them."""
+    """Entries against the median of the nonzero ones, if there are at least three of them."""
     there = np.abs(values) > 1e-9 * np.max(np.abs(values), initial=0.0)
     if np.count_nonzero(there) < 3:
         return
     middle = float(np.median(np.abs(values[there])))
     for value, name in zip(values[there], (n for n, t in zip(names, there, strict=True) if t), strict=True):
         share = abs(value) / middle
-        judge("unequal", share, f"{name} of {value:.3g} is {share:.2g} times that of the others")
+        judge("unequal", share, f"{name} of {value:.3g} is {share:.2g} times the median of its kind")
 
 
 def _clock(rig: Rig, f: float, judge: Judge) -> None:
-    judge("samples_per_cycle", rig.sample_rate_Hz / f, f"{rig.sample_rate_Hz / f:.2g} samples in a cycle of the "
-                                                            f"fastest mode, {f:.3g} Hz")
-    judge("delay_cycles", rig.loop_delay_s * f, f"a loop delay of {rig.loop_delay_s:g} s, {rig.loop_delay_s * f:.2g} "
-          f"cycles of the fastest mode and {rig.loop_delay_s * rig.sample_rate_Hz:.3g} samples")
+    judge("samples_per_cycle", rig.sample_rate_Hz / f, f"{rig.sample_rate_Hz / f:.2g} samples per cycle of the "
+                                                            f"fastest mode at {f:.3g} Hz")
+    judge("delay_cycles", rig.loop_delay_s * f, f"a loop delay of {rig.loop_delay_s:g} s "
+          f"({rig.loop_delay_s * rig.sample_rate_Hz:.3g} samples), {rig.loop_delay_s * f:.2g} cycles of the "
+          "fastest mode")
 
 
 def _hearing(content: dict[str, Any], judge: Judge) -> None:
-    """Sensors of velocity against converter, noise and floor."""
+    """Full scale and noise of velocity sensors against converter and floor motion."""
     def of(section: str, key: str) -> float | None:
         part = content.get(section)
         value = part.get(key) if isinstance(part, dict) else None
@@ -300,13 +301,13 @@ def _hearing(content: dict[str, Any], judge: Judge) -> None:
     floor = of("ambient", "floor_velocity_rms_m_per_s")
     for name, gain in _velocity_sensors(content):
         if full is not None:
-            judge("full_scale_m_per_s", full / gain, f"a full scale of {full / gain:.2g} m/s of {name}")
+            judge("full_scale_m_per_s", full / gain, f"a full scale of {full / gain:.2g} m/s at {name}")
         if full is not None and floor is not None:
             share = floor * gain / full
-            judge("floor_share", share, f"the floor alone, {floor:.2g} m/s, fills {share:.2g} of the converter at "
-                                             f"{name}")
+            judge("floor_share", share, f"the floor motion alone, {floor:.2g} m/s, fills {share:.2g} of the "
+                                             f"converter's range at {name}")
             own = max(noise, full * 2.0 ** (1 - bits) / np.sqrt(12)) / gain
-            judge("deaf", own / floor, f"noise of {name}, {own:.2g} m/s, {own / floor:.3g} times the floor's motion")
+            judge("deaf", own / floor, f"noise of {name}, {own:.2g} m/s, {own / floor:.3g} times the floor motion")
 
 
 def _velocity_sensors(content: dict[str, Any]) -> Iterator[tuple[str, float]]:

@@ -1,7 +1,8 @@
-"""What a table may be: ranges outside of which a rig file is refused, and those outside of which it is told.
+"""Ranges of the properties of real tables: outside the wide ones a rig file is refused, outside the narrow ones it
+gets a warning.
 
-They hold tables from 0.3 kg to 100 t, on springs, air, rubber, magnets or piezo stacks, of laboratory and factory. A
-slip of a unit is a factor of 25 to 1e9; the ranges are as wide as tables are, and no wider.
+They cover tables from 0.3 kg to 100 t, on springs, air, rubber, magnets or piezo stacks, in laboratory and factory. A
+wrong unit is a factor of 25 to 1e9; the ranges are as wide as real tables need, and no wider.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from types import MappingProxyType
 class Range:
     """lowest, low, high, highest in `unit`: outside low .. high is unusual, outside lowest .. highest is refused.
 
-    why : the reason, as a table's builder would say it.
+    why : the reason for the range.
     """
 
     lowest: float

@@ -57,7 +57,7 @@ class Rig(ABC):
     @property
     @abstractmethod
     def drive_limit_V(self) -> float:
-        """Largest voltage of an actuator, of all where they differ."""
+        """Largest voltage of the actuators; the largest of all limits if they differ."""
 
     def drive_limits_V(self) -> np.ndarray:
         """(n_u,) largest voltage of each actuator."""
@@ -113,11 +113,11 @@ class Rig(ABC):
         return {one.name: (np.array(one.position), np.array(one.direction)) for one in self.sensors()}
 
     def with_sensor_gains(self, gains: Mapping[str, float]) -> Self:
-        """The rig with other volts per unit of motion of some sensors, preamplifiers included.
+        """The rig with other gains of some sensors, in volts per unit of motion, preamplifiers included.
 
-        Raises InputError where the rig's file has no place for them.
+        Raises InputError if this kind of rig has no gain per sensor.
         """
-        raise InputError("a rig file of this kind has one sensitivity for all; leave them out", field="parameters",
+        raise InputError("a rig file of this kind has one sensitivity for all; leave these out", field="parameters",
                          value=[f"sensor.{name}" for name in gains])
 
     def sensor_rows(self) -> tuple[tuple[str, ...], np.ndarray]:

@@ -51,8 +51,8 @@ File = TypeVar("File", bound=BaseModel)
 def load_rig(path_or_name: str | Path, loaded: bool = False, check: bool = True) -> AvisTable | Halcyonics:
     """The rig of a file, or a shipped one: "avis", "halcyonics", "halcyonics_loaded".
 
-    `loaded` puts the load of the file's [load] section on the table. `check` holds a file against what tables can be
-    (`plausibility`), a warning `UnusualRig` saying what is rare; not for files that an identification wrote.
+    `loaded` puts the load of the file's [load] section on the table. `check` compares the values with those of real
+    tables (`plausibility`) and warns of unusual ones (`UnusualRig`); not for files that an identification wrote.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def _common_limit(file: AvisFile) -> float:
         return file.actuators.limit_V
     for k, one in enumerate(file.drive, 1):
         if one.limit_V is None:
-            raise InputError("this key is missing, and there is no limit_V for all drives in [actuators]",
+            raise InputError("this key is missing, and [actuators] has no limit_V for all drives",
                              field=f"drive[{k}].limit_V")
     return max((one.limit_V for one in file.drive if one.limit_V is not None), default=1.0)
 

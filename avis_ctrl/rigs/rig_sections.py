@@ -26,7 +26,7 @@ Axis = Literal["x", "y", "z"]
 
 def _with_a_length(direction: list[float]) -> list[float]:
     if not any(direction):
-        raise ValueError("expected a vector with a length")
+        raise ValueError("expected a vector that is not zero")
     return direction
 
 

@@ -1,12 +1,12 @@
-"""What a digital controller makes of the sensors of a rig: one velocity an axis, whatever the sensors are.
+"""How a digital controller turns a rig's sensor signals into one velocity per axis, whatever the sensors are.
 
     volts / gain -> conditioning of each channel -> decoding -> seen velocity of each axis
 
-Decoding adds channels, so that all channels of an axis must look alike. A digital filter brings every sensor that reads
-motion in space to one high-pass of second order on velocity, s^2 / p(s): an accelerometer is integrated with a leak, a
-geophone's corner is moved to that of the others. The corner is the highest that any of them has by itself: no channel
-is amplified below its own; for a lower corner a geophone has its compensation filter in the rig file. Position sensors
-are differentiated: they show the velocity of the payload against the chassis.
+Decoding adds channels, so all channels of an axis need the same dynamics. A digital filter gives every sensor of motion
+in space the same second-order high-pass on velocity, s^2 / p(s): an accelerometer is integrated with a leak, and a
+geophone's corner is moved to that of the others. The common corner is the highest of all their own corners, so that no
+channel is amplified below its own; for a lower corner, give a geophone a compensation filter in the rig file. Position
+sensors are differentiated: they give the velocity of the payload relative to the chassis.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from avis_ctrl.rigs.rig import Rig
 
 @dataclass(frozen=True)
 class SensingSettings:
-    """differentiator_share : corner of the position sensors' differentiator over the clock, 1: as far above the loop's
-    band as the bilinear map leaves it a corner."""
+    """differentiator_share : corner of the position sensors' differentiator, as a fraction of the sample rate: as far
+    above the loop's band as the bilinear map allows."""
 
     differentiator_share: float = 0.2
 
@@ -103,12 +103,12 @@ class Sensing:
 
     @property
     def relative(self) -> tuple[str, ...]:
-        """Axes whose velocity is seen against the chassis, not in space."""
+        """Axes whose velocity is measured relative to the chassis, not in space."""
         return self.decoder.relative
 
 
 def sensing(rig: Rig, axes: Sequence[str], integrator_corner_Hz: float) -> Sensing:
-    """The controller's side of a rig's sensors.
+    """How the controller measures these axes with the rig's sensors.
 
     integrator_corner_Hz : leak of the accelerometers' integrators.
 
@@ -171,5 +171,5 @@ def _noise(rig: Rig, filters: Sequence[Filter], used: np.ndarray) -> tuple[Noise
         shape = gain([[largest]]) if one.is_one else Filter(zeros, one.poles, leading).system()
         groups.append(NoiseGroup(shape, np.where(own, density / largest if largest else 1.0, 0.0)))
     if not groups:
-        raise InputError("expected sensors that see the axes", field="sensors", value=[one.name for one in sensors])
+        raise InputError("expected sensors that measure the axes", field="sensors", value=[one.name for one in sensors])
     return tuple(groups)

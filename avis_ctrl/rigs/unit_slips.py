@@ -1,4 +1,4 @@
-"""The numbers of a rig file with the units of their keys, and what a slip of the unit makes of them."""
+"""The numbers of a rig file with the units of their keys, and their values if given in a wrong unit (a "slip")."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 G = 9.80665
 INCH = 0.0254
 KILO = 1e3
-# Unit at the end of a key, with what people write instead: (factor to the key's unit, the unit that was meant). The
-# first ones are the likeliest. A key without a unit is a ratio.
+# Unit at the end of a key, with units used by mistake: (factor to the key's unit, the unit that was meant), the most
+# likely first. A key without a unit is a ratio.
 UNITS: dict[str, tuple[tuple[float, str], ...]] = {
     "_kgm2": ((1e-4, "kg cm^2"), (1e-6, "kg mm^2"), (1e-9, "g mm^2"), (1e-7, "g cm^2"), (KILO, "t m^2"),
               (1e-3, "g m^2")),
@@ -119,7 +119,7 @@ def unit_of(key: str) -> str:
 
 
 def slips(content: dict[str, Any]) -> Iterator[Slip]:
-    """Every single slip that a person may have made: of one number, a list, a key, a unit in a section or the file.
+    """Every single unit error that may have been made: in one number, a list, a key, a unit in a section or the file.
 
     Single numbers of lists come last.
     """

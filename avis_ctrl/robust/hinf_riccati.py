@@ -5,10 +5,10 @@ Formulas of Glover and Doyle, Systems & Control Letters 11 (1988) 167-172, for a
 
     gamma > max(sigma [D1111 D1112], sigma [D1111; D1121]),   X >= 0,   Y >= 0,   rho(X Y) < gamma^2 .
 
-In double precision the test has a third outcome, in doubt. A bound is claimed only where it is not: a gamma is
-called too small where the failing condition fails by more than its error, or where the response at one frequency
-forbids it (Parrott's bound at the Hamiltonian's eigenvalue on the axis); a gamma that passes in doubt counts where
-the central controller's closed loop is measured to keep it.
+In double precision the test can also be undecided. A bound is claimed only if the test is decisive: a gamma is too
+small if the failing condition fails by more than its numerical error, or if the response at one frequency rules it out
+(Parrott's bound at the Hamiltonian's eigenvalue on the axis); a gamma that passes undecided counts only if the norm of
+the central controller's closed loop is computed and is below it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from avis_ctrl.robust.riccati import ROUND_OFF, refined_balanced, solve_riccati
 ZERO_GAMMA = 1e-9
 # Relative accuracy of a norm or a bound beside gamma.
 NEARLY = 1e-6
-IN_DOUBT = "the Riccati test passes in doubt and its controller does not keep this gamma"
+IN_DOUBT = "the Riccati test is undecided and its controller does not reach this gamma"
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def direct_term_bound(plant: Plant) -> float:
 def gamma_test(plant: Plant, gamma: float) -> GammaTest:
     """The existence test at one gamma, for a plant in normal form."""
     if gamma <= direct_term_bound(plant):
-        return GammaTest(gamma, False, "gamma is not above what D11 leaves at infinite frequency", forbidden=gamma)
+        return GammaTest(gamma, False, "gamma is not above the bound of D11 at infinite frequency", forbidden=gamma)
     solutions = []
     for name, letter, data in (("control", "X", control_riccati), ("filter", "Y", filter_riccati)):
         try:

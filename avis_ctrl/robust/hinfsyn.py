@@ -59,8 +59,8 @@ class Status(Enum):
                    "of the plant without them")
     BACKED_OFF = ("the closed loop missed its target at the back-off asked for, which was raised: this usually "
                   "means a badly scaled plant or a nearly singular D12 or D21")
-    WIDE = ("the optimum lies between the bounds, which are wider apart than asked for: between them the Riccati "
-            "test is in doubt, and nothing is claimed")
+    WIDE = ("the optimum lies between the bounds, which are further apart than asked for: between them the Riccati "
+            "test is undecided")
     SUBOPTIMAL = "a controller at the gamma asked for; the optimum was not sought"
 
 
@@ -283,8 +283,8 @@ class _Problem:
                 continue
             if found.gamma <= target * (1 + LOOP_ACCURACY) and found.fastest_pole < result.fastest_pole:
                 said = (f"the central controller has poles up to {result.fastest_pole:.3g} rad/s, the plant up to "
-                        f"{plant_fastest:.3g}: those far beyond were replaced by their gain, up to "
-                        f"{found.fastest_pole:.3g} remain, and the loop was measured with that")
+                        f"{plant_fastest:.3g}: those far beyond it were replaced by their gain, the fastest left has "
+                        f"{found.fastest_pole:.3g}, and all figures are of that controller")
                 return replace(found, notes=(said,))
         return result
 
@@ -307,8 +307,8 @@ def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
     again = float(np.linalg.norm(loop, 2))
     if abs(again - result.gamma) <= SAME_GAMMA * result.gamma:
         return ()
-    return (f"gamma is round-off: {result.gamma:.4g} from the closed loop, {again:.4g} from P and K at the same "
-            f"frequency, a small difference of large terms",)
+    return (f"gamma is lost in round-off: {result.gamma:.4g} from the closed loop, {again:.4g} from P and K at the "
+            f"same frequency, a small difference of large terms",)
 
 
 def _widest_gap(poles: np.ndarray, plant_fastest: float) -> float:
@@ -327,7 +327,7 @@ def _consistent(bounds: tuple[float, float], reached: float, tolerance: float, z
     """
     lower, upper = bounds
     if lower > reached * (1 + LOOP_ACCURACY):
-        notes = (*notes, f"the lower bound computed, {lower:.6g}, is passed by the measured loop and is not claimed")
+        notes = (*notes, f"the lower bound computed, {lower:.6g}, is above the norm of the closed loop and is dropped")
         lower = 0.0
     upper = min(upper, max(reached, lower))
     if status is Status.OPTIMAL and upper - lower > max(2 * tolerance * upper, zero):

@@ -1,8 +1,9 @@
 """mu synthesis: a controller that makes the peak of the structured singular value small.
 
 D-K iteration (Doyle 1985; Zhou, Doyle and Glover 1996, section 11.4) with scalings of automatic order, followed,
-where it stalls, by descent on the H-infinity optimum over the scalings themselves (`gamma_descent`). Where the first
-H-infinity controller does nothing, the iteration starts from other constant scalings. See `musyn_iteration`.
+where it stalls, by descent on the H-infinity optimum over the scalings themselves (`gamma_descent`). If the first
+H-infinity controller is no better than no control, the iteration starts from other constant scalings. See
+`musyn_iteration`.
 
 Real uncertainty is synthesised for as if it were complex, which is conservative: every real perturbation is a
 complex one. What that costs is measured on the final loop, where mu is computed both ways.
@@ -77,8 +78,8 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     nmeas, ncon : number of measurements y and controls u.
     callback : called with each `Iteration`; returning False or "stop" ends the iteration.
     target : stop once the scaled loop is measured below this (mu is then below it at every frequency).
-    max_iterations : most K-steps, the first H-infinity controller counted. No clock decides anything: the same call
-        gives the same controller on any machine, and more iterations, or a lower target, go on where fewer ended.
+    max_iterations : most K-steps, including the first H-infinity controller. There is no time limit: the same call
+        gives the same controller on any machine, and more iterations, or a lower target, continue where fewer ended.
     backoff : relative distance from the H-infinity optimum at which each controller is taken. mu ends about as much
         above what the scalings allow; the nearer the optimum, the faster the controller's poles.
     polish : go on with descent on gamma where D-K iteration stalls (and orders that grow where that pays), and with

@@ -6,8 +6,8 @@ step gains less than `STALL`, the whole where a round of all three gains less th
 at the best constant scalings ("start"): first of all where the controllers to start from do nothing, next where a D-K
 step from them leads nowhere, else in the end. The best loop of all paths is kept.
 
-Only counts end anything, never a clock, and nothing depends on the target or on the number of iterations allowed but
-where the iteration ends: what a short run does is the beginning of what a long one does.
+Only counts end the iteration, never a clock. The target and the number of iterations allowed decide only where it
+ends: a short run is the beginning of a long one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ STALL = 0.005
 ROUND = 0.002
 # A step that lowers mu by more than this share is followed by another of its kind.
 FAST = 0.25
-# A loop within this share of the plant without control is that of a controller that does nothing.
+# A controller whose loop is within this share of the plant without control counts as doing nothing.
 IDLE = 0.01
 # Constant scalings of all uncertainty against performance from which the iteration starts where identity leads nowhere.
 CONSTANTS = tuple(10.0 ** k for k in (-3, -2.5, -2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2, 2.5, 3))
@@ -253,7 +253,7 @@ def _steps(state: State) -> list[float]:
 
 
 def _next_grid(state: State, closed_loop: StateSpace) -> np.ndarray:
-    """Frequencies of the next analysis: those of the last one, denser at its peaks."""
+    """Frequencies of the next analysis: those of the last one, with more around its peaks."""
     if state.points is None:
         return frequency_grid(closed_loop)
     return refined_grid(state.points.omega, state.points.mu)

@@ -1,4 +1,4 @@
-"""What makes a closed loop unstable: the axes that move in its unstable mode, and the loops that do it."""
+"""Why a closed loop is unstable: the axes that move in its unstable mode, and the loops that cause it."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ class Culprit:
 
     Attributes
     ----------
-    plant : name of the plant. radius : its spectral radius over one sample.
-    frequency_Hz, growth_per_s : of the fastest-growing mode; the growth is negative where only the nonlinear
-        simulation diverges.
+    plant : name of the plant. radius : spectral radius of its loop over one sample period.
+    frequency_Hz, growth_per_s : of the fastest-growing mode; the growth rate is negative if only the nonlinear
+        simulation diverges, and no loop is named then.
     axes : coordinates that move most in that mode, the largest first, rotations as displacement of the edge.
-    kind : "table" (unstable without control), "controller" (the design's controller alone does it), "companions"
-        (loops of the other axes alone do it), "together" (only both), "nonlinear" (the linear loop is stable).
-    loops : axes of the fewest companion loops without which this plant is stable; empty where there are none such.
+    kind : "table" (unstable without control), "controller" (unstable with the design's controller alone), "companions"
+        (unstable with the other axes' loops alone), "together" (only with both), "nonlinear" (only the simulation
+        diverges).
+    loops : axes of the smallest set of other axes' loops without which this plant is stable; empty if there is none.
     """
 
     plant: str
@@ -38,25 +39,24 @@ class Culprit:
     loops: tuple[str, ...] = ()
 
     def words(self) -> str:
-        """One clause: who, at which frequency, how fast."""
+        """The cause, with frequency and growth of the motion."""
+        at = f"(plant \"{self.plant}\", spectral radius {self.radius:.6f})"
         if self.kind == "nonlinear":
-            return (f"the nonlinear table leaves its stops, although the linear loop is stable "
-                    f"(plant \"{self.plant}\", spectral radius {self.radius:.6f})")
-        how = (f"the motion along {_joined(self.axes)} grows at {self.frequency_Hz:.3g} Hz by a factor of e in "
-               f"{1 / max(self.growth_per_s, 1e-12):.3g} s")
-        loops = f"the loop{'s' if len(self.loops) > 1 else ''} of {_joined(self.loops)}"
-        who = {"table": "the table itself is unstable without control",
-               "controller": "the controller does it, without the other axes' loops too",
-               "companions": f"{loops} {'do' if len(self.loops) > 1 else 'does'} it; without "
-                             f"{'them' if len(self.loops) > 1 else 'it'} the table is stable",
-               "together": (f"the controller and {loops} do it together; without "
-                            f"{'them' if len(self.loops) > 1 else 'it'} the table is stable") if self.loops else
-                           "the controller and the other axes' loops do it together"}[self.kind]
-        return f"{how} (plant \"{self.plant}\", spectral radius {self.radius:.6f}): {who}"
+            return f"the nonlinear simulation diverges although the linear loop is stable {at}"
+        how = (f"the motion along {_joined(self.axes)} grows at {self.frequency_Hz:.3g} Hz with a time constant of "
+               f"{1 / max(self.growth_per_s, 1e-12):.3g} s {at}")
+        loops = f"the skyhook loop{'s' if len(self.loops) > 1 else ''} of {_joined(self.loops)}"
+        without = f"without {'these loops' if len(self.loops) > 1 else 'that loop'} this plant is stable"
+        who = {"table": "the table is unstable even without control",
+               "controller": "the cause is the controller; this plant is unstable even without the other axes' loops",
+               "companions": f"the cause is {loops}; {without}",
+               "together": (f"the cause is the controller together with {loops}; {without}") if self.loops else
+                           "the cause is the controller together with the other axes' loops"}[self.kind]
+        return f"{how}: {who}"
 
 
 def find_culprit(loop: SampledLoop) -> Culprit:
-    """The cause of the instability of one plant's loop; none is looked for where the linear loop is stable."""
+    """The cause of the instability of one plant's loop; no loop is named if its linear loop is stable."""
     values, vectors = la.eig(period_map(loop))
     most = int(np.argmax(np.abs(values)))
     rate = np.log(values[most]) * loop.sample_rate_Hz

@@ -81,8 +81,8 @@ def digital_controller(loop: SampledLoop) -> StateSpace:
 def loop_axes(rig: Rig, axes: Sequence[str], loops: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Allocation (n_u, n) and decoding (n, n_s) of the controlled axes and of those under loops of their own.
 
-    Where drives and sensors reach all six, the axes leave each other alone. Where they do not, those of the
-    controller are as it was designed for, whatever else is controlled, and each loop's are as if it were alone.
+    If drives and sensors span all six coordinates, the axes are decoupled. If not, the axes of the controller are those
+    it was designed for, whatever else is controlled, and the axis of each loop is decoupled as if it were alone.
     """
     whole = (*axes, *loops)
     together = actuator_axes(rig, whole), sensor_axes(rig, whole)

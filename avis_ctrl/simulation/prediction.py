@@ -122,7 +122,7 @@ def _image(loop: SampledLoop, image: np.ndarray) -> list[np.ndarray]:
     velocity = np.linalg.solve(dynamic, pushed)
     _, H = loop.plant.sensor_rows()
     n = len(COORDINATES)
-    # Position sensors read against the chassis, which moves as the floor does, held as it is.
+    # Position sensors measure relative to the chassis, which moves with the floor, here held as sampled.
     moved = H @ velocity
     against = np.array([kind == "displacement" for kind in loop.sensors.quantities])
     moved[:, against, :n] -= H[against] * (sinc ** 2)[:, None, None]

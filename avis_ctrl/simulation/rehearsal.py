@@ -95,10 +95,10 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
 
 
 def within_tolerances(rig: AvisTable, rng: np.random.Generator) -> AvisTable:
-    """The table off by normal draws of its file's [tolerances], one standard deviation each.
+    """A table drawn from normal distributions about the rig, with the [tolerances] of its file as standard deviations.
 
-    Corners and damping of geophones stay: in a rig file a compensation filter fits its geophone. Motors and geophones
-    of the isolators move with these and keep their axes.
+    Corners and damping ratios of sensors are kept: in a rig file a compensation filter matches its geophone. Motors and
+    geophones in the isolators move with these and keep their directions.
     """
     t = rig.tolerances
     if t is None:

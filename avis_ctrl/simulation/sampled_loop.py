@@ -38,8 +38,8 @@ class SensorBank:
 
     Attributes
     ----------
-    quantity : what the chains take in, "velocity" [m/s] or "acceleration" [m/s^2] of the payload in space, or
-        "displacement" [m] of the payload against the chassis; one for all, or one a sensor.
+    quantity : what the sensors measure, "velocity" [m/s] or "acceleration" [m/s^2] of the payload in space, or
+        "displacement" [m] of the payload relative to the chassis; one for all, or one per sensor.
     chains : one system a sensor, to volts.
     gain_V : (n_s,) volts per unit of motion in the passband; the controller divides by it.
     noise_rms_V : (n_s,) white noise of one sample, before the converter.
@@ -58,10 +58,10 @@ class SensorBank:
     def __post_init__(self) -> None:
         n = len(self.chains)
         if len(self.quantities) != n or not set(self.quantities) <= set(ORDER):
-            raise InputError(f"velocity, acceleration or displacement, of each of {n} sensors", field="quantity",
+            raise InputError(f"velocity, acceleration or displacement for each of {n} sensors", field="quantity",
                              value=self.quantity)
         if len(self.filters) != n:
-            raise InputError(f"one filter or {n}", field="conditioning", value=len(self.filters))
+            raise InputError(f"one filter, or {n}", field="conditioning", value=len(self.filters))
         for name in ("gain_V", "noise_rms_V"):
             values = np.array(np.broadcast_to(getattr(self, name), (n,)), dtype=float)
             if not np.all(np.isfinite(values)) or np.any(values < 0):
@@ -138,8 +138,8 @@ class SampledLoop:
     drive_coupling : volts of all drives to volts that act (I + what couples them), behind amplifiers and errors;
         None where each drive acts by itself.
     amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
-    sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage. The rig's
-        drives each have their own limit; another limit_V is for all.
+    sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage. By
+        default each drive has its own limit; a given limit_V is for all drives.
 
     Raises
     ------

@@ -39,15 +39,15 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
 
     Raises
     ------
-    ComputationError : the closed loop of the nominal plant is unstable; what the bounds raise.
+    ComputationError : the closed loop of the nominal plant is unstable, or a bound cannot be computed.
     """
     full = plant.full.closed(K)
     if not full.is_stable():
         fastest_growing = max(full.poles(), key=lambda pole: pole.real)
         raise ComputationError(
-            "unstable with the nominal plant, so that no bound of it exists",
-            measured=f"a closed-loop pole at {abs(fastest_growing.imag) / (2 * np.pi):.3g} Hz that grows by a factor "
-                     f"of e in {1 / max(fastest_growing.real, 1e-12):.3g} s")
+            "the closed loop is unstable with the nominal plant, so its mu has no bounds",
+            measured=f"a closed-loop pole at {abs(fastest_growing.imag) / (2 * np.pi):.3g} Hz that grows with a time "
+                     f"constant of {1 / max(fastest_growing.real, 1e-12):.3g} s")
     performance = plant.synthesis.closed(K)
     motion = plant.full.restricted([*plant.floor_velocities], [*plant.velocities]).closed(K)
     blocks, all_blocks = plant.synthesis.blocks, plant.synthesis.all_blocks

@@ -1,4 +1,4 @@
-"""A controller of a study before anything is measured on it."""
+"""A controller of a study before it is analysed."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Velocity loops for the axes that a design does not keep, for the rig's own sensors, checked with the rest.
+"""Skyhook loops on the axes that a design does not control, designed for the rig's own sensors.
 
-The controller of a design drives the axes it keeps. Every other axis that the drives can push and the sensors can tell
-apart gets a skyhook loop of its own:
+The controller of a design drives the axes in `keep`. Every other axis that the drives can move and the sensors can
+measure independently gets a skyhook loop, called a companion loop in the code:
 
     F = -g  s/(s + w_tilt)  1/(s/w_roll + 1)  v
 
@@ -35,15 +35,15 @@ from avis_ctrl.uncertainty.weight_base import Weight
 
 @dataclass(frozen=True)
 class CompanionSettings:
-    """Search of the companion loops.
+    """Settings of the search for the companion loops.
 
-    modulus_margin : least |1 + L|, dimensionless; 0.5 is a sensitivity peak of 6 dB, the textbooks' usual limit.
-    gain_factors : gains tried, over critical damping of the axis taken alone; down to a value that hardly acts, up to
-        twice the classical rule.
-    tilt_corners_Hz, roll_offs_Hz : corners tried; the customary 0.1 and 100 Hz and their neighbours.
-    passes : rounds over the axes; the second one sees all the other loops closed.
-    shrink : factor on all gains while some plant of the uncertainty set is unstable, 3 dB a step.
-    shrinks : steps of it before the loops are left out, 18 dB in all.
+    modulus_margin : least |1 + L|, dimensionless; 0.5 is a sensitivity peak of 6 dB, the usual limit in textbooks.
+    gain_factors : gains tried, as multiples of critical damping of the axis taken alone; from almost no effect to twice
+        the classical rule.
+    tilt_corners_Hz, roll_offs_Hz : corners tried; the usual 0.1 and 100 Hz and their neighbours.
+    passes : rounds over the axes; in the second one all the other loops are closed.
+    shrink : factor on all gains while a plant of the uncertainty set is unstable, 3 dB per step.
+    shrinks : largest number of such steps, 18 dB in all, before the loops are left out.
     low_Hz, points : start and number of points of the frequency grid; it ends at 90 % of half the sample rate.
     """
 
@@ -82,7 +82,7 @@ class Companions:
     """The loops of the axes that a design does not keep.
 
     passive : (axis, reason) of those that have no loop.
-    notes : what had to be given up, in words.
+    notes : what had to be reduced or left out, in words.
     """
 
     loops: tuple[Companion, ...]
@@ -133,7 +133,7 @@ def design_companions(bare: SampledLoop, chain_error: Weight | None = None, band
             others = {name: one for name, one in found.items() if name != axis}
             best = search.best(axis, others)
             found = others if best is None else {**others, axis: best}
-    missing = tuple((axis, "no loop tried is stable with its margins") for axis in axes if axis not in found)
+    missing = tuple((axis, "no gain and corners tried are stable with the required margins") for axis in axes if axis not in found)
     return search.with_margins(Companions(tuple(found[axis] for axis in axes if axis in found), (*passive, *missing)))
 
 
@@ -145,9 +145,9 @@ def _grid(bare: SampledLoop, settings: CompanionSettings) -> np.ndarray:
 
 def until_stable(companions: Companions, plants: Sequence[SampledLoop],
                  settings: CompanionSettings = CompanionSettings()) -> Companions:
-    """The same loops with gains lowered until every plant is stable in the linear sampled loop; without them at last.
+    """The loops with gains lowered until the linear sampled loop of every plant is stable; without loops if that fails.
 
-    plants : the loop of each plant with any companions, the nominal one first; theirs are replaced.
+    plants : the loop of each plant, the nominal one first; its companion loops are replaced.
     """
     if not companions.loops:
         return companions
@@ -155,19 +155,19 @@ def until_stable(companions: Companions, plants: Sequence[SampledLoop],
         factor = settings.shrink ** step
         tried = companions.scaled(factor)
         if all(spectral_radius(replace(plant, loops=tried.systems())) < 1 for plant in plants):
-            lowered = (f"The gains of the other axes' loops are lowered by {-20 * np.log10(factor):.0f} dB: with more, "
-                       "a plant of the uncertainty set is unstable.")
+            lowered = (f"The gains of the other axes' loops were lowered by {-20 * np.log10(factor):.0f} dB: with "
+                       "higher gains a plant of the uncertainty set was unstable.")
             if not step:
                 return tried
             bare = replace(plants[0], loops={})
             search = _Search(bare, _grid(bare, settings), None, (0.0, np.inf), settings)
             return replace(search.with_margins(tried), notes=(*tried.notes, lowered))
-    # The loops as designed are kept where none of this helps: the instability is not theirs alone, or not theirs.
+    # The loops as designed are kept if even leaving them out does not help: then they are not the cause.
     without = [spectral_radius(replace(plant, loops={})) for plant in plants]
     if max(without) < 1:
         lowest = -20 * settings.shrinks * np.log10(settings.shrink)
-        reason = (f"a plant of the uncertainty set is unstable with the other axes' loops, with gains {lowest:.0f} dB "
-                  "lower, too, and stable without them")
+        reason = (f"with the other axes' loops, even with gains lowered by {lowest:.0f} dB, a plant of the uncertainty "
+                  "set is unstable")
         return Companions((), (*companions.passive, *((one.axis, reason) for one in companions.loops)),
                           companions.notes)
     return companions
@@ -197,7 +197,7 @@ class _Search:
         self.critical = dict(zip(COORDINATES, np.maximum(2 * np.sqrt(M * stiffness) - C, 0.0), strict=True))
 
     def best(self, axis: str, others: dict[str, Companion]) -> Companion | None:
-        """The candidate of least r.m.s. payload velocity that keeps the margins and is stable; None if none does."""
+        """The stable candidate with the required margins and least r.m.s. payload velocity; None if there is none."""
         g, motion, through, seen, reach = self._around(axis, others)
         # |motion + through k seen|^2 summed over axes and sources, as a quadratic form in the number k.
         weight = self.sources[:, None, :] ** 2

@@ -46,10 +46,10 @@ def nominal_hinf(design: Design, plant: DesignPlant, rig: Rig) -> Candidate:
 
 def mu_optimal(design: Design, plant: DesignPlant, rig: Rig, callback: Callable[[Any], Any] | None = None,
                rivals: Sequence[Candidate] = ()) -> tuple[Candidate, MuSynthesis]:
-    """D-K iteration on the whole uncertainty set, then the lowest order that keeps its mu.
+    """D-K iteration on the whole uncertainty set, then reduction to the lowest order with nearly the same mu.
 
-    rivals : controllers that the study has made already. The iteration starts from the best of them, and the result is
-        never worse by complex mu; that of the reduced controller is within reduction_cost_percent of it.
+    rivals : controllers that the study already has. The iteration starts from the best of them, and its complex mu is
+        never larger than theirs; that of the reduced controller is within reduction_cost_percent of it.
     """
     P, asked = plant.synthesis, design.synthesis
     made = musyn(P.P, P.blocks, P.nmeas, P.ncon, callback=callback, target=asked.target_mu,
@@ -58,7 +58,7 @@ def mu_optimal(design: Design, plant: DesignPlant, rig: Rig, callback: Callable[
                  sample_rate_Hz=rig.sample_rate_Hz)
     K, note = _reduced(plant, rig, made, asked.reduction_cost_percent / 100)
     before = tuple(f"before reduction: {one}" for one in made.notes)
-    old = ("synthesis.time_limit_s decides nothing any more: max_iterations and target_mu do",)
+    old = ("synthesis.time_limit_s is ignored: max_iterations and target_mu end the iteration",)
     notes = (made.status, *(old if asked.time_limit_s is not None else ()), *before, note)
     return Candidate("mu", "mu synthesis", "mu", K, notes), made
 
@@ -76,21 +76,21 @@ def _reduced(plant: DesignPlant, rig: Rig, made: MuSynthesis, cost: float) -> tu
     harmless = P.closed(slow).is_stable() and peak_on_grid(slow) <= (1 + cost) * full
     reduced = reduce_controller(P.P, slow if harmless else made.K, peak_on_grid, cost)
     return reduced.K, (f"reduced from {made.K.nstates} to {reduced.order} states: complex mu on a grid of {omega.size} "
-                       f"frequencies from {full:.4f} to {reduced.figure:.4f}")
+                       f"frequencies changes from {full:.4f} to {reduced.figure:.4f}")
 
 
 def best_of(mu: ControllerResult, others: Sequence[ControllerResult]) -> ControllerResult:
-    """What a study delivers as its mu controller: of all controllers measured, the one of least mu.
+    """The controller with the smallest mu of all those analysed, delivered under the name of the mu controller.
 
-    `mu` itself, or the best of the others under its name where its upper bound over the whole set is smaller; a note
-    then says where the controller comes from. Passive tables (K None) and loops that are not stable do not take part.
+    This is `mu` itself, unless another one has a smaller upper bound over the whole set; a note then says which one it
+    is. The table without control (K None) and unstable loops do not take part.
     """
     stable = [one for one in others if one.K is not None and one.stable and np.isfinite(one.mu.upper)]
     best = min((mu, *stable), key=lambda one: one.mu.upper if np.isfinite(one.mu.upper) else np.inf)
     if best is mu:
         return mu
-    note = (f"this is the controller {best.title!r}: its mu, {best.mu.upper:.4g}, is less than the {mu.mu.upper:.4g} "
-            "that the D-K iteration and the reduction of its order ended with")
+    note = (f"this is the controller {best.title!r}: its mu of {best.mu.upper:.4g} is below the {mu.mu.upper:.4g} "
+            "reached by D-K iteration and order reduction")
     return replace(best, name=mu.name, title=mu.title, kind=mu.kind, notes=(note, *mu.notes, *best.notes))
 
 

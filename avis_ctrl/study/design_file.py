@@ -152,11 +152,11 @@ class FloorSection(_Section):
 
 
 class SynthesisSection(_Section):
-    """D-K iteration and what ends it: counts only, so that the same file gives the same controller on any machine.
+    """D-K iteration and its limits: only counts, so that the same file gives the same controller on any machine.
 
-    max_iterations : most K-steps. target_mu : end once mu is proved below; without it, go on while mu falls.
-    polish : descend on gamma where D-K iteration stalls; by default yes.
-    time_limit_s : of older files; decides nothing.
+    max_iterations : most K-steps. target_mu : end once mu is proved below it; without it, go on while mu falls.
+    polish : minimise gamma over the scalings when D-K iteration stalls; by default yes.
+    time_limit_s : ignored; accepted because older files contain it.
     """
 
     max_iterations: Annotated[int, Field(ge=1, le=50)] = 8

@@ -138,7 +138,7 @@ def _gates(measured: Campaign, rig: Rig, options: GapOptions, progress: Progress
     for one in stops:
         progress(f"  stop: {one.sentence}")
     if stops and not options.despite_gates:
-        raise InputError(f"{stops[0].sentence.rstrip('.')}; --despite-gates goes on all the same", field="measurement",
+        raise InputError(f"{stops[0].sentence.rstrip('.')}; --despite-gates continues anyway", field="measurement",
                          value=stops[0].gate)
     return findings
 

@@ -76,7 +76,7 @@ class DesignEffect:
     in_files, not_in_files : labels of effects that rig.toml and design.toml hold, and of those that only this holds.
     files : contents of rig.toml and design.toml by name: `avis design` runs on them.
     sentences : the outcome first. seconds : wall clock.
-    not_checked : labels of named effects against which no controller was checked, and why: the loops hold nothing of
+    not_checked : labels of named effects against which no controller was checked, and why: the loops do not contain
         them, so that no figure here says whether they matter.
     """
 
@@ -165,7 +165,7 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
     realised = realise(updated)
     files, in_files, not_in_files = start_files(design, updated, when)
     left_out = not_realised(updated)
-    not_checked = left_out | dict.fromkeys(signals, "it adds to the signals and is no part of the loop")
+    not_checked = left_out | dict.fromkeys(signals, "it acts on the measured signals and is not part of the loop")
     held = "all" if not left_out else "none" if len(left_out) == len(updated.effects) else "some"
     words = (*_outcome(before, after, new, design.synthesis.target_mu, held), *_unchecked(not_checked), *notes,
              *_told(realised, design, new_rig, updated, when, in_files, not_in_files))
@@ -236,7 +236,7 @@ def start_files(design: Design, model: TableModel, when: float = 0.0
 
 
 def _unchecked(not_checked: dict[str, str]) -> list[str]:
-    """That no figure says anything of these effects; empty where there are none."""
+    """That no controller was checked with these effects; empty if there are none."""
     if not not_checked:
         return []
     each = "; ".join(f"{label}: {why}" for label, why in not_checked.items())
@@ -291,8 +291,8 @@ def _verdict(before: float, after: float, held: str) -> str:
         return "robust performance is reached"
     if abs(after - before) <= 0.02 * before:
         return {"all": "the effect does not matter to it",
-                "some": "what of the named effects is in this loop does not matter to it",
-                "none": "mu stays because nothing of what was named is in this loop"}[held]
+                "some": "the named effects that this loop contains do not matter to it",
+                "none": "mu stays because this loop contains none of the named effects"}[held]
     kept = "robust performance is kept" if after < 1 else "robust performance is missed on both"
     return f"it is {'worse' if after > before else 'better'}, {kept}"
 

@@ -48,7 +48,7 @@ def write_gap(folder: Path, gap: Gap, html: str | None = None, pdf: bytes | None
 
     told : content of gap.json, by default the gap's own without provenance.
 
-    Raises ComputationError where the disk refuses.
+    Raises ComputationError if the disk cannot hold the files.
     """
     texts: dict[str, str | bytes | None] = {
         BASELINE_RIG: _toml(gap.baseline, "the rig's own structure, its parameters re-identified", None),
@@ -160,7 +160,7 @@ def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
     Raises
     ------
     InputError : a folder or campaign that does not fit, a place that cannot be written.
-    ComputationError : an effect with which the table leaves every bound; the disk refuses.
+    ComputationError : an effect with which the motion diverges; a disk that cannot hold the file.
     """
     effects = read_gap(folder)["effects"]
     models = {"y_baseline": read_model(folder / BASELINE_FILE), "y_updated": read_model(folder / UPDATED_FILE)}

@@ -215,7 +215,7 @@ def gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options:
             progress(f"  {finding.severity}: {finding.sentence}")
     if raised is not None:
         more = f" (and {len(stops) - 1} more, above)" if len(stops) > 1 else ""
-        raise InputError(f"{raised.sentence.rstrip('.')}{more}; --despite-gates goes on all the same",
+        raise InputError(f"{raised.sentence.rstrip('.')}{more}; --despite-gates continues anyway",
                          field="measurement", value=raised.gate)
     return findings
 

@@ -158,19 +158,20 @@ def _template(found: Identification, template: Path | Design | None) -> Design:
 
 
 def default_keep(rig: Rig) -> list[str]:
-    """z and phi_x, as far as the drives push and the sensors see them; else the first coordinate that they do.
+    """z and phi_x, if the drives can move and the sensors can measure them; otherwise the first such coordinate.
 
-    Raises InputError where there is none.
+    Raises InputError if there is none.
     """
     reached = [name for name in COORDINATES if name in drivable(rig) and name in sensed(rig)]
     keep = [name for name in _COMMON["keep"] if name in reached] or reached[:1]
     if not keep:
-        raise InputError("expected a coordinate that the drives push and the sensors see", field="keep", value=rig.name)
+        raise InputError("expected a coordinate that the drives can move and the sensors can measure", field="keep",
+                         value=rig.name)
     return keep
 
 
 def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float] | None = None) -> Design:
-    """Of z and phi_x, or what the rig reaches of them, as designs/*.toml have it for its kind, beside rig.toml.
+    """A design for the coordinates of `default_keep`, as designs/*.toml have it for this kind of rig, beside rig.toml.
 
     parameters_percent : ranges of the rig's parameters; by default none, for an identification brings them.
     """

@@ -111,7 +111,7 @@ def write_identification(found: Identification, folder: Path, html: bytes | None
 
 
 def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:
-    """Rig of an identification's folder, the corner of its amplifiers, and what turns with the payload.
+    """Rig in an identification's folder, the corner of its amplifiers, and which axes turn with the payload.
 
     Raises InputError where the folder holds no identification, or half of one.
     """
@@ -143,7 +143,7 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
     Raises
     ------
     InputError : a folder or campaign that does not fit, a place that cannot be written.
-    ComputationError : the disk refuses.
+    ComputationError : the disk cannot hold the file.
     """
     rig, corner, turning = read_identified(folder)
     model = replace(ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner),

@@ -134,11 +134,11 @@ class SixDofCheck:
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """The sampled loop of all axes: the other axes' loops, the plants simulated, the controller as a processor runs it.
+    """The sampled loop of all axes: the other axes' loops, the simulated plants, the controller as a processor runs it.
 
     digital : sensor volts to demanded drive volts at the rig's rate, decoding, companion loops and allocation included;
         delay_samples from a sample to the voltage it causes.
-    culprit : what makes the first unstable plant unstable; None where every plant is stable.
+    culprit : why the first unstable plant is unstable; None if every plant is stable.
     """
 
     companions: Companions
@@ -163,7 +163,7 @@ class Requirement:
 
 @dataclass(frozen=True)
 class FailedController:
-    """A controller that was asked for and could not be made or measured, and why."""
+    """A controller that could not be designed or analysed, and why."""
 
     name: str
     title: str
@@ -175,8 +175,8 @@ class FailedController:
 class DesignResult:
     """Everything that `avis design` found.
 
-    loop : the sampled loop of all axes: companion loops, simulation, what makes it unstable.
-    failed : controllers that were to be compared and could not be.
+    loop : the sampled loop of all axes: the other axes' loops, simulation, why it is unstable, if it is.
+    failed : controllers for comparison that could not be designed or analysed.
     """
 
     design: Design
@@ -195,12 +195,12 @@ class DesignResult:
 
     @property
     def simulation(self) -> SimulationCheck | None:
-        """The closed loop of the nonlinear rig, plant by plant; None where none was run."""
+        """The closed loop of the nonlinear rig, plant by plant; None if none was simulated."""
         return self.loop.check if self.loop is not None else None
 
     @property
     def stable(self) -> bool:
-        """Whether every plant that was looked at is stable in the sampled loop of all axes."""
+        """Whether the sampled loop of all axes is stable for every plant simulated."""
         return self.simulation is None or all(plant.stable for plant in self.simulation.plants)
 
     def controller(self, name: str) -> ControllerResult:

@@ -68,7 +68,7 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
 
 
 def _failed_row(c: FailedController) -> dict[str, Any]:
-    """A controller without figures: the reason in its note."""
+    """A controller that could not be analysed: the reason is in its note."""
     figures = ("gamma", "mu_upper", "mu_lower", "mu_peak_Hz", "peak_transmissibility_dB",
                "worst_case_peak_transmissibility_dB")
     return {"name": c.name, "kind": c.kind, "file": None, "order": None, "stable": False, **dict.fromkeys(figures),
@@ -76,7 +76,7 @@ def _failed_row(c: FailedController) -> dict[str, Any]:
 
 
 def _all_axes(loop: Simulated | None) -> dict[str, Any]:
-    """Loops of the axes that the design does not keep, and what makes the whole unstable where it is."""
+    """Loops of the axes that the design does not control, and why the whole loop is unstable, if it is."""
     if loop is None:
         return {}
     culprit = None if loop.culprit is None else {**asdict(loop.culprit), "words": loop.culprit.words()}
@@ -104,6 +104,6 @@ def write_study(result: DesignResult, folder: Path, html: bytes | None = None, p
     contents["plant.json"] = as_json(result.plant.synthesis.as_dict())
     contents |= {name: content for name, content in (("report.html", html), ("report.pdf", pdf)) if content is not None}
     contents["result.json"] = as_json(result_dict(result))
-    # Of an earlier study nothing stays.
+    # Files of an earlier study are removed.
     return write_together(folder, contents, [*(folder / name for name in FILES),
                                              *(folder / "controllers").glob("*.json")])

@@ -50,7 +50,7 @@ class DesignPlant:
     sensor_chain : velocity -> seen velocity of one axis, unit passband gain.
     sensor_noise : unit white noise density -> noise of one sensor as velocity [m/s/sqrt(Hz)]; where the sensors are of
         several kinds, of the first.
-    noises : inputs of the sensors' noise. relative : axes whose velocity is seen against the chassis.
+    noises : inputs of the sensors' noise. relative : axes whose velocity is measured relative to the chassis.
     floor_density : mean velocity density of the floor [m/s/sqrt(Hz)]: the unit of the noise inputs.
     floor : spectrum of the floor's motion, each kept axis alike.
     weights : the weighting filters by name, with their meaning, for the report.
@@ -108,7 +108,7 @@ def build_plant(design: Design, rig: Rig) -> DesignPlant:
     seen = sensing(rig, design.keep, design.loop.integrator_corner_Hz)
     decoder = seen.decoder
     decoding = decoder.decoding * lever[:, None]
-    # What each sensor sees of the kept axes, rotations at the edge.
+    # Motion that each sensor measures per unit of the kept axes, rotations at the edge.
     rows = decoder.matrix[:, [COORDINATES.index(name) for name in design.keep]] / lever
 
     diagram = Diagram()
@@ -264,7 +264,7 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decodin
     """
     groups = [_Noise.of(axes, seen.noise[k], decoding, reference, k) for k in range(len(seen.noise))]
     inertial = seen.decoder.inertial
-    # What the decoding makes of motion in space and of motion against the chassis.
+    # The decoding applied to motion in space and to motion relative to the chassis.
     by_velocity, by_relative = decoding[:, inertial] @ rows[inertial], decoding[:, ~inertial] @ rows[~inertial]
     for k, axis in enumerate(axes):
         both = ((by_velocity[k], "dot", seen.chain, f"sensor chain {axis}", f"{axis}_in_space"),
@@ -292,20 +292,20 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decodin
 
 def _chain_of(diagram: Diagram, axes: tuple[str, ...], k: int, row: np.ndarray, of: str, chain: StateSpace, label: str,
               made: str) -> None:
-    """The common chain of an axis' channels, on what their decoding makes of the motion: row (n_axes,)."""
+    """The common chain of an axis' channels, applied to the motion that they decode: row (n_axes,)."""
     read = f"{axes[k]}_{of}"
     if np.max(np.abs(row - np.eye(len(axes))[k])) > 1e-9:
         felt = [a for a in range(len(axes)) if abs(row[a]) > 1e-9]
         read = f"{made}_motion"
         diagram.add(f"motion of {label}", gain(row[None, felt], [f"{axes[a]}_{of}" for a in felt], [read]), "sum")
-        diagram.means(read, "motion along the sensors that make this axis", "m/s" if of == "dot" else "m")
+        diagram.means(read, "motion decoded for this axis, before the sensor chain", "m/s" if of == "dot" else "m")
     diagram.add(label, chain.renamed([read], [made]), "sensor")
     diagram.means(made, "velocity as the sensors' band shows it", "m/s")
 
 
 @dataclass(frozen=True, eq=False)
 class _Noise:
-    """Noise of one kind of sensors, mixed as the decoding mixes it, of the axes that they make."""
+    """Noise of one kind of sensors in the axes decoded from them, correlated as the decoding mixes it."""
 
     shape: StateSpace
     axes: tuple[str, ...]
@@ -329,7 +329,7 @@ class _Noise:
         """The noise of one axis."""
         name = f"{axis}{self.tag}"
         diagram.add(f"noise {name}", self.shape.renamed([f"mixed_noise_{name}"], [f"sensor_noise_{name}"]), "weight")
-        diagram.means(f"mixed_noise_{name}", "noise of the sensors that make this axis, before its filter", "1")
+        diagram.means(f"mixed_noise_{name}", "noise of the sensors used for this axis, before its filter", "1")
         diagram.means(f"noise_{name}", "sensor noise that accompanies 1 m/s of floor velocity", "1")
         diagram.means(f"sensor_noise_{name}", "sensor noise as velocity", "m/s")
 

@@ -1,9 +1,9 @@
-"""Whether records can be those of a rig at all, before any fit: levels and resonances against the rig's model.
+"""Whether records can come from a rig at all, checked before any fit: levels and resonances against the rig's model.
 
-The model's answer to the recorded voltages is compared with what was recorded, per sensor and third of an octave, as
-decades of r.m.s. Where the records are off by more than any table is from its file, single slips of a unit are undone
-in turn: of a gain (of all channels, one sensor, one drive), of the unit of y, and of each kind of parameter of the rig.
-The one that makes the records fit is named.
+The model's response to the recorded voltages is compared with the recorded outputs, per sensor and third octave, as the
+logarithm of the r.m.s. ratio (in decades). If they differ by more than any table differs from its file, single unit
+errors are undone in turn: in a gain (of all channels, one sensor, one drive), in the unit of y, and in each kind of
+parameter of the rig. The one that makes the records agree is named.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from avis_ctrl.rigs.plausible_ranges import RANGES
 
 @dataclass(frozen=True)
 class RecordPlausibility:
-    """When records are taken for those of another unit; distances are mean decades of r.m.s., see `distance`.
+    """When records count as given in a wrong unit; distances are mean decades of r.m.s., see `distance`.
 
-    far : below it nothing is said (tables off by 30 % in any parameter with hidden effects stay below half of it).
-    fits, share : a slip is named where undoing it leaves at most `fits`, and at most `share` of what there was.
-    cap : decades at which one band counts no more.
-    gain_decades : of the slips of a gain that are tried. rig_factors : of a rig's parameters.
-    coherent : multiple coherence of a band from which its power is an answer to the drives.
-    records, samples, lines : that are looked at, for speed. octaves : width of a band.
-    hopeless : distance at which records are refused though no slip explains them: ten times and more off everywhere.
-    rare : added to the distance left by a slip of other than three decades, scope : by one that is not a gain of all,
-    half of it by one of a single channel, so that the plainest of like ones is named.
-    rate : ratio of sample rates of records and rig from which one of them is taken for a slip.
+    far : below this distance records pass (tables with any parameter off by 30 % and hidden effects stay below half).
+    fits, share : an error is named if undoing it leaves at most `fits`, and at most `share` of the distance before.
+    cap : largest number of decades that one band contributes.
+    gain_decades : errors of a gain that are tried. rig_factors : errors of a rig's parameters that are tried.
+    coherent : multiple coherence from which the power of a band counts as response to the drives.
+    records, samples, lines : largest numbers used, for speed. octaves : width of a band.
+    hopeless : distance at which records are refused although no single error explains them: a factor of ten or more.
+    rare : penalty added to the distance for an error other than three decades. scope : penalty for an error that is
+        not a common gain; half of it for one of a single channel, so that the simplest of similar ones is named.
+    rate : ratio of the sample rates of records and rig from which one of them is taken for an error.
     """
 
     far: float = 0.30
@@ -85,13 +85,13 @@ class Seen:
     bands: np.ndarray
 
     def predicted(self, G: np.ndarray, volts: np.ndarray | None = None) -> np.ndarray:
-        """(bands, n_y) power of the model's answer; volts (n_u,) factors on the drives."""
+        """(bands, n_y) power of the model's response; volts (n_u,) factors on the drives."""
         U = self.U if volts is None else self.U * volts
         Y = np.einsum("fij,kfj->kfi", G, U)
         return self.bands @ np.sum(np.abs(Y) ** 2, axis=0)
 
     def decades(self, G: np.ndarray, volts: np.ndarray | None = None) -> np.ndarray:
-        """(bands, n_y) recorded over predicted, decades of r.m.s., nan where nothing answered."""
+        """(bands, n_y) recorded over predicted, decades of r.m.s., nan where there is no response."""
         predicted = self.predicted(G, volts)
         ok = np.isfinite(self.power) & (predicted > 0)
         found = np.full(self.power.shape, np.nan)
@@ -100,7 +100,7 @@ class Seen:
 
 
 def distance(decades: np.ndarray, cap: float = SETTINGS.cap) -> float:
-    """Mean over sensors of the mean over bands of |decades|; nan where nothing answered."""
+    """Mean over sensors of the mean over bands of |decades|; nan where there is no response."""
     size = np.minimum(np.abs(decades), cap)
     there = np.isfinite(size)
     columns = there.any(axis=0)
@@ -110,28 +110,28 @@ def distance(decades: np.ndarray, cap: float = SETTINGS.cap) -> float:
 
 
 def records_fit(measured: Campaign, model: ResponseModel, despite: bool, progress: Callable[[str], None]) -> None:
-    """`check_records`; where the user goes on `despite` what gates say, its complaint is a line of progress."""
+    """`check_records`; if the user continues `despite` the gates, its message is only a line of progress."""
     try:
         check_records(measured, model)
     except InputError as error:
         if not despite:
-            raise InputError(f"{error.expected}; --despite-gates goes on all the same", field=error.field,
+            raise InputError(f"{error.expected}; --despite-gates continues anyway", field=error.field,
                              value=error.value) from None
         progress(f"  stop: {error}")
 
 
 def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlausibility = SETTINGS) -> None:
-    """Refuse records that one slip of a unit explains, or that no table like the rig could have given.
+    """Refuse records that a single unit error explains, or that no table like the rig could have produced.
 
     Raises
     ------
-    InputError : one line that names the field and the likely slip.
+    InputError : one line that names the field and the likely error.
     """
     ratio = measured.sample_rate_Hz / model.rig.sample_rate_Hz
     if not 1 / settings.rate < ratio < settings.rate:
         raise InputError(f"the rig file says {model.rig.sample_rate_Hz:g} Hz, {1 / ratio:g} times that; did you mean "
                          f"{measured.sample_rate_Hz * 1e3:g} (given in kHz)?" if ratio < 1 else
-                         f"the rig file says {model.rig.sample_rate_Hz:g} Hz; was that given in kHz, or this in mHz?",
+                         f"the rig file says {model.rig.sample_rate_Hz:g} Hz; is that in kHz, or this in mHz?",
                          field="sample_rate_Hz of the records", value=measured.sample_rate_Hz)
     seen = look(measured, settings)
     if seen is None:
@@ -150,11 +150,11 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
     left = [one for one in found if one[0] <= settings.fits and one[0] <= settings.share * max(before, worst)]
     if left:
         _, field, value, said = left[0]
-        raise InputError(f"the records are {_said(now)} what the rig's model answers to the same voltages; {said}",
+        raise InputError(f"the recorded y is {_said(now)} what the rig's model predicts for these voltages; {said}",
                          field=field, value=value)
     if before > settings.hopeless:
-        raise InputError(f"the records are {_said(now)} what the rig's model answers to the same voltages, and no "
-                         "single slip of a unit explains it; check units of y and u, sensitivities, gains, force "
+        raise InputError(f"the recorded y is {_said(now)} what the rig's model predicts for these voltages, and no "
+                         "single wrong unit explains it; check the units of y and u, sensitivities, gains and force "
                          "constants", field="records")
 
 
@@ -165,13 +165,13 @@ def _said(decades: np.ndarray) -> str:
 
 
 def _worst_channel(decades: np.ndarray, settings: RecordPlausibility) -> float:
-    """A single channel that is off by itself, in the same measure as the mean over all: a slip is three decades."""
+    """The distance of the worst single channel, scaled to compare with the mean over all: an error is three decades."""
     each = [np.nanmedian(np.abs(column)) for column in decades.T if np.isfinite(column).any()]
     return settings.far * 1.01 if max(each, default=0.0) > 1.5 else 0.0
 
 
 def look(measured: Campaign, settings: RecordPlausibility = SETTINGS) -> Seen | None:
-    """Spectra of the first records that drive something; None where there are none, or too few samples."""
+    """Spectra of the first records with drive voltages; None if there are none, or too few samples."""
     driven = [one for one in measured.records if one.header.level_V > 0 or one.header.excitation in ("multisine",
                                                                                                       "noise", "sine")]
     parts, peak_u, peak_y = [], 0.0, 0.0
@@ -220,8 +220,8 @@ def _candidates(seen: Seen, G: np.ndarray, now: np.ndarray, measured: Campaign, 
             volts = np.ones(len(measured.u_names))
             volts[k] = 10.0 ** c
             yield (distance(seen.decades(G, volts)) + settings.scope / 2, f"force constant of {name}", None,
-                   f"did you mean {10.0 ** c:g} times that constant, or is u of {name} in "
-                   f"{'kV' if c > 0 else 'mV'} where V is said?")
+                   f"did you mean {10.0 ** c:g} times that constant, or is u of {name} given in "
+                   f"{'kV' if c > 0 else 'mV'} instead of V?")
     for unit in ("V", "m", "m/s", "m/s^2"):
         if unit != measured.y_unit:
             try:
@@ -273,15 +273,15 @@ def _kind(name: str) -> str:
 
 
 def _common_gain(factor: float, seen: Seen, measured: Campaign, model: ResponseModel) -> tuple[str, object, str]:
-    """All channels alike: force constants, sensitivities, units of u and y; what is beyond a limit first, then what
-    becomes usual."""
+    """A factor common to all channels: force constants, sensitivities, units of u and y. A value beyond a limit is
+    named first, then one that the factor would make usual."""
     rig, unit = model.rig, measured.y_unit
     limit, full = rig.drive_limit_V, rig.acquisition.adc_range_V if rig.acquisition else np.inf
     if factor == 1e-3 and seen.peak_u > 3 * limit:
         return ("u of the records", float(f"{seen.peak_u:.4g}"), f"the drives' limit is {limit:g} V: did you mean "
                 f"{seen.peak_u / 1e3:.4g} V (given in mV)?")
     if factor == 1e3 and unit == "V" and seen.peak_y > 3 * full:
-        return ("y of the records", float(f"{seen.peak_y:.4g}"), f"the converter ends at {full:g} V: did you mean "
+        return ("y of the records", float(f"{seen.peak_y:.4g}"), f"the converter's range is {full:g} V: did you mean "
                 f"{seen.peak_y / 1e3:.4g} V (given in mV)?")
     options: list[tuple[float, str, object, str]] = []
     mass = float(rig.equations_of_motion().M[0, 0])
@@ -306,12 +306,12 @@ def _common_gain(factor: float, seen: Seen, measured: Campaign, model: ResponseM
     if options and options[0][0] < -0.2:
         _, field, value, meant = options[0]
         return field, value, f"did you mean {meant}{', or ' if records else '?'}{records}"
-    others = "; ".join(f"{field} = {value:g} (then {meant})" for _, field, value, meant in options)
-    return "unit of y or u", None, f"all channels alike: {records} Else a slip in {others}"
+    others = "; ".join(f"{field} = {value:g} ({meant} would fit)" for _, field, value, meant in options)
+    return "unit of y or u", None, f"all channels are off alike: {records} Otherwise check {others}"
 
 
 def _gained(within, value: float, factor: float) -> float:
-    """How much further from the middle of what is usual a value goes by a factor; negative where it comes nearer."""
+    """How much further from the middle of the usual range a factor moves a value; negative if it comes nearer."""
     return within.off_centre(value * factor) - within.off_centre(value)
 
 
@@ -320,4 +320,4 @@ def _sensor_gain(name: str, factor: float, model: ResponseModel) -> tuple[str, o
     value = float(model.sensors.sensitivity[k])
     return (f"sensitivity of {name}", value,
             f"only {name} is off: did you mean {value * factor:g} {model.sensors.sensitivity_units[k]} (with "
-            "preamplifier), or are its records in another unit than the others?")
+            "preamplifier), or are its records in a different unit from the others?")

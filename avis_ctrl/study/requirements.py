@@ -29,19 +29,19 @@ def _advantage(skyhook: ControllerResult, mu: ControllerResult) -> float:
 
 
 def judge_loop(check: SimulationCheck) -> tuple[Requirement, ...]:
-    """What every design must keep whatever its file asks: the sampled loop of all axes is stable, within its limits,
-    and does as the linear model predicts, plant by plant."""
+    """What every design must meet whatever its file asks: for each plant the sampled loop of all axes is stable, stays
+    within its voltage limits, and moves as the linear model predicts."""
     n = len(check.plants)
 
     def row(name: str, kept: int, note: str) -> Requirement:
         return Requirement(name, n, kept, "plants", kept == n, "at least", note)
     return (
         row("closed loop of all axes is stable", sum(p.stable for p in check.plants),
-            "linear sampled loop and nonlinear simulation: hold, delay, converters, sensors, the other axes' loops"),
+            "linear sampled loop and nonlinear simulation, with hold, delay, converters, sensors and all axes' loops"),
         row("voltages stay within the limits of drives and converter", sum(p.within_limits for p in check.plants),
             f"nonlinear simulation of {check.duration_s:g} s"),
         row("motion agrees with the linear prediction", sum(p.agrees for p in check.plants),
-            f"third octaves; chance alone fails one plant or more with probability {check.false_alarm:g}"))
+            f"in third octaves; by chance alone at least one plant fails with probability {check.false_alarm:g}"))
 
 
 def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requirement, ...]:
@@ -49,7 +49,7 @@ def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requ
     by_name = {c.name: c for c in controllers}
     mu, skyhook, passive = (by_name.get(name) for name in ("mu", "skyhook", "passive"))
     if mu is None or passive is None:
-        raise InputError("requirements are judged on the controllers mu and passive", field="controllers",
+        raise InputError("requirements need the controllers mu and passive", field="controllers",
                          value=sorted(by_name))
     low, high = design.transmissibility.band_Hz
     # The poles of a controller that does nothing say nothing.

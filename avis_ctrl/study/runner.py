@@ -77,9 +77,9 @@ class Compared:
 
 def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress = lambda text: None
                ) -> tuple[list[Candidate], list[FailedController], MuSynthesis]:
-    """The controllers that need no other: mu, nominal H-infinity, classical skyhook, none; and the D-K iteration.
+    """The mu, nominal H-infinity and classical skyhook controllers, the table without control; and the D-K iteration.
 
-    A rival that cannot be made is no reason to lose the design: it comes back among the failed.
+    A controller for comparison that cannot be made does not stop the design: it is returned among the failed.
     """
     with threadpool_limits(1):
         progress("H-infinity synthesis of the nominal plant")
@@ -109,7 +109,7 @@ def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesi
         six_dof = six_dof_check(design, rig, plant, mu, compared.loop.companions)
         assumed = plant.identified.assumption if plant.identified else ""
         verdict = best_found(plant, mu, controllers, synthesis.history) if mu.mu.upper >= 1 else ""
-        unlike = [f"{one.title} is left out of the comparison: {one.reason}" for one in compared.failed]
+        unlike = [f"{one.title!r} is missing from the comparison: {one.reason}" for one in compared.failed]
         passive_axes = [f"The axis {axis} stays passive: {why}." for axis, why in compared.loop.companions.passive]
         notes = tuple(text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.notes)
                       if text)
@@ -125,12 +125,12 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
             failed: Sequence[FailedController] = (), progress: Progress = lambda text: None) -> Compared:
     """Bounds of every controller, a skyhook tuned to the worst-case peak of mu, and the simulation of mu.
 
-    On two processes: none needs another but the last two, which need the bounds of all the others, for the best of them
-    is what the study delivers as its mu controller.
+    Runs on two processes. The tuning of the skyhook and the simulation wait for the bounds of all the others, because
+    the best of these is delivered as the mu controller.
 
     Raises
     ------
-    ComputationError : the mu controller itself, or the table at rest, could not be measured.
+    ComputationError : the mu controller itself, or the table without control, could not be analysed.
     """
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     with Workers() as workers:
@@ -146,7 +146,7 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
         gather()
         mu = found["mu"]
         if isinstance(mu, FailedController):
-            raise ComputationError(f"the {mu.title} controller could not be measured: {mu.reason}")
+            raise ComputationError(f"the controller {mu.title!r} could not be analysed: {mu.reason}")
         # The best one found is delivered, whatever its name; the skyhook's limit follows from it.
         mu = best_of(mu, [one for one in found.values() if isinstance(one, ControllerResult)])
         simulation = workers.submit(simulate_study, design, rig, plant, mu)
@@ -159,7 +159,7 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
             found["mu"] = mu = best_of(mu, [skyhook])
             loop = simulate_study(design, rig, plant, mu)
     if isinstance(rest := found["passive"], FailedController):
-        raise ComputationError(f"the table without control could not be measured: {rest.reason}")
+        raise ComputationError(f"the table without control could not be analysed: {rest.reason}")
     every = [*failed, *(one for one in found.values() if isinstance(one, FailedController))]
     measured = {name: one for name, one in found.items() if isinstance(one, ControllerResult)}
     return Compared(tuple(measured[name] for name in ORDER if name in measured),

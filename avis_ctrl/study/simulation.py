@@ -47,8 +47,8 @@ def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: Control
 
 
 def bare_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None) -> SampledLoop:
-    """The design's controller on its nominal rig, the other axes without loops; the floor moves along x, y, z and
-    the kept rotations."""
+    """The design's controller on its nominal rig, without loops on the other axes; the floor moves along x, y, z and
+    the controlled rotations."""
     if K is None:
         K = gain(np.zeros((len(design.keep), len(design.keep))))
     return SampledLoop(rig, K, tuple(design.keep), {}, sensor_bank(design, rig),

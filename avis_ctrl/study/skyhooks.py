@@ -1,7 +1,7 @@
-"""The baselines of a study: skyhook loops by the classical rule, and tuned for the worst case of the uncertainty set.
+"""Skyhook controllers for comparison: by the classical rule, and tuned for the worst case of the uncertainty set.
 
-A rival that loses by bad tuning makes the comparison worthless. So the classical tunings are starts of the search and
-take part to its end, and what decides between two tunings is the bound over the whole set that the report shows, too.
+A comparison with a badly tuned skyhook is worthless. So the search starts from the classical tunings, which remain
+candidates to its end, and tunings are ranked by the same bound over the whole set that the report shows.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ TUNING_HZ = np.concatenate([np.geomspace(0.1, 5.0, 20), np.geomspace(5.5, 200.0,
 
 @dataclass(frozen=True)
 class SkyhookSettings:
-    """What bounds the search for the worst case; every budget is a count.
+    """Limits of the search for the worst case; every limit is a count, none a time.
 
-    samples : plants on the boundary of the set that the search begins with.
-    rounds : how often the worst case of the best tuning joins the samples, at most.
-    agreement : share by which a worst case may be above the samples' before it joins them.
-    room : share of the limit at which the search aims, so that the worst case ends below the limit and not at it.
-    certified : tunings, beside the classical one, whose bound over the whole set is computed; where one is above the
-        limit its worst case and frequency join the samples for the next.
-    beside : frequencies that join with the worst one, as factors: a peak is not missed by a hair.
+    samples : number of plants on the boundary of the set that the search begins with.
+    rounds : how often, at most, the worst case of the best tuning is added to the samples.
+    agreement : relative excess of a worst case over the samples' largest value above which it is added to them.
+    room : fraction of the limit that the search aims at, so that the worst case ends below the limit and not at it.
+    certified : number of tunings, besides the classical one, whose bound over the whole set is computed; if one is
+        above the limit, its worst case and frequency are added to the samples for the next.
+    beside : frequencies added around the worst one, as factors, so that a narrow peak is not missed.
     ascents, ascent_steps : effort of the search for a worst case at each frequency.
     """
 
@@ -52,7 +52,7 @@ class SkyhookSettings:
 
 
 def classical_skyhook(plant: DesignPlant, rig: Rig, design: Design) -> Candidate:
-    """Critical damping of each axis taken alone, with customary corners."""
+    """Critical damping of each axis taken alone, with the usual corners."""
     loops = classical_loops(plant, rig, design)
     return Candidate("skyhook_classical", "skyhook, critical damping", "skyhook", loops.controller(),
                      (in_words(loops),))
@@ -65,14 +65,14 @@ def classical_loops(plant: DesignPlant, rig: Rig, design: Design) -> Skyhook:
 
 def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: float,
                   settings: SkyhookSettings = SkyhookSettings()) -> Candidate:
-    """The best skyhook found: among those whose worst-case peak keeps the limit the one of least worst-case
-    transmissibility in the band; where none keeps it the one of least worst-case peak, and a note says so.
+    """The best skyhook found: of those whose worst-case peak meets the limit, the one with the least worst-case
+    transmissibility in the band; if none meets it, the one with the least worst-case peak, and a note says so.
 
-    Never worse, by the bounds over the whole set, than critical damping with customary corners.
+    Never worse, by the bounds over the whole set, than critical damping with the usual corners.
 
     Raises
     ------
-    ComputationError : no tuning looked at, the classical ones included, is stable on the nominal plant.
+    ComputationError : no tuning tried, the classical ones included, is stable on the nominal plant.
     """
     contest = _Contest(plant, design, peak_limit, settings)
     classical = classical_loops(plant, rig, design)
@@ -87,23 +87,23 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
         if bound.meets or worst is None:
             break
         task = contest.learned(task, worst)
-        # What the bound still stands above the worst case found: the search has to stay below the limit by as much.
+        # The bound lies above the worst case found: the search has to stay below the limit by the same ratio.
         missed = contest.worst(task, found)[0].peak / bound.peak if np.isfinite(bound.peak) else 1.0
         target = settings.room * peak_limit * min(1.0, missed)
     best, loops = min(ranked, key=lambda one: one[0].key())
     if best.unstable:
-        raise ComputationError("no skyhook in the range searched is stable on the nominal plant",
+        raise ComputationError("no skyhook tuning tried is stable on the nominal plant",
                                measured=f"gains from {task.search.gain_factor[0]:g} to {task.search.gain_factor[1]:g} "
-                                        "of critical damping tried",
-                               cause="the phase of sensors and delay turns damping into its opposite",
-                               next_step="other corners in [skyhook], or sensors that see lower frequencies")
+                                        "times critical damping",
+                               cause="the phase of the sensors and the delay turns damping into excitation",
+                               next_step="change the corners in [skyhook], or use sensors with a lower corner")
     notes = [in_words(loops)]
     if loops is classical:
-        notes.append("critical damping with customary corners: no tuning found is better over the whole set")
+        notes.append("this is critical damping with the usual corners: no better tuning was found for the whole set")
     if not best.meets:
-        reached = (f"of those found this one has the least, {_decibel(best.peak):+.2f} dB" if np.isfinite(best.peak)
-                   else "none found is proved stable for the whole set")
-        notes.append(f"no skyhook found keeps the worst-case peak at {_decibel(peak_limit):+.2f} dB: {reached}")
+        reached = (f"the lowest found is that of this one, {_decibel(best.peak):+.2f} dB" if np.isfinite(best.peak)
+                   else "no tuning found is proved stable for the whole set")
+        notes.append(f"no skyhook found keeps the worst-case peak below {_decibel(peak_limit):+.2f} dB: {reached}")
     return Candidate("skyhook", "skyhook, tuned", "skyhook", loops.controller(), tuple(notes))
 
 

@@ -1,4 +1,4 @@
-"""The first sentence of a design's result: is the loop stable, and what was asked and reached."""
+"""The first sentence of a design's result: whether the loop is stable, and which requirements are met."""
 
 from __future__ import annotations
 
@@ -7,30 +7,29 @@ from avis_ctrl.study.model import DesignResult
 
 
 def first_sentence(result: DesignResult) -> str:
-    """Unstable loops first, then requirements that are not met, by name."""
+    """That the loop is unstable, if it is; otherwise which requirements are not met."""
     return unstable(result) or _counted(result)
 
 
 def unstable(result: DesignResult) -> str:
-    """Which plants are unstable and what makes them so; empty where all are stable."""
+    """How many plants are unstable, and why; empty if all are stable."""
     if result.stable or result.loop is None:
         return ""
     plants = result.loop.check.plants
     bad = sum(not plant.stable for plant in plants)
     why = f": {result.loop.culprit.words()}" if result.loop.culprit else ""
-    return (f"UNSTABLE: {'the closed loop of all axes' if bad == len(plants) else 'the closed loop'} is unstable in "
-            f"{bad} of {len(plants)} plants{why}.")
+    return f"UNSTABLE: the closed loop of all axes is unstable in {bad} of {len(plants)} plants{why}."
 
 
 def refuse_unstable(result: DesignResult) -> None:
-    """Raises ComputationError, exit code 3, where the delivered loop is unstable in some plant."""
+    """Raises ComputationError, exit code 3, if the delivered loop is unstable for any plant."""
     if not (text := unstable(result)):
         return
     kind = result.loop.culprit.kind if result.loop is not None and result.loop.culprit is not None else ""
     steps = {"table": "check the rig file's stiffness, centre of mass and damping",
-             "nonlinear": "look at that plant's voltages (drives at their limit?) and floor motion",
-             "controller": "keep the axes that move among those the design controls, or ask for less bandwidth"}
-    step = steps.get(kind, "use sensors with a lower corner, or keep these axes in the design")
+             "nonlinear": "look at that plant's drive voltages (at their limit?) and its floor motion",
+             "controller": "add the axes that move to keep in the design file, or ask for less bandwidth"}
+    step = steps.get(kind, "use sensors with a lower corner frequency, or add these axes to keep in the design file")
     raise ComputationError(text.removesuffix("."), next_step=step)
 
 
@@ -38,7 +37,7 @@ def _counted(result: DesignResult) -> str:
     asked = result.requirements
     missed = [r.name for r in asked if not r.met]
     if not asked:
-        return "The design file asks for nothing, so nothing is judged."
+        return "The design file states no requirements, so there is no verdict."
     if missed:
         return (f"{len(missed)} of {len(asked)} requirements {'is' if len(missed) == 1 else 'are'} not met: "
                 f"{'; '.join(missed)}.")

@@ -177,7 +177,7 @@ def test_a_settling_drift_is_nearly_over_in_the_middle_of_the_campaign(rig, plai
 def test_what_vanishes_with_amplitude_is_left_out_and_said(plain, name, place, values):
     made, without = realise(with_one(plain, name, place, values)), realise(plain)
     assert differ(made.system.frequency_response(made.omega), without.system.frequency_response(made.omega)) < 1e-9
-    assert len(made.notes) == 1 and "without it" in made.notes[0]
+    assert len(made.notes) == 1 and "left out" in made.notes[0]
 
 
 def test_structural_damping_is_a_ladder(plain):

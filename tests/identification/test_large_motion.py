@@ -126,7 +126,7 @@ def test_combinations_of_drives_that_no_record_plays_are_told():
         return excited_space(Campaign("avis", (Record(h, u, np.zeros((len(u), 1))),)), (1.0, 100.0))
     found = space(rng.normal(size=(3000, 6)) @ axes.allocation.T)
     assert not found.full and np.allclose(found.unplayed @ axes.allocation, 0, atol=1e-6)
-    assert len(found.unplayed) == 2 and "play 6 of the 8" in found.sentence
+    assert len(found.unplayed) == 2 and "excite 6 of 8" in found.sentence
     drives = rng.normal(size=(3000, 8))
     assert space(drives).full and not space(drives).sentence
     drives[:, 2] = 0

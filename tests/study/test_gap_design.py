@@ -191,7 +191,7 @@ def test_an_effect_without_a_realisation_is_said_to_be_unchecked(monkeypatch, ba
     hum = SimpleNamespace(name="mains_hum", location="geophones", label="")
     found = design_effect(SimpleNamespace(baseline=baseline, updated=updated, effects=(hum,)), design)
     assert set(found.not_checked) == {"sensor_lowpass@Sz1", "cubic_stiffness@isolators z", "mains_hum@geophones"}
-    assert "nothing of what was named is in this loop" in found.sentences[0]
+    assert "contains none of the named effects" in found.sentences[0]
     assert "the effect does not matter" not in " ".join(found.sentences)
     said = next(one for one in found.sentences if one.startswith("NOT checked"))
     assert all(label in said for label in found.not_checked) and "no realisation" in said

@@ -159,7 +159,7 @@ def test_several_files_are_all_written_or_none(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device")
 def test_a_device_is_not_replaced():
-    with pytest.raises(InputError, match="no regular file"):
+    with pytest.raises(InputError, match="not a regular file"):
         write_whole(Path("/dev/full"), b"x")
     assert Path("/dev/full").is_char_device()
 

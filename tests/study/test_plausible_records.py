@@ -94,8 +94,8 @@ def test_sound_records_pass(sound):
 
 @pytest.mark.parametrize("change, said", [
     (lambda m: changed(m, u=1e3), r"^u of the records = .*limit is 10 V: did you mean .*\(given in mV\)"),
-    (lambda m: changed(m, u=1e-3), "all channels alike: are the records' y in mV or u in kV"),
-    (lambda m: changed(m, y=1e-3), "all channels alike: are the records' y in kV or u in mV"),
+    (lambda m: changed(m, u=1e-3), "all channels are off alike: are the records' y in mV or u in kV"),
+    (lambda m: changed(m, y=1e-3), "all channels are off alike: are the records' y in kV or u in mV"),
     (lambda m: changed(m, y=only(len(m.y_names), 2, 1e3)), "sensitivity of (Sx2|acc_A3) = .*only (Sx2|acc_A3) is off"),
     (lambda m: changed(m, u=only(len(m.u_names), 3, 1e3)), "force constant of A(z2|4): .* did you mean 0.001 times"),
     (lambda m: changed(m, y_unit="m/s"), r"^unit of y = 'm/s': .*did you mean V\?"),
@@ -126,7 +126,8 @@ def test_a_slip_of_the_rig_is_named(name, pattern, factor, field, meant):
     moved = {n: p.value * factor for n, p in rig.parameters().items() if re.fullmatch(pattern, n)}
     with pytest.raises(InputError) as refused:
         check_records(measured, model_of(rig.with_parameters(moved), measured))
-    assert str(refused.value).startswith(f"{field}: the records are ") and f"did you mean {meant}" in str(refused.value)
+    assert str(refused.value).startswith(f"{field}: the recorded y is ")
+    assert f"did you mean {meant}" in str(refused.value)
 
 
 EFFECTS = [("sensor_gain", "Sz1", (0.5,)), ("actuator_gain", "Az1", (0.5,)), ("loop_delay", "loop", (20e-3,)),
@@ -167,7 +168,7 @@ def test_records_that_fit_nothing_are_refused_without_a_name():
     measured = campaign(rig)
     factors = np.array([3e2, 1e-3, 4e3, 2e-2, 5e4, 1e-2])
     wrong = changed(measured, y=factors)
-    with pytest.raises(InputError, match="no single slip of a unit explains it"):
+    with pytest.raises(InputError, match="no single wrong unit explains it"):
         check_records(wrong, model_of(rig, wrong))
 
 

@@ -125,11 +125,11 @@ class FrequencyResponse:
         """The response to inputs played in the proportions of V (n_u, k), under names and a unit of input of their own,
         on the lines where it is known.
 
-        Raises InputError where it is known on no line, or where the proportions depend on each other.
+        Raises InputError if it is known on no line, or if the columns of V are linearly dependent.
         """
         keep = np.all(self.spanned(V), axis=1)
         if not np.any(keep):
-            raise InputError(f"expected records that play {', '.join(names)}", field="inputs", value=list(self.inputs))
+            raise InputError(f"expected records exciting {', '.join(names)}", field="inputs", value=list(self.inputs))
         one = self.at(keep)
         if one.entry_variance is not None:
             return replace(one, value=one.value @ V, entry_variance=one.entry_variance @ np.abs(V) ** 2, inputs=names,
@@ -140,7 +140,7 @@ class FrequencyResponse:
         try:
             gram = np.linalg.inv(inverse / scale) / scale
         except np.linalg.LinAlgError:
-            raise InputError("expected proportions that do not depend on each other", field="inputs",
+            raise InputError("expected linearly independent columns", field="inputs",
                              value=list(names)) from None
         return replace(one, value=one.value @ V, gram=gram, inputs=names, input_unit=unit)
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1
 
-# A drive of which a smaller share lies in the directions that are excited does not move.
+# A drive with a smaller share in the excited directions counts as not driven.
 STILL = 1e-9
 
 
@@ -34,11 +34,11 @@ STILL = 1e-9
 class MapSettings:
     """What counts as evidence.
 
-    chance : that the map is called wrong where it is right, shared over the alternatives; a stop ends the work, so it
-        is rarer than other alarms. least_agreement : of a channel with what it is said to be; a model that agrees less
-        with the data than that describes them by less than half their power, and proves nothing. delay_s : range of
-        delays that are fitted, from a u recorded late to the slowest loop. delay_step_s : a tenth of a turn at 100 Hz.
-        closest : 1 - a^2 is not taken for less: resonances 2.5 % beside the model's leave as much.
+    chance : probability that a correct map is called wrong, shared over the alternatives; a stop ends the work, so it
+        is smaller than for other alarms. least_agreement : correlation of a channel with its assigned response; a model
+        below it describes less than half the power of the data, and proves nothing. delay_s : range of delays that are
+        fitted, from a u recorded late to the slowest loop. delay_step_s : a tenth of a turn at 100 Hz.
+        closest : smallest value used for 1 - a^2: resonances 2.5 % away from the model's leave as much.
     """
 
     chance: float = 1e-4
@@ -81,16 +81,16 @@ class Comparison:
         return np.asarray(own / np.maximum(self.rows_M[:, None] * np.sqrt(np.maximum(power, 0.0)), 1e-300))
 
     def likelihood(self, a: np.ndarray) -> np.ndarray:
-        """Log-likelihood of agreements; opposite signs are worse than none."""
+        """Log-likelihood of agreements; a negative agreement is less likely than zero."""
         left = 1 - (1 - self.settings.closest) * a * np.abs(a)
         return np.asarray(-self.N * np.log(left))
 
     def evidence(self, alternatives: int) -> float:
-        """Log-likelihood ratio that chance reaches in one of so many alternatives with the stated probability."""
+        """Log-likelihood ratio that one of this many alternatives reaches by chance with probability `chance`."""
         return float(np.log(alternatives / self.settings.chance))
 
     def least(self, alternatives: int) -> float:
-        """Agreement that a response must have with what it is said to be."""
+        """Agreement that a channel must have with its assigned response."""
         by_chance = 1 - (self.settings.chance / alternatives) ** (1 / max(self.N - 1, 1))
         return max(self.settings.least_agreement, float(np.sqrt(by_chance)))
 
@@ -145,8 +145,8 @@ class Faults:
     own, other : (n_y,) agreement of each row with its own expectation and with what was found for it, the rest as
     found. columns : for each drive that was exchanged or flipped, the row that says so, and its agreement without and
     with that.
-    doubtful : names of nothing: rows ("row", i) and columns ("column", j) that would agree better otherwise, but
-    without evidence that is strong in absolute terms.
+    doubtful : rows ("row", i) and columns ("column", j) that would agree better in another order or sign, but without
+    evidence that is strong in absolute terms; they are not called faults.
     """
 
     p: np.ndarray
@@ -194,7 +194,7 @@ def explain(comparison: Comparison) -> Faults:
 
 def _judged(comparison: Comparison, p: np.ndarray, q: np.ndarray, r: np.ndarray, c: np.ndarray,
             alternatives: int) -> Faults:
-    """What was found, where the evidence for all of it is strong; nothing, and what is doubtful, otherwise."""
+    """What was found, if the evidence for all of it is strong; otherwise no fault, and the doubtful channels."""
     n_y, n_u = len(p), len(q)
     rows, straight, ones = np.arange(n_y), np.arange(n_u), np.ones(n_y)
     least, evidence = comparison.least(alternatives), comparison.evidence(alternatives)

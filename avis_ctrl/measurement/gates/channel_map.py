@@ -30,11 +30,11 @@ class _Kept:
 
 
 class ChannelMap(Gate):
-    """`ChannelOrder` and `Polarity`, which look at the same.
+    """`ChannelOrder` and `Polarity`, which use the same comparison.
 
     With a model: the fewest exchanges and flips that explain the measured rows (sensors) and columns (drives), see
-    `explain`; settings and the chance of a false stop: `MapSettings`. What fits better otherwise without such evidence
-    is a note.
+    `explain`; for settings and the probability of a false stop see `MapSettings`. If another order fits better without
+    such evidence, that is a note.
     """
 
     name = "channel map"
@@ -105,24 +105,24 @@ class ChannelOrder:
             return Finding(
                 self.name,
                 "warning",
-                f"Sensor {quoted(alone)} agrees with no response of the model (by {faults.other[worst]:.2f} at least,"
-                f" where 1 is all), while the others do: its signal comes more than {1000 * high:g} ms late or"
-                f" {-1000 * low:g} ms early, is not what the channel list says, or lacks something in the model.",
+                f"Sensor {quoted(alone)} agrees with no response of the model (correlation as low as"
+                f" {faults.other[worst]:.2f}), while the others do: its signal is more than {1000 * high:g} ms late or"
+                f" {-1000 * low:g} ms early, is not what the channel list says, or the model lacks an effect there.",
                 alone,
                 value=float(faults.other[worst]),
                 limit=enough,
                 picture=picture,
             )
-        least = f"the least, {campaign.y_names[worst]!r}, by {faults.other[worst]:.2f}"
+        least = f"the lowest correlation is {faults.other[worst]:.2f}, of {campaign.y_names[worst]!r}"
         if faults.doubtful:
             names = [(campaign.y_names if what == "row" else campaign.u_names)[k] for what, k in faults.doubtful]
             sentence = (
-                f"Model and records agree too little to tell the channels apart ({least}; of {quoted(names)} another"
-                f" order or sign would agree better, but not beyond what a wrong model does by chance). Check the"
+                f"Model and records agree too little to check the order of the channels ({least}; another order or sign"
+                f" of {quoted(names)} would agree better, but an inaccurate model can do that by chance). Check the"
                 " channel list by hand."
             )
         else:
-            sentence = f"No other order of the channels agrees better with the model; own responses do, {least}."
+            sentence = f"No other order of the channels agrees better with the model ({least})."
         return Finding(
             self.name,
             "note" if faults.doubtful else "ok",
@@ -146,22 +146,22 @@ class ChannelOrder:
             if kind == "row":
                 gain = min(faults.other[j] - faults.own[j] for j in cycle)
                 listed = "; ".join(
-                    f"{names[j]!r} agrees with the model's {names[int(p[j])]!r} by {faults.other[j]:.2f}, with its own"
-                    f" by {faults.own[j]:.2f}"
+                    f"the correlation of {names[j]!r} with the model's {names[int(p[j])]!r} is {faults.other[j]:.2f},"
+                    f" with its own {faults.own[j]:.2f}"
                     for j in cycle
                 )
             else:
                 of, before, after = faults.columns[i]
                 gain = after - before
-                listed = f"with that {sensors[of]!r} agrees with the model by {after:.2f}, without it by {before:.2f}"
+                listed = f"exchanging them raises the correlation of {sensors[of]!r} from {before:.2f} to {after:.2f}"
             verb = "are exchanged" if len(pair) == 2 else "are mixed up"
             found.append(
                 Finding(
                     self.name,
                     "stop",
-                    f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is all; magnitude and phase, any gain"
-                    f" and delay; chance less than {comparison.settings.chance:g}). Exchange their names or their"
-                    " cables.",
+                    f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay do not"
+                    f" count; probability by chance below {comparison.settings.chance:g}). Exchange their names or"
+                    " their cables.",
                     pair,
                     value=float(gain),
                     limit=comparison.settings.least_agreement,
@@ -209,7 +209,7 @@ class Polarity:
             picture = Picture(
                 "Polarity of each sensor",
                 "sensor number",
-                "agreement [-]",
+                "correlation [-]",
                 (Series("not known", x, 0.0 * x, "points"),),
             )
             return [
@@ -222,9 +222,9 @@ class Polarity:
             ]
         r, c = faults.r, faults.c
         picture = Picture(
-            "Agreement of each sensor with the model, with the sign that it has",
+            "Correlation of each sensor with the model, sign as recorded",
             "sensor",
-            "agreement [-]",
+            "correlation [-]",
             (Series("sensors", np.arange(len(r)), r * faults.other, "bars"),),
             (Limit("opposite sign", -comparison.settings.least_agreement),),
             x_names=campaign.y_names,
@@ -234,12 +234,12 @@ class Polarity:
         doubt = " It could as well be that all the other channels are flipped." if 2 * both == total else ""
         said = [
             (campaign.y_names[k], "Sensor", -float(faults.other[k]),
-             f"agreement {-faults.other[k]:.2f} where +1 is expected")
+             f"correlation {-faults.other[k]:.2f} where +1 is expected")
             for k in np.flatnonzero(r < 0)
         ] + [
             (campaign.u_names[k], "Drive", faults.columns[k][1] - faults.columns[k][2],
-             f"sensor {campaign.y_names[faults.columns[k][0]]!r} agrees by {faults.columns[k][2]:.2f} with it flipped,"
-             f" by {faults.columns[k][1]:.2f} as it is")
+             f"flipping it raises the correlation of sensor {campaign.y_names[faults.columns[k][0]]!r} from"
+             f" {faults.columns[k][1]:.2f} to {faults.columns[k][2]:.2f}")
             for k in map(int, np.flatnonzero(c < 0))
         ]
         found = [
@@ -260,8 +260,8 @@ class Polarity:
                 Finding(
                     self.name,
                     "note" if faults.doubtful else "ok",
-                    "Signs were not told, for model and records agree too little." if faults.doubtful else
-                    f"All signs agree with the model (lowest agreement {faults.other.min():.2f} among sensors).",
+                    "The signs could not be checked: model and records agree too little." if faults.doubtful else
+                    f"All signs agree with the model (lowest correlation of a sensor {faults.other.min():.2f}).",
                     value=float(faults.other.min()),
                     limit=comparison.settings.least_agreement,
                     picture=picture,
@@ -294,8 +294,8 @@ def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str,
 
 
 def _pairs(kept: list[_Kept]) -> list[tuple[Spectra, Spectra]]:
-    """Measured and expected spectra, of segments as long as all records together allow: records of one axis after the
-    other are short, but many."""
+    """Measured and expected spectra, with segments as long as all records together allow: records that drive one axis
+    after the other are short, but many."""
     held = [(k, k.u, k.y, k.model) for k in kept if k.u is not None and k.y is not None and k.model is not None]
     if not held:
         return []
@@ -348,8 +348,8 @@ def _picture(a: np.ndarray, names: tuple[str, ...], limit: float) -> Picture:
     return Picture(
         "Sensors against the model",
         "sensor",
-        "agreement [-]",
+        "correlation [-]",
         (Series("own expected response", x, np.diag(a), "points"), Series("best other", x, others, "points")),
-        (Limit("least that proves anything", limit),),
+        (Limit("least that counts as evidence", limit),),
         x_names=tuple(names),
     )

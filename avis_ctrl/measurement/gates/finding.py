@@ -127,7 +127,7 @@ def quoted(names: tuple[str, ...] | list[str], most: int = 4) -> str:
 
 
 def times(ratio: float, most: float = 1000.0) -> str:
-    """"3.1 times", or "over 1000 times": larger numbers tell nobody more."""
+    """"3.1 times", or "over 1000 times": larger numbers say nothing more."""
     return f"over {most:g} times" if ratio > most else f"{ratio:.1f} times" if ratio < 100 else f"{ratio:.0f} times"
 
 

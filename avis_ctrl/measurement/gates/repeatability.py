@@ -29,7 +29,7 @@ COMMON = 1 - 1e-6
 # Lines with less than this part of the median power of the driven ones are the skirt of the band: u and y are small
 # there, and differ by what leaks into them.
 EXCITED = 0.03
-# T beyond this many times its limit is said in words: the number tells nobody anything.
+# T beyond this many times its limit is put in words: the number itself says nothing more.
 TOLD = 20.0
 # Differences below these parts of the response are not worth a note, or a warning.
 NOTABLE, LARGE = 0.01, 0.05
@@ -361,5 +361,5 @@ def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def beyond_chance(T: float) -> str:
-    """In words, how far a statistic is beyond its limit at 1 %."""
+    """How far a statistic is beyond its 1 % limit, in words."""
     return "far beyond chance" if T > TOLD else f"{T:.1f} times what chance gives at 1 %"

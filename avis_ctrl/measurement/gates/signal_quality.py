@@ -71,8 +71,8 @@ class SignalToNoise(Gate):
             ]
         f, snr, segment_s = max(measured, key=lambda m: float(np.median(m[1])))
         advice = (
-            f"; it is noise, or leakage of a mode that decays longer than the segments of {segment_s:.3g} s. A periodic"
-            " voltage tells which; more drive helps against noise only."
+            f": noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. A periodic"
+            " excitation would show which; more drive helps only against noise."
             if segment_s
             else ". Those bands weigh little in a fit; drive them more if they matter."
         )

@@ -111,7 +111,7 @@ class Spikes(Gate):
             "warning",
             f"Channel {k.channel!r} of record {k.record} has {many} far outside the neighbours, at {k.at_s:.6g} s"
             f" (sample {k.sample}): {k.value:.4g} {unit} where the neighbours lead to {k.expected:.4g},"
-            f" {times(k.ratio)} the usual departure (limit {FACTOR:g}): an electrical disturbance or a faulty"
+            f" {times(k.ratio)} the usual deviation (limit {FACTOR:g}): an electrical disturbance or a faulty"
             " conversion. Look at cables and grounding; repeat the record, or replace the sample by what its neighbours"
             " lead to.",
             (k.channel,),

@@ -33,9 +33,9 @@ def method(found: Identification) -> Section:
                   "It is fitted along with the parameters:"),
         Formula("t_k = B(omega_k, theta) x", "the transient on line k is B times x"),
         Paragraph("Large rotations. The second-order terms of the nonlinear table (Newton and Euler, finite angles) "
-                  "are simulated in time at the present parameters and taken off the records, in the fit and in the "
-                  "validation; predictions in time hold them, as the simulation of closed loops does. Whether motors "
-                  "and sensors turn with the table is what the records say."),
+                  "are simulated in time with the current parameters and subtracted from the records, in the fit and "
+                  "in the validation; predictions in time include them, as the simulation of closed loops does. "
+                  "Whether the axes of motors and sensors turn with the table is decided from the records."),
         Paragraph("Likelihood. With circular complex normal noise of covariance C_k on line k, minus twice the "
                   "logarithm of the likelihood is, up to a constant,"),
         Formula("chi^2(theta) = min_x 2 sum_k e_k^H C_k^(-1) e_k + sum_j (theta_j - theta_j^0)^2 / sigma_j^2",

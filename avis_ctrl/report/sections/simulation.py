@@ -52,10 +52,11 @@ def _companions(companions: Companions) -> Table:
     rows = [(words.axis(one.axis), f"{words.number(one.gain)} N s/m", f"{words.number(one.tilt_corner_Hz)} Hz",
              f"{words.number(one.roll_off_Hz)} Hz", words.number(one.modulus_margin, 2)) for one in companions.loops]
     rows += [(words.axis(axis), "passive", "", "", why) for axis, why in companions.passive]
-    return table("The axes that the design does not keep, each under a skyhook loop that was designed for this rig's "
-                 "sensors with all other loops closed. The modulus margin is the least distance of the Nyquist curve "
-                 "from the critical point, nominal plant. sampled_controller.json holds these loops and the mu "
-                 "controller together.", ("axis", "gain", "tilt corner", "roll-off", "modulus margin"), rows, "lrrrr")
+    return table("Axes outside the mu controller. Each has a skyhook loop that was designed for this rig's sensors "
+                 "with all other loops closed, or stays passive. The modulus margin is the least distance of the "
+                 "Nyquist curve from the critical point, for the nominal plant. sampled_controller.json holds these "
+                 "loops and the mu controller.", ("axis", "gain", "tilt corner", "roll-off", "modulus margin"), rows,
+                 "lrrrr")
 
 
 def _agreement(p: PlantCheck) -> Mark | str:

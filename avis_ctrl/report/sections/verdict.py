@@ -69,7 +69,7 @@ def comparison(result: DesignResult) -> Section:
     controllers = result.controllers
     body = [(name, *(value(c) for c in controllers)) for name, value in rows]
     notes = [Paragraph(f"{c.title}: {'; '.join(c.notes)}", "note") for c in controllers if c.notes]
-    notes += [Paragraph(f"{c.title} is not in the table: {c.reason}", "note") for c in result.failed]
+    notes += [Paragraph(f"The controller {c.title!r} is not in the table: {c.reason}", "note") for c in result.failed]
     floor = controllers[0].site.floor_rating
     return Section("Controllers compared", "comparison", (
         table("Every controller measured in the same way on the same plants. Worst cases are upper bounds over the "
