@@ -152,7 +152,10 @@ class Predictor:
         return power[:n, :n], power[:n, n:n + m], power[:n, n + m:]
 
     def read(self, u: np.ndarray, floor: np.ndarray | None = None) -> np.ndarray:
-        """(n, n_y) for commanded u (n, n_u) in the model's order and floor velocity (n, 3) or None."""
+        """(n, n_y) for commanded u (n, n_u) in the model's order and floor velocity (n, 3) or None.
+
+        floor : with the sample that follows, (n + 1, 3), where it is known: the floor moves in a straight line to it.
+        """
         n = len(u)
         held = np.vstack([self.pending, u])
         self.pending = held[n:]
@@ -161,7 +164,7 @@ class Predictor:
         drive = new @ self.new.T + old @ self.old.T
         w = np.zeros((n + 1, len(FLOOR)))
         if floor is not None:
-            w[:-1], w[-1] = floor, floor[-1]
+            w[:len(floor)], w[len(floor):] = floor, floor[-1]
             drive += w[:-1] @ self.floor.T + np.diff(w, axis=0) @ self.ramp.T
         x = np.empty((n, len(self.x)))
         acting = new if not np.any(self.old) else old

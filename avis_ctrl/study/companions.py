@@ -133,7 +133,8 @@ def design_companions(bare: SampledLoop, chain_error: Weight | None = None, band
             others = {name: one for name, one in found.items() if name != axis}
             best = search.best(axis, others)
             found = others if best is None else {**others, axis: best}
-    missing = tuple((axis, "no gain and corners tried are stable with the required margins") for axis in axes if axis not in found)
+    reason = "no gain and corners tried are stable with the required margins"
+    missing = tuple((axis, reason) for axis in axes if axis not in found)
     return search.with_margins(Companions(tuple(found[axis] for axis in axes if axis in found), (*passive, *missing)))
 
 

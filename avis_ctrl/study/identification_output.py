@@ -163,7 +163,9 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
             group.attrs["sample_rate_Hz"] = h.sample_rate_Hz
             predictor = Predictor(model, large_motion=True)
             for start, stop in ranges(h.samples, PIECE):
-                y = predictor.read(*model_inputs(model, record.load(start, stop)))
+                # With the sample that follows: the floor's line to it belongs to this piece.
+                u, floor = model_inputs(model, record.load(start, min(stop + 1, h.samples)))
+                y = predictor.read(u[:stop - start], floor)
                 data[start:stop] = y if limits is None else np.clip(y, *limits)
 
 

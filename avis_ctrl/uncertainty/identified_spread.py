@@ -17,7 +17,7 @@ POINTS_PER_OCTAVE = 8
 # How far beyond the data (and a declared crossover) the filter is asked to follow.
 REACH = 10.0
 # Steepest envelope first; a flatter one where no filter of its order follows.
-SLOPES, ORDERS = (2.0, 1.0), (6, 10)
+SLOPES, ORDERS = (2.0, 1.0), (6, 12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class IdentifiedSpread(Weight):
     factor: float = 1.0
     slope: float = 1.0
     tolerance_dB: float = 1.0
-    max_order: int = 10
+    max_order: int = 12
 
     role: ClassVar[Role] = "level"
     unit: ClassVar[str] = "relative"
@@ -104,7 +104,7 @@ def covering_spread(omega: np.ndarray, data: np.ndarray, declared: NeglectedDyna
 
     Raises
     ------
-    InputError : as `IdentifiedSpread`. ComputationError : order 10 does not cover the flatter one either.
+    InputError : as `IdentifiedSpread`. ComputationError : order 12 does not cover the flatter one either.
     """
     steep, flat = (IdentifiedSpread(omega, data, declared, factor, slope, max_order=order)
                    for slope, order in zip(SLOPES, ORDERS, strict=True))

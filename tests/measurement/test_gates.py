@@ -117,11 +117,11 @@ def doubled(u, y):
 FAULTS = [
     (overdriven, {}, "clipping", ("Sz1",), {"signal to noise"}),
     (clipped, {"y_range_V": None}, "clipping", ("Sz1",), set()),
-    (constant, {}, "dead channel", ("Sx2",), {"signal to noise", "coherence"}),
-    (noise_alone, {}, "dead channel", ("Sx2",), {"signal to noise", "coherence"}),
+    (constant, {}, "dead channel", ("Sx2",), {"signal to noise", "coherence", "channel order"}),
+    (noise_alone, {}, "dead channel", ("Sx2",), {"signal to noise", "coherence", "channel order"}),
     (stuck, {}, "dead channel", ("Sx2",), set()),
     (humming, {}, "hum", ("Sy3",), {"periodicity"}),
-    (noisy, {}, "signal to noise", ("Sy1",), set()),
+    (noisy, {}, "signal to noise", ("Sy1",), {"channel order"}),
     (doubled, {"response": None}, "channel order", ("Sz1", "Sz2"), set()),
 ]
 

@@ -52,7 +52,7 @@ def controller(folder) -> StateSpace:
 
 def test_every_requirement_is_met(folder):
     result = json.loads((folder / "design" / "result.json").read_text(encoding="utf-8"))
-    assert all(row["met"] for row in result["requirements"]) and len(result["requirements"]) == 3
+    assert all(row["met"] for row in result["requirements"]) and len(result["requirements"]) == 3 + 3
     assert result["simulation"]["passed"]
     report = (folder / "design" / "report.html").read_text(encoding="utf-8")
     assert "Uncertainty from the identification" in report

@@ -136,7 +136,9 @@ def h1(of: list[Spectra]) -> H1 | None:
         return None
     reduced = U @ basis
     gram = np.einsum("kfi,kfj->fij", reduced.conj(), reduced)
-    power = np.linalg.eigvalsh(gram)
+    # Each direction over its own size in the whole band: one drive played much louder hides none of the others.
+    size = np.sqrt(np.real(np.einsum("fii->i", gram[keep])))
+    power = np.linalg.eigvalsh(gram / np.outer(size, size))
     keep &= power[:, 0] > AT_LINE * power[:, -1]
     if not keep.any():
         return None
