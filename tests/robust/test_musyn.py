@@ -115,7 +115,9 @@ def test_history_shows_each_iteration_and_the_best_is_kept(distilled):
     result, _ = distilled
     assert [row.iteration for row in result.history] == list(range(len(result.history)))
     assert result.mu_upper == pytest.approx(min(row.mu_upper for row in result.history), rel=2e-3)
-    assert all(row.mu_upper <= row.gamma * 1.01 and row.seconds > 0 and row.order >= 6 for row in result.history)
+    assert all(row.mu_upper <= row.gamma * 1.01 and row.seconds > 0 for row in result.history)
+    # The plant has six states; the nominal one lacks the two of the uncertainty's weights.
+    assert all(row.order >= (4 if row.kind == "nominal" else 6) for row in result.history)
 
 
 def test_synthesis_improves_on_h_infinity():
