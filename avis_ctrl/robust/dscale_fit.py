@@ -249,6 +249,10 @@ def maximise_last(A: sp.csc_matrix, b: np.ndarray, cones: list[Any]) -> np.ndarr
 
 def _spectral_factor(p: np.ndarray, q: np.ndarray, unit: float) -> ScalarScaling:
     """d(s) with |d(j omega)|^2 = p / q at y = (omega / unit)^2, all roots in the left half plane."""
+    if not p[-1] / q[-1] > 0:
+        raise ComputationError("a positive polynomial came out of the fit with a leading coefficient below zero",
+                               measured=f"{p[-1]:.3g} over {q[-1]:.3g}", cause="frequencies spanning too many decades",
+                               next_step="a lower order or a narrower band")
     return ScalarScaling.from_roots(float(np.sqrt(p[-1] / q[-1])), stable_roots(p) * unit, stable_roots(q) * unit)
 
 
