@@ -81,7 +81,7 @@ def test_axes_that_no_record_pushes_are_named(model):
     measured = replace(measured, value=measured.value[:, :, up], gram=measured.gram[:, up][:, :, up],
                        inputs=tuple(model.actuators[k] for k in up))
     frf_spread(measured, model, KEEP, (0.9,))
-    with pytest.raises(InputError, match=r"'x'\].*push along each"):
+    with pytest.raises(InputError, match=r"'x'\].*excite each of these coordinates"):
         frf_spread(measured, model, ("x", "z"), (0.9,))
 
 

@@ -334,7 +334,7 @@ def test_inputs_that_depend_on_each_other_tell_what_they_span(rng):
     assert np.allclose(along.value, plain.value, rtol=1e-6, atol=1e-9)
     assert np.allclose(along.noise, plain.noise, rtol=1e-6) and got.dof == plain.dof
     assert np.allclose(along.variance(), plain.variance(), rtol=1e-5)
-    with pytest.raises(InputError, match="play three"):
+    with pytest.raises(InputError, match="exciting three"):
         got.along(np.array([[1.0], [0.0], [0.0]]), ("three",), "V")
     at = np.linspace(10, 75, 20)
     of_three, of_two = (noise_covariance(campaign([(one, y)], RATE), at, band_Hz=(5, 80)) for one in (u, two))

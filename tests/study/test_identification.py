@@ -130,6 +130,7 @@ def test_a_gate_that_says_stop_stops(rehearsal):
         identify(broken, load_rig("avis"), FEW)
 
 
+@pytest.mark.slow
 def test_a_campaign_through_a_file_gives_the_same(rehearsal, found, tmp_path):
     write_campaign(tmp_path / "c.h5", rehearsal.campaign)
     again = identify(read_measurements(tmp_path / "c.h5"), load_rig("avis"), FEW)
