@@ -8,7 +8,6 @@ import numpy as np
 
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.robust.mu import mu_upper
-from avis_ctrl.robust.musyn_state import Iteration
 from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.model import ControllerResult
 from avis_ctrl.study.plant import DesignPlant
@@ -50,8 +49,7 @@ def _mu(M: np.ndarray, blocks: BlockStructure) -> float:
     return float(mu_upper(M, blocks).upper)
 
 
-def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[ControllerResult],
-               history: Sequence[Iteration]) -> str:
+def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[ControllerResult]) -> str:
     """What was reached by a design whose mu stays above 1, what stands in the way, and what to try.
 
     It is no proof that nothing better exists: the synthesis may have ended early, and says so here.

@@ -108,7 +108,7 @@ def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesi
         mu = next(c for c in controllers if c.name == "mu")
         six_dof = six_dof_check(design, rig, plant, mu, compared.loop.companions)
         assumed = plant.identified.assumption if plant.identified else ""
-        verdict = best_found(plant, mu, controllers, synthesis.history) if mu.mu.upper >= 1 else ""
+        verdict = best_found(plant, mu, controllers) if mu.mu.upper >= 1 else ""
         unlike = [f"{one.title!r} is missing from the comparison: {one.reason}" for one in compared.failed]
         passive_axes = [f"The axis {axis} stays passive: {why}." for axis, why in compared.loop.companions.passive]
         notes = tuple(text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.notes)

@@ -171,7 +171,7 @@ def test_a_controller_no_better_than_none_is_called_so(one_axis, measured):
     nothing = replace(rest, name="mu", K=idle)
     line, = judge(asking(design, fastest_controller_pole_Hz=250.0), [rest, replace(rest, name="skyhook"), nothing])
     assert np.isnan(line.value) and not line.met
-    text = best_found(plant, nothing, [rest], ())
+    text = best_found(plant, nothing, [rest])
     assert "no controller better than none" in text and "ended too early" not in text
     better = replace(nothing, mu=replace(rest.mu, upper=0.9 * rest.mu.upper), fastest_pole_Hz=20.0)
     line, = judge(asking(design, fastest_controller_pole_Hz=250.0), [rest, replace(rest, name="skyhook"), better])
