@@ -11,6 +11,7 @@ A problem is WRONG where
 
     the measured gamma is not the norm of F_l(P, K): stability from the poles of a loop formed here, the norm from
         SLICOT's AB13DD and from P(jw), K(jw) closed pointwise (the larger of the two; the tolerance is 1e-3);
+    a bracket wider than 1 per cent is called the optimum;
     the bracket's lower end is above that norm, or the bracket misses that of the plant before it was scaled and
         padded, or for every fourth problem that of the transposed plant or the optimum of the matrix inequalities;
     I - M Delta is not singular, Delta has not its structure or its norm, or a bound of mu is passed by a perturbation;
@@ -40,7 +41,7 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, discretise
 from avis_ctrl.robust.hinf_lmi import lmi_gamma
-from avis_ctrl.robust.hinfsyn import hinfsyn
+from avis_ctrl.robust.hinfsyn import Status, hinfsyn
 from avis_ctrl.robust.mu import mu
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
@@ -250,6 +251,8 @@ def judge_synthesis(P: StateSpace, base: StateSpace, u: int, y: int, r: Any, sec
     lower, upper = r.gamma_optimal_bounds
     if not lower <= upper * (1 + 1e-9):
         wrong.append(f"bracket {lower:.6g}..{upper:.6g} upside down")
+    if r.status is Status.OPTIMAL and upper > tiny and lower < 0.99 * upper:
+        wrong.append(f"bracket {lower:.6g}..{upper:.6g} said to be the optimum")
     if lower > norm * (1 + 1e-6) + tiny:
         wrong.append(f"lower bound {lower:.6g} above the norm {norm:.6g} of its own loop")
     others: list[tuple[str, float, float]] = []
