@@ -5,7 +5,9 @@
 
 A change is an arithmetic operator, a comparison, a sign or a condition replaced by cosmic-ray. It is made
 in a copy of the tree. A test that fails, and a run that takes several times as long as the unchanged one, has noticed
-it. Finished changes are one line each in the file, and are not run again.
+it. Only the folder's test files that execute the changed line are run, the tests that do so first; all of the folder's
+where none is known to (a line of a class body, or compiled by numba). Finished changes are one line each in the file,
+and are not run again.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("robust", "uncertainty", "rigs", "identification", "simulation", "measurement")
@@ -52,30 +56,81 @@ def drawn(count: int, seed: int) -> list[tuple[str, str, int]]:
     return random.Random(seed).sample(places, count)
 
 
-def changed(path: Path, operator: str, occurrence: int) -> tuple[str, str]:
-    """The file with one place changed, and the line before and after."""
+def changed(path: Path, operator: str, occurrence: int) -> tuple[str, int, str]:
+    """The file with one place changed, the number of the line, and the line before and after."""
     from cosmic_ray.mutating import mutate_code
     from cosmic_ray.plugins import get_operator
 
     before = path.read_text()
     after = mutate_code(before, get_operator(f"core/{operator}")(), occurrence)
     assert after is not None and after != before
-    lines = zip(before.splitlines(), after.splitlines(), strict=False)
-    return after, next((f"{a.strip()}  ->  {b.strip()}" for a, b in lines if a != b), "")
+    lines = enumerate(zip(before.splitlines(), after.splitlines(), strict=False), start=1)
+    number, (was, now) = next((number, pair) for number, pair in lines if pair[0] != pair[1])
+    return after, number, f"{was.strip()}  ->  {now.strip()}"
 
 
-def tests_run(tree: Path, folder: str, limit_s: float) -> tuple[bool, float, str]:
-    """(a test failed, seconds, the first that did) of a folder's tests in a tree."""
-    began = time.monotonic()
+@dataclass(frozen=True)
+class FolderTests:
+    """The tests of a folder: seconds of each by its name, and which execute a line, {file: {line: names}}."""
+
+    folder: str
+    seconds: dict[str, float]
+    by_line: dict[str, dict[int, set[str]]]
+
+    def of(self, file: str, line: int) -> list[str]:
+        """The tests to run for a change of a line, the quickest that execute it first, then the rest of their files.
+
+        A fixture's lines are executed in the set-up of one test and looked at by all that share it: hence whole files.
+        """
+        known = self.by_line.get(file, {}).get(line, set()) & set(self.seconds)
+        if not known:
+            return [f"tests/{self.folder}"]
+        files = {name.split("::")[0] for name in known}
+        rest = [name for name in self.seconds if name not in known and name.split("::")[0] in files]
+        return [*sorted(known, key=self.seconds.__getitem__), *sorted(rest, key=self.seconds.__getitem__)]
+
+    def whole_s(self, names: list[str]) -> float:
+        """Seconds that these tests take together on the unchanged code."""
+        return sum(self.seconds.values() if len(names) == 1 and "::" not in names[0]
+                   else (self.seconds[name] for name in names))
+
+
+def folder_tests(tree: Path, folder: str) -> FolderTests:
+    """Runs a folder's tests once on the unchanged code, under coverage."""
+    from coverage import CoverageData
+
+    report, data = tree / "report.xml", tree / ".coverage"
+    failed, said = pytest(tree, [f"tests/{folder}", f"--junitxml={report}", "--cov=avis_ctrl", "--cov-context=test",
+                                 "--cov-report="], 7200.0)
+    if failed:
+        raise SystemExit(f"the tests of {folder} fail without a change: {said}")
+    measured = CoverageData(str(data))
+    measured.read()
+    names = {context.rsplit("|", 1)[0] for context in measured.measured_contexts()} - {""}
+    short = {}
+    for case in ElementTree.parse(report).iter("testcase"):
+        path = case.get("classname", "").replace(".", "/") + ".py"
+        short[f"{path}::{case.get('name')}"] = float(case.get("time", 0.0))
+    by_line = {}
+    for file in measured.measured_files():
+        lines = measured.contexts_by_lineno(file)
+        by_line[str(Path(file).relative_to(tree))] = {line: {c.rsplit("|", 1)[0] for c in contexts} - {""}
+                                                      for line, contexts in lines.items()}
+    return FolderTests(folder, {name: short.get(name, 0.0) for name in sorted(names)}, by_line)
+
+
+def pytest(tree: Path, words: list[str], limit_s: float) -> tuple[bool, str]:
+    """(a test failed, the first that did) of a run in a tree."""
     single = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")}
-    pytest = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider"]
+    (tree / "words").write_text("\n".join(words))
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "@words"]
     try:
-        done = subprocess.run([*pytest, f"tests/{folder}"], cwd=tree, capture_output=True, text=True, timeout=limit_s,
+        done = subprocess.run(command, cwd=tree, capture_output=True, text=True, timeout=limit_s,
                               env={**os.environ, **single, "PYTHONPATH": str(tree)})
     except subprocess.TimeoutExpired:
-        return True, time.monotonic() - began, "took too long"
+        return True, "took too long"
     failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.M)
-    return done.returncode != 0, time.monotonic() - began, failed.group(1) if failed else ""
+    return done.returncode != 0, failed.group(1) if failed else done.stdout[-500:] if done.returncode else ""
 
 
 def copied(folder: Path) -> Path:
@@ -100,12 +155,8 @@ def run(count: int, seed: int, out: Path, jobs: int) -> None:
         for k in range(jobs):
             (Path(scratch) / str(k)).mkdir()
             trees.append(copied(Path(scratch) / str(k)))
-        unchanged = {}
-        for folder in sorted({one[0].split("/")[1] for one in todo}):
-            failed, seconds, name = tests_run(trees[0], folder, 3600.0)
-            if failed:
-                raise SystemExit(f"the tests of {folder} fail without a change: {name}")
-            unchanged[folder] = seconds
+        folders = sorted({one[0].split("/")[1] for one in todo})
+        unchanged = {folder: folder_tests(trees[0], folder) for folder in folders}
 
         def one(change: tuple[str, str, int]) -> None:
             file, operator, occurrence = change
@@ -113,14 +164,16 @@ def run(count: int, seed: int, out: Path, jobs: int) -> None:
             path = tree / file
             before = path.read_text()
             try:
-                after, line = changed(path, operator, occurrence)
+                after, number, line = changed(path, operator, occurrence)
                 path.write_text(after)
-                noticed, seconds, by = tests_run(tree, folder, SLOWER * unchanged[folder] + 60.0)
+                began, names = time.monotonic(), unchanged[folder].of(file, number)
+                noticed, by = pytest(tree, names, SLOWER * unchanged[folder].whole_s(names) + 60.0)
+                seconds = time.monotonic() - began
             finally:
                 path.write_text(before)
                 trees.append(tree)
-            row = {"file": file, "operator": operator, "occurrence": occurrence, "line": line, "noticed": noticed,
-                   "by": by, "seconds": seconds}
+            row = {"file": file, "operator": operator, "occurrence": occurrence, "line": f"{number}: {line}",
+                   "noticed": noticed, "by": by, "tests": len(names), "seconds": seconds}
             with out.open("a") as file_out:
                 file_out.write(json.dumps(row) + "\n")
             print(f"{'noticed' if noticed else 'PASSED '} {file}: {line}", flush=True)

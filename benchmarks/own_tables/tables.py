@@ -68,14 +68,14 @@ def tripod() -> Table:
     drives, sensors = [], []
     for leg, a in enumerate(angles, 1):
         drives += [
-            Drive(f"V{leg}", _at(0.41, a, -0.10), Z, 0.8),
-            Drive(f"H{leg}", _at(0.45, a, -0.08), _turned(a + 90), 0.8),
+            Drive(f"V{leg}", _at(0.41, a, -0.10), Z, 3.0),
+            Drive(f"H{leg}", _at(0.45, a, -0.08), _turned(a + 90), 3.0),
         ]
         for name, place, d in (
             (f"GV{leg}", _at(0.47, a, -0.05), Z),
             (f"GH{leg}", _at(0.47, a, -0.06), _turned(a + 90)),
         ):
-            sensors.append(Geophone(name, place, d, 80.0, 1.0, 0.6, 100.0, noise_rms_V=2e-3))
+            sensors.append(Geophone(name, place, d, 80.0, 1.0, 0.6, 300.0, noise_rms_V=2e-3))
     J = np.diag([12.9, 13.4, 24.8])
     return Table(
         "tripod", 200.0, J, (0.0, 0.0, 0.0), mounts, tuple(drives), tuple(sensors), 1000.0, 16, 10.0, 0.001, 5e-6
@@ -93,13 +93,13 @@ def four_vertical() -> Table:
     )
     damp = ((38.0, 38.0, 28.0), (39.0, 37.0, 30.0), (38.0, 38.0, 27.0), (37.0, 39.0, 29.0))
     mounts = tuple(Mount((x, y, -0.06), k, c) for (x, y), k, c in zip(corners, stiff, damp, strict=True))
-    drives = tuple(Drive(f"V{i}", (x * 0.9, y * 0.9, -0.05), Z, 0.4) for i, (x, y) in enumerate(corners, 1))
+    drives = tuple(Drive(f"V{i}", (x * 0.9, y * 0.9, -0.05), Z, 1.5) for i, (x, y) in enumerate(corners, 1))
     sensors = tuple(
-        Geophone(f"G{i}", (round(x * 1.1, 3), round(y * 1.1, 3), 0.02), Z, 28.8, 4.5, 0.56, 300.0, 0.8, 0.7, 2e-3)
+        Geophone(f"G{i}", (round(x * 1.1, 3), round(y * 1.1, 3), 0.02), Z, 28.8, 4.5, 0.56, 500.0, 0.8, 0.7, 2e-3)
         for i, (x, y) in enumerate(corners, 1)
     )
     J = np.diag([2.47, 4.33, 6.67])
-    return Table("four_vertical", 80.0, J, (0.0, 0.0, 0.0), mounts, drives, sensors, 1000.0, 14, 10.0, 0.001, 2e-6)
+    return Table("four_vertical", 80.0, J, (0.0, 0.0, 0.0), mounts, drives, sensors, 1000.0, 14, 10.0, 0.001, 5e-6)
 
 
 def twelve_sensors() -> Table:
@@ -114,13 +114,13 @@ def twelve_sensors() -> Table:
     damp = ((95.0, 92.0, 130.0), (93.0, 96.0, 138.0), (98.0, 94.0, 126.0), (92.0, 95.0, 134.0))
     mounts = tuple(Mount((x, y, -0.15), k, c) for (x, y), k, c in zip(places, stiff, damp, strict=True))
     drives = [
-        Drive(f"V{i}", (x, y, -0.10), Z, 1.0)
+        Drive(f"V{i}", (x, y, -0.10), Z, 4.0)
         for i, (x, y) in enumerate(((-0.55, -0.35), (0.55, -0.35), (0.45, 0.35), (-0.45, 0.35)), 1)
     ]
     sides = ((0.0, -0.42, X), (0.58, 0.0, Y), (0.0, 0.42, (-1.0, 0.0, 0.0)), (-0.52, 0.0, (0.0, -1.0, 0.0)))
-    drives += [Drive(f"H{i}", (x, y, -0.05), d, 1.0) for i, (x, y, d) in enumerate(sides, 1)]
+    drives += [Drive(f"H{i}", (x, y, -0.05), d, 4.0) for i, (x, y, d) in enumerate(sides, 1)]
     sensors = [
-        Geophone(f"G{n}", p, d, 60.0, 2.0, 0.6, 150.0, 0.4, 0.7, 2e-3)
+        Geophone(f"G{n}", p, d, 60.0, 2.0, 0.6, 200.0, 0.4, 0.7, 2e-3)
         for n, p, d in (
             ("v1", (-0.62, -0.42, 0.0), Z), ("v2", (0.62, -0.42, 0.0), Z),
             ("v3", (0.52, 0.42, 0.0), Z), ("v4", (-0.52, 0.42, 0.0), Z),
@@ -162,7 +162,7 @@ def skewed() -> Table:
     mounts = tuple(Mount((x, y, -0.10), k, c) for (x, y), k, c in zip(corners, stiff, damp, strict=True))
     feet = ((20.0, 110.0), (100.0, 10.0), (140.0, 230.0), (220.0, 130.0), (260.0, 350.0), (340.0, 250.0))  # place, lean
     drives = tuple(
-        Drive(f"L{i}", _at(0.32, a, -0.06), _turned(b, 45.0), 2.0, corner_Hz=300.0) for i, (a, b) in enumerate(feet, 1)
+        Drive(f"L{i}", _at(0.32, a, -0.06), _turned(b, 45.0), 5.0, corner_Hz=300.0) for i, (a, b) in enumerate(feet, 1)
     )
     sensors = tuple(
         Accelerometer(f"A{i}", _at(0.34, a, -0.02), _turned(b, 45.0), 100.0, 0.3, 3e-3)
@@ -185,11 +185,11 @@ def granite() -> Table:
         for (x, y), s in zip(grid, share, strict=True)
     )
     drives = [
-        Drive(f"V{i}", (x, y, -0.25), Z, 10.0)
+        Drive(f"V{i}", (x, y, -0.25), Z, 40.0)
         for i, (x, y) in enumerate(((-1.0, -0.6), (1.0, -0.6), (1.0, 0.6), (-1.0, 0.6)), 1)
     ]
     drives += [
-        Drive(n, p, d, 10.0)
+        Drive(n, p, d, 40.0)
         for n, p, d in (
             ("X1", (-1.3, -0.5, -0.1), X),
             ("X2", (1.3, 0.5, -0.1), X),
@@ -198,12 +198,12 @@ def granite() -> Table:
         )
     ]
     sensors = [
-        PositionSensor(f"P{n}", p, d, 2e4, 5e-4, 200.0)
+        PositionSensor(f"P{n}", p, d, 2e4, 5e-4, 500.0)
         for n, p, d in (("z1", (-1.3, -0.8, -0.2), Z), ("z2", (1.3, -0.8, -0.2), Z), ("z3", (0.0, 0.8, -0.2), Z),
                         ("x1", (1.35, 0.0, -0.2), X), ("y1", (-1.0, 0.85, -0.2), Y), ("y2", (1.0, 0.85, -0.2), Y))
     ]  # fmt: skip
     sensors += [
-        Geophone(f"G{n}", p, d, 100.0, 1.0, 0.7, 100.0, noise_rms_V=2e-3)
+        Geophone(f"G{n}", p, d, 100.0, 1.0, 0.7, 200.0, noise_rms_V=2e-3)
         for n, p, d in (
             ("z1", (-1.0, 0.0, 0.0), Z),
             ("z2", (1.0, 0.3, 0.0), Z),

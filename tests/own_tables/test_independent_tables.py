@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from avis_ctrl.rigs.rig_file import load_rig
 from benchmarks.own_tables import campaign, closed_loop, tables
 from benchmarks.own_tables.physics import (
     Drive,
@@ -21,7 +22,10 @@ from benchmarks.own_tables.physics import (
     PositionSensor,
     State,
     Table,
+    cross_matrix,
+    drive_matrix,
     floor_motion,
+    rigid,
     simulate,
 )
 
@@ -254,3 +258,31 @@ def test_floor_motion_is_one_motion():
     for k in (0, 6):  # central differences of place and velocity
         slope = (floor[2:, k] - floor[:-2, k]) / 2e-3
         assert np.abs(slope - floor[1:-1, k + 6]).max() < 0.03 * np.abs(slope).max()
+
+
+@pytest.mark.parametrize("name", tables.NOMINAL)
+def test_nominal_table_is_that_of_the_rig_file(name):
+    """Equations of motion, drives, and each sensor's response: a comparison on another table says nothing."""
+    own, rig = tables.NOMINAL[name](), load_rig(str(Path(__file__).parents[2] / "designs" / "rigs" / f"{name}.toml"))
+    equations = rig.equations_of_motion()
+    # The rig's coordinates are the motion of its geometric centre, the own ones that of the centre of mass.
+    there = np.eye(6)
+    there[:3, 3:] = cross_matrix(own.centre_of_mass_m)
+    theirs = [there.T @ X @ there for X in (equations.M, equations.C, equations.K)] + [there.T @ equations.T]
+    for mine, other in zip((*rigid(own), drive_matrix(own)), theirs, strict=True):
+        assert np.allclose(mine, other, rtol=0, atol=1e-4 * abs(other).max())  # directions have four digits
+    for mine in own.sensors:
+        other = next(one for one in rig.sensors() if one.name == mine.name)
+        assert mine.position_m == pytest.approx(other.position) and mine.direction == pytest.approx(other.direction,
+                                                                                                    abs=1e-4)
+        assert mine.noise_rms_V == other.noise_rms_V
+        order, (A, B, C, D) = mine.filter()  # of acceleration, floor excluded; a position sensor's of displacement
+        for f in (0.3, 1.0, 20.0, 200.0):
+            s = 2j * np.pi * f
+            response = (C @ np.linalg.solve(s * np.eye(len(A)) - A, B) + D)[0, 0] * (s if order < 2 else 1.0)
+            expected = other.as_velocity(np.array([2 * np.pi * f]))[0] * other.gain * (1.0 if order < 2 else s)
+            assert response == pytest.approx(expected, rel=1e-9), mine.name
+    said = rig.acquisition, rig.ambient
+    assert (own.sample_rate_Hz, own.adc_bits, own.adc_range_V, own.loop_delay_s, own.floor_velocity_rms_m_per_s) == (
+        said[0].sample_rate_Hz, said[0].adc_bits, said[0].adc_range_V, said[0].loop_delay_s,
+        said[1].floor_velocity_rms_m_per_s)
