@@ -6,7 +6,8 @@ The independent simulator makes a campaign of the true table. `avis identify` an
 and the rig file in designs/rigs. The sampled controller that they deliver then runs on the independent nonlinear table:
 on the nominal one and on the true one, which differs within tolerances. The last column says whether both agree: the
 package's simulation of the identified table and the independent one of the nominal table are both stable or both not,
-and a verdict of stability holds on the true table. What is asked of each design is in `ASKED`; a design that misses it is a result, not a failure.
+and a verdict of stability holds on the true table. What is asked of each design is in `ASKED`; a design that misses it
+is a result, not a failure.
 """
 
 import argparse
