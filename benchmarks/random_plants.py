@@ -225,13 +225,18 @@ def in_doubt(r: Any) -> bool:
     return any("gamma is lost in round-off" in note for note in r.notes)
 
 
+def size(P: StateSpace, u: int, y: int) -> float:
+    """A gain beside which F_l(P, K) is zero or not: |P11| + |P12| |P21|, the median over frequencies."""
+    z, w = P.noutputs - y, P.ninputs - u
+    responses = [at(P, omega) for omega in frequencies(P, count=20)]
+    return float(np.median([la.norm(p[:z, :w], 2) + la.norm(p[:z, w:], 2) * la.norm(p[z:, :w], 2) for p in responses]))
+
+
 def judge_synthesis(P: StateSpace, base: StateSpace, u: int, y: int, r: Any, second: bool) -> list[str]:
     """What is wrong with a synthesis; `second`: other opinions on the bracket, too."""
     wrong = []
     own = closed(P, r.K)
-    # An optimum of zero is met to round-off of the open loop.
-    w, z = base.ninputs - u, base.noutputs - y
-    tiny = 1e-9 * float(np.median([la.norm(at(base, omega)[:z, :w], 2) for omega in frequencies(base, count=20)]))
+    tiny = 1e-8 * size(base, u, y)
     balanced = la.matrix_balance(own.A, permute=False)[0] if own.nstates else own.A
     poles = la.eigvals(balanced) if own.nstates else np.zeros(0)
     margin = np.max(np.abs(poles) - 1 if P.dt else poles.real, initial=-1.0)

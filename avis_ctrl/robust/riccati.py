@@ -81,7 +81,7 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
     if asymmetry > LAGRANGIAN_TOLERANCE:
         return RiccatiSolution(None, False, INACCURATE, omega=nearest)
     lowest = float(la.eigvalsh((gram + gram.T) / 2)[0])
-    lu, piv = la.lu_factor(X1.T, check_finite=False)
+    lu, piv, _ = la.lapack.dgetrf(X1.T)  # singular is an answer here, not a warning
     if np.min(np.abs(np.diag(lu))) < 1e-15:
         return RiccatiSolution(None, False, "the Riccati solution is infinite")
     X = la.lu_solve((lu, piv), X2.T).T

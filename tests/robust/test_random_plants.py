@@ -1,0 +1,49 @@
+"""Random problems that were answered wrongly once, each recomputed by the judge of benchmarks/random_plants.py."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from avis_ctrl.lti import StateSpace
+from avis_ctrl.robust.hinf_lmi import lmi_gamma
+from avis_ctrl.robust.hinfsyn import Status, hinfsyn
+from benchmarks.random_plants import plant, solve
+
+
+@pytest.mark.parametrize("seed", [(77, 26), (5, 3386)])
+def test_singular_filter_riccati_solution_is_no_indefinite_one(seed):
+    """The disturbance is measured exactly: Y is zero. The bracket has to hold the optimum of the inequalities."""
+    P, base, ncon, nmeas, _ = plant(np.random.default_rng(seed))
+    lower, upper = hinfsyn(P, nmeas, ncon).gamma_optimal_bounds
+    other = lmi_gamma(base, nmeas, ncon)
+    assert other.violation <= 0 and other.lower >= 0.999 * other.upper
+    assert lower <= other.upper * (1 + 1e-6) and upper >= other.lower * (1 - 1e-6)
+    assert lower >= 0.99 * upper
+
+
+@pytest.mark.parametrize("index", [1315, 1568, 1729, 1946])
+def test_optimum_of_zero(index):
+    """w does not reach z, or all of it can be cancelled: what is left is round-off, and no bound is above it."""
+    row = solve(2026, index)
+    assert row["wrong"] == []
+    assert row["gamma"] < 1e-5
+
+
+@pytest.mark.parametrize("index", range(12))
+def test_any_problem(index):
+    """A dozen of the campaign of 10 000."""
+    assert solve(1, index)["wrong"] == []
+
+
+def test_zero_is_said():
+    """z = u alone, and a stable plant: K = 0 is optimal."""
+    P = StateSpace([[-1.0]], [[1.0, 1.0]], [[0.0], [1.0]], [[0.0, 1.0], [1.0, 0.0]])
+    found = hinfsyn(P, 1, 1)
+    assert found.status is Status.OPTIMAL and found.gamma < 1e-6
+    assert any("zero to working precision" in note for note in found.notes)
+    assert not any("zero to working" in note for note in hinfsyn(
+        StateSpace([[1.0]], [[1.0, 1.0]], [[0.0], [1.0]], [[0.0, 1.0], [1.0, 0.0]]), 1, 1).notes)
