@@ -32,6 +32,7 @@ SILENT_LINE = 1e-3
 QUIET_BAND_Hz = (0.5, 60.0)
 # Share of an input's power that may lie below, and above, the band of the fit.
 TAIL = 5e-4
+MOMENTS = ("J1", "J2", "J3", "Ixx", "Iyy", "Izz")
 Progress = Callable[[str], None]
 
 
@@ -268,6 +269,14 @@ def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:
 
 
 def _bounds(found: LikelihoodFit) -> tuple[str, ...]:
-    """A sentence on parameters that physics stops."""
-    return (f"the data ask for less than physics allows of {', '.join(found.held)}: held just above zero, where "
-            "standard deviations say little",) if found.held else ()
+    """Sentences on parameters that physics stops."""
+    moments = [name for name in found.held if name in MOMENTS]
+    low = [name for name in found.held if name not in MOMENTS]
+    said = []
+    if low:
+        said.append(f"the data ask for less than physics allows of {', '.join(low)}: held just above zero, where "
+                    "standard deviations say little")
+    if moments:
+        said.append(f"the data ask for more than a body can have of {', '.join(moments)}: held at the sum of the other "
+                    "two moments of inertia; something that was taken as known is wrong, or these data hardly see it")
+    return tuple(said)

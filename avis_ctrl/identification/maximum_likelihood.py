@@ -13,7 +13,7 @@ Levenberg-Marquardt steps in relative parameters; the information matrix is J^T 
 Cramer-Rao bound where C_k is known. Where C_k was estimated, weights that scatter cost precision, and the information
 is less by what they cost (`weight_cost`). Directions that the data do not determine keep their starting value.
 Parameters that physics keeps positive stop just above zero, and stay there while chi2 would fall below it (an active
-set); the others then find their own optimum.
+set); the others then find their own optimum. So does a moment of inertia at the sum of the other two.
 """
 
 from __future__ import annotations
@@ -25,15 +25,18 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
+from scipy.linalg import null_space
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.response import ResponseModel, positive
+from avis_ctrl.identification.response import ResponseModel, moment_rows, positive
 from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns, transient_parts
 
 Prior = tuple[float, float]
 # Lines of all blocks together below which threads cost more than they bring.
 FEW_LINES = 4000
+# Relative distance that a moment of inertia keeps from the sum of the other two.
+EDGE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +62,9 @@ class LikelihoodFit:
     iterations, converged : of the best start. history : chi2 after each of its steps.
     residuals : one a block.
     starts : chi2 reached from each start, infinite where it failed.
-    priors : used, by name. held : parameters that ended at the smallest value that physics allows; what the information
-        says of them, and of what goes with them, is that of a normal law that is cut off there.
+    priors : used, by name. held : parameters that ended at the smallest value that physics allows, and moments of
+        inertia that ended at the largest; what the information says of them, and of what goes with them, is that of a
+        normal law that is cut off there.
     """
 
     model: ResponseModel
@@ -140,7 +144,8 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
     dof = sum(block.numbers for block in blocks) + len(priors) - unknown - information.rank
     return LikelihoodFit(best.model, information, last.chi2, dof, best.iterations, best.converged,
                          tuple(best.history), last.residuals, tuple(value for value, _ in reached), priors,
-                         tuple(name for name, low in zip(model.names, best.at_bound(), strict=True) if low))
+                         tuple(name for name, low in zip(model.names, best.at_bound(), strict=True) if low)
+                         + best.largest_moments())
 
 
 def _thinned_descent(begin: ResponseModel, blocks, priors, first: ResponseModel, max_iterations: int) -> ResponseModel:
@@ -159,6 +164,7 @@ class _Descent:
     def __init__(self, model: ResponseModel, blocks, whiteners, priors, first: ResponseModel):
         self.model, self.blocks, self.whiteners, self.priors = model, blocks, whiteners, priors
         self.scale, (self.lowest, self.highest) = first.scales(), first.bounds()
+        self.rows = _held_rows(first)
         self.now = self.evaluate(model)
         self.history = [self.now.chi2]
         self.iterations, self.converged = 0, False
@@ -219,13 +225,27 @@ class _Descent:
     def _step(self, damping: float) -> tuple[np.ndarray, float]:
         """Relative step, and the decrease of chi2 that the expansion promises for it.
 
-        The diagonal is scaled away before the eigenvalues tell what is determined.
+        Along the bounds and the edges that a step would leave.
         """
         free = ~((self.at_bound() & (self.now.gradient > 0)) | (self.at_top() & (self.now.gradient < 0)))
-        step = np.zeros(len(free))
-        H, g = self.now.H[np.ix_(free, free)], self.now.gradient[free]
+        basis = np.eye(len(free))[:, free]
+        step, promised = self._step_in(basis, damping)
+        for _ in self.rows:
+            leaving = self.rows[self.at_edge() & (self.rows @ (step * self.scale) < 0)] * self.scale
+            if not len(leaving) or not basis.size:
+                break
+            basis = basis @ null_space(leaving @ basis)
+            step, promised = self._step_in(basis, damping)
+        return step, promised
+
+    def _step_in(self, basis: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
+        """The step in the directions of basis (n_p, k).
+
+        The diagonal is scaled away before the eigenvalues tell what is determined.
+        """
+        H, g = basis.T @ self.now.H @ basis, basis.T @ self.now.gradient
         if not g.size:
-            return step, 0.0
+            return np.zeros(len(basis)), 0.0
         size = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(H / np.outer(size, size))
         along = vectors.T @ (g / size)
@@ -234,7 +254,7 @@ class _Descent:
         down, up = self.model.reach()
         while True:
             y = np.where(known, -along / np.where(known, values + damping, 1.0), 0.0)
-            step[free] = vectors @ y / size
+            step = basis @ (vectors @ y / size)
             largest = np.max(np.abs(step) / np.where(step > 0, up, down))
             if largest <= 1 or damping >= 1.0:
                 break
@@ -242,6 +262,14 @@ class _Descent:
         if largest > 1:
             y, step = y / largest, step / largest
         return step, float(-(2 * along @ y + y @ (values * y)))
+
+    def at_edge(self) -> np.ndarray:
+        """(k,) moments of inertia that are the sum of the other two."""
+        return self.rows @ self.model.values <= 3 * EDGE * np.abs(self.rows) @ np.abs(self.model.values)
+
+    def largest_moments(self) -> tuple[str, ...]:
+        """Names of the moments of inertia at the largest value that a body can have."""
+        return tuple(self.model.names[int(np.argmin(row))] for row in self.rows[self.at_edge()])
 
     def at_bound(self) -> np.ndarray:
         """(n_p,) parameters at the smallest value that physics allows."""
@@ -254,8 +282,15 @@ class _Descent:
         return self.model.values >= self.highest - slack
 
     def _try(self, step: np.ndarray) -> tuple[ResponseModel, float] | None:
+        values = np.clip(self.model.values + step * self.scale, self.lowest, self.highest)
+        if len(self.rows):
+            # Back along the step to where a moment is, but for EDGE, the sum of the other two.
+            room = self.rows @ self.model.values - EDGE * np.abs(self.rows) @ np.abs(self.model.values)
+            used = -(self.rows @ (values - self.model.values))
+            share = np.min(np.where(used > room, np.maximum(room, 0.0) / np.where(used > 0, used, 1.0), 1.0))
+            values = self.model.values + share * (values - self.model.values)
         try:
-            model = self.model.at(np.clip(self.model.values + step * self.scale, self.lowest, self.highest))
+            model = self.model.at(values)
         except InputError:
             return None  # no rig has these parameters: a shorter step
         if not _physical(model):
@@ -378,9 +413,15 @@ def _moved(model: ResponseModel, spread: float, rng: np.random.Generator) -> Res
             moved = model.at(model.values + model.scales() * spread * rng.uniform(-1, 1, len(model.names)))
         except InputError:
             continue
-        if _physical(moved):
+        if _physical(moved) and np.all(_held_rows(model) @ moved.values > 0):
             return moved
     return None
+
+
+def _held_rows(first: ResponseModel) -> np.ndarray:
+    """`moment_rows`, but for those that the rig file breaks itself."""
+    rows = moment_rows(first.names)
+    return rows[rows @ first.values > 0]
 
 
 def _check(model: ResponseModel, blocks, priors, starts: int) -> None:

@@ -398,6 +398,23 @@ class ResponseModel:
         return a[:, None, None], folded[:, :, None]
 
 
+def moment_rows(names: Sequence[str]) -> np.ndarray:
+    """(k, n_p) rows r with r @ theta > 0 where no principal moment of inertia is above the sum of the other two.
+
+    For a payload whose three moments are free; products of inertia are taken to be small beside them.
+    """
+    rows = []
+    for moments in (("J1", "J2", "J3"), ("Ixx", "Iyy", "Izz")):
+        if set(moments) <= set(names):
+            at = [list(names).index(name) for name in moments]
+            for largest in at:
+                row = np.zeros(len(names))
+                row[at] = 1.0
+                row[largest] = -1.0
+                rows.append(row)
+    return np.array(rows).reshape(-1, len(names))
+
+
 def positive(name: str) -> bool:
     """Whether physics asks for a positive value: masses, stiffness, damping, force constants, sensitivities.
 
