@@ -199,16 +199,22 @@ def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: fl
     scan = _Scan.of(N, band, lambda M: upper_bound(M, structure, accuracy), slack)
     # One stage draws the curve; the search goes on at the peaks only.
     lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9, stages=1)
+
+    def covered(level: float, first: Array) -> Cover:
+        return cover(N, structure, lambda system, level: system.scaled(left=1 / level),
+                     lambda M: upper_bound(M, structure, accuracy).beta, level, band, first, slack=slack)
     if known_upper is not None and known_upper <= (1 + KNOWN_SLACK) * scan.level:
         done = Cover(known_upper)
     else:
-        done = cover(N, structure, lambda system, level: system.scaled(left=1 / level),
-                     lambda M: upper_bound(M, structure, accuracy).beta, scan.level, band, scan.peak, slack=slack)
+        done = covered(scan.level, scan.peak)
     best, at, delta = _best_singular(N, structure, scan.omega, scan.bound, lower, done, band)
+    if best > done.level:
+        # mu of real blocks can jump up at a single frequency, which no grid meets: the search for a singular one did.
+        done = covered(best * (1 + slack), np.array([at]))
     if best == 0.0:
         at = float(scan.peak[0])
-    return MuPeak(done.level, best, at, delta, not done.gaps, _in_words(done, band), scan.omega, scan.bound.beta,
-                  lower.beta)
+    return MuPeak(max(done.level, best), best, at, delta, not done.gaps, _in_words(done, band), scan.omega,
+                  scan.bound.beta, lower.beta)
 
 
 def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found: UpperBound, lower: LowerBound,

@@ -33,6 +33,14 @@ def test_optimum_of_zero(index):
     assert row["gamma"] < 1e-5
 
 
+def test_real_blocks_that_make_one_frequency_singular():
+    """A repeated real scalar: mu is zero but at a single frequency, and the bounds are those of that one."""
+    row = solve(2026, 5019)
+    assert row["wrong"] == [] and row["status"] == "proved"
+    assert row["bounds"][0] == pytest.approx(0.0741486, rel=1e-5)
+    assert row["bounds"][1] < 1.01 * row["bounds"][0]
+
+
 @pytest.mark.parametrize("index", range(12))
 def test_any_problem(index):
     """A dozen of the campaign of 10 000."""
