@@ -40,6 +40,7 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.gates import Expectation, Finding, examine
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
+from avis_ctrl.study.plausible_fit import far_from_file
 from avis_ctrl.study.plausible_records import records_fit
 from avis_ctrl.study.rig_channels import in_words_of
 
@@ -141,7 +142,10 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
         progress(f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
                  + (f"; {split.how}" if split else ""))
         found = fit_campaign(fitted, model, band, options.priors, options.starts, options.seed, progress=progress)
-        found = replace(found, notes=(*found.notes, *([unplayed] if unplayed else [])))
+        far = far_from_file(model, found.fit)
+        for sentence in far:
+            progress(f"  warning: {sentence}")
+        found = replace(found, notes=(*far, *found.notes, *([unplayed] if unplayed else [])))
         floor = any(block.block.kind == "floor measured" for block in found.fit.residuals)
         report = identifiability_report(found.fit.information, found.fit.model, floor,
                                         {name: sigma for name, (_, sigma) in found.fit.priors.items()})

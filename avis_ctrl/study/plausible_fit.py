@@ -1,0 +1,49 @@
+"""Whether an identified rig can be the one that its file describes: a mass is known before anything is measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.identification.maximum_likelihood import LikelihoodFit
+from avis_ctrl.identification.response import ResponseModel
+
+INERTIAL = ("mass", "load.mass", "J1", "J2", "J3", "Ixx", "Iyy", "Izz")
+
+
+@dataclass(frozen=True)
+class FitPlausibility:
+    """When an identified mass or moment of inertia is called far from the rig file's.
+
+    far : ratio of the two, either way; drawings and scales are right to a few per cent.
+    alike : largest ratio among the parameters' own ratios that still counts as one common factor.
+    known : relative standard deviation above which a parameter is left out.
+    """
+
+    far: float = 1.5
+    alike: float = 1.5
+    known: float = 0.1
+
+
+def far_from_file(start: ResponseModel, fit: LikelihoodFit, settings: FitPlausibility = FitPlausibility()
+                  ) -> tuple[str, ...]:
+    """A sentence where masses or moments of inertia are far from the rig file's, with the likely cause."""
+    before = dict(zip(start.names, start.values, strict=True))
+    found = [(name, float(value / before[name]), float(value), unit)
+             for name, value, unit, sigma in zip(fit.model.names, fit.values, fit.model.units,
+                                                 fit.information.standard_deviation, strict=True)
+             if before[name] > 0 and value > 0 and sigma <= settings.known * value]
+    far = [one for one in found if one[0] in INERTIAL and not 1 / settings.far < one[1] < settings.far]
+    if not far:
+        return ()
+    name, ratio, value, unit = far[0]
+    said = f"{name} is identified as {value:.4g} {unit}, {ratio:.3g} times the rig file's {value / ratio:.4g} {unit}"
+    others = [one[1] for one in found if one[0] in INERTIAL or ".k_" in one[0] or one[0].startswith("k_")]
+    if len(others) > 2 and max(others) / min(others) < settings.alike:
+        middle = float(np.median(others))
+        return (f"{said}, and all masses, moments of inertia and stiffnesses are about {middle:.2g} times the file's: "
+                f"a response shows only their ratio to the force constants and sensitivities, so look there for a "
+                f"factor of {middle:.2g} or {1 / middle:.2g}",)
+    more = f"; the same holds for {', '.join(one[0] for one in far[1:])}" if len(far) > 1 else ""
+    return (f"{said}{more}: check the rig file, or these data do not determine it",)
