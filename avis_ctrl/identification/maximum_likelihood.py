@@ -285,9 +285,10 @@ class _Descent:
         values = np.clip(self.model.values + step * self.scale, self.lowest, self.highest)
         if len(self.rows):
             # Back along the step to where a moment is, but for EDGE, the sum of the other two.
-            room = self.rows @ self.model.values - EDGE * np.abs(self.rows) @ np.abs(self.model.values)
-            used = -(self.rows @ (values - self.model.values))
-            share = np.min(np.where(used > room, np.maximum(room, 0.0) / np.where(used > 0, used, 1.0), 1.0))
+            size = EDGE * np.abs(self.rows) @ np.abs(self.model.values)
+            room, used = self.rows @ self.model.values - size, -(self.rows @ (values - self.model.values))
+            beyond = used > room + 0.1 * size  # along the edge there is round-off of either sign
+            share = np.min(np.where(beyond, np.maximum(room, 0.0) / np.where(beyond, used, 1.0), 1.0))
             values = self.model.values + share * (values - self.model.values)
         try:
             model = self.model.at(values)

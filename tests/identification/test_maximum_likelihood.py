@@ -139,6 +139,29 @@ def test_a_parameter_at_its_bound_leaves_the_others_at_their_optimum(avis):
     assert met >= 2
 
 
+def test_a_moment_of_inertia_stops_at_the_sum_of_the_others(avis):
+    """Data of a body that cannot be: scipy's bounded optimum with J3 = J1 + J2 is the same place."""
+    names = ["mass", "J1", "J2", "J3", "isolator1.k_z"]
+    true = ResponseModel.of(avis, names)
+    true = true.at(true.values * np.array([1.0, 1.0, 1.0, 1.3, 1.0]))  # J3 61 -> 79.3, J1 + J2 = 71.2
+    block = responses(true, lines=40)
+    found = fit(ResponseModel.of(avis, names), [block], starts=2)
+    value = dict(zip(names, found.values, strict=True))
+    assert value["J3"] == pytest.approx(value["J1"] + value["J2"], rel=1e-5) and value["J3"] < value["J1"] + value["J2"]
+    assert found.held == ("J3",) and found.converged
+
+    room = value["J1"] + value["J2"] - value["J3"]
+
+    def residual(x):
+        e = block.Y - true.at(np.array([x[0], x[1], x[2], x[1] + x[2] - room, x[3]])).driven(
+            block.omega, block.U, False).Y
+        white = e / np.sqrt(block.noise[:, 0, 0, 0].real)[:, None, None] * np.sqrt(2)
+        return np.concatenate([white.real.ravel(), white.imag.ravel()])
+    other = least_squares(residual, found.values[[0, 1, 2, 4]] * 1.02, x_scale="jac", xtol=1e-14, ftol=1e-14)
+    assert found.chi2 == pytest.approx(2 * other.cost, rel=1e-5)
+    assert np.allclose(found.values[[0, 1, 2, 4]], other.x, rtol=1e-4)
+
+
 def test_of_too_many_lines_some_driven_ones_are_fitted(avis, monkeypatch):
     """A multisine of two periods has every other line driven; of 200 of these 100 are drawn, and told."""
     model = ResponseModel.of(avis, ["mass"])
