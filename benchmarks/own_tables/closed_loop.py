@@ -7,7 +7,7 @@ push leaves in the nonlinear simulation) and know nothing of each other.
 import json
 import math
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -118,10 +118,12 @@ def lifted_map(
 ) -> tuple[np.ndarray, list[str]]:
     """One-sample map of the closed loop about rest by central differences of the nonlinear model; names of its states.
 
+    Drives and converter without limits: a controller's states may be in units in which a small step saturates them.
     States: 6 of place (m, rad), 6 of velocity, amplifiers with a lag, sensors, commands under way, controller.
     """
     c = controller or open_loop(table)
     K, delay = c.on(table), c.delay_s(table, own_delay)
+    table = replace(table, drives=tuple(replace(d, limit_V=1e12) for d in table.drives), adc_range_V=1e12)
     P = table.arrays
     nd, order = len(table.drives), P.B.shape[1]
     rest = State.rest(table, len(K[0]), delay)

@@ -286,3 +286,13 @@ def test_nominal_table_is_that_of_the_rig_file(name):
     assert (own.sample_rate_Hz, own.adc_bits, own.adc_range_V, own.loop_delay_s, own.floor_velocity_rms_m_per_s) == (
         said[0].sample_rate_Hz, said[0].adc_bits, said[0].adc_range_V, said[0].loop_delay_s,
         said[1].floor_velocity_rms_m_per_s)
+
+
+def test_units_of_the_controllers_states_change_no_eigenvalue():
+    """States a million times smaller, an output matrix as much larger: a finite step must not meet a limit."""
+    twelve = tables.NOMINAL["twelve_sensors"]()
+    K = closed_loop.velocity_feedback(twelve, 500.0)
+    assert len(K.A)  # accelerometers are summed up
+    other = replace(K, B=K.B * 1e-6, C=K.C * 1e6)
+    one, two = (np.sort_complex(np.linalg.eigvals(closed_loop.lifted_map(twelve, c)[0])) for c in (K, other))
+    assert np.abs(np.abs(one) - np.abs(two)).max() < 1e-5
