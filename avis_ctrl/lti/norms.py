@@ -55,18 +55,17 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
     balanced = _balanced(system)
     for _ in range(60):
         crossings = _level_crossings(balanced, (1.0 + tolerance) * level)
-        if crossings.size == 0:
-            # Over many decades of poles round-off can hide the crossings of a flat peak: look around it.
-            omega_near, near = _best(system, omega * NEIGHBOURHOOD) if 0 < omega < np.inf else (omega, level)
-            if near <= (1.0 + tolerance) * level:
-                return PeakGain(near, omega_near) if near > level else PeakGain(level, omega)
-            omega, level = omega_near, near
-            continue
-        edges = np.unique(np.concatenate([[0.0], crossings]))
-        points = np.concatenate([edges, (edges[:-1] + edges[1:]) / 2, np.sqrt(edges[:-1] * edges[1:])])
-        new_omega, new_level = _best(system, points)
+        new_omega, new_level = omega, level
+        if crossings.size:
+            edges = np.unique(np.concatenate([[0.0], crossings]))
+            points = np.concatenate([edges, (edges[:-1] + edges[1:]) / 2, np.sqrt(edges[:-1] * edges[1:])])
+            new_omega, new_level = _best(system, points)
+        if new_level <= (1.0 + tolerance) * level and 0 < omega < np.inf:
+            # Over many decades of poles round-off can hide crossings of a flat peak, or one of a pair: look around it.
+            near_omega, near = _best(system, omega * NEIGHBOURHOOD)
+            if near > new_level:
+                new_omega, new_level = near_omega, near
         if new_level <= (1.0 + tolerance) * level:
-            # Only round-off keeps the crossings on the axis: the level is the norm within the tolerance.
             return PeakGain(max(level, new_level), omega if level >= new_level else new_omega)
         omega, level = new_omega, new_level
     raise ComputationError("the H-infinity norm did not settle in 60 steps", measured=f"last level {level:.6g}",

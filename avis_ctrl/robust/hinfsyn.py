@@ -43,8 +43,8 @@ from avis_ctrl.robust.riccati import INACCURATE, ON_AXIS
 
 # Relative accuracy to which a closed loop's norm contradicts a bound.
 LOOP_ACCURACY = 1e-5
-# Relative difference from which two computations of gamma say that it is round-off.
-SAME_GAMMA = 1e-2
+# Relative difference from which two computations of gamma say that round-off shows in it.
+SAME_GAMMA = 1e-4
 # A controller pole this many times the plant's fastest comes from the formulas, not from the plant.
 FAR_BEYOND = 10.0
 # Shares of the back-off at which a controller without them is tried: the smaller, the nearer they are to a gain.
@@ -317,8 +317,8 @@ def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
     other = highest if highest > (1 + SAME_GAMMA) * result.gamma else at_peak
     if abs(other - result.gamma) <= SAME_GAMMA * result.gamma:
         return ()
-    return (f"gamma is lost in round-off: {result.gamma:.4g} from the closed loop, {other:.4g} from P and K, "
-            f"frequency by frequency, a small difference of large terms",)
+    return (f"round-off shows in gamma: {result.gamma:.6g} from the closed loop, {other:.6g} from P and K, frequency by "
+            f"frequency",)
 
 
 def _widest_gap(poles: np.ndarray, plant_fastest: float) -> float:

@@ -27,6 +27,8 @@ from avis_ctrl.robust.mu_upper import block_balance, expand, rescaled
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 SINGULAR = 1e-9
+# With a perturbation so large that the round-off of M Delta is above this, no singular value is called zero.
+MEANINGLESS = 1e-6
 
 
 class _Step(NamedTuple):
@@ -181,7 +183,7 @@ def is_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
 def _balanced_is_singular(M: Array, delta: Array) -> Array:
     A = M @ delta
     least = np.linalg.svd(np.eye(A.shape[-1]) - A, compute_uv=False)[:, -1]
-    return least < SINGULAR + 1e-14 * np.linalg.norm(A, ord=2, axis=(1, 2))
+    return least < np.minimum(SINGULAR + 1e-14 * np.linalg.norm(A, ord=2, axis=(1, 2)), MEANINGLESS)
 
 
 def _complex_part(structure: BlockStructure) -> Array:

@@ -289,10 +289,10 @@ def test_nominal_table_is_that_of_the_rig_file(name):
 
 
 def test_units_of_the_controllers_states_change_no_eigenvalue():
-    """States a million times smaller, an output matrix as much larger: a finite step must not meet a limit."""
+    """States a thousand million times smaller, an output matrix as much larger: a finite step must not meet a limit."""
     twelve = tables.NOMINAL["twelve_sensors"]()
     K = closed_loop.velocity_feedback(twelve, 500.0)
     assert len(K.A)  # accelerometers are summed up
-    other = replace(K, B=K.B * 1e-6, C=K.C * 1e6)
+    other = replace(K, B=K.B * 1e-9, C=K.C * 1e9)
     one, two = (np.sort_complex(np.linalg.eigvals(closed_loop.lifted_map(twelve, c)[0])) for c in (K, other))
     assert np.abs(np.abs(one) - np.abs(two)).max() < 1e-5

@@ -55,3 +55,8 @@ def test_zero_is_said():
     assert any("zero to working precision" in note for note in found.notes)
     assert not any("zero to working" in note for note in hinfsyn(
         StateSpace([[1.0]], [[1.0, 1.0]], [[0.0], [1.0]], [[0.0, 1.0], [1.0, 0.0]]), 1, 1).notes)
+
+
+def test_no_perturbation_where_round_off_is_all_that_is_singular():
+    """A repeated real scalar on a sampled system whose mu is zero: a perturbation of 1e13 proves nothing."""
+    assert solve(2026, 7933)["wrong"] == []
