@@ -317,8 +317,8 @@ def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
     other = highest if highest > (1 + SAME_GAMMA) * result.gamma else at_peak
     if abs(other - result.gamma) <= SAME_GAMMA * result.gamma:
         return ()
-    return (f"round-off shows in gamma: {result.gamma:.6g} from the closed loop, {other:.6g} from P and K, frequency by "
-            f"frequency",)
+    return (f"round-off shows in gamma: {result.gamma:.6g} from the closed loop, {other:.6g} from P and K at "
+            f"single frequencies",)
 
 
 def _widest_gap(poles: np.ndarray, plant_fastest: float) -> float:
