@@ -8,9 +8,10 @@ simulator in tests/truth, which shares no dynamics with the package; the rest (t
 own. Voltages are multisines, noise, swept sines, six logical axes, or one drive after the other; records last 6 to 16
 seconds.
 
-Each campaign is judged as it is, when any stop is false, and once more with one fault put into it. Printed: false stops
-and warnings by gate, with the 95 % bound of Clopper and Pearson, and detections by fault. A hidden converter that clips
-and samples that were dropped are faults that the gates are to stop at: such campaigns are counted apart.
+Each campaign is judged as it is, when any stop is false (the check of units and levels before the gates included), and
+once more with one fault put into it. Printed: false stops and warnings by gate, with the 95 % bound of Clopper and
+Pearson, and detections by fault. A hidden converter that clips and samples that were dropped are faults that the gates
+are to stop at: such campaigns are counted apart.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ from scipy.signal import chirp
 from scipy.stats import beta
 from threadpoolctl import threadpool_limits
 
+from avis_ctrl.errors import InputError
+from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordHeader
 from avis_ctrl.measurement.gates import Finding, examine
 from avis_ctrl.rigs import load_rig
@@ -39,6 +42,7 @@ from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
 from avis_ctrl.simulation.rehearsal import perturbed_truth
 from avis_ctrl.study.identification import IdentifyOptions, expectation, start_model
+from avis_ctrl.study.plausible_records import check_records
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -292,14 +296,24 @@ def judge(seed: int, faults: tuple[str, ...], keep: Path | None) -> Outcome:
     """One campaign, as it is and with a fault."""
     with threadpool_limits(1):
         campaign, words, faulty = made(seed, keep)
-        known: Any = expectation(start_model(campaign, load_rig(campaign.rig), IdentifyOptions()))
-        sound = grave(examine(campaign, known))
+        model = start_model(campaign, load_rig(campaign.rig), IdentifyOptions())
+        known: Any = expectation(model)
+        sound = (*implausible(campaign, model), *grave(examine(campaign, known)))
         fault = faults[seed % len(faults)]
         broken, channels = with_fault(campaign, fault, seed)
         findings = examine(broken, known)
         found = any(f.gate in FAULTS[fault][0] and f.severity in ("warning", "stop") and channels <= set(f.channels)
                     for f in findings)
         return Outcome(seed, words, faulty, sound, fault, found, grave(findings))
+
+
+def implausible(campaign: Campaign, model: ResponseModel) -> tuple[tuple[str, str, str], ...]:
+    """What the check of units and levels that comes before the gates says, as a stop."""
+    try:
+        check_records(campaign, model)
+    except InputError as error:
+        return (("stop", "units", str(error)),)
+    return ()
 
 
 def bound(k: int, n: int) -> float:
