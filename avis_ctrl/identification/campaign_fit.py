@@ -244,7 +244,7 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     if isinstance(campaign, FrequencyResponse) or not blocks[0].transient:
         return CampaignFit(found, first, band_Hz, (*notes, *_bounds(found)), model)
     turning, added = chosen_turning(campaign, blocks, found.model)
-    found = fit(replace(found.model, turning=turning), without(blocks, added), priors, seed=seed)
+    found = fit(replace(found.model, turning=turning), without(blocks, added), priors, seed=seed, about=model)
     if progress:
         progress(f"second-order terms of the table's rotations: {found.iterations} iterations")
     notes.append(f"{turning.sentence}: {_share(blocks, added)}")
@@ -255,7 +255,7 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
             added = terms(campaign, blocks, found.model)
             weighed = [replace(block, Y=one.Y) for block, one in
                        zip(weighed, without(blocks, [one[0] for one in added]), strict=True)]
-        found = fit(found.model, weighed, priors, seed=seed)
+        found = fit(found.model, weighed, priors, seed=seed, about=model)
         if progress:
             progress(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
     return CampaignFit(replace(found, starts=first.starts), first, band_Hz, (*notes, *_bounds(found)), model, known)

@@ -101,7 +101,7 @@ class _Quadratic:
 
 def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior] | None = None,
         starts: int = 1, spread: float = 0.1, seed: int = 1, max_iterations: int = 60,
-        progress: Callable[[str], None] | None = None) -> LikelihoodFit:
+        progress: Callable[[str], None] | None = None, about: ResponseModel | None = None) -> LikelihoodFit:
     """The most likely parameters of `model.names`, from its present values.
 
     Parameters
@@ -109,13 +109,15 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
     blocks : data with the covariance of their noise.
     priors : (mean, standard deviation) of parameters, in their units.
     starts : how many starting points; the first is the model itself, the others are `spread` (relative) about it.
+    about : the model whose values are the units and bounds of the steps, `model` by default. For a fit that goes on
+        from another: a parameter that ended near zero is no unit.
 
     Raises
     ------
     InputError : no parameters, blocks without noise, priors of unknown parameters.
     ComputationError : no start came to a finite chi-square.
     """
-    priors = dict(priors or {})
+    priors, about = dict(priors or {}), about or model
     _check(model, blocks, priors, starts)
     rng = np.random.default_rng(seed)
     whiteners = [whitener(block) for block in blocks]
@@ -124,8 +126,8 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
         begin = model if k == 0 else _moved(model, spread, rng)
         if begin is not None:
             if k > 0:
-                begin = _thinned_descent(begin, blocks, priors, model, max_iterations)
-            descent = _Descent(begin, blocks, whiteners, priors, model)
+                begin = _thinned_descent(begin, blocks, priors, about, max_iterations)
+            descent = _Descent(begin, blocks, whiteners, priors, about)
             descent.run(max_iterations)
             reached.append((descent.now.chi2, descent))
         else:
@@ -138,7 +140,7 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
                                cause="data that are zero or far from this rig",
                                next_step="look at the gates, and start nearer")
     last = best.evaluate(best.model, residuals=True)
-    scale = model.scales()
+    scale = about.scales()
     unknown = sum(_unknowns(block, model) for block in blocks)
     information = Information(model.names, best.model.values, model.units, last.F / np.outer(scale, scale), scale)
     dof = sum(block.numbers for block in blocks) + len(priors) - unknown - information.rank

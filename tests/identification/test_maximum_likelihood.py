@@ -139,6 +139,18 @@ def test_a_parameter_at_its_bound_leaves_the_others_at_their_optimum(avis):
     assert met >= 2
 
 
+def test_a_fit_goes_on_from_a_parameter_near_zero(avis):
+    """Its units are those of the first start: half of next to nothing at a step would lead nowhere."""
+    names = ["mass", "J1", "isolator1.k_z", "isolator1.c_z"]
+    true = ResponseModel.of(avis, names)
+    block, start = responses(true, lines=60), true.at([520, 30, 46e3, 160])
+    found, other = fit(start.at([520, 30, 46e3, 1e-7]), [block], about=start), fit(start, [block])
+    assert found.converged and found.iterations <= 12
+    assert found.chi2 == pytest.approx(other.chi2, rel=1e-9)
+    assert np.allclose(found.information.matrix, other.information.matrix, rtol=1e-3)
+    assert np.allclose(found.information.standard_deviation, other.information.standard_deviation, rtol=1e-3)
+
+
 def test_a_moment_of_inertia_stops_at_the_sum_of_the_others(avis):
     """Data of a body that cannot be: scipy's bounded optimum with J3 = J1 + J2 is the same place."""
     names = ["mass", "J1", "J2", "J3", "isolator1.k_z"]
