@@ -292,10 +292,13 @@ def made(seed: int, keep: Path | None) -> tuple[Campaign, str, bool]:
     return found
 
 
-def judge(seed: int, faults: tuple[str, ...], keep: Path | None) -> Outcome:
-    """One campaign, as it is and with a fault."""
+def judge(seed: int, faults: tuple[str, ...], keep: Path | None) -> Outcome | None:
+    """One campaign, as it is and with a fault; None where what is hidden makes the table unstable."""
     with threadpool_limits(1):
-        campaign, words, faulty = made(seed, keep)
+        try:
+            campaign, words, faulty = made(seed, keep)
+        except ArithmeticError:
+            return None
         model = start_model(campaign, load_rig(campaign.rig), IdentifyOptions())
         known: Any = expectation(model)
         sound = (*implausible(campaign, model), *grave(examine(campaign, known)))
@@ -358,6 +361,9 @@ def main() -> None:
         outcomes = []
         for o in pool.map(partial(judge, faults=faults, keep=given.keep),
                           range(given.first, given.first + given.count)):
+            if o is None:
+                print("one draw is no table: it is unstable", flush=True)
+                continue
             outcomes.append(o)
             if given.list:
                 for s, gate, sentence in o.sound:
