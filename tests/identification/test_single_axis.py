@@ -106,6 +106,7 @@ def test_noise_of_the_position_lowers_the_mass_unless_the_reference_is_the_instr
 
 @pytest.mark.parametrize(("change", "expected"), [
     ({"cutoff_Hz": 600.0}, "cutoff_Hz = 600.0: expected a cutoff between 0 and 500 Hz"),
+    ({"cutoff_Hz": 0.0}, "cutoff_Hz = 0.0: expected a cutoff between 0 and 500 Hz"),
     ({"coulomb": "both"}, "coulomb = 'both': expected one of symmetric, asymmetric, none"),
     ({"force": np.zeros(7)}, "expected 20000 samples of each channel"),
     ({"time": np.zeros(20_000)}, "expected at least 32 uniform, increasing times"),

@@ -357,10 +357,12 @@ def response_file(path, rng, edit):
     return path
 
 
-def test_a_response_with_coherence_gets_variances_in_si(path, rng):
-    response = read_measurements(response_file(path, rng, lambda file: None))
+@pytest.mark.parametrize(("units", "factor"), [(("V", "mV"), 1e-3), (("mV", "V"), 1e3), (("mV", "mm/s"), 1.0)])
+def test_a_response_with_coherence_gets_variances_in_si(path, rng, units, factor):
+    response = read_measurements(response_file(path, rng, lambda file: file["frf"].attrs.update(
+        input_unit=units[0], output_unit=units[1])))
     with h5py.File(path) as file:
-        c, value = file["frf/coherence"][()], file["frf/value"][()] * 1e-3
+        c, value = file["frf/coherence"][()], file["frf/value"][()] * factor
     np.testing.assert_allclose(response.value, value)
     np.testing.assert_allclose(response.entry_variance, np.abs(value) ** 2 * (1 - c) / (c * 19), rtol=1e-12)
 

@@ -259,6 +259,7 @@ def test_every_exchanged_pair_is_named(which, pair):
     names = Y_NAMES if which == "y" else U_NAMES
     found = channel_alarms(everywhere(SHORT, exchange), known())
     assert [(f.gate, set(f.channels)) for f in found] == [("channel order", {names[i], names[k]})]
+    assert "are exchanged" in found[0].sentence
 
 
 @pytest.mark.parametrize(("which", "k"), [("y", k) for k in range(6)] + [("u", k) for k in range(8)])

@@ -179,7 +179,7 @@ def test_hum_names_mains_and_channel(rng, mains):
     gate = Hum()
     found = gate.conclude([gate.look(excerpt(record), Expectation())], Campaign("x", (record,)), Expectation())
     assert [(f.channels, f.severity) for f in found] == [(("y2",), "warning")]
-    assert f"{mains:g} Hz" in found[0].sentence
+    assert f"carries mains hum at {mains:g} Hz:" in found[0].sentence
 
 
 def test_false_alarms_of_periodicity(rng):

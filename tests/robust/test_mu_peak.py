@@ -351,6 +351,17 @@ def test_worst_case_gain_of_an_unstable_family():
     assert singular_at(N.select(slice(2), slice(2)), found)
 
 
+def test_no_gain_is_proved_in_a_band_where_another_frequency_is_unstable():
+    """A resonance at 10 rad/s that a perturbation of norm 1 destabilises, asked about far below it."""
+    N = append(tf([20.0], [1, 0.2, 100], ["w"], ["z"]), tf([1.0], [1, 1], ["d"], ["e"]))
+    structure = [C()]
+    assert mu_peak(N.select([0], [0]), structure).lower > 1
+    found = worst_case_gain(N, structure, band=(0.01, 0.1))
+    assert found.upper == np.inf and found.lower == np.inf
+    halved = worst_case_gain(N.scaled(left=[0.05, 1.0]), structure, band=(0.01, 0.1))
+    assert halved.guaranteed and halved.upper == pytest.approx(abs(1 / (1 + 0.01j)), rel=6e-3)
+
+
 def test_realised_perturbation_puts_a_pole_on_the_axis(rng):
     blocks = [R(), C(2), F(2, 3)]
     structure = BlockStructure.of(blocks)
