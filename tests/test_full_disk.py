@@ -13,6 +13,7 @@ from test_cli import ONE_THREAD
 
 import avis_ctrl
 from avis_ctrl.measurement.formats import write_campaign
+from avis_ctrl.measurement.formats.hdf5_writing import STRUCTURE, PatientFile
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.simulation import simulate_campaign
@@ -96,3 +97,14 @@ def test_files_are_written_in_one_place():
     """Identify, gap, design and gap-axis compute for long before they write; they write by the same few lines."""
     found = {where.split(":")[0] for path in PACKAGE.rglob("*.py") for where in _writes(path)}
     assert found == {"files.py", os.path.join("measurement", "formats", "hdf5_writing.py")}
+
+
+def test_small_pieces_are_read_again_after_the_disk_refused_and_large_ones_are_not():
+    """HDF5 finds its structure again; data that no longer fit are not kept in memory."""
+    with open("/dev/full", "wb") as full:
+        file = PatientFile(full.fileno())
+        file.write(b"structure")
+        assert isinstance(file.refused, OSError)
+        file.write(bytes(STRUCTURE + 1))
+        assert set(file.kept) == {0} and bytes(file.kept[0]) == b"structure"
+        assert file.tell() == file.end == 9 + STRUCTURE + 1

@@ -195,6 +195,8 @@ def test_the_28_in_words(avis):
                 assert f"{one} and {two} only as their sum" in text
         assert {row.name for row in report.rows if row.known == "alone"} == {
             *BODY, *(name for name in MOUNTS if name.endswith("_z"))}
+        assert {row.name for row in report.rows if row.known == "together"} == {
+            name for name in MOUNTS if not name.endswith("_z")}
         group = group_of(report, "isolator1.k_x")
         assert [model.names[j] for j in group.members] == ["isolator1.k_x", "isolator2.k_x"]
     combination = next(one for one in report.combinations if one.words == "isolator1.k_x + isolator2.k_x")
@@ -361,6 +363,9 @@ def test_wrong_calls_are_answered(avis):
         info.of([1.0])
     with pytest.raises(InputError, match="some of a, b"):
         info.fixing(["c"])
+    for sigma in (0.0, -1.0, np.inf):
+        with pytest.raises(InputError, match="prior of a"):
+            info.with_priors({"a": sigma})
     with pytest.raises(InputError, match="positive sizes"):
         Information(("a",), np.ones(1), ("m",), np.eye(1), np.zeros(1))
 

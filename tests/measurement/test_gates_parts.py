@@ -20,6 +20,7 @@ from avis_ctrl.measurement.gates.hum import Hum
 from avis_ctrl.measurement.gates.missing_samples import delay_step, repeated_block, runs_away
 from avis_ctrl.measurement.gates.periodicity import compared
 from avis_ctrl.measurement.gates.sine_fit import fit_sine, second_order
+from avis_ctrl.measurement.gates.spikes import _corner, _departure
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -57,6 +58,17 @@ def test_longest_run_by_groupby(values):
 
     lengths = sorted((len(list(g)) for _, g in groupby(values)), reverse=True)
     assert [n for n, _ in equal_runs(np.array(values, float))] == lengths[:2]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("size", [1.0, -2.5])
+def test_a_corner_leaves_nothing_and_a_single_sample_much(share, size):
+    """Where a slope changes, at a sample or between two, the departures from cubics have the corner's shape."""
+    t = np.arange(-4.0, 5.0)
+    bend = size * np.maximum(t - share, 0.0)
+    assert _corner(_departure(bend)) < 1e-12 * np.sum(_departure(bend) ** 2)
+    alone = np.where(t == 0, size, 0.0)
+    assert _corner(_departure(alone)) > 0.04 * np.sum(_departure(alone) ** 2)
 
 
 @given(seeds, st.integers(20, 200), st.integers(0, 300))
