@@ -20,20 +20,32 @@ from avis_ctrl.measurement.campaign import Campaign, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import noise_covariance
 
-# Longer records are cut: their spectra would fill the memory and their lines say the same.
-LONGEST_PIECE = 1 << 18
-# Spectral lines of all records together that are fitted: their derivatives by some thirty parameters fit into memory
-# (0.2 GB), and no rig of a few dozen parameters needs more. Of more, those without drive are left out first, then some
-# drawn at random: averaged into frequency responses they would round off the resonances.
-MOST_LINES = 60_000
-# Amplitude of a line's drive over that of the record's strongest line, below which it counts as silent.
-SILENT_LINE = 1e-3
-# Where no input says what band is excited.
-QUIET_BAND_Hz = (0.5, 60.0)
-# Share of an input's power that may lie below, and above, the band of the fit.
-TAIL = 5e-4
+# Names of parameters: moments of inertia.
 MOMENTS = ("J1", "J2", "J3", "Ixx", "Iyy", "Izz")
 Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class CampaignFitSettings:
+    """longest_piece : samples from which records are cut: their spectra would fill the memory and their lines say the
+        same.
+    most_lines : spectral lines of all records together that are fitted: their derivatives by some thirty parameters fit
+        into memory (0.2 GB), and no rig of a few dozen parameters needs more. Of more, those without drive are left out
+        first, then some drawn at random: averaged into frequency responses they would round off the resonances.
+    silent_line : amplitude of a line's drive over that of the record's strongest line, below which it counts as silent:
+        60 dB, a millionth of the power.
+    quiet_band_Hz : where no input says what band is excited: that of a rig file's floor velocity.
+    tail : share of an input's power that may lie below, and above, the band of the fit: noise of a generator is less.
+    """
+
+    longest_piece: int = 1 << 18
+    most_lines: int = 60_000
+    silent_line: float = 1e-3
+    quiet_band_Hz: tuple[float, float] = (0.5, 60.0)
+    tail: float = 5e-4
+
+
+SETTINGS = CampaignFitSettings()
 
 
 class Split(NamedTuple):
@@ -81,7 +93,7 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
 
 def driven_inputs(record: RecordSource) -> set[str]:
     """Inputs that are not zero in the first quarter of a million samples."""
-    piece = record.load(0, min(record.header.samples, LONGEST_PIECE))
+    piece = record.load(0, min(record.header.samples, SETTINGS.longest_piece))
     return {name for name, column in zip(piece.header.u_names, piece.u.T, strict=True) if np.any(column)}
 
 
@@ -107,15 +119,15 @@ def excited_band(campaign: Campaign) -> tuple[float, float]:
     """
     ends: list[tuple[float, float]] = []
     for record in campaign.records:
-        piece = record.load(0, min(record.header.samples, LONGEST_PIECE))
+        piece = record.load(0, min(record.header.samples, SETTINGS.longest_piece))
         drive = piece.u if np.any(piece.u) else piece.floor
         if drive is None or not np.any(drive) or record.header.excitation == "rest":
             continue
         power = np.cumsum(np.sum(np.abs(scipy.fft.rfft(drive - drive.mean(0), axis=0)) ** 2, axis=1))
         frequency = scipy.fft.rfftfreq(piece.header.samples, 1 / piece.header.sample_rate_Hz)
-        low, high = np.searchsorted(power, np.array([TAIL, 1 - TAIL]) * power[-1])
+        low, high = np.searchsorted(power, np.array([SETTINGS.tail, 1 - SETTINGS.tail]) * power[-1])
         ends.append((float(frequency[low]), float(frequency[high])))
-    low, high = (min(e[0] for e in ends), max(e[1] for e in ends)) if ends else QUIET_BAND_Hz
+    low, high = (min(e[0] for e in ends), max(e[1] for e in ends)) if ends else SETTINGS.quiet_band_Hz
     return max(low, 0.2), min(high, campaign.sample_rate_Hz / 4)
 
 
@@ -124,7 +136,7 @@ def _fewer(block: SpectralBlock, share: float, crowded: bool, rng: np.random.Gen
     power = np.sum(np.abs(block.U) ** 2, axis=(1, 2))
     if not crowded or not np.any(power):
         return block
-    driven = np.flatnonzero(power > SILENT_LINE ** 2 * power.max())
+    driven = np.flatnonzero(power > SETTINGS.silent_line ** 2 * power.max())
     count = max(round(share * len(driven)), min(len(driven), 10))
     return block.lines(np.sort(rng.choice(driven, min(count, len(driven)), replace=False)))
 
@@ -135,10 +147,10 @@ def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[flo
     width = band_Hz[1] - band_Hz[0]
     lines = [record.header.duration_s * width for record in campaign.records]
     driven = [n / max(record.header.periods, 1) for n, record in zip(lines, campaign.records, strict=True)]
-    crowded, share = sum(lines) > MOST_LINES, min(MOST_LINES / max(sum(driven), 1.0), 1.0)
+    crowded, share = sum(lines) > SETTINGS.most_lines, min(SETTINGS.most_lines / max(sum(driven), 1.0), 1.0)
     blocks, rng = [], np.random.default_rng(0)
     for record in campaign.records:
-        for piece in record.pieces(max(LONGEST_PIECE, record.header.period_samples or 0)):
+        for piece in record.pieces(max(SETTINGS.longest_piece, record.header.period_samples or 0)):
             if piece.header.duration_s * width > 10:
                 blocks.append(_fewer(record_block(piece, model, band_Hz), share, crowded, rng))
     if not blocks:
@@ -198,7 +210,8 @@ def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[floa
     campaign = campaign.only(tuple(header.name for header in rest or alike))
     frequency = block.omega / (2 * np.pi)
     at = np.unique(np.clip(np.linspace(frequency[0], frequency[-1], min(len(frequency), 1500)), *band_Hz))
-    noise = noise_covariance(campaign, at, band_Hz=band_Hz, floor=floor, smooth_Hz=0.3, longest_piece=LONGEST_PIECE)
+    noise = noise_covariance(campaign, at, band_Hz=band_Hz, floor=floor, smooth_Hz=0.3,
+                             longest_piece=SETTINGS.longest_piece)
     nearest = np.clip(np.searchsorted(at, frequency), 0, len(at) - 1)
     return block.with_noise(noise.covariance[nearest], float(np.median(noise.dof)))
 

@@ -13,7 +13,7 @@ import scipy.fft
 
 from avis_ctrl.identification.sparse_space import sparse_rows
 from avis_ctrl.measurement.campaign import Campaign, ranges
-from avis_ctrl.measurement.frequency_response.local_fit import SPAN_TOLERANCE
+from avis_ctrl.measurement.frequency_response.local_fit import SETTINGS
 
 # Samples that are read at once.
 PIECE = 1 << 18
@@ -64,12 +64,12 @@ def excited_space(campaign: Campaign, band_Hz: tuple[float, float]) -> ExcitedSp
             U = scipy.fft.rfft(u, axis=0)[(f >= band_Hz[0]) & (f <= band_Hz[1]) & (f > 0)]
             gram += np.real(U.conj().T @ U)
     size = np.sqrt(np.diag(gram))
-    driven = np.flatnonzero(size > SPAN_TOLERANCE * np.max(size, initial=0.0))
+    driven = np.flatnonzero(size > SETTINGS.span_tolerance * np.max(size, initial=0.0))
     if not driven.size or not np.any(size):
         return ExcitedSpace(names, (), np.zeros((0, 0)))
     size = size[driven]
     values, vectors = np.linalg.eigh(gram[np.ix_(driven, driven)] / np.outer(size, size))
-    missing = vectors[:, values < SPAN_TOLERANCE ** 2]
+    missing = vectors[:, values < SETTINGS.span_tolerance ** 2]
     # w with w^T u = 0: in volts the entries are over the sizes.
     rows = sparse_rows(missing / size[:, None], 1e-4) if missing.size else np.zeros((0, len(driven)))
     return ExcitedSpace(names, tuple(names[j] for j in driven), rows)

@@ -33,10 +33,20 @@ from avis_ctrl.identification.response import ResponseModel, moment_rows, positi
 from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns, transient_parts
 
 Prior = tuple[float, float]
-# Lines of all blocks together below which threads cost more than they bring.
-FEW_LINES = 4000
-# Relative distance that a moment of inertia keeps from the sum of the other two.
-EDGE = 1e-6
+
+
+@dataclass(frozen=True)
+class LikelihoodSettings:
+    """few_lines : of all blocks together, below which threads cost more than they bring.
+    edge : distance that a moment of inertia keeps from the sum of the other two, by the sum of all three: round-off
+        takes none beyond it.
+    """
+
+    few_lines: int = 4000
+    edge: float = 1e-6
+
+
+SETTINGS = LikelihoodSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +188,7 @@ class _Descent:
         _ = model.matrices, derivative and model.derivative_matrices  # formed once, before the threads ask for them
         work = partial(_block_residual, model, derivative=derivative)
         # Large arrays in few calls, which leave the interpreter free: threads serve, and keep the order of the sums.
-        if sum(len(block.omega) for block in self.blocks) < FEW_LINES:
+        if sum(len(block.omega) for block in self.blocks) < SETTINGS.few_lines:
             parts = list(map(work, self.blocks, self.whiteners))
         else:
             with ThreadPoolExecutor(min(len(self.blocks), os.cpu_count() or 1)) as threads:
@@ -267,7 +277,7 @@ class _Descent:
 
     def at_edge(self) -> np.ndarray:
         """(k,) moments of inertia that are the sum of the other two."""
-        return self.rows @ self.model.values <= 3 * EDGE * np.abs(self.rows) @ np.abs(self.model.values)
+        return self.rows @ self.model.values <= 3 * SETTINGS.edge * np.abs(self.rows) @ np.abs(self.model.values)
 
     def largest_moments(self) -> tuple[str, ...]:
         """Names of the moments of inertia at the largest value that a body can have."""
@@ -286,8 +296,8 @@ class _Descent:
     def _try(self, step: np.ndarray) -> tuple[ResponseModel, float] | None:
         values = np.clip(self.model.values + step * self.scale, self.lowest, self.highest)
         if len(self.rows):
-            # Back along the step to where a moment is, but for EDGE, the sum of the other two.
-            size = EDGE * np.abs(self.rows) @ np.abs(self.model.values)
+            # Back along the step to where a moment is, but for the edge, the sum of the other two.
+            size = SETTINGS.edge * np.abs(self.rows) @ np.abs(self.model.values)
             room, used = self.rows @ self.model.values - size, -(self.rows @ (values - self.model.values))
             beyond = used > room + 0.1 * size  # along the edge there is round-off of either sign
             share = np.min(np.where(beyond, np.maximum(room, 0.0) / np.where(beyond, used, 1.0), 1.0))

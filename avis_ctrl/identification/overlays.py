@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification import model_error
-from avis_ctrl.identification.campaign_fit import LONGEST_PIECE
+from avis_ctrl.identification.campaign_fit import SETTINGS
 from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.identification.spread import kept_axes
@@ -136,7 +136,7 @@ def measured_response(data: Campaign | FrequencyResponse, band_Hz: tuple[float, 
             raise InputError("expected a band with lines of every record", field="band_Hz", value=band_Hz) from None
         points = min(POINTS, round((high - low) / step) + 1)
         grid = np.clip(np.geomspace(low, high, points), low, high)
-        return model_error.measured_response(_wholes(data), model, band_Hz, LONGEST_PIECE, grid)
+        return model_error.measured_response(_wholes(data), model, band_Hz, SETTINGS.longest_piece, grid)
 
 
 def _wholes(data: Campaign) -> Campaign:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
-from avis_ctrl.identification.campaign_fit import LONGEST_PIECE, CampaignFit, measured_noise
+from avis_ctrl.identification.campaign_fit import SETTINGS, CampaignFit, measured_noise
 from avis_ctrl.identification.modes import MeasuredModes, ModeRow, measured_modes, mode_table
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.overlays import ResponseOverlay, measured_response, overlay
@@ -165,7 +165,7 @@ def _blocks(found: CampaignFit, held_out: Campaign | FrequencyResponse
         return [(response_block(held_out.between(*found.band_Hz), model, "held-out lines"), None)]
     blocks: list[tuple[SpectralBlock, RecordSource | None]] = []
     for record in held_out.records:
-        for k, piece in enumerate(record.pieces(max(LONGEST_PIECE, record.header.period_samples or 0))):
+        for k, piece in enumerate(record.pieces(max(SETTINGS.longest_piece, record.header.period_samples or 0))):
             block = record_block(piece, model, found.band_Hz)
             if np.any(block.U):
                 whole = k == 0 and not (isinstance(record, Portion) and record.start > 0)

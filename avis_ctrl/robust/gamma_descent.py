@@ -23,8 +23,9 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, balance
-from avis_ctrl.robust.hinf_plant import RANK_TOLERANCE, NormalForm, Plant, normal_form, rank_margins, regularised
+from avis_ctrl.robust.hinf_plant import NormalForm, Plant, normal_form, rank_margins, regularised
 from avis_ctrl.robust.hinf_riccati import GammaBracket, control_riccati, filter_riccati, find_gamma, gamma_test
+from avis_ctrl.robust.hinf_settings import SETTINGS
 from avis_ctrl.robust.scalings import MAX_ORDER, ScalarScaling, Scalings
 
 COUPLED = "rho(X Y)"
@@ -45,7 +46,7 @@ class ScaledProblem:
     @staticmethod
     def of(P: StateSpace, nmeas: int, ncon: int) -> ScaledProblem:
         of_u, of_y = rank_margins(Plant.of(P, nmeas, ncon))
-        return ScaledProblem(balance(P), nmeas, ncon, (of_u < RANK_TOLERANCE, of_y < RANK_TOLERANCE))
+        return ScaledProblem(balance(P), nmeas, ncon, (of_u < SETTINGS.rank_tolerance, of_y < SETTINGS.rank_tolerance))
 
     def normal(self, scalings: Scalings) -> NormalForm:
         """Normal form of the scaled plant, with extra channels where D12 or D21 lacks rank."""

@@ -23,7 +23,6 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.hinf_plant import (
-    RANK_TOLERANCE,
     Plant,
     as_plant,
     channel_sizes,
@@ -35,6 +34,7 @@ from avis_ctrl.robust.hinf_plant import (
     regularised,
 )
 from avis_ctrl.robust.hinf_riccati import find_gamma
+from avis_ctrl.robust.hinf_settings import SETTINGS
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def hinf_lower_bound(P: Any, nmeas: int, ncon: int, omega: np.ndarray | None = N
     P = as_plant(P, nmeas, ncon)
     plant = posed_plant(P, nmeas, ncon)
     best = pointwise_bound(plant, omega)
-    if min(rank_margins(plant)) >= RANK_TOLERANCE:
+    if min(rank_margins(plant)) >= SETTINGS.rank_tolerance:
         lower = find_gamma(normal_form(plant).plant, 1e-3).lower
         if lower > best.gamma:
             return LowerBound(float(lower), complex(np.nan), "the two-Riccati test fails there")
@@ -96,7 +96,7 @@ def limiting_weights(P: Any, nmeas: int, ncon: int, step: float = 0.02) -> tuple
 
 def _optimum(P: StateSpace, nmeas: int, ncon: int) -> float:
     plant = posed_plant(P, nmeas, ncon)
-    singular = [margin < RANK_TOLERANCE for margin in rank_margins(plant)]
+    singular = [margin < SETTINGS.rank_tolerance for margin in rank_margins(plant)]
     if any(singular):
         plant = regularised(plant, 1e-4, singular[0], singular[1], True)
     return find_gamma(normal_form(plant).plant, 1e-6).upper.gamma

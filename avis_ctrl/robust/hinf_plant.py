@@ -20,11 +20,7 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, minimal
 from avis_ctrl.lti.norms import bilinear_to_continuous
-
-RANK_TOLERANCE = 1e-8
-PBH_TOLERANCE = 1e-10
-RANK_AT_POINT = 1e-9
-RESPONSE_TOLERANCE = 1e-9
+from avis_ctrl.robust.hinf_settings import SETTINGS
 
 
 @dataclass(frozen=True)
@@ -102,11 +98,11 @@ def check_stabilisable(plant: Plant) -> None:
             if pole.imag < 0 or pole.real < -1e-15 * size:
                 continue
             margin = la.svdvals(np.hstack([A - pole * np.eye(plant.n), B]))[-1] / size
-            if margin < PBH_TOLERANCE:
+            if margin < SETTINGS.pbh_tolerance:
                 raise ComputationError(
                     f"mode at {abs(pole.imag) / (2 * np.pi):.4g} Hz is {verb} {list(names)}: no controller exists",
                     measured=f"pole {pole.real:.4g} {pole.imag:+.4g}j rad/s, rank margin {margin:.1e} "
-                             f"of the PBH matrix (at least {PBH_TOLERANCE:.0e} is needed)",
+                             f"of the PBH matrix (at least {SETTINGS.pbh_tolerance:.0e} is needed)",
                     cause="an integrator or unstable weight outside the loop, or a missing channel",
                     next_step=f"make the mode stable, or give {who} that reaches it")
 
@@ -125,7 +121,7 @@ def without_hidden_states(P: StateSpace, nmeas: int, ncon: int) -> StateSpace:
 
     Such states (a weight realised twice, say) do not change the problem once they are known to be stable, but X and Y
     are singular on them, or ill conditioned. Compared block by block off the imaginary axis: on it the
-    response near a lightly damped pole is not known to RESPONSE_TOLERANCE.
+    response near a lightly damped pole is not known to `response_tolerance`.
     """
     small = minimal(P)
     if small.nstates == P.nstates:
@@ -139,7 +135,7 @@ def without_hidden_states(P: StateSpace, nmeas: int, ncon: int) -> StateSpace:
                 a, b = (one.at(s, getattr(one, B), getattr(one, C), getattr(one, D)) for one in (old, new))
             except np.linalg.LinAlgError:
                 return P
-            if not la.norm(a - b) <= RESPONSE_TOLERANCE * la.norm(a):
+            if not la.norm(a - b) <= SETTINGS.response_tolerance * la.norm(a):
                 return P
     return small
 
@@ -241,5 +237,5 @@ def pointwise(plant: Plant, s: complex, sizes: tuple[float, float] | None = None
 def _kernel(matrix: np.ndarray, size: float) -> np.ndarray:
     """Orthonormal basis of the null space of a matrix, singular values judged against `size` and their largest."""
     _, s, Vh = la.svd(matrix)
-    rank = int(np.sum(s > RANK_AT_POINT * max(size, float(s[0])))) if s.size and s[0] > 0 else 0
+    rank = int(np.sum(s > SETTINGS.rank_at_point * max(size, float(s[0])))) if s.size and s[0] > 0 else 0
     return Vh[rank:].conj().T

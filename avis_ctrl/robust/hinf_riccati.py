@@ -21,12 +21,9 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, hinf_norm, lft_lower
 from avis_ctrl.robust.hinf_plant import NormalForm, Plant, pointwise
+from avis_ctrl.robust.hinf_settings import SETTINGS
 from avis_ctrl.robust.riccati import ROUND_OFF, refined_balanced, solve_riccati
 
-# Relative to the open channel w -> z, a gamma below this is round-off.
-ZERO_GAMMA = 1e-9
-# Relative accuracy of a norm or a bound beside gamma.
-NEARLY = 1e-6
 IN_DOUBT = "the Riccati test is undecided and its controller does not reach this gamma"
 
 
@@ -103,7 +100,7 @@ def gamma_test(plant: Plant, gamma: float) -> GammaTest:
 def _forbidden(plant: Plant, gamma: float, omega: np.ndarray) -> float:
     """What the response at these frequencies forbids, at most gamma; 0 where that is clearly less."""
     best = max((pointwise(plant, 1j * w) for w in omega), default=0.0)
-    return min(best, gamma) if best > (1 - NEARLY) * gamma else 0.0
+    return min(best, gamma) if best > (1 - SETTINGS.norm_accuracy) * gamma else 0.0
 
 
 def _coupled_for_certain(plant: Plant, gamma: float, X: np.ndarray, Y: np.ndarray) -> bool:
@@ -128,7 +125,7 @@ def keeps(plant: Plant, test: GammaTest) -> bool:
         K = central_controller(form, test)
         P = StateSpace(plant.A, np.hstack([plant.B1, plant.B2]), np.vstack([plant.C1, plant.C2]),
                        np.block([[plant.D11, plant.D12], [plant.D21, plant.D22]]))
-        return hinf_norm(lft_lower(P, balance(K))).gain <= test.gamma * (1 + NEARLY)
+        return hinf_norm(lft_lower(P, balance(K))).gain <= test.gamma * (1 + SETTINGS.norm_accuracy)
     except (ComputationError, InputError, np.linalg.LinAlgError):
         return False
 
@@ -139,7 +136,7 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
     ComputationError where even gamma = limit times the start fails.
     """
     floor, natural = direct_term_bound(plant), natural_gamma(plant)
-    nothing = ZERO_GAMMA * natural
+    nothing = SETTINGS.zero_gamma * natural
     start = max(hint or natural, floor * (1 + 2 * tolerance), nothing)
     search = _Search(plant, floor)
     step, factor = start, 1.05 if hint else 4.0

@@ -21,7 +21,6 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, discretise, hinf_norm, lft_lower
 from avis_ctrl.robust.hinf_bounds import pointwise_bound
 from avis_ctrl.robust.hinf_plant import (
-    RANK_TOLERANCE,
     NormalForm,
     Plant,
     as_plant,
@@ -31,24 +30,15 @@ from avis_ctrl.robust.hinf_plant import (
     regularised,
 )
 from avis_ctrl.robust.hinf_riccati import (
-    ZERO_GAMMA,
     GammaBracket,
     central_controller,
     find_gamma,
     gamma_test,
     natural_gamma,
 )
+from avis_ctrl.robust.hinf_settings import SETTINGS
 from avis_ctrl.robust.reduction import residualise_fast
 from avis_ctrl.robust.riccati import INACCURATE, ON_AXIS
-
-# Relative accuracy to which a closed loop's norm contradicts a bound.
-LOOP_ACCURACY = 1e-5
-# Relative difference from which two computations of gamma say that round-off shows in it.
-SAME_GAMMA = 1e-4
-# A controller pole this many times the plant's fastest comes from the formulas, not from the plant.
-FAR_BEYOND = 10.0
-# Shares of the back-off at which a controller without them is tried: the smaller, the nearer they are to a gain.
-CLOSER = (1.0, 0.3, 0.1, 0.03, 0.01)
 
 
 class Status(Enum):
@@ -136,7 +126,7 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     if raised:
         status, notes = Status.BACKED_OFF, (*notes, raised)
         bounds = bounds[0], max(bounds[1], result.gamma)
-    zero = 200 * ZERO_GAMMA * natural_gamma(form.plant)
+    zero = 200 * SETTINGS.zero_gamma * natural_gamma(form.plant)
     bounds, status, notes = _consistent(bounds, result.gamma, tolerance, zero, status, notes)
     if status is not Status.OPTIMAL:
         notes = (*notes, *_doubt_of_gamma(P, result))
@@ -166,7 +156,7 @@ def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
         raise ComputationError(f"no controller reaches gamma = {gamma:.6g}", cause=test.reason,
                                measured=f"rho(XY)/gamma^2 = {test.coupling:.4g}", next_step="ask for a larger gamma")
     result = problem.measured(central_controller(form, test))
-    if result.gamma > gamma * (1 + LOOP_ACCURACY):
+    if result.gamma > gamma * (1 + SETTINGS.loop_accuracy):
         raise ComputationError(f"the controller for gamma = {gamma:.6g} was not confirmed",
                                measured=f"closed-loop norm {result.gamma:.6g}",
                                cause="gamma too near the optimum for double precision, or a badly scaled plant",
@@ -186,7 +176,7 @@ class _Problem:
     def of(P: StateSpace, nmeas: int, ncon: int) -> _Problem:
         plant = posed_plant(P, nmeas, ncon)
         of_u, of_y = rank_margins(plant)
-        return _Problem(P, plant, (of_u < RANK_TOLERANCE, of_y < RANK_TOLERANCE))
+        return _Problem(P, plant, (of_u < SETTINGS.rank_tolerance, of_y < SETTINGS.rank_tolerance))
 
     def form(self, of_D12: bool, of_D21: bool, epsilon: float, of_states: bool = False) -> tuple[NormalForm,
                                                                                                  tuple[str, ...]]:
@@ -272,9 +262,9 @@ class _Problem:
     def _slower(self, form: NormalForm, result: Synthesis, gamma: float, target: float) -> Synthesis:
         """A controller without poles far beyond the plant's and its own others that keeps the target, or the given."""
         plant_fastest = float(np.max(np.abs(la.eigvals(self.plant.A)), initial=0.0))
-        if not result.fastest_pole > FAR_BEYOND * plant_fastest > 0:
+        if not result.fastest_pole > SETTINGS.far_beyond * plant_fastest > 0:
             return result
-        for share in CLOSER:
+        for share in SETTINGS.closer:
             test = gamma_test(form.plant, gamma + share * (target - gamma))
             if not test.feasible:
                 continue
@@ -283,7 +273,7 @@ class _Problem:
                 found = self.measured(residualise_fast(K, _widest_gap(K.poles(), plant_fastest), also_unstable=True))
             except (ComputationError, np.linalg.LinAlgError):
                 continue
-            if found.gamma <= target * (1 + LOOP_ACCURACY) and found.fastest_pole < result.fastest_pole:
+            if found.gamma <= target * (1 + SETTINGS.loop_accuracy) and found.fastest_pole < result.fastest_pole:
                 said = (f"the central controller has poles up to {result.fastest_pole:.3g} rad/s, the plant up to "
                         f"{plant_fastest:.3g}: those far beyond it were replaced by their gain, the fastest left has "
                         f"{found.fastest_pole:.3g}, and all figures are of that controller")
@@ -314,8 +304,8 @@ def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
     loop = p[:, :z, :w] + p[:, :z, w:] @ np.linalg.solve(np.eye(u) - k @ p[:, z:, w:], k @ p[:, z:, :w])
     again = np.linalg.norm(loop, 2, axis=(1, 2))
     at_peak, highest = float(again[0]), float(np.max(again))
-    other = highest if highest > (1 + SAME_GAMMA) * result.gamma else at_peak
-    if abs(other - result.gamma) <= SAME_GAMMA * result.gamma:
+    other = highest if highest > (1 + SETTINGS.same_gamma) * result.gamma else at_peak
+    if abs(other - result.gamma) <= SETTINGS.same_gamma * result.gamma:
         return ()
     return (f"round-off shows in gamma: {result.gamma:.6g} from the closed loop, {other:.6g} from P and K at "
             f"single frequencies",)
@@ -336,7 +326,7 @@ def _consistent(bounds: tuple[float, float], reached: float, tolerance: float, z
     zero : width below which an optimum is zero to working precision.
     """
     lower, upper = bounds
-    if lower > reached * (1 + LOOP_ACCURACY):
+    if lower > reached * (1 + SETTINGS.loop_accuracy):
         notes = (*notes, f"the lower bound computed, {lower:.6g}, is above the norm of the closed loop and is dropped")
         lower = 0.0
     upper = min(upper, max(reached, lower))

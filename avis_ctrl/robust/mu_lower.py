@@ -17,6 +17,7 @@ det(I - M Delta) = 0 with the least ||Delta||. Starts come from the null vectors
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,9 +27,20 @@ from avis_ctrl.robust.mu_lmi import Array, Scalings, dagger, residual
 from avis_ctrl.robust.mu_upper import block_balance, expand, rescaled
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-SINGULAR = 1e-9
-# With a perturbation so large that the round-off of M Delta is above this, no singular value is called zero.
-MEANINGLESS = 1e-6
+
+@dataclass(frozen=True)
+class MuLowerSettings:
+    """singular : smallest singular value of I - M Delta, beside the round-off of M Delta, below which it is singular: a
+        Delta that is off by as little changes no digit of mu that is told.
+    meaningless : with a perturbation so large that the round-off of M Delta is above this, no singular value is called
+        zero.
+    """
+
+    singular: float = 1e-9
+    meaningless: float = 1e-6
+
+
+SETTINGS = MuLowerSettings()
 
 
 class _Step(NamedTuple):
@@ -183,7 +195,7 @@ def is_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
 def _balanced_is_singular(M: Array, delta: Array) -> Array:
     A = M @ delta
     least = np.linalg.svd(np.eye(A.shape[-1]) - A, compute_uv=False)[:, -1]
-    return least < np.minimum(SINGULAR + 1e-14 * np.linalg.norm(A, ord=2, axis=(1, 2)), MEANINGLESS)
+    return least < np.minimum(SETTINGS.singular + 1e-14 * np.linalg.norm(A, ord=2, axis=(1, 2)), SETTINGS.meaningless)
 
 
 def _complex_part(structure: BlockStructure) -> Array:

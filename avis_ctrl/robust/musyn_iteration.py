@@ -2,7 +2,7 @@
 
 Phases of a path in turn: D-K iteration; descent on the H-infinity optimum over the scalings (`gamma_descent`); the same
 with one more order where gamma asks for it ("growth"); then D-K iteration again from the best loop. Each ends where a
-step gains less than `STALL`, the whole where a round of all three gains less than `ROUND`. Another path begins, once,
+step gains less than `stall`, the whole where a round of all three gains less than `round`. Another path begins, once,
 at the best constant scalings ("start"): first of all where the controllers to start from do nothing, next where a D-K
 step from them leads nowhere, else in the end. The best loop of all paths is kept.
 
@@ -31,18 +31,32 @@ from avis_ctrl.robust.musyn_state import DONE, GIVEN, NOMINAL, Iteration, Loop, 
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-# A step that lowers the best mu by less than this share has stalled; a round of all phases that gains less ends it.
-STALL = 0.005
-ROUND = 0.002
-# A step that lowers mu by more than this share is followed by another of its kind.
-FAST = 0.25
-# A controller whose loop is within this share of the plant without control counts as doing nothing.
-IDLE = 0.01
-# Constant scalings of all uncertainty against performance from which the iteration starts where identity leads nowhere.
-CONSTANTS = tuple(10.0 ** k for k in (-3, -2.5, -2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2, 2.5, 3))
+# The phase after each.
 FOLLOWING = {"first start": "D-K", "D-K": "descent", "other start": "descent", "descent": "growth",
              "growth": "last start", "last start": DONE}
 STOPPED = "stopped by the callback"
+
+
+@dataclass(frozen=True)
+class IterationSettings:
+    """stall : a step that lowers mu by less than this share ends its phase: another is not worth its synthesis.
+    round : a round of all phases that lowers mu by less than this share ends the iteration.
+    fast : a D-K step that lowers mu by more than this share is followed by another that fits mu's profile as roughly;
+        after a slower one the profile's details are what is left to gain.
+    idle : a controller whose mu is within this share of the plant's without control does nothing: ten times the
+        accuracy of mu there.
+    constants : scalings of all uncertainty against performance from which the iteration starts where identity leads
+        nowhere: over six decades, for the units of the signals may differ.
+    """
+
+    stall: float = 0.005
+    round: float = 0.002
+    fast: float = 0.25
+    idle: float = 0.01
+    constants: tuple[float, ...] = tuple(10.0 ** k for k in (-3, -2.5, -2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2, 2.5, 3))
+
+
+SETTINGS = IterationSettings()
 
 
 @dataclass(frozen=True)
@@ -165,9 +179,9 @@ def _no_further(state: State, options: Options) -> str:
     """Why no further iteration starts; empty where one does."""
     if state.phase == DONE:
         return (f"converged: a round of D-K iteration, descent on gamma and larger orders gains no more than "
-                f"{100 * ROUND:g} %")
+                f"{100 * SETTINGS.round:g} %")
     if state.phase in ("descent", "growth", "last start") and not options.polish:
-        return f"D-K iteration stalled: a step gained less than {100 * STALL:g} %"
+        return f"D-K iteration stalled: a step gained less than {100 * SETTINGS.stall:g} %"
     if options.target is not None and state.best and state.best.gamma <= options.target:
         return f"target {options.target:g} reached"
     if len(_steps(state)) >= options.max_iterations:
@@ -222,29 +236,29 @@ def _at_rest(problem: Problem, omega: np.ndarray, mu: float) -> bool:
     if not at_rest.is_stable():
         return False
     open_loop = upper_bound(at_rest.frequency_response(omega)[:, None], problem.structure, 1e-3).beta
-    return mu > (1 - IDLE) * float(np.max(open_loop))
+    return mu > (1 - SETTINGS.idle) * float(np.max(open_loop))
 
 
 def _other_constants(problem: Problem, gamma: float, options: Options) -> Proposal | None:
     """The constant scalings, alike for all uncertainty, of least H-infinity optimum; None where none is below gamma."""
     best, scaled = None, ScaledProblem.of(problem.P, problem.nmeas, problem.ncon)
-    for d in CONSTANTS:
+    for d in SETTINGS.constants:
         scalings = Scalings.uniform(problem.structure, d)
         try:
-            if not scaled.reaches(scalings, (1 - STALL) * gamma):
+            if not scaled.reaches(scalings, (1 - SETTINGS.stall) * gamma):
                 continue
             made = hinfsyn(scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff)
         except ComputationError:
             continue
-        if made.gamma < (1 - STALL) * gamma:
+        if made.gamma < (1 - SETTINGS.stall) * gamma:
             best, gamma = scalings, made.gamma
     return Proposal(best, 0.0, "start") if best else None
 
 
 def _falls_fast(state: State) -> bool:
-    """Whether the last step lowered mu by more than `FAST`, or none was taken yet on this path."""
+    """Whether the last step lowered mu by more than `fast`, or none was taken yet on this path."""
     steps = _steps(state)
-    return len(steps) < 2 or state.history[-1].kind == "start" or steps[-1] < (1 - FAST) * steps[-2]
+    return len(steps) < 2 or state.history[-1].kind == "start" or steps[-1] < (1 - SETTINGS.fast) * steps[-2]
 
 
 def _steps(state: State) -> list[float]:
@@ -269,7 +283,7 @@ def _recorded(problem: Problem, state: State, loop: Loop, row: Iteration, points
         return replace(state, phase="D-K", path=loop, round_mu=loop.mu)
     gained = 1 - loop.mu / path.mu
     state = replace(state, path=loop if gained > 0 else path)
-    return state if gained > STALL else _moved_on(problem, state)
+    return state if gained > SETTINGS.stall else _moved_on(problem, state)
 
 
 def _moved_on(problem: Problem, state: State) -> State:
@@ -277,7 +291,7 @@ def _moved_on(problem: Problem, state: State) -> State:
     assert state.path is not None and state.last is not None and state.points is not None
     if state.phase == "D-K" and state.path.mu >= state.round_mu:
         return replace(state, phase="other start")
-    if state.phase != "growth" or state.path.mu > (1 - ROUND) * state.round_mu:
+    if state.phase != "growth" or state.path.mu > (1 - SETTINGS.round) * state.round_mu:
         return replace(state, phase=FOLLOWING[state.phase])
     points = state.points
     if state.last is not state.path:

@@ -27,11 +27,8 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.lti.norms import symplectic_scale
+from avis_ctrl.robust.hinf_settings import SETTINGS
 
-AXIS_TOLERANCE = 1e-10
-LAGRANGIAN_TOLERANCE = 1e-6
-# A negative eigenvalue of X below this share of the largest is not looked at further.
-CLEARLY = 1e-10
 # Round-off of the residual in units of what each of its terms rounds to.
 ROUND_OFF = 8 * np.finfo(float).eps
 INACCURATE = "the Hamiltonian is too badly conditioned for its stable subspace"
@@ -70,7 +67,7 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
         return RiccatiSolution(None, False, "the Hamiltonian overflows")
     T, U, stable = la.schur(H, output="real", sort="lhp")
     poles = _schur_eigenvalues(T)
-    on_axis = np.abs(poles.real) <= AXIS_TOLERANCE * np.abs(poles) + 1e-15 * la.norm(H)
+    on_axis = np.abs(poles.real) <= SETTINGS.axis_tolerance * np.abs(poles) + 1e-15 * la.norm(H)
     angle = np.abs(poles.real) / np.maximum(np.abs(poles), 1e-300)
     nearest = np.unique(np.abs(poles[np.argsort(angle)[:4]].imag))
     if stable != n or np.any(on_axis):
@@ -78,7 +75,7 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
     X1, X2 = U[:n, :n], U[n:, :n]
     gram = X1.T @ X2
     asymmetry = float(la.norm(gram - gram.T, 2))
-    if asymmetry > LAGRANGIAN_TOLERANCE:
+    if asymmetry > SETTINGS.lagrangian_tolerance:
         return RiccatiSolution(None, False, INACCURATE, omega=nearest)
     lowest = float(la.eigvalsh((gram + gram.T) / 2)[0])
     lu, piv, _ = la.lapack.dgetrf(X1.T)  # singular is an answer here, not a warning
@@ -89,7 +86,7 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
     values = la.eigvalsh(X)
     X = X / np.outer(scale, scale)
     # X1' X2 is small where X1 is (X near infinity), and X where its states' units are large: both must be clear.
-    if lowest >= -1e-13 * n and values[0] >= -CLEARLY * values[-1]:
+    if lowest >= -1e-13 * n and values[0] >= -SETTINGS.negative * values[-1]:
         return RiccatiSolution(X, True)
     error = None
     if noise is not None:

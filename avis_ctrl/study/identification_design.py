@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.campaign_fit import LONGEST_PIECE, driven_inputs, excited_band
+from avis_ctrl.identification.campaign_fit import SETTINGS, driven_inputs, excited_band
 from avis_ctrl.identification.model_error import measured_response
 from avis_ctrl.identification.spread import FrfSpread, frf_spread
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -94,7 +94,7 @@ def measured_spread(found: Identification, keep: tuple[str, ...]) -> FrfSpread:
     driven = measured.only(tuple(record.header.name for record in measured.records if driven_inputs(record)))
     low, high = excited_band(driven)
     band = max(band[0], low), min(band[1], high)
-    return frf_spread(measured_response(driven, model, band, LONGEST_PIECE), model, keep)
+    return frf_spread(measured_response(driven, model, band, SETTINGS.longest_piece), model, keep)
 
 
 def identification_design(content: UncertaintyFile, template: Design, rig: Rig) -> str:

@@ -181,12 +181,12 @@ def test_of_too_many_lines_some_driven_ones_are_fitted(avis, monkeypatch):
     u = multisine(rng, 0.3, 5000, 2, (10.0, 29.9))
     one = record(avis, u, np.zeros((len(u), 3)), rng, period_s=5.0)
     campaign = Campaign("avis", (one, replace(one, header=replace(one.header, name="01"))))
-    monkeypatch.setattr(campaign_fit, "MOST_LINES", 100)
+    monkeypatch.setattr(campaign_fit, "SETTINGS", campaign_fit.CampaignFitSettings(most_lines=100))
     blocks, said = campaign_fit.campaign_blocks(campaign, model, (10.0, 30.0))
     assert [len(block.omega) for block in blocks] == [50, 50] and "100 of 400 lines" in said[0]
     lines = np.rint(blocks[0].omega * 10 / (2 * np.pi)).astype(int)
     assert np.all(lines % 2 == 0) and np.all(np.diff(lines) > 0)
-    monkeypatch.setattr(campaign_fit, "MOST_LINES", 1000)
+    monkeypatch.setattr(campaign_fit, "SETTINGS", campaign_fit.CampaignFitSettings(most_lines=1000))
     assert len(campaign_fit.campaign_blocks(campaign, model, (10.0, 30.0))[0][0].omega) == 201
 
 
@@ -199,7 +199,7 @@ def test_eight_drives_played_along_six_axes_are_fitted_like_any(avis, monkeypatc
         u = multisine(rng, 1.0, 8000, 1, (2.0, 25.0), 6) @ axes.allocation.T
         u *= 0.3 / np.sqrt(np.mean(u ** 2))
         records.append(record(true.rig, u, floor_velocity(rng, len(u), 1e-6), rng, name=f"{k:02d}"))
-    monkeypatch.setattr(campaign_fit, "MOST_LINES", 300)
+    monkeypatch.setattr(campaign_fit, "SETTINGS", campaign_fit.CampaignFitSettings(most_lines=300))
     found = campaign_fit.fit_campaign(Campaign("avis", tuple(records)), ResponseModel.of(avis, BODY), (2.0, 25.0),
                                       reweights=1)
     assert found.measured and any("of 552 lines are fitted" in note for note in found.notes)

@@ -25,7 +25,13 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
-from avis_ctrl.measurement.frequency_response.periodic import PeriodMean, average, periodic_records, settled_after
+from avis_ctrl.measurement.frequency_response.periodic import (
+    SETTINGS,
+    PeriodMean,
+    average,
+    periodic_records,
+    settled_after,
+)
 from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.spectra import (
     Band,
@@ -37,11 +43,6 @@ from avis_ctrl.measurement.frequency_response.spectra import (
 )
 
 Transient = Literal["auto", "drop", "remove", "none"]
-# A line is excited where the mean power of an input exceeds this part of its largest, and this many times its noise.
-EXCITED_POWER, EXCITED_OVER_NOISE = 1e-6, 30.0
-# Experiments whose inputs differ by less than this part of their power are repetitions of one.
-REPEATED = 1e-2
-DEPENDENT = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +137,7 @@ def _experiments(means: Sequence[PeriodMean], n_u: int) -> _Experiments:
     for mean in means:
         for group in groups:
             first = group[0].Z[:, :n_u]
-            if np.linalg.norm(mean.Z[:, :n_u] - first) ** 2 < REPEATED * np.linalg.norm(first) ** 2:
+            if np.linalg.norm(mean.Z[:, :n_u] - first) ** 2 < SETTINGS.repeated * np.linalg.norm(first) ** 2:
                 group.append(mean)
                 break
         else:
@@ -162,7 +163,7 @@ def _excited_sets(data: _Experiments, used: Channels) -> list[tuple[list[int], n
         # Smoothed over lines: a few periods tell the noise of a single line badly.
         raw = np.real(np.einsum("nii->ni", data.covariance))[:, :n_u]
         noise = _running_mean(raw, min(10, (len(raw) - 1) // 2))
-    on = (power > EXCITED_POWER * power.max(axis=0)) & (power > EXCITED_OVER_NOISE * noise)
+    on = (power > SETTINGS.excited_power * power.max(axis=0)) & (power > SETTINGS.excited_over_noise * noise)
     if not np.any(on):
         if np.any(power > 0):
             raise InputError("expected inputs that repeat from period to period: they differ as much as they drive; "
@@ -209,7 +210,7 @@ def _response(data: _Experiments, frequency_Hz: np.ndarray, line: np.ndarray, ac
 def _check_rank(gram: np.ndarray, names: tuple[str, ...], experiments: int, frequency_Hz: np.ndarray) -> None:
     size = np.sqrt(np.real(np.einsum("nii->ni", gram)))
     values, vectors = np.linalg.eigh(gram / (size[:, :, None] * size[:, None, :]))
-    bad = np.flatnonzero(values[:, 0] < DEPENDENT)
+    bad = np.flatnonzero(values[:, 0] < SETTINGS.dependent)
     if bad.size:
         which = [n for n, part in zip(names, np.abs(vectors[bad[0], :, 0]), strict=True) if part > 0.03]
         raise ComputationError(

@@ -16,12 +16,10 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response.best_linear import Transient, chosen_treatment
-from avis_ctrl.measurement.frequency_response.periodic import average
+from avis_ctrl.measurement.frequency_response.periodic import SETTINGS, average
 from avis_ctrl.measurement.frequency_response.spectra import Band, channels, checked_band, lines
 
 Kind = Literal["excited", "odd", "even"]
-# Amplitude of an input relative to its largest line, above which a line counts as excited.
-EXCITED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +76,7 @@ def distortion_levels(campaign: Campaign, record: str, *, band_Hz: Band | None =
     mean = average(source, used, keep, drop, remove)
     n_u, harmonic = len(used.inputs), np.arange(keep.start, keep.stop)
     size = np.abs(mean.Z[:, :n_u])
-    on = np.any((size > EXCITED * size.max(axis=0, initial=0)) & (size > 0), axis=1)
+    on = np.any((size > SETTINGS.excited_amplitude * size.max(axis=0, initial=0)) & (size > 0), axis=1)
     if not np.any(on):
         raise InputError("expected an excited line in the band", field=field)
     if np.any(harmonic[on] % 2 == 0):

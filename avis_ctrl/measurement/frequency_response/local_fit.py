@@ -22,14 +22,27 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 
-# Lines whose least-squares problems are factored at once, which bounds the work arrays.
-BATCH = 192
-# Relative size of an input's own part (not explained by the others) below which it counts as dependent.
-RANK_TOLERANCE = 1e-8
-# The same where the inputs need not be told apart: what single precision rounds is no direction of its own.
-SPAN_TOLERANCE = 1e-6
-# Amplitude relative to the band's r.m.s. below which an input counts as silent.
-SILENT = 1e-5
+
+@dataclass(frozen=True)
+class LocalFitSettings:
+    """batch : lines whose least-squares problems are factored at once, which bounds the work arrays.
+    together_bytes : of spectra held at once: records are taken in together up to this size, which saves factorisations.
+    rank_tolerance : relative size of an input's own part (not explained by the others) below which it counts as
+        dependent: half the digits of double precision.
+    span_tolerance : the same where the inputs need not be told apart: what single precision rounds is no direction of
+        its own.
+    silent : amplitude relative to the band's r.m.s. below which an input counts as silent: 100 dB, more than
+        converters of 16 bits span.
+    """
+
+    batch: int = 192
+    together_bytes: int = 1 << 26
+    rank_tolerance: float = 1e-8
+    span_tolerance: float = 1e-6
+    silent: float = 1e-5
+
+
+SETTINGS = LocalFitSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +147,8 @@ class LocalFit:
         if self._unit is None:
             self._unit = _scale(U), _scale(Y)
         U, Y = U / self._unit[0], Y / self._unit[1]
-        for start in range(0, self.frequency_Hz.size, BATCH):
-            keep = slice(start, min(start + BATCH, self.frequency_Hz.size))
+        for start in range(0, self.frequency_Hz.size, SETTINGS.batch):
+            keep = slice(start, min(start + SETTINGS.batch, self.frequency_Hz.size))
             index, d = self.window(line_Hz, keep)
             rows = self._free @ self._columns(U[:, index], Y[:, index], d)
             rows = np.moveaxis(rows, 0, 1).reshape(index.shape[0], -1, self._size)
@@ -178,7 +191,7 @@ class LocalFit:
                              field="half_width", value=self.half_width)
         names = tuple(f"u{j}" for j in range(self.n_u)) if names is None else names
         dof = self.dof
-        if partial and not self.rational and np.any(self._weakest() < SPAN_TOLERANCE):
+        if partial and not self.rational and np.any(self._weakest() < SETTINGS.span_tolerance):
             value, noise, gram, dof = self._spanned()
         else:
             self._check_rank(names)
@@ -201,7 +214,7 @@ class LocalFit:
         Q, found = _basis(slopes / np.tile(size, self.order)[:, None, :])
         own, outputs = (part - Q @ (np.swapaxes(Q.conj(), 1, 2) @ part) for part in (own, outputs))
         left, s, right = np.linalg.svd(own / size[:, None, :], full_matrices=False)
-        known = s > SPAN_TOLERANCE
+        known = s > SETTINGS.span_tolerance
         along = np.swapaxes(left.conj(), 1, 2) @ outputs * known[:, :, None]
         inverse = np.where(known, 1 / np.where(known, s, 1.0), 0.0)
         value = np.swapaxes(right.conj(), 1, 2) @ (inverse[:, :, None] * along) / size[:, :, None]
@@ -213,7 +226,7 @@ class LocalFit:
     def _sizes(self) -> np.ndarray:
         """(n, n_u) of each input in the window, no less than what counts as silent."""
         raw = np.linalg.norm(self._factor[:, :, self._lead:self._lead + self.n_u], axis=1)
-        return np.maximum(raw, SILENT * np.sqrt(self.records * (2 * self.half_width - self.order)))
+        return np.maximum(raw, SETTINGS.silent * np.sqrt(self.records * (2 * self.half_width - self.order)))
 
     def _weakest(self) -> np.ndarray:
         """(n,) relative size of the weakest direction's own part."""
@@ -267,7 +280,7 @@ class LocalFit:
         if not self.n_u:
             return
         own, size, weakest = self._corner()[0], self._sizes(), self._weakest()
-        bad = np.flatnonzero(weakest < RANK_TOLERANCE)
+        bad = np.flatnonzero(weakest < SETTINGS.rank_tolerance)
         if bad.size == 0:
             return
         null = np.linalg.svd(own[bad[0]] / size[bad[0]])[2][-1]
@@ -286,7 +299,7 @@ class LocalFit:
 def _basis(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n, m, k) orthonormal columns, zero beyond the rank, that span columns (n, m, k); (n,) their rank."""
     left, s, _ = np.linalg.svd(columns, full_matrices=False)
-    known = s > SPAN_TOLERANCE
+    known = s > SETTINGS.span_tolerance
     return left * known[:, None, :], np.sum(known, axis=1)
 
 
@@ -347,8 +360,8 @@ def _transient(fit: LocalFit, U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray)
     known = fit._lead + fit.n_u
     slopes = np.linalg.solve(fit._factor[:, :known, :known], fit._factor[:, :known, known:])
     result = np.empty((U.shape[0], fit.frequency_Hz.size, fit.n_y), complex)
-    for start in range(0, fit.frequency_Hz.size, BATCH):
-        keep = slice(start, min(start + BATCH, fit.frequency_Hz.size))
+    for start in range(0, fit.frequency_Hz.size, SETTINGS.batch):
+        keep = slice(start, min(start + SETTINGS.batch, fit.frequency_Hz.size))
         index, d = fit.window(line_Hz, keep)
         columns = fit._columns(U[:, index] / unit_u, Y[:, index] / unit_y, d)
         left = columns[..., known:] - columns[..., :known] @ slopes[keep]

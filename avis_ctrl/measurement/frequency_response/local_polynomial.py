@@ -15,7 +15,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
-from avis_ctrl.measurement.frequency_response.local_fit import SPAN_TOLERANCE, LocalFit, least_half_width
+from avis_ctrl.measurement.frequency_response.local_fit import SETTINGS, LocalFit, least_half_width
 from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.spectra import (
     Band,
@@ -47,10 +47,6 @@ class NoiseCovariance:
     def density(self) -> np.ndarray:
         """(n, n_y, n_y) one-sided cross power spectral density, squared unit of y per Hz."""
         return 2 * self.covariance / self.sample_rate_Hz
-
-
-# Spectra held at once: records are taken in together up to this size, which saves factorisations.
-TOGETHER_BYTES = 1 << 26
 
 
 class _Spectra(NamedTuple):
@@ -278,7 +274,7 @@ def _spectra(records: Sequence[RecordSource], used: Channels, driven: list[int],
             u, y = used.of(piece)
             new = _Spectra(transform(u[:, driven], keep)[None], transform(y, keep)[None],
                            np.arange(keep.start, keep.stop) * rate / n)
-            full = sum(part.U.nbytes + part.Y.nbytes for part in held) > TOGETHER_BYTES
+            full = sum(part.U.nbytes + part.Y.nbytes for part in held) > SETTINGS.together_bytes
             if held and (full or not np.array_equal(held[0].line_Hz, new.line_Hz)):
                 yield _together(held)
                 held = []
@@ -309,4 +305,4 @@ def _driven(records: Sequence[RecordSource], used: Channels, band: Band, plan: _
     kept = np.flatnonzero(moving)
     size = np.sqrt(np.real(np.diag(gram)))[kept]
     values = np.linalg.eigvalsh(gram[np.ix_(kept, kept)] / np.outer(size, size)) if kept.size else np.zeros(0)
-    return [int(j) for j in kept], spacing, int(np.count_nonzero(values > SPAN_TOLERANCE ** 2))
+    return [int(j) for j in kept], spacing, int(np.count_nonzero(values > SETTINGS.span_tolerance ** 2))

@@ -20,12 +20,36 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
 from avis_ctrl.measurement.frequency_response.spectra import Channels
 
-# Lines over which powers are added before they are compared, and the chance of dropping a settled period.
-BLOCK, FALSE_ALARM = 8, 1e-3
-# Degree of the transient's polynomials, and degrees of freedom that their residuals must leave.
-DEGREE = 2
-# Relative difference of r.m.s. levels that still counts as the same level.
-SAME_LEVEL = 0.05
+
+@dataclass(frozen=True)
+class PeriodicSettings:
+    """Of the methods for periodic records, here and in `best_linear` and `distortion_lines`.
+
+    block : lines over which powers of outputs are added before periods are compared: 16 degrees of freedom a record.
+    false_alarm : chance of dropping a settled period, over all blocks and outputs; small, for it costs data.
+    degree : of the transient's polynomials, as of the local polynomial method.
+    same_level : relative difference of r.m.s. levels that still counts as the same: realisations scatter.
+    excited_power, excited_over_noise : a line is excited where the mean power of an input exceeds this part of its
+        largest (60 dB below), and this many times its noise (which alone does so with probability e^-30).
+    excited_amplitude : the same of a single record without its noise, amplitude by that of the largest line.
+    repeated : difference of the inputs of two experiments by their power, below which they are repetitions of one: that
+        of other phases is 2.
+    dependent : eigenvalue of the inputs' Gram matrix, scaled to unit diagonal, below which responses cannot be told
+        apart: they would have 10^4 times the noise.
+    """
+
+    block: int = 8
+    false_alarm: float = 1e-3
+    degree: int = 2
+    same_level: float = 0.05
+    excited_power: float = 1e-6
+    excited_over_noise: float = 30.0
+    excited_amplitude: float = 1e-3
+    repeated: float = 1e-2
+    dependent: float = 1e-8
+
+
+SETTINGS = PeriodicSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +81,11 @@ def periodic_records(campaign: Campaign, level_V: float | None) -> tuple[RecordS
                          value=[r.header.excitation for r in campaign.records])
     if level_V is not None:
         levels = sorted({r.header.level_V for r in found})
-        found = [r for r in found if abs(r.header.level_V - level_V) <= SAME_LEVEL * abs(level_V)]
+        found = [r for r in found if abs(r.header.level_V - level_V) <= SETTINGS.same_level * abs(level_V)]
         if not found:
             raise InputError(f"expected one of the levels {levels}", field="level_V", value=level_V)
     levels = sorted({r.header.level_V for r in found})
-    if levels[-1] - levels[0] > SAME_LEVEL * levels[-1]:
+    if levels[-1] - levels[0] > SETTINGS.same_level * levels[-1]:
         raise InputError("the records have several levels, and the response of a nonlinear rig depends on the level: "
                          "choose one", field="level_V", value=levels)
     periods = sorted({r.header.period_s for r in found if r.header.period_s is not None})
@@ -91,11 +115,11 @@ def settled_after(records: Sequence[RecordSource], used: Channels, keep: slice) 
     for record in records:
         Y = fft.rfft(periods_of(record, used)[:count, :, n_u:], axis=1)[:, keep]
         square = np.abs(np.diff(Y, axis=0)) ** 2
-        starts = np.arange(0, square.shape[1] - BLOCK + 1, BLOCK) if square.shape[1] >= BLOCK else np.array([0])
+        starts = np.arange(0, max(square.shape[1] - SETTINGS.block, 0) + 1, SETTINGS.block)
         power = power + np.add.reduceat(square, starts, axis=1)
     power = np.asarray(power)
-    dof = 2 * BLOCK * len(records)
-    limit = stats.f(dof, dof).isf(FALSE_ALARM / power[0].size)
+    dof = 2 * SETTINGS.block * len(records)
+    limit = stats.f(dof, dof).isf(SETTINGS.false_alarm / power[0].size)
     moving = [bool(np.any(p > limit * power[-1] + 1e-24 * power.max())) for p in power[:-1]]
     if not any(moving):
         return 0, True
@@ -132,7 +156,7 @@ def _without_transient(x: np.ndarray, count: int, keep: slice, n_u: int, name: s
     X = fft.rfft(x, axis=0) / np.sqrt(x.shape[0])
     n_z, last = X.shape[1], (X.shape[0] - 1) // count
     side = 1
-    while 2 * side * (count - 1) < DEGREE + 1 + max(4, n_z // 2):
+    while 2 * side * (count - 1) < SETTINGS.degree + 1 + max(4, n_z // 2):
         side += 1
     harmonic = np.arange(keep.start, keep.stop)
     if 2 * side > last:
@@ -141,15 +165,15 @@ def _without_transient(x: np.ndarray, count: int, keep: slice, n_u: int, name: s
     base = np.clip(harmonic, side, last - side)
     offset = np.array([j for j in range(-side * count + 1, side * count) if j % count])
     span = offset / (side * count)
-    basis = np.vander(span, DEGREE + 1, increasing=True)
+    basis = np.vander(span, SETTINGS.degree + 1, increasing=True)
     shift = (harmonic - base) / side
-    weight = np.vander(shift, DEGREE + 1, increasing=True) @ np.linalg.pinv(basis)
+    weight = np.vander(shift, SETTINGS.degree + 1, increasing=True) @ np.linalg.pinv(basis)
     around = X[count * base[:, None] + offset]
     free = np.eye(offset.size) - basis @ np.linalg.pinv(basis)
     around, a = _times_denominator(around, span, free, n_u, shift == 0)
     transient = np.einsum("nj,njz->nz", weight, around)
     E = free @ around
-    dof = offset.size - DEGREE - 1
+    dof = offset.size - SETTINGS.degree - 1
     # a V instead of V, and two unknowns spent on all outputs together.
     rows = dof * (n_z - n_u)
     shrink = np.mean(np.abs(a) ** 2, axis=1) * np.where(np.all(a == 1, axis=1), 1.0, (rows - 2) / rows)
@@ -183,7 +207,7 @@ def _times_denominator(around: np.ndarray, span: np.ndarray, free: np.ndarray, n
     along = np.swapaxes(q.conj(), 1, 2) @ right
     unknown = -np.linalg.solve(r, along)[:, :, 0]
     left = np.sum(np.abs(right - q @ along) ** 2, axis=(1, 2))
-    spare = (free.shape[0] - DEGREE - 1) * Y.shape[2] - 2
+    spare = (free.shape[0] - SETTINGS.degree - 1) * Y.shape[2] - 2
     if spare < 1:
         return around, np.ones((n, span.size), complex)
     limit = 4 / 9 / stats.f(2 * spare, 2 * spare).isf(0.01)

@@ -20,13 +20,24 @@ from scipy.optimize import least_squares
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
 
-# Half-power bandwidths to each side that the fit tries, narrow first: the wider one is kept while the misfit says that
-# the background is still a straight line there. Fewest lines of a fit.
-REACH, MISFIT, FEWEST_LINES = (1.0, 2.0, 4.0), 1.3, 9
-# Part of near_Hz within which the mode is looked for.
-SEARCH = 0.05
-# Chance that noise passes for a mode; small, as the pole was searched for.
-FALSE_ALARM = 1e-5
+
+@dataclass(frozen=True)
+class ResonanceSettings:
+    """reach : half-power bandwidths to each side that the fit tries, narrow first.
+    misfit : weighted mean square residual up to which the wider band is kept: the background is still a straight line.
+    fewest_lines : of a fit: three times the complex unknowns of an entry.
+    search : part of near_Hz within which the mode is looked for: expected frequencies are off by some percent.
+    false_alarm : chance that noise passes for a mode; small, as the pole was searched for.
+    """
+
+    reach: tuple[float, ...] = (1.0, 2.0, 4.0)
+    misfit: float = 1.3
+    fewest_lines: int = 9
+    search: float = 0.05
+    false_alarm: float = 1e-5
+
+
+SETTINGS = ResonanceSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,17 +72,17 @@ def resonance(response: FrequencyResponse, near_Hz: float, *, width_Hz: float | 
     InputError : no lines there. ComputationError : no mode inside the band.
     """
     f = response.frequency_Hz
-    reach = SEARCH * near_Hz if width_Hz is None else width_Hz / 2
+    reach = SETTINGS.search * near_Hz if width_Hz is None else width_Hz / 2
     inside = np.flatnonzero(np.abs(f - near_Hz) <= reach)
-    if not (np.isfinite(near_Hz) and near_Hz > 0) or inside.size < 3 or f.size < FEWEST_LINES:
-        raise InputError(f"expected at least three lines within {reach:g} Hz and {FEWEST_LINES} in all; there are "
-                         f"lines from {f[0]:g} to {f[-1]:g} Hz" if f.size else "expected lines", field="near_Hz",
+    if not (np.isfinite(near_Hz) and near_Hz > 0) or inside.size < 3 or f.size < SETTINGS.fewest_lines:
+        raise InputError(f"expected at least three lines within {reach:g} Hz and {SETTINGS.fewest_lines} in all; there "
+                         f"are lines from {f[0]:g} to {f[-1]:g} Hz" if f.size else "expected lines", field="near_Hz",
                          value=near_Hz)
     size = np.sum(np.abs(response.value) ** 2 / np.mean(np.abs(response.value[inside]) ** 2, axis=0), axis=(1, 2))
     peak = f[inside[np.argmax(size[inside])]]
-    half = reach if width_Hz is not None else max(reach / 2, FEWEST_LINES / 2 * float(np.median(np.diff(f))))
+    half = reach if width_Hz is not None else max(reach / 2, SETTINGS.fewest_lines / 2 * float(np.median(np.diff(f))))
     found = _fit(response, peak, half, near_Hz, reach)
-    for width in REACH if width_Hz is None else ():
+    for width in SETTINGS.reach if width_Hz is None else ():
         wider = found
         for _ in range(4):
             again = _fit(response, wider.frequency_Hz, width * 2 * wider.damping * wider.frequency_Hz, near_Hz, reach,
@@ -79,7 +90,7 @@ def resonance(response: FrequencyResponse, near_Hz: float, *, width_Hz: float | 
             settled, wider = again.band_Hz == wider.band_Hz, again
             if settled:
                 break
-        if width > REACH[0] and wider.misfit > max(MISFIT, found.misfit):
+        if width > SETTINGS.reach[0] and wider.misfit > max(SETTINGS.misfit, found.misfit):
             break
         found = wider
     return found
@@ -89,8 +100,8 @@ def _fit(response: FrequencyResponse, centre: float, half: float, near_Hz: float
          start: Resonance | None = None) -> Resonance:
     f = response.frequency_Hz
     use = np.flatnonzero(np.abs(f - centre) <= half)
-    if use.size < FEWEST_LINES:
-        use = np.sort(np.argsort(np.abs(f - centre), kind="stable")[:FEWEST_LINES])
+    if use.size < SETTINGS.fewest_lines:
+        use = np.sort(np.argsort(np.abs(f - centre), kind="stable")[:SETTINGS.fewest_lines])
     w, w0 = 2 * np.pi * f[use], 2 * np.pi * centre
     scale = (w[-1] - w[0]) / 2
     G = response.value[use].reshape(use.size, -1)
@@ -134,7 +145,7 @@ def _check_significant(with_pole: float, without: float, entries: int, free: int
     """F test of the pole against the background alone."""
     added = 2 * entries + 2
     ratio = (without - with_pole) / added / max(with_pole / free, np.finfo(float).tiny)
-    limit = float(stats.f(added, free).isf(FALSE_ALARM))
+    limit = float(stats.f(added, free).isf(SETTINGS.false_alarm))
     if ratio < limit:
         raise ComputationError(f"no mode found near {near_Hz:g} Hz",
                                measured=f"a pole explains {ratio:.3g} times what noise would give it, from {f[0]:.6g} "

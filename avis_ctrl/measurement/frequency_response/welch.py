@@ -14,6 +14,7 @@ includes: `local_polynomial` is the better method for resonances; this one is wh
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -33,10 +34,20 @@ from avis_ctrl.measurement.frequency_response.spectra import (
 )
 
 Estimator = Literal["H1", "H2", "Hv"]
-# Samples of segments transformed at once.
-AT_ONCE = 1 << 20
-# Eigenvalue of the inputs' spectra, scaled to unit diagonal, below which they are dependent.
-DEPENDENT = 1e-10
+
+
+@dataclass(frozen=True)
+class WelchSettings:
+    """samples_at_once : of segments transformed together, which bounds the memory.
+    dependent : eigenvalue of the inputs' spectra, scaled to unit diagonal, below which responses cannot be told apart:
+        they would have 10^5 times the noise.
+    """
+
+    samples_at_once: int = 1 << 20
+    dependent: float = 1e-10
+
+
+SETTINGS = WelchSettings()
 
 
 def effective_averages(window: np.ndarray, step: int, segments: int) -> float:
@@ -139,7 +150,7 @@ def _spectra(records: Sequence[RecordSource], used: Channels, window: np.ndarray
 
 def _segments(record: RecordSource, used: Channels, n: int, step: int, count: int) -> Iterator[np.ndarray]:
     """(some, n, n_z) overlapping segments; no more of the record in memory than these need."""
-    some = max(1, AT_ONCE // n)
+    some = max(1, SETTINGS.samples_at_once // n)
     for first in range(0, count, some):
         last = min(first + some, count)
         z = np.hstack(used.of(record.load(first * step, (last - 1) * step + n)))
@@ -151,11 +162,11 @@ def _check_rank(S_uu: np.ndarray, names: tuple[str, ...], frequency_Hz: np.ndarr
     # Power far below an input's largest is the window's side lobes or rounding.
     silent = size < 1e-9 * size.max(axis=0)
     values, vectors = np.linalg.eigh(S_uu / (size[:, :, None] * size[:, None, :]))
-    bad = np.flatnonzero((values[:, 0] < DEPENDENT) | silent.any(axis=1))
+    bad = np.flatnonzero((values[:, 0] < SETTINGS.dependent) | silent.any(axis=1))
     if bad.size:
         k = bad[0]
         which = [n for n, part, off in zip(names, np.abs(vectors[k, :, 0]), silent[k], strict=True)
-                 if off or (values[k, 0] < DEPENDENT and part > 0.03)]
+                 if off or (values[k, 0] < SETTINGS.dependent and part > 0.03)]
         raise ComputationError(
             f"the responses to {', '.join(which)} cannot be told apart or are not excited",
             measured=f"{bad.size} of {frequency_Hz.size} lines from {frequency_Hz[k]:.6g} Hz",

@@ -26,9 +26,6 @@ import numpy as np
 
 from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1
 
-# A drive with a smaller share in the excited directions counts as not driven.
-STILL = 1e-9
-
 
 @dataclass(frozen=True)
 class MapSettings:
@@ -39,6 +36,7 @@ class MapSettings:
         below it describes less than half the power of the data, and proves nothing. delay_s : range of delays that are
         fitted, from a u recorded late to the slowest loop. delay_step_s : a tenth of a turn at 100 Hz.
         closest : smallest value used for 1 - a^2: resonances 2.5 % away from the model's leave as much.
+    still : share of a drive in the excited directions up to which it does not move: round-off of their basis.
     """
 
     chance: float = 1e-4
@@ -46,6 +44,7 @@ class MapSettings:
     delay_s: tuple[float, float] = (-0.005, 0.02)
     delay_step_s: float = 0.001
     closest: float = 0.1
+    still: float = 1e-9
 
 
 SETTINGS = MapSettings()
@@ -72,7 +71,7 @@ class Comparison:
     @property
     def moving(self) -> np.ndarray:
         """(n_u,) drives that move."""
-        return np.diag(self.P) > STILL
+        return np.diag(self.P) > self.settings.still
 
     def agreement(self, q: np.ndarray, c: np.ndarray) -> np.ndarray:
         """(n_y, n_y) of measured row i with expected row k, columns matched by q with signs c."""
@@ -112,7 +111,7 @@ def compare(pairs: list[tuple[Spectra, Spectra]], response: Callable[[np.ndarray
         return None
     M, E = measured.G, expected.G
     P = measured.basis @ measured.basis.T
-    if response is not None and measured.rank < np.count_nonzero(np.diag(P) > STILL):
+    if response is not None and measured.rank < np.count_nonzero(np.diag(P) > settings.still):
         E = response(measured.f)
     spread = measured.noise * np.trace(measured.covariance, axis1=1, axis2=2).real[:, None]
     w = 1 / np.maximum(np.sum(np.abs(E) ** 2, axis=(1, 2)) + np.sum(spread, axis=1), 1e-300)

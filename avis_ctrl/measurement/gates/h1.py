@@ -19,15 +19,29 @@ from scipy import signal
 
 from avis_ctrl.measurement.gates.excerpt import Excerpt
 
-MOST_SAMPLES = 1 << 16
-# Half-overlapping Hann segments are worth this many independent ones each.
+# Independent segments that each of many half-overlapping Hann segments is worth: 1 / (1 + 2 rho^2), rho = 1/6 the
+# correlation of the window with itself shifted by half its length.
 OVERLAP = 1 / 1.056
-# Lines whose input power is below this part of the largest count as not driven.
-DRIVEN = 1e-3
-# Power of a direction of the voltages by the strongest one's, below which it is not excited; each at equal r.m.s.
-DIRECTION = 1e-6
-# The same at a single line, by the line's own strongest direction.
-AT_LINE = 1e-4
+
+
+@dataclass(frozen=True)
+class H1Settings:
+    """most_samples : of a record that are read, for speed: 31 segments for up to four inputs.
+    driven : power of u at a line by that at the strongest, below which the line counts as not driven: 30 dB down,
+        most of u and y is what leaks from others.
+    direction : power of a direction of the voltages by the strongest one's, each drive at equal r.m.s., below which it
+        is not excited: voltages rounded to four digits leave less.
+    at_line : the same at a single line, by the line's own strongest direction: a weaker one would have 100 times the
+        noise of that one.
+    """
+
+    most_samples: int = 1 << 16
+    driven: float = 1e-3
+    direction: float = 1e-6
+    at_line: float = 1e-4
+
+
+SETTINGS = H1Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +63,7 @@ class Spectra:
     def driven(self) -> np.ndarray:
         """(n,) lines at which the inputs have power; never the mean."""
         power = np.sum(np.abs(self.U) ** 2, axis=(0, 2))
-        mask = power > DRIVEN * np.max(power[1:], initial=0.0)
+        mask = power > SETTINGS.driven * np.max(power[1:], initial=0.0)
         mask[:2] = False
         return mask
 
@@ -79,9 +93,9 @@ def usable(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, bool]:
     """u, y and whether they wrap around: the mean period after the first, or the first piece of the record."""
     if seen.periodic:
         u, y = seen.periods("u"), seen.periods("y")
-        if u.shape[1] <= MOST_SAMPLES:
+        if u.shape[1] <= SETTINGS.most_samples:
             return u[1:].mean(axis=0), y[1:].mean(axis=0), True
-    return seen.first.u[:MOST_SAMPLES], seen.first.y[:MOST_SAMPLES], False
+    return seen.first.u[:SETTINGS.most_samples], seen.first.y[:SETTINGS.most_samples], False
 
 
 def segment_length(samples: int, inputs: int) -> int:
@@ -108,14 +122,14 @@ def spectra(u: np.ndarray, y: np.ndarray, rate_Hz: float, length: int, wrap: boo
 
 
 def directions(U: np.ndarray) -> np.ndarray:
-    """(n_u, rank) orthonormal basis of the real span of voltages U (..., n_u): what is at least `DIRECTION` of it."""
+    """(n_u, rank) orthonormal basis of the real span of voltages U (..., n_u): what is excited."""
     flat = U.reshape(-1, U.shape[-1])
     gram = np.real(flat.conj().T @ flat)
     size = np.sqrt(np.diag(gram))
     moves = size > np.sqrt(1e-12) * np.max(size, initial=0.0)
     scale = np.where(moves, size, 1.0)
     power, V = np.linalg.eigh(np.where(np.outer(moves, moves), gram / np.outer(scale, scale), 0.0))
-    found = scale[:, None] * V[:, power > DIRECTION * np.max(power, initial=0.0)] * moves[:, None]
+    found = scale[:, None] * V[:, power > SETTINGS.direction * np.max(power, initial=0.0)] * moves[:, None]
     return np.asarray(np.linalg.qr(found)[0])
 
 
@@ -139,7 +153,7 @@ def h1(of: list[Spectra]) -> H1 | None:
     # Each direction over its own size in the whole band: one drive played much louder hides none of the others.
     size = np.sqrt(np.real(np.einsum("fii->i", gram[keep])))
     power = np.linalg.eigvalsh(gram / np.outer(size, size))
-    keep &= power[:, 0] > AT_LINE * power[:, -1]
+    keep &= power[:, 0] > SETTINGS.at_line * power[:, -1]
     if not keep.any():
         return None
     reduced, Y, gram = reduced[:, keep], Y[:, keep], gram[keep]

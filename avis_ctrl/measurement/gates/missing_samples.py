@@ -14,15 +14,24 @@ from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series
 from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, segment_length, spectra
 
-# A repeated block has at least this many rows, equal in every channel.
-BLOCK = 16
-# A jump of the delay smaller than this many samples is no lost sample.
-JUMP = 0.5
-# Delays are looked for up to so many samples either way.
-LONGEST_DELAY = 64
-# What undoing a step takes at least off the residual, mean logarithm: a tenth of its power, where steps that come from
-# a sine's sweep or from a model's delay over frequency put some on it.
-EXPLAINS = 0.1
+
+@dataclass(frozen=True)
+class MissingSamplesSettings:
+    """block_rows : of the shortest repeated block, equal in every channel: noise in one alone makes that no chance.
+    jump_samples : smallest step of the delay that counts: rows are lost whole.
+    longest_samples : largest delay that is looked for, either way, and largest step: segments without a clear delay
+        scatter over all that is looked for.
+    explains : what undoing a step takes at least off the residual, mean logarithm: a tenth of its power, where steps
+        that come from a sine's sweep or from a model's delay over frequency put some on it.
+    """
+
+    block_rows: int = 16
+    jump_samples: float = 0.5
+    longest_samples: int = 64
+    explains: float = 0.1
+
+
+SETTINGS = MissingSamplesSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +64,8 @@ class MissingSamples(Gate):
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
         t, delay = delays(seen)
         stepped = [one for one in delay if (step := delay_step(one, FALSE_ALARM)) is not None
-                   and JUMP < abs(step[1]) <= LONGEST_DELAY and not runs_away(one, step[0])
-                   and explained(seen, t, *step) > EXPLAINS]
+                   and SETTINGS.jump_samples < abs(step[1]) <= SETTINGS.longest_samples and not runs_away(one, step[0])
+                   and explained(seen, t, *step) > SETTINGS.explains]
         block = repeated_block(seen.first.y, seen.header.period_samples)
         return _Kept(seen.header, block, t, delay, stepped, _clock(seen))
 
@@ -77,7 +86,7 @@ class MissingSamples(Gate):
                         (),
                         (name,),
                         float(n),
-                        float(BLOCK),
+                        float(SETTINGS.block_rows),
                         picture,
                     )
                 )
@@ -98,7 +107,7 @@ class MissingSamples(Gate):
                     )
                 )
             step = largest_step(k.stepped, level)
-            if step is not None and abs(step[1]) > JUMP:
+            if step is not None and abs(step[1]) > SETTINGS.jump_samples:
                 at, size = step
                 found.append(
                     Finding(
@@ -111,13 +120,13 @@ class MissingSamples(Gate):
                         (),
                         (name,),
                         float(size),
-                        JUMP,
+                        SETTINGS.jump_samples,
                         picture,
                     )
                 )
         if not found:
             longest = max(kept, key=lambda k: len(k.t))
-            told = [k for k in kept if len(k.t) > 3 and np.std(k.delay[0]) < JUMP]
+            told = [k for k in kept if len(k.t) > 3 and np.std(k.delay[0]) < SETTINGS.jump_samples]
             vague = sum(len(k.t) > 3 for k in kept) - len(told)
             scatter = float(max((np.std(k.delay[0]) for k in told), default=np.nan))
             said = f"; the delay scatters by at most {scatter:.2g} samples r.m.s." if told else ""
@@ -129,7 +138,7 @@ class MissingSamples(Gate):
                     f"No lost or repeated samples were found ({len(told)} of {len(kept)} records could be compared with"
                     f" a moving commanded voltage{said}).",
                     value=scatter if told else None,
-                    limit=JUMP,
+                    limit=SETTINGS.jump_samples,
                     picture=_picture(longest),
                 )
             )
@@ -188,7 +197,7 @@ def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
     weight = np.abs(expected) ** 2 / np.maximum(estimate.noise, 1e-300)
     omega = 2 * np.pi * estimate.f[None, :, None] / rate
     # Gauss-Newton of sum weight |Y / expected - exp(-j omega d)|^2, from the best of a scan over whole samples.
-    scan = np.arange(-LONGEST_DELAY, LONGEST_DELAY + 1)
+    scan = np.arange(-SETTINGS.longest_samples, SETTINGS.longest_samples + 1)
     summed = np.sum(cross, axis=2)
     power = np.real(summed @ np.exp(1j * omega[0] * scan))
     d = scan[np.argmax(power, axis=1)].astype(float)
@@ -257,21 +266,21 @@ def runs_away(delay: np.ndarray, where: int) -> bool:
 
 def repeated_block(y: np.ndarray, period: int | None) -> tuple[int, int, int] | None:
     """(where, how far back, rows) of the longest block equal to earlier rows; None where there is none."""
-    moving = np.ptp(y, axis=0) > 0
-    if not moving.any() or len(y) < 2 * BLOCK:
+    moving, rows = np.ptp(y, axis=0) > 0, SETTINGS.block_rows
+    if not moving.any() or len(y) < 2 * rows:
         return None
     _, codes = np.unique(
         np.ascontiguousarray(y[:, moving]).view(np.dtype((np.void, 8 * int(moving.sum())))).ravel(), return_inverse=True
     )
     changed = np.concatenate([[True], np.diff(codes) != 0])
-    factors = np.random.default_rng(0).integers(1, 1 << 62, BLOCK, dtype=np.int64) | 1
-    windows = np.lib.stride_tricks.sliding_window_view(codes.astype(np.int64), BLOCK)
-    hashed = sum(windows[:, k] * factors[k] for k in range(BLOCK))
+    factors = np.random.default_rng(0).integers(1, 1 << 62, rows, dtype=np.int64) | 1
+    windows = np.lib.stride_tricks.sliding_window_view(codes.astype(np.int64), rows)
+    hashed = sum(windows[:, k] * factors[k] for k in range(rows))
     order = np.argsort(hashed, kind="stable")
     same = np.flatnonzero(np.diff(hashed[order]) == 0)
     later, back = order[same + 1], order[same + 1] - order[same]
     # Rows that stand still are for the dead-channel gate.
-    lively = np.lib.stride_tricks.sliding_window_view(changed, BLOCK).sum(axis=1)[later] > BLOCK // 2
+    lively = np.lib.stride_tricks.sliding_window_view(changed, rows).sum(axis=1)[later] > rows // 2
     if period:
         lively &= back % period != 0
     if not lively.any():
@@ -279,7 +288,7 @@ def repeated_block(y: np.ndarray, period: int | None) -> tuple[int, int, int] | 
     later, back = later[lively], back[lively]
     lag = int(np.bincount(back).argmax())
     where = np.sort(later[back == lag])
-    return int(where[0]), lag, int(len(where) + BLOCK - 1)
+    return int(where[0]), lag, int(len(where) + rows - 1)
 
 
 def _clock(seen: Excerpt) -> np.ndarray | None:
@@ -302,5 +311,5 @@ def _picture(kept: _Kept) -> Picture:
         "time [s]",
         "delay [samples]",
         (Series("delay", t, kept.delay[0], "points"),),
-        (Limit("half a sample", JUMP), Limit("half a sample", -JUMP)),
+        (Limit("half a sample", SETTINGS.jump_samples), Limit("half a sample", -SETTINGS.jump_samples)),
     )

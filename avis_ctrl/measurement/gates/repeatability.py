@@ -24,19 +24,29 @@ from avis_ctrl.measurement.gates.finding import (
 from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, octaves, segment_length, spectra, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
-# Directions of the voltages count as common to two records down to this cosine of the angle between them.
-COMMON = 1 - 1e-6
-# Lines with less than this part of the median power of the driven ones are the skirt of the band: u and y are small
-# there, and differ by what leaks into them.
-EXCITED = 0.03
-# T beyond this many times its limit is put in words: the number itself says nothing more.
-TOLD = 20.0
-# Differences below these parts of the response are not worth a note, or a warning.
-NOTABLE, LARGE = 0.01, 0.05
-# Noise of the comparison above this part of the response hides changes that matter.
-BLIND = 0.2
-# Levels closer than this factor cannot show a dependence on the level.
-APART = 1.4
+
+@dataclass(frozen=True)
+class ComparisonSettings:
+    """common : cosine of the angle between directions of the voltages above which they count as common to two records:
+        1.4 mrad, more than voltages rounded to four digits turn them.
+    excited : power of u at a line by the median of the driven ones, below which it is the skirt of the band: u and y
+        are small there, and differ by what leaks into them.
+    told : T beyond this many times its limit is put in words: the number itself says nothing more.
+    notable, large : difference by the response that is worth a note, for gains are known to 1 % at best, or a warning.
+    blind : noise of the comparison by the response above which it hides changes that matter.
+    apart : smallest factor between levels that are compared: closer ones show leakage and drift, not nonlinearity.
+    """
+
+    common: float = 1 - 1e-6
+    excited: float = 0.03
+    told: float = 20.0
+    notable: float = 0.01
+    large: float = 0.05
+    blind: float = 0.2
+    apart: float = 1.4
+
+
+SETTINGS = ComparisonSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +103,7 @@ class _Records(Gate):
             "frequency [Hz]",
             "relative difference [-]",
             tuple(Series(n, d.f, d.by_line[:, j]) for j, n in enumerate(names)),
-            (Limit("large", LARGE),),
+            (Limit("large", SETTINGS.large),),
             "log",
             "log",
         )
@@ -101,7 +111,7 @@ class _Records(Gate):
     def _alike(self, differences: list[Difference], campaign: Campaign, what: str) -> Finding:
         """Nothing stands out; a note where that means little."""
         d = max(differences, key=lambda d: d.noise)
-        severity: Severity = "note" if d.noise > BLIND else "ok"
+        severity: Severity = "note" if d.noise > SETTINGS.blind else "ok"
         hint = (
             " Smaller changes would not show; records that repeat the same periodic voltage compare more sharply."
             if severity == "note"
@@ -150,10 +160,10 @@ class Repeatability(_Records):
             ]
         found = []
         for d in differences:
-            bad = (d.limit < d.T) & (d.relative > NOTABLE)
+            bad = (d.limit < d.T) & (d.relative > SETTINGS.notable)
             if bad.any():
                 names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-                severity: Severity = "warning" if d.relative[bad].max() > LARGE else "note"
+                severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
                 found.append(
                     Finding(
                         self.name,
@@ -193,7 +203,7 @@ class LevelDependence(_Records):
     def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         groups = _by_kind_and_level(kept)
         pairs = [
-            (a, b) for a, b in combinations(sorted(groups), 2) if a[0] == b[0] and b[1] >= APART * a[1]
+            (a, b) for a, b in combinations(sorted(groups), 2) if a[0] == b[0] and b[1] >= SETTINGS.apart * a[1]
         ]
         level = FALSE_ALARM / max(1, len(pairs) * len(campaign.y_names))
         differences = [d for a, b in pairs if (d := _of_levels(groups[a], groups[b], level)) is not None]
@@ -203,16 +213,16 @@ class LevelDependence(_Records):
                     self.name,
                     "ok",
                     "Dependence on the level was not tested: no driven records of one kind and enough length at"
-                    f" two levels, at least a factor {APART:g} apart.",
+                    f" two levels, at least a factor {SETTINGS.apart:g} apart.",
                     picture=Picture("Level dependence", "frequency [Hz]", "relative difference [-]", ()),
                 )
             ]
         found = []
         for d in differences:
-            bad = (d.limit < d.T) & (d.relative > NOTABLE)
+            bad = (d.limit < d.T) & (d.relative > SETTINGS.notable)
             if bad.any():
                 names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-                severity: Severity = "warning" if d.relative[bad].max() > LARGE else "note"
+                severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
                 low, high = d.band_Hz[int(np.argmax(np.where(bad, d.relative, 0)))]
                 found.append(
                     Finding(
@@ -290,7 +300,7 @@ def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Dif
     f = np.fft.rfftfreq(len(a.y), 1 / a.rate)[2:-1:2]
     driven = np.sum(np.abs(windowed(b.u)) ** 2, axis=1)
     keep = driven > 1e-3 * driven.max()
-    keep &= driven > EXCITED * np.median(driven[keep])
+    keep &= driven > SETTINGS.excited * np.median(driven[keep])
     power = np.abs(D) ** 2
     by_line = np.sqrt(power / np.maximum(size, 1e-300))
     T, relative, band = _by_band(
@@ -335,7 +345,8 @@ def _compare(a: H1 | None, b: H1 | None, level: float, names: tuple[str, str]) -
     if a is None or b is None:
         return None
     f, ia, ib = np.intersect1d(a.f, b.f, return_indices=True)
-    inside = (a.power[ia] > EXCITED * np.median(a.power)) & (b.power[ib] > EXCITED * np.median(b.power))
+    inside = ((a.power[ia] > SETTINGS.excited * np.median(a.power))
+              & (b.power[ib] > SETTINGS.excited * np.median(b.power)))
     ia, ib, f = ia[inside][::2], ib[inside][::2], f[inside][::2]
     common = _common(a.basis, b.basis)
     rank = common.shape[1]
@@ -357,9 +368,9 @@ def _compare(a: H1 | None, b: H1 | None, level: float, names: tuple[str, str]) -
 def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(n_u, m) orthonormal basis of the directions that two records share: others cannot be compared."""
     left, cosine, _ = np.linalg.svd(a.T @ b, full_matrices=False)
-    return np.asarray(a @ left[:, cosine > COMMON])
+    return np.asarray(a @ left[:, cosine > SETTINGS.common])
 
 
 def beyond_chance(T: float) -> str:
     """How far a statistic is beyond its 1 % limit, in words."""
-    return "far beyond chance" if T > TOLD else f"{T:.1f} times what chance gives at 1 %"
+    return "far beyond chance" if SETTINGS.told < T else f"{T:.1f} times what chance gives at 1 %"
