@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import eigh
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import rig_file
@@ -186,3 +187,12 @@ def test_every_command_that_reads_a_rig_answers_in_one_line(tmp_path, pattern, c
     lines = done.stderr.strip().splitlines()
     assert done.returncode == 2 and len(lines) == 1 and not (tmp_path / "c.h5").exists(), done.stderr
     assert lines[0].startswith(f"avis: {path}: {said}") and "did you mean" in lines[0]
+
+
+def test_words_quote_the_rigs_own_numbers():
+    """Natural frequencies from the eigenvalues of M and K, and their ratio."""
+    rig = load_rig("avis")
+    equations = rig.equations_of_motion()
+    f = np.sqrt(np.sort(eigh(equations.K, equations.M, eigvals_only=True))) / (2 * np.pi)
+    words = next(one.words for one in judged(CONTENT["avis"], rig) if one.kind == "spread")
+    assert words == f"natural frequencies {f[0]:.3g} to {f[-1]:.3g} Hz, a ratio of {f[-1] / f[0]:.3g}"
