@@ -41,7 +41,7 @@ def resonances(poles: np.ndarray, low: float = 0.0, high: float = np.inf) -> np.
 def merged(omega: np.ndarray, extra: np.ndarray) -> np.ndarray:
     """Sorted union without points closer than a thousandth, at most MAX_POINTS of them."""
     every = np.sort(np.concatenate([omega, extra]))
-    kept = every[np.concatenate([[True], np.diff(np.log(every)) > 1e-3])]
+    kept = every[np.concatenate([[True], every[1:] > every[:-1] * np.exp(1e-3)])]
     return kept if kept.size <= MAX_POINTS else kept[np.unique(np.linspace(0, kept.size - 1, MAX_POINTS).astype(int))]
 
 

@@ -41,6 +41,7 @@ def test_stated_deviations_are_those_of_repeated_experiments(rng):
     ratio = np.std(found, axis=0) / np.sqrt(np.mean(stated, axis=0))
     # The Bartlett kernel states somewhat too little, as it must: it cuts the correlation at finite lag.
     assert np.all((ratio > 0.9) & (ratio < 1.2)), ratio
+    assert fit.noise == "residual" and fit.chi2 == fit.dof
     # A white residual would be believed to be three to four times better.
     assert np.all(np.std(found, axis=0) / np.sqrt(np.mean(white, axis=0)) > 2.5)
 
