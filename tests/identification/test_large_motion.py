@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exact import floor_velocity, multisine
+from scipy.spatial.transform import Rotation
 from truth.cases import run
 from truth.table import draw_plant
 
 from avis_ctrl.identification.excited_space import excited_space
-from avis_ctrl.identification.large_motion import Turning
+from avis_ctrl.identification.large_motion import Turning, turned_force, turned_reading
 from avis_ctrl.identification.noise import relative_noise
 from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction import Predictor
@@ -20,6 +21,7 @@ from avis_ctrl.identification.spectra import record_block
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.logical_axes import actuator_axes
+from avis_ctrl.rigs.nonlinear import rig_arrays
 from avis_ctrl.simulation.campaign_data import open_loop
 from avis_ctrl.simulation.loop import simulate
 from avis_ctrl.study.campaign_plan import plan_from_table
@@ -32,6 +34,39 @@ def off(found: np.ndarray, expected: np.ndarray) -> float:
 def within(u: np.ndarray, rig) -> np.ndarray:
     """As large as the drives allow."""
     return 0.99 * rig.drive_limit_V * u / np.max(np.abs(u))
+
+
+def test_motors_that_turn_push_along_turned_axes():
+    """Force phi x f and moment p x (phi x f), to first order in the angles; signs of all coordinates."""
+    rig, rng = load_rig("avis"), np.random.default_rng(0)
+    arrays = rig_arrays(rig.mounted_body())
+    q, u, out = rng.normal(size=6), rng.normal(size=8), np.empty(6)
+    turned_force(out, q, u, arrays)
+    forces = np.cross(q[3:], np.array(arrays.actuator_force)) * u[:, None]
+    moments = np.cross(np.array(arrays.actuator_position), forces)
+    assert np.allclose(out, np.concatenate([forces.sum(0), moments.sum(0)]), rtol=1e-12)
+
+
+def test_sensors_that_turn_read_the_second_order_of_exact_kinematics():
+    """Second differences in time of q + R(phi) p along R(phi) d, less the linear reading; 3-2-1 angles."""
+    rng = np.random.default_rng(1)
+    place, direction = rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
+    offset, rate, bend = 1e-3 * rng.normal(size=(3, 6))
+    h = 1e-2
+
+    def motion(t):
+        return offset + rate * t + bend * t * t / 2
+
+    def points(t):
+        q = motion(t)
+        return q[:3] + Rotation.from_euler("ZYX", q[:2:-1]).apply(place)
+    acceleration = (points(h) - 2 * points(0.0) + points(-h)) / h ** 2
+    turned = Rotation.from_euler("ZYX", offset[:2:-1]).apply(direction)
+    linear = np.sum((bend[:3] + np.cross(bend[3:], place)) * direction, axis=1)
+    out = np.empty(5)
+    turned_reading(out, offset, rate, bend, place, direction)
+    assert np.allclose(out, np.sum(acceleration * turned, axis=1) - linear, rtol=0, atol=2e-2 * np.abs(out).max())
+    assert np.abs(out).max() > 1e-7
 
 
 @pytest.mark.parametrize("name", ["avis", "halcyonics_loaded"])

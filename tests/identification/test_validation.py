@@ -222,6 +222,23 @@ def test_modes_that_cannot_be_measured_are_answered(true, records):
         mode_table(heavy, np.eye(len(true.names)), heavy, None)
 
 
+@pytest.mark.parametrize("name", ["mass", "isolator1.k_z", "isolator1.c_z"])
+def test_errors_of_the_modes_follow_from_each_parameter(true, name):
+    """Covariance of frequencies and damping ratios against central differences."""
+    j, step = true.names.index(name), 1e-5
+    sigma = 0.01 * true.values[j]
+    covariance = np.zeros((len(true.names),) * 2)
+    covariance[j, j] = sigma ** 2
+    moved = [model_modes(true.at(true.values + sign * step * true.values[j] * np.eye(len(true.names))[j]), None)
+             for sign in (1, -1)]
+    slope = np.concatenate([moved[0].frequency_Hz - moved[1].frequency_Hz, moved[0].damping - moved[1].damping]) / (
+        2 * step * true.values[j])
+    found = model_modes(true, covariance).covariance
+    assert np.allclose(found, np.outer(slope, slope) * sigma ** 2, rtol=1e-3, atol=1e-6 * np.abs(found).max())
+    spread = np.sqrt(np.diag(found)[6:])
+    assert np.allclose(spread, np.abs(slope[6:]) * sigma, rtol=1e-3, atol=1e-6 * spread.max())
+
+
 def test_bands_of_the_model_are_those_of_drawn_parameters(true):
     rng = np.random.default_rng(9)
     covariance = np.diag((1e-3 * true.values) ** 2)
