@@ -242,12 +242,13 @@ class _Descent:
         free = ~((self.at_bound() & (self.now.gradient > 0)) | (self.at_top() & (self.now.gradient < 0)))
         basis = np.eye(len(free))[:, free]
         step, promised = self._step_in(basis, damping)
-        for _ in self.rows:
-            leaving = self.rows[self.at_edge() & (self.rows @ (step * self.scale) < 0)] * self.scale
-            if not len(leaving) or not basis.size:
+        rows, edge, held = self.rows * self.scale, self.at_edge(), np.zeros(len(self.rows), bool)
+        for _ in rows:
+            leaving = edge & ~held & (rows @ step < 0)
+            if not np.any(leaving):
                 break
-            basis = basis @ null_space(leaving @ basis)
-            step, promised = self._step_in(basis, damping)
+            held |= leaving
+            step, promised = self._step_in(basis @ null_space(rows[held] @ basis), damping)
         return step, promised
 
     def _step_in(self, basis: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
@@ -298,9 +299,10 @@ class _Descent:
         if len(self.rows):
             # Back along the step to where a moment is, but for the edge, the sum of the other two.
             size = SETTINGS.edge * np.abs(self.rows) @ np.abs(self.model.values)
-            room, used = self.rows @ self.model.values - size, -(self.rows @ (values - self.model.values))
-            beyond = used > room + 0.1 * size  # along the edge there is round-off of either sign
-            share = np.min(np.where(beyond, np.maximum(room, 0.0) / np.where(beyond, used, 1.0), 1.0))
+            room = np.maximum(self.rows @ self.model.values - size, 0.0)
+            used = -(self.rows @ (values - self.model.values))
+            beyond = used > room + 1e-6 * size  # along the edge there is round-off of either sign
+            share = np.min(np.where(beyond, room / np.where(beyond, used, 1.0), 1.0))
             values = self.model.values + share * (values - self.model.values)
         try:
             model = self.model.at(values)

@@ -157,7 +157,8 @@ def test_a_moment_of_inertia_stops_at_the_sum_of_the_others(avis):
     true = ResponseModel.of(avis, names)
     true = true.at(true.values * np.array([1.0, 1.0, 1.0, 1.3, 1.0]))  # J3 61 -> 79.3, J1 + J2 = 71.2
     block = responses(true, lines=40)
-    found = fit(ResponseModel.of(avis, names), [block], starts=2)
+    start = ResponseModel.of(avis, names)
+    found = fit(start, [block])
     value = dict(zip(names, found.values, strict=True))
     assert value["J3"] == pytest.approx(value["J1"] + value["J2"], rel=1e-5) and value["J3"] < value["J1"] + value["J2"]
     assert found.held == ("J3",) and found.converged
@@ -172,6 +173,12 @@ def test_a_moment_of_inertia_stops_at_the_sum_of_the_others(avis):
     other = least_squares(residual, found.values[[0, 1, 2, 4]] * 1.02, x_scale="jac", xtol=1e-14, ftol=1e-14)
     assert found.chi2 == pytest.approx(2 * other.cost, rel=1e-5)
     assert np.allclose(found.values[[0, 1, 2, 4]], other.x, rtol=1e-4)
+
+    # A thin plate's rig file begins at the sum itself.
+    mass, J1, J2, _, k_z = start.values
+    thin = fit(start.at([mass, J1, J2, J1 + J2 - 1e-13, k_z]), [block])
+    assert thin.held == ("J3",) and thin.converged
+    assert thin.chi2 == pytest.approx(found.chi2, rel=1e-4)
 
 
 def test_of_too_many_lines_some_driven_ones_are_fitted(avis, monkeypatch):
