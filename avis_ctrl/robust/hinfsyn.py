@@ -130,8 +130,8 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     bounds, status, notes = _consistent(bounds, result.gamma, tolerance, zero, status, notes)
     if status is not Status.OPTIMAL:
         notes = (*notes, *_doubt_of_gamma(P, result))
-    elif result.gamma <= zero:
-        notes = (*notes, f"the optimum is zero to working precision: {result.gamma:.2g} is round-off")
+    elif result.gamma <= zero and bounds[1] - bounds[0] >= 2 * tolerance * bounds[1]:
+        notes = (*notes, f"the optimum is zero to working precision (gamma {result.gamma:.2g})")
     rate = _rate_note(result, sample_rate_Hz)
     return replace(result, gamma_optimal_bounds=(float(bounds[0]), float(bounds[1])), status=status,
                    limited_by=bracket.limited_by, notes=(*notes, *result.notes, *rate))

@@ -213,7 +213,7 @@ def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: fl
         done = covered(best * (1 + slack), np.array([at]))
     if best == 0.0:
         at = float(scan.peak[0])
-    return MuPeak(max(done.level, best), best, at, delta, not done.gaps, _in_words(done, band), scan.omega,
+    return MuPeak(done.level, best, at, delta, not done.gaps, _in_words(done, band), scan.omega,
                   scan.bound.beta, lower.beta)
 
 

@@ -57,6 +57,15 @@ def test_zero_is_said():
         StateSpace([[1.0]], [[1.0, 1.0]], [[0.0], [1.0]], [[0.0, 1.0], [1.0, 0.0]]), 1, 1).notes)
 
 
+def test_a_small_optimum_that_is_proved_is_not_called_zero():
+    """A measured disturbance that u cancels, beside a direct term of 1e-7 that nothing changes."""
+    P = StateSpace([[-1.0]], [[1.0, 0.0, 0.0]], [[1.0], [0.0], [0.0]],
+                   [[0.0, 0.0, 1.0], [0.0, 1e-7, 0.0], [1.0, 0.0, 0.0]])
+    found = hinfsyn(P, 1, 1)
+    assert found.status is Status.OPTIMAL and found.gamma_optimal_bounds == pytest.approx((1e-7, 1e-7))
+    assert not any("zero to working" in note for note in found.notes)
+
+
 def test_no_perturbation_where_round_off_is_all_that_is_singular():
     """A repeated real scalar on a sampled system whose mu is zero: a perturbation of 1e13 proves nothing."""
     assert solve(2026, 7933)["wrong"] == []
