@@ -8,8 +8,8 @@ simulator in tests/truth, which shares no dynamics with the package; the rest (t
 own. Voltages are multisines, noise, swept sines, six logical axes, or one drive after the other; records last 6 to 16
 seconds.
 
-Each campaign is judged as it is, when any stop is false (the check of units and levels before the gates included), and
-once more with one fault put into it. Printed: false stops and warnings by gate, with the 95 % bound of Clopper and
+Each campaign is judged twice: as it is, where any stop is false, that of the check of units and levels before the gates
+included; and with one fault put into it. Printed: false stops and warnings by gate, with the 95 % bound of Clopper and
 Pearson, and detections by fault. A hidden converter that clips and samples that were dropped are faults that the gates
 are to stop at: such campaigns are counted apart.
 """
@@ -293,7 +293,7 @@ def made(seed: int, keep: Path | None) -> tuple[Campaign, str, bool]:
 
 
 def judge(seed: int, faults: tuple[str, ...], keep: Path | None) -> Outcome | None:
-    """One campaign, as it is and with a fault; None where what is hidden makes the table unstable."""
+    """One campaign, as it is and with a fault; None where the hidden effect makes the table unstable."""
     with threadpool_limits(1):
         try:
             campaign, words, faulty = made(seed, keep)
@@ -311,7 +311,7 @@ def judge(seed: int, faults: tuple[str, ...], keep: Path | None) -> Outcome | No
 
 
 def implausible(campaign: Campaign, model: ResponseModel) -> tuple[tuple[str, str, str], ...]:
-    """What the check of units and levels that comes before the gates says, as a stop."""
+    """The error that the check of units and levels before the gates raises, as a stop; empty where it raises none."""
     try:
         check_records(campaign, model)
     except InputError as error:
@@ -362,7 +362,7 @@ def main() -> None:
         for o in pool.map(partial(judge, faults=faults, keep=given.keep),
                           range(given.first, given.first + given.count)):
             if o is None:
-                print("one draw is no table: it is unstable", flush=True)
+                print("one campaign is left out: its table is unstable", flush=True)
                 continue
             outcomes.append(o)
             if given.list:

@@ -3,11 +3,11 @@
     .venv/bin/python -m benchmarks.mutations --count 200 --seed 1 --out mutations.jsonl
     .venv/bin/python -m benchmarks.mutations --report mutations.jsonl
 
-A change is an arithmetic operator, a comparison, a sign or a condition replaced by cosmic-ray. It is made
-in a copy of the tree. A test that fails, and a run that takes several times as long as the unchanged one, has noticed
-it. Only the folder's test files that execute the changed line are run, the tests that do so first; all of the folder's
-where none is known to (a line of a class body, or compiled by numba). Finished changes are one line each in the file,
-and are not run again.
+A change is an arithmetic operator, a comparison, a sign or a condition replaced by cosmic-ray, made in a copy of the
+tree. It counts as noticed where a test fails, or where the run takes several times as long as on the unchanged code.
+Only the test files of the folder that execute the changed line are run, the tests that do so first; where no test is
+known to execute it (a line of a class body, or compiled by numba), all tests of the folder. Finished changes are one
+line each in the file, and are not run again.
 """
 
 from __future__ import annotations
@@ -71,16 +71,16 @@ def changed(path: Path, operator: str, occurrence: int) -> tuple[str, int, str]:
 
 @dataclass(frozen=True)
 class FolderTests:
-    """The tests of a folder: seconds of each by its name, and which execute a line, {file: {line: names}}."""
+    """The tests of a folder: {name: seconds} of each, and which tests execute a line, {file: {line: names}}."""
 
     folder: str
     seconds: dict[str, float]
     by_line: dict[str, dict[int, set[str]]]
 
     def of(self, file: str, line: int) -> list[str]:
-        """The tests to run for a change of a line, the quickest that execute it first, then the rest of their files.
+        """The tests to run for a changed line: those that execute it, the quickest first, then the rest of their files.
 
-        A fixture's lines are executed in the set-up of one test and looked at by all that share it: hence whole files.
+        Whole files, because a shared fixture is executed in the set-up of only one of the tests that use it.
         """
         known = self.by_line.get(file, {}).get(line, set()) & set(self.seconds)
         if not known:
@@ -90,13 +90,13 @@ class FolderTests:
         return [*sorted(known, key=self.seconds.__getitem__), *sorted(rest, key=self.seconds.__getitem__)]
 
     def whole_s(self, names: list[str]) -> float:
-        """Seconds that these tests take together on the unchanged code."""
+        """Seconds that these tests together take on the unchanged code."""
         return sum(self.seconds.values() if len(names) == 1 and "::" not in names[0]
                    else (self.seconds[name] for name in names))
 
 
 def folder_tests(tree: Path, folder: str) -> FolderTests:
-    """Runs a folder's tests once on the unchanged code, under coverage."""
+    """Runs a folder's tests once on the unchanged code, with coverage recorded for each test."""
     from coverage import CoverageData
 
     report, data = tree / "report.xml", tree / ".coverage"
@@ -120,7 +120,7 @@ def folder_tests(tree: Path, folder: str) -> FolderTests:
 
 
 def pytest(tree: Path, words: list[str], limit_s: float) -> tuple[bool, str]:
-    """(a test failed, the first that did) of a run in a tree."""
+    """Whether a test failed in a run in a tree, and which failed first."""
     single = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")}
     (tree / "words").write_text("\n".join(words))
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "@words"]

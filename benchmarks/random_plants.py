@@ -11,7 +11,7 @@ A problem is WRONG where
 
     the measured gamma is not the norm of F_l(P, K): stability from the poles of a loop formed here, the norm from
         SLICOT's AB13DD and from P(jw), K(jw) closed pointwise (the larger of the two; the tolerance is 1e-3);
-    a bracket wider than 1 per cent is called the optimum;
+    a bracket wider than 1 per cent is reported as the optimum;
     the bracket's lower end is above that norm, or the bracket misses that of the plant before it was scaled and
         padded, or for every fourth problem that of the transposed plant or the optimum of the matrix inequalities;
     I - M Delta is not singular, Delta has not its structure or its norm, or a bound of mu is passed by a perturbation;
@@ -221,12 +221,12 @@ def frequencies(*systems: StateSpace, count: int = 300) -> np.ndarray:
 
 
 def in_doubt(r: Any) -> bool:
-    """Whether the synthesis itself says that its gamma is round-off."""
+    """Whether the synthesis itself reports round-off in its gamma."""
     return any("round-off shows in gamma" in note for note in r.notes)
 
 
 def size(P: StateSpace, u: int, y: int) -> float:
-    """A gain beside which F_l(P, K) is zero or not: |P11| + |P12| |P21|, the median over frequencies."""
+    """The gain relative to which F_l(P, K) is judged to be zero: |P11| + |P12| |P21|, median over frequencies."""
     z, w = P.noutputs - y, P.ninputs - u
     responses = [at(P, omega) for omega in frequencies(P, count=20)]
     return float(np.median([la.norm(p[:z, :w], 2) + la.norm(p[:z, w:], 2) * la.norm(p[z:, :w], 2) for p in responses]))
@@ -248,7 +248,7 @@ def judge_synthesis(P: StateSpace, base: StateSpace, u: int, y: int, r: Any, sec
         with contextlib.suppress(ComputationError):
             norm = max(norm, hinf_norm_slicot(own))
         if norm > on_grid * (1 + SAME):
-            # A peak between the points, or the round-off of poles that are far apart: more points tell.
+            # Either a peak between the points or round-off of poles that are far apart: more points decide.
             on_grid = pointwise(P, r.K, frequencies(P, own, count=10_000))
             norm = min(norm, max(on_grid, r.gamma))
     if in_doubt(r):
@@ -261,7 +261,7 @@ def judge_synthesis(P: StateSpace, base: StateSpace, u: int, y: int, r: Any, sec
     if not lower <= upper * (1 + 1e-9):
         wrong.append(f"bracket {lower:.6g}..{upper:.6g} upside down")
     if r.status is Status.OPTIMAL and upper > tiny and lower < 0.99 * upper:
-        wrong.append(f"bracket {lower:.6g}..{upper:.6g} said to be the optimum")
+        wrong.append(f"bracket {lower:.6g}..{upper:.6g} reported as the optimum")
     if lower > norm * (1 + 1e-6) + tiny:
         wrong.append(f"lower bound {lower:.6g} above the norm {norm:.6g} of its own loop")
     others: list[tuple[str, float, float]] = []

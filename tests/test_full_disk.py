@@ -100,7 +100,7 @@ def test_files_are_written_in_one_place():
 
 
 def test_small_pieces_are_read_again_after_the_disk_refused_and_large_ones_are_not():
-    """HDF5 finds its structure again; data that no longer fit are not kept in memory."""
+    """HDF5 can read its structure back; data that no longer fit on the disk are not kept in memory."""
     with open("/dev/full", "wb") as full:
         file = PatientFile(full.fileno())
         file.write(b"structure")

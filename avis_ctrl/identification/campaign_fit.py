@@ -20,22 +20,25 @@ from avis_ctrl.measurement.campaign import Campaign, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import noise_covariance
 
-# Names of parameters: moments of inertia.
+# Names of the parameters that are moments of inertia.
 MOMENTS = ("J1", "J2", "J3", "Ixx", "Iyy", "Izz")
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class CampaignFitSettings:
-    """longest_piece : samples from which records are cut: their spectra would fill the memory and their lines say the
-        same.
-    most_lines : spectral lines of all records together that are fitted: their derivatives by some thirty parameters fit
-        into memory (0.2 GB), and no rig of a few dozen parameters needs more. Of more, those without drive are left out
-        first, then some drawn at random: averaged into frequency responses they would round off the resonances.
-    silent_line : amplitude of a line's drive over that of the record's strongest line, below which it counts as silent:
-        60 dB, a millionth of the power.
-    quiet_band_Hz : where no input says what band is excited: that of a rig file's floor velocity.
-    tail : share of an input's power that may lie below, and above, the band of the fit: noise of a generator is less.
+    """longest_piece : samples; longer records are cut into pieces of this length, because the spectrum of the whole
+        would fill the memory and its finer lines add nothing.
+    most_lines : largest number of spectral lines fitted, all records together: their derivatives with respect to some
+        thirty parameters fit into memory (0.2 GB), and a rig of a few dozen parameters needs no more. Where there are
+        more, the lines without drive are left out first, and of the others a random selection is fitted; averaging them
+        into frequency responses would flatten the resonances.
+    silent_line : ratio of the drive's amplitude at a line to that at the record's strongest line, below which the line
+        counts as silent: -60 dB, a millionth of the power.
+    quiet_band_Hz : band of the fit where no input shows what band is excited: the band of the floor velocity in a rig
+        file.
+    tail : share of an input's power that may lie below the band of the fit, and above it; the noise of a generator has
+        a smaller share.
     """
 
     longest_piece: int = 1 << 18
@@ -282,14 +285,15 @@ def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:
 
 
 def _bounds(found: LikelihoodFit) -> tuple[str, ...]:
-    """Sentences on parameters that physics stops."""
+    """Sentences about parameters that ended at a physical limit."""
     moments = [name for name in found.held if name in MOMENTS]
     low = [name for name in found.held if name not in MOMENTS]
     said = []
     if low:
-        said.append(f"the data ask for less than physics allows of {', '.join(low)}: held just above zero, where "
-                    "standard deviations say little")
+        said.append(f"the best fit would need values below the physical limit for {', '.join(low)}: held just above "
+                    "zero, where standard deviations say little")
     if moments:
-        said.append(f"the data ask for more than a body can have of {', '.join(moments)}: held at the sum of the other "
-                    "two moments of inertia; something that was taken as known is wrong, or these data hardly see it")
+        said.append(f"the best fit would need a larger {', '.join(moments)} than a rigid body can have: held at the "
+                    "sum of the other two moments of inertia; either a value that was taken as known is wrong, or "
+                    "these data hardly determine it")
     return tuple(said)

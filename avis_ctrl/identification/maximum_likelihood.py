@@ -12,8 +12,9 @@ problem).
 Levenberg-Marquardt steps in relative parameters; the information matrix is J^T J at the end, its inverse the
 Cramer-Rao bound where C_k is known. Where C_k was estimated, weights that scatter cost precision, and the information
 is less by what they cost (`weight_cost`). Directions that the data do not determine keep their starting value.
-Parameters that physics keeps positive stop just above zero, and stay there while chi2 would fall below it (an active
-set); the others then find their own optimum. So does a moment of inertia at the sum of the other two.
+Parameters that physics keeps positive stop just above zero, and stay there while chi2 would fall further below zero
+(an active set); the other parameters then find their own optimum. A moment of inertia stops in the same way at the sum
+of the other two.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ Prior = tuple[float, float]
 
 @dataclass(frozen=True)
 class LikelihoodSettings:
-    """few_lines : of all blocks together, below which threads cost more than they bring.
-    edge : distance that a moment of inertia keeps from the sum of the other two, by the sum of all three: round-off
-        takes none beyond it.
+    """few_lines : number of lines, all blocks together, below which threads cost more time than they save.
+    edge : distance that a moment of inertia keeps from the sum of the other two, relative to the sum of all three:
+        large enough that round-off takes it no further.
     """
 
     few_lines: int = 4000
@@ -73,8 +74,8 @@ class LikelihoodFit:
     residuals : one a block.
     starts : chi2 reached from each start, infinite where it failed.
     priors : used, by name. held : parameters that ended at the smallest value that physics allows, and moments of
-        inertia that ended at the largest; what the information says of them, and of what goes with them, is that of a
-        normal law that is cut off there.
+        inertia that ended at the largest; for these, and for parameters correlated with them, the information describes
+        a normal distribution that is truncated there.
     """
 
     model: ResponseModel
@@ -119,8 +120,8 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
     blocks : data with the covariance of their noise.
     priors : (mean, standard deviation) of parameters, in their units.
     starts : how many starting points; the first is the model itself, the others are `spread` (relative) about it.
-    about : the model whose values are the units and bounds of the steps, `model` by default. For a fit that goes on
-        from another: a parameter that ended near zero is no unit.
+    about : the model whose values scale the steps and set the bounds, `model` by default. A fit that continues an
+        earlier one passes that one's start: a parameter that ended near zero would make a useless scale.
 
     Raises
     ------
@@ -235,25 +236,26 @@ class _Descent:
                     break
 
     def _step(self, damping: float) -> tuple[np.ndarray, float]:
-        """Relative step, and the decrease of chi2 that the expansion promises for it.
+        """Relative step, and the decrease of chi2 that the expansion predicts for it.
 
-        Along the bounds and the edges that a step would leave.
+        The step runs along the bounds and edges that it would otherwise cross.
         """
         free = ~((self.at_bound() & (self.now.gradient > 0)) | (self.at_top() & (self.now.gradient < 0)))
         basis = np.eye(len(free))[:, free]
         step, promised = self._step_in(basis, damping)
-        for _ in self.rows:
-            leaving = self.rows[self.at_edge() & (self.rows @ (step * self.scale) < 0)] * self.scale
-            if not len(leaving) or not basis.size:
+        rows, edge, held = self.rows * self.scale, self.at_edge(), np.zeros(len(self.rows), bool)
+        for _ in rows:
+            leaving = edge & ~held & (rows @ step < 0)
+            if not np.any(leaving):
                 break
-            basis = basis @ null_space(leaving @ basis)
-            step, promised = self._step_in(basis, damping)
+            held |= leaving
+            step, promised = self._step_in(basis @ null_space(rows[held] @ basis), damping)
         return step, promised
 
     def _step_in(self, basis: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
-        """The step in the directions of basis (n_p, k).
+        """The step in the space spanned by the columns of basis (n_p, k).
 
-        The diagonal is scaled away before the eigenvalues tell what is determined.
+        H is scaled to a unit diagonal before its eigenvalues decide what is determined.
         """
         H, g = basis.T @ self.now.H @ basis, basis.T @ self.now.gradient
         if not g.size:
@@ -276,7 +278,7 @@ class _Descent:
         return step, float(-(2 * along @ y + y @ (values * y)))
 
     def at_edge(self) -> np.ndarray:
-        """(k,) moments of inertia that are the sum of the other two."""
+        """(k,) whether each row's moment of inertia has reached the sum of the other two."""
         return self.rows @ self.model.values <= 3 * SETTINGS.edge * np.abs(self.rows) @ np.abs(self.model.values)
 
     def largest_moments(self) -> tuple[str, ...]:
@@ -296,11 +298,12 @@ class _Descent:
     def _try(self, step: np.ndarray) -> tuple[ResponseModel, float] | None:
         values = np.clip(self.model.values + step * self.scale, self.lowest, self.highest)
         if len(self.rows):
-            # Back along the step to where a moment is, but for the edge, the sum of the other two.
+            # Shorten the step to end where a moment reaches the sum of the other two, less the distance `edge`.
             size = SETTINGS.edge * np.abs(self.rows) @ np.abs(self.model.values)
-            room, used = self.rows @ self.model.values - size, -(self.rows @ (values - self.model.values))
-            beyond = used > room + 0.1 * size  # along the edge there is round-off of either sign
-            share = np.min(np.where(beyond, np.maximum(room, 0.0) / np.where(beyond, used, 1.0), 1.0))
+            room = np.maximum(self.rows @ self.model.values - size, 0.0)
+            used = -(self.rows @ (values - self.model.values))
+            beyond = used > room + 1e-6 * size  # a step along the edge leaves it by round-off
+            share = np.min(np.where(beyond, room / np.where(beyond, used, 1.0), 1.0))
             values = self.model.values + share * (values - self.model.values)
         try:
             model = self.model.at(values)
@@ -432,7 +435,7 @@ def _moved(model: ResponseModel, spread: float, rng: np.random.Generator) -> Res
 
 
 def _held_rows(first: ResponseModel) -> np.ndarray:
-    """`moment_rows`, but for those that the rig file breaks itself."""
+    """`moment_rows` without those that the starting values violate."""
     rows = moment_rows(first.names)
     return rows[rows @ first.values > 0]
 

@@ -399,9 +399,10 @@ class ResponseModel:
 
 
 def moment_rows(names: Sequence[str]) -> np.ndarray:
-    """(k, n_p) rows r with r @ theta > 0 where no principal moment of inertia is above the sum of the other two.
+    """(k, n_p) rows r: r @ theta > 0 for all of them where no moment of inertia exceeds the sum of the other two.
 
-    For a payload whose three moments are free; products of inertia are taken to be small beside them.
+    No rows unless all three moments are free. The moments about the axes stand for the principal ones: products of
+    inertia are assumed to be small.
     """
     rows = []
     for moments in (("J1", "J2", "J3"), ("Ixx", "Iyy", "Izz")):

@@ -15,9 +15,9 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti.statespace import StateSpace
 
-# Angle from the imaginary axis within which an eigenvalue of the Hamiltonian is looked at as a crossing.
+# Angle [rad] from the imaginary axis within which an eigenvalue of the Hamiltonian is tried as a crossing.
 NEAR_AXIS = 3e-2
-# Where a peak that no crossing contradicts is looked at once more, as multiples of its frequency.
+# Frequencies, as multiples of the peak's, that are searched once more before a peak is accepted.
 NEIGHBOURHOOD = np.geomspace(0.5, 2.0, 101)
 
 
@@ -61,7 +61,7 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
             points = np.concatenate([edges, (edges[:-1] + edges[1:]) / 2, np.sqrt(edges[:-1] * edges[1:])])
             new_omega, new_level = _best(system, points)
         if new_level <= (1.0 + tolerance) * level and 0 < omega < np.inf:
-            # Over many decades of poles round-off can hide crossings of a flat peak, or one of a pair: look around it.
+            # Where the poles span many decades, round-off can hide the crossings of a flat peak: search around it.
             near_omega, near = _best(system, omega * NEIGHBOURHOOD)
             if near > new_level:
                 new_omega, new_level = near_omega, near

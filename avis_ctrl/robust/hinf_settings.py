@@ -7,28 +7,32 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class HinfSettings:
-    """All are ratios.
+    """All values are ratios.
 
-    rank_tolerance : singular value of D12 (columns of unit length) or D21 (rows) below which it lacks rank: the
-        formulas divide by it, which costs half the digits.
-    pbh_tolerance : smallest singular value of the PBH matrix by the norm of [A B], or of [A; C], below which no input
-        moves a mode, or no measurement sees it: well above the round-off of its pole.
-    rank_at_point : singular value of a channel at one frequency, by its typical size, up to which it lacks rank there:
-        above the round-off of a response, but little, for lost rank raises a bound.
-    response_tolerance : difference of two responses off the imaginary axis, by their size, up to which it is round-off.
-    axis_tolerance : real part of an eigenvalue of the Hamiltonian by its magnitude, up to which it is on the imaginary
-        axis: its round-off.
+    rank_tolerance : singular value of D12 (columns of unit length) or D21 (rows of unit length) below which the matrix
+        counts as rank deficient: the formulas divide by it, which costs half the digits.
+    pbh_tolerance : smallest singular value of the PBH matrix relative to the norm of [A B], or of [A; C], below which a
+        mode counts as uncontrollable, or unobservable: well above the round-off of its pole.
+    rank_at_point : singular value of a channel at one frequency, relative to its typical size, below which the channel
+        counts as rank deficient there: only just above the round-off of a response, because lost rank raises a bound.
+    response_tolerance : largest difference of two responses off the imaginary axis, relative to their size, that counts
+        as round-off.
+    axis_tolerance : real part of an eigenvalue of the Hamiltonian relative to its magnitude, up to which it counts as
+        lying on the imaginary axis: its round-off.
     lagrangian_tolerance : largest asymmetry of X1' X2, whose entries are below 1: with more, the stable subspace is not
         known to six digits.
-    negative : size of a negative eigenvalue of X by the largest, up to which it is round-off and not looked at further.
-    zero_gamma : gamma by the gain of the open channel w -> z, below which it is round-off.
-    norm_accuracy : of a norm or a bound beside gamma: that of `hinf_norm`.
-    loop_accuracy : by how much a closed loop's norm contradicts a bound: ten times that, for round-off of the loop.
-    same_gamma : difference of two computations of gamma that says that round-off shows in it; less changes no decision.
-    far_beyond : controller poles this many times the plant's fastest come from the formulas, not from the plant, which
-        feels little but their gain.
-    closer : shares of the back-off at which a controller without those poles is tried: the smaller, the nearer they are
-        to a gain.
+    negative : magnitude of a negative eigenvalue of X relative to the largest one, up to which it counts as round-off
+        and is not examined further.
+    zero_gamma : gamma relative to the gain of the open channel w -> z, below which it counts as round-off.
+    norm_accuracy : relative accuracy of a norm or a bound that is compared with gamma: that of `hinf_norm`.
+    loop_accuracy : relative amount by which a closed loop's norm must pass a bound to contradict it: ten times the
+        accuracy of the norm, to allow for the round-off of the loop.
+    same_gamma : relative difference between two computations of gamma from which round-off is reported; a smaller one
+        changes no decision.
+    far_beyond : controller poles faster than this many times the plant's fastest come from the formulas, not from the
+        plant, on which they act as a gain.
+    closer : fractions of the back-off at which a controller without those poles is tried: the smaller the fraction, the
+        faster these poles are.
     """
 
     rank_tolerance: float = 1e-8

@@ -130,8 +130,8 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     bounds, status, notes = _consistent(bounds, result.gamma, tolerance, zero, status, notes)
     if status is not Status.OPTIMAL:
         notes = (*notes, *_doubt_of_gamma(P, result))
-    elif result.gamma <= zero:
-        notes = (*notes, f"the optimum is zero to working precision: {result.gamma:.2g} is round-off")
+    elif result.gamma <= zero and bounds[1] - bounds[0] >= 2 * tolerance * bounds[1]:
+        notes = (*notes, f"the optimum is zero to working precision (gamma {result.gamma:.2g})")
     rate = _rate_note(result, sample_rate_Hz)
     return replace(result, gamma_optimal_bounds=(float(bounds[0]), float(bounds[1])), status=status,
                    limited_by=bracket.limited_by, notes=(*notes, *result.notes, *rate))
@@ -291,14 +291,15 @@ class _Problem:
 
 
 def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
-    """A note where the loop's gain, computed from P and K apart, is another: a small difference of large terms.
+    """A note where the loop's gain, computed from the responses of P and K, differs from that of the closed loop.
 
-    At the peak, and wherever the loop's poles are: a loop whose poles are round-off peaks elsewhere each way.
+    Gamma is then a small difference of large terms. P and K are evaluated at the peak and at the magnitudes of the
+    loop's poles: where these are round-off, the two computations have their peaks at different frequencies.
     """
     peak = hinf_norm(result.closed_loop).omega
     poles = result.closed_loop.poles()
-    turns = np.abs(np.angle(poles)) / P.dt if P.dt else np.abs(poles)
-    p, k = (one.frequency_response(np.concatenate([[peak], turns[turns > 0]])) for one in (P, result.K))
+    at_poles = np.abs(np.angle(poles)) / P.dt if P.dt else np.abs(poles)
+    p, k = (one.frequency_response(np.concatenate([[peak], at_poles[at_poles > 0]])) for one in (P, result.K))
     u, y = k.shape[1:]
     w, z = P.ninputs - u, P.noutputs - y
     loop = p[:, :z, :w] + p[:, :z, w:] @ np.linalg.solve(np.eye(u) - k @ p[:, z:, w:], k @ p[:, z:, :w])
@@ -308,7 +309,7 @@ def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
     if abs(other - result.gamma) <= SETTINGS.same_gamma * result.gamma:
         return ()
     return (f"round-off shows in gamma: {result.gamma:.6g} from the closed loop, {other:.6g} from P and K at "
-            f"single frequencies",)
+            f"one frequency",)
 
 
 def _widest_gap(poles: np.ndarray, plant_fastest: float) -> float:

@@ -30,10 +30,10 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 @dataclass(frozen=True)
 class MuLowerSettings:
-    """singular : smallest singular value of I - M Delta, beside the round-off of M Delta, below which it is singular: a
-        Delta that is off by as little changes no digit of mu that is told.
-    meaningless : with a perturbation so large that the round-off of M Delta is above this, no singular value is called
-        zero.
+    """singular : I - M Delta counts as singular if its smallest singular value is below this plus the round-off of
+        M Delta: an error of this size in Delta changes no digit of mu that is printed.
+    meaningless : round-off of M Delta above which a small singular value proves nothing, and I - M Delta never counts
+        as singular.
     """
 
     singular: float = 1e-9
@@ -182,7 +182,7 @@ def block_norm(delta: Array, structure: BlockStructure) -> Array:
 
 
 def is_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
-    """Whether I - M Delta is singular (B,): smallest singular value below 1e-9, up to the round-off of M Delta.
+    """Whether I - M Delta is singular (B,): smallest singular value below 1e-9 plus the round-off of M Delta.
 
     Judged on the balanced M, which has the same determinant: a badly scaled M looks singular to any Delta.
     """
@@ -195,7 +195,8 @@ def is_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
 def _balanced_is_singular(M: Array, delta: Array) -> Array:
     A = M @ delta
     least = np.linalg.svd(np.eye(A.shape[-1]) - A, compute_uv=False)[:, -1]
-    return least < np.minimum(SETTINGS.singular + 1e-14 * np.linalg.norm(A, ord=2, axis=(1, 2)), SETTINGS.meaningless)
+    round_off = 1e-14 * np.linalg.norm(A, ord=2, axis=(1, 2))
+    return (least < SETTINGS.singular + round_off) & (round_off < SETTINGS.meaningless)
 
 
 def _complex_part(structure: BlockStructure) -> Array:

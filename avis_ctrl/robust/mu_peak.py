@@ -209,11 +209,11 @@ def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: fl
         done = covered(scan.level, scan.peak)
     best, at, delta = _best_singular(N, structure, scan.omega, scan.bound, lower, done, band)
     if best > done.level:
-        # mu of real blocks can jump up at a single frequency, which no grid meets: the search for a singular one did.
+        # mu of real blocks can jump at a single frequency that no grid contains; the search for it found one.
         done = covered(best * (1 + slack), np.array([at]))
     if best == 0.0:
         at = float(scan.peak[0])
-    return MuPeak(max(done.level, best), best, at, delta, not done.gaps, _in_words(done, band), scan.omega,
+    return MuPeak(done.level, best, at, delta, not done.gaps, _in_words(done, band), scan.omega,
                   scan.bound.beta, lower.beta)
 
 

@@ -31,7 +31,7 @@ from avis_ctrl.robust.musyn_state import DONE, GIVEN, NOMINAL, Iteration, Loop, 
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-# The phase after each.
+# Which phase follows which.
 FOLLOWING = {"first start": "D-K", "D-K": "descent", "other start": "descent", "descent": "growth",
              "growth": "last start", "last start": DONE}
 STOPPED = "stopped by the callback"
@@ -39,14 +39,14 @@ STOPPED = "stopped by the callback"
 
 @dataclass(frozen=True)
 class IterationSettings:
-    """stall : a step that lowers mu by less than this share ends its phase: another is not worth its synthesis.
-    round : a round of all phases that lowers mu by less than this share ends the iteration.
-    fast : a D-K step that lowers mu by more than this share is followed by another that fits mu's profile as roughly;
-        after a slower one the profile's details are what is left to gain.
-    idle : a controller whose mu is within this share of the plant's without control does nothing: ten times the
-        accuracy of mu there.
-    constants : scalings of all uncertainty against performance from which the iteration starts where identity leads
-        nowhere: over six decades, for the units of the signals may differ.
+    """stall : a step that lowers mu by a smaller fraction than this ends its phase: another is not worth a synthesis.
+    round : a round of all phases that lowers mu by a smaller fraction than this ends the iteration.
+    fast : a D-K step that lowers mu by a larger fraction than this is followed by another with an equally coarse fit of
+        the scalings; after a smaller gain the fit must become finer for mu to fall further.
+    idle : a controller does nothing if its mu is within this fraction of that of the plant without control: ten times
+        the accuracy of that mu.
+    constants : constant scalings of the uncertainty relative to the performance, tried as starts where the identity
+        leads nowhere: over six decades, because the units of the signals may differ.
     """
 
     stall: float = 0.005
@@ -256,7 +256,7 @@ def _other_constants(problem: Problem, gamma: float, options: Options) -> Propos
 
 
 def _falls_fast(state: State) -> bool:
-    """Whether the last step lowered mu by more than `fast`, or none was taken yet on this path."""
+    """Whether the last step lowered mu by more than `fast`, or no step was taken yet on this path."""
     steps = _steps(state)
     return len(steps) < 2 or state.history[-1].kind == "start" or steps[-1] < (1 - SETTINGS.fast) * steps[-2]
 

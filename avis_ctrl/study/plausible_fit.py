@@ -1,4 +1,4 @@
-"""Whether an identified rig can be the one that its file describes: a mass is known before anything is measured."""
+"""Whether the identified masses and moments of inertia are near those of the rig file, which are known roughly."""
 
 from __future__ import annotations
 
@@ -16,9 +16,11 @@ INERTIAL = ("mass", "load.mass", "J1", "J2", "J3", "Ixx", "Iyy", "Izz")
 class FitPlausibility:
     """When an identified mass or moment of inertia is called far from the rig file's.
 
-    far : ratio of the two, either way; drawings and scales are right to a few per cent.
-    alike : largest ratio among the parameters' own ratios that still counts as one common factor.
-    known : relative standard deviation above which a parameter is left out.
+    far : ratio of the two, or its inverse, from which they are far apart; drawings and scales are right to a few per
+        cent.
+    alike : the identified values have a factor to the file's in common if the largest of these factors is less than
+        this many times the smallest.
+    known : relative standard deviation above which a parameter is not judged.
     """
 
     far: float = 1.5
@@ -28,7 +30,7 @@ class FitPlausibility:
 
 def far_from_file(start: ResponseModel, fit: LikelihoodFit, settings: FitPlausibility = FitPlausibility()
                   ) -> tuple[str, ...]:
-    """A sentence where masses or moments of inertia are far from the rig file's, with the likely cause."""
+    """A sentence with the likely cause if a mass or moment of inertia is far from the rig file's, else nothing."""
     before = dict(zip(start.names, start.values, strict=True))
     found = [(name, float(value / before[name]), float(value), unit)
              for name, value, unit, sigma in zip(fit.model.names, fit.values, fit.model.units,
@@ -42,8 +44,8 @@ def far_from_file(start: ResponseModel, fit: LikelihoodFit, settings: FitPlausib
     others = [one[1] for one in found if one[0] in INERTIAL or ".k_" in one[0] or one[0].startswith("k_")]
     if len(others) > 2 and max(others) / min(others) < settings.alike:
         middle = float(np.median(others))
-        return (f"{said}, and all masses, moments of inertia and stiffnesses are about {middle:.2g} times the file's: "
-                f"a response shows only their ratio to the force constants and sensitivities, so look there for a "
-                f"factor of {middle:.2g} or {1 / middle:.2g}",)
+        return (f"{said}, and all masses, moments of inertia and stiffnesses that are well determined are about "
+                f"{middle:.2g} times the file's: a response to the drives shows only their ratio to the force "
+                f"constants and sensitivities, so check these for a factor of {middle:.2g} or {1 / middle:.2g}",)
     more = f"; the same holds for {', '.join(one[0] for one in far[1:])}" if len(far) > 1 else ""
-    return (f"{said}{more}: check the rig file, or these data do not determine it",)
+    return (f"{said}{more}: check the rig file, and whether these data determine the value",)

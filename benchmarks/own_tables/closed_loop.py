@@ -118,7 +118,7 @@ def lifted_map(
 ) -> tuple[np.ndarray, list[str]]:
     """One-sample map of the closed loop about rest by central differences of the nonlinear model; names of its states.
 
-    Drives and converter without limits: a controller's states may be in units in which a small step saturates them.
+    Drives and converter have no limits here: in some units of the controller's states a small step would saturate them.
     States: 6 of place (m, rad), 6 of velocity, amplifiers with a lag, sensors, commands under way, controller.
     """
     c = controller or open_loop(table)

@@ -4,10 +4,10 @@
 
 The independent simulator makes a campaign of the true table. `avis identify` and `avis design` see only that campaign
 and the rig file in designs/rigs. The sampled controller that they deliver then runs on the independent nonlinear table:
-on the nominal one and on the true one, which differs within tolerances. The last column says whether both agree: the
-package's simulation of the identified table and the independent one of the nominal table are both stable or both not,
-and a verdict of stability holds on the true table. What is asked of each design is in `ASKED`; a design that misses it
-is a result, not a failure.
+on the nominal one and on the true one, which differs within tolerances. The last column says whether they agree: the
+package's simulation of the identified table and the independent one of the nominal table are both stable or both
+unstable, and where the verdict is "stable", the true table is stable. What is asked of each design is in `ASKED`; a
+design that misses it is a result, not a failure.
 """
 
 import argparse
@@ -57,7 +57,7 @@ at_most = 1.0
 """
 # Bands about each table's vertical modes, and a floor that uses a decent part of the drives.
 BOTH = '["z", "phi_x"]'
-# On the granite only z is measured in space; turns are measured against the floor, which isolates nothing.
+# On the granite only z is measured absolutely; rotations are measured relative to the floor, which gives no isolation.
 ASKED = {"tripod": (BOTH, -6.0, 2.0, 8.0, 2e-5), "four_vertical": (BOTH, -6.0, 3.0, 12.0, 2e-5),
          "twelve_sensors": (BOTH, -6.0, 2.0, 10.0, 2e-5), "skewed": (BOTH, -3.0, 8.0, 20.0, 2e-5),
          "granite": ('["z"]', -3.0, 2.0, 6.0, 2e-5)}
@@ -96,7 +96,7 @@ def flow(name: str, form: str, seed: int, out: Path) -> dict:
             row[f"{kind}_radius"], row[f"{kind}_stable"] = linear.spectral_radius, bool(linear.stable and record.stable)
         identified = next(one for one in result["simulation"]["plants"] if one["name"] == "nominal")
         row |= {"package_radius": identified["spectral_radius"], "package_nominal_stable": identified["stable"]}
-        # A verdict of instability may come from one perturbed plant of several: the true table need not be like it.
+        # A verdict "unstable" may rest on a single perturbed plant, which the true table need not resemble.
         row["agree"] = (row["package_nominal_stable"] == row["nominal_stable"]
                         and (row["true_stable"] or not row["says_stable"]))
     return row

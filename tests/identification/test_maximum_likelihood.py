@@ -140,7 +140,7 @@ def test_a_parameter_at_its_bound_leaves_the_others_at_their_optimum(avis):
 
 
 def test_a_fit_goes_on_from_a_parameter_near_zero(avis):
-    """Its units are those of the first start: half of next to nothing at a step would lead nowhere."""
+    """The steps keep the scale of the first start: in steps of half a tiny value the fit would make no progress."""
     names = ["mass", "J1", "isolator1.k_z", "isolator1.c_z"]
     true = ResponseModel.of(avis, names)
     block, start = responses(true, lines=60), true.at([520, 30, 46e3, 160])
@@ -152,12 +152,13 @@ def test_a_fit_goes_on_from_a_parameter_near_zero(avis):
 
 
 def test_a_moment_of_inertia_stops_at_the_sum_of_the_others(avis):
-    """Data of a body that cannot be: scipy's bounded optimum with J3 = J1 + J2 is the same place."""
+    """Data of an impossible body: the fit ends at the optimum that scipy finds with J3 = J1 + J2."""
     names = ["mass", "J1", "J2", "J3", "isolator1.k_z"]
     true = ResponseModel.of(avis, names)
     true = true.at(true.values * np.array([1.0, 1.0, 1.0, 1.3, 1.0]))  # J3 61 -> 79.3, J1 + J2 = 71.2
     block = responses(true, lines=40)
-    found = fit(ResponseModel.of(avis, names), [block], starts=2)
+    start = ResponseModel.of(avis, names)
+    found = fit(start, [block])
     value = dict(zip(names, found.values, strict=True))
     assert value["J3"] == pytest.approx(value["J1"] + value["J2"], rel=1e-5) and value["J3"] < value["J1"] + value["J2"]
     assert found.held == ("J3",) and found.converged
@@ -172,6 +173,12 @@ def test_a_moment_of_inertia_stops_at_the_sum_of_the_others(avis):
     other = least_squares(residual, found.values[[0, 1, 2, 4]] * 1.02, x_scale="jac", xtol=1e-14, ftol=1e-14)
     assert found.chi2 == pytest.approx(2 * other.cost, rel=1e-5)
     assert np.allclose(found.values[[0, 1, 2, 4]], other.x, rtol=1e-4)
+
+    # The rig file of a thin plate: the fit starts at the sum itself.
+    mass, J1, J2, _, k_z = start.values
+    thin = fit(start.at([mass, J1, J2, J1 + J2 - 1e-13, k_z]), [block])
+    assert thin.held == ("J3",) and thin.converged
+    assert thin.chi2 == pytest.approx(found.chi2, rel=1e-4)
 
 
 def test_of_too_many_lines_some_driven_ones_are_fitted(avis, monkeypatch):

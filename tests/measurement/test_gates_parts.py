@@ -63,7 +63,7 @@ def test_longest_run_by_groupby(values):
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("size", [1.0, -2.5])
 def test_a_corner_leaves_nothing_and_a_single_sample_much(share, size):
-    """Where a slope changes, at a sample or between two, the departures from cubics have the corner's shape."""
+    """Where the slope changes, at a sample or between two, the departure from cubics has the shape of a corner."""
     t = np.arange(-4.0, 5.0)
     bend = size * np.maximum(t - share, 0.0)
     assert _corner(_departure(bend)) < 1e-12 * np.sum(_departure(bend) ** 2)

@@ -295,7 +295,7 @@ def test_noise_covariance_of_coloured_noise(rng):
     chi = stats.chi2(6 * got.dof)
     inside = (6 * got.dof * trace > chi.ppf(0.005)) & (6 * got.dof * trace < chi.ppf(0.995))
     assert np.mean(inside) > 0.93
-    # Neither more nor fewer degrees of freedom than the scatter shows: var(trace) = 1 / (n dof).
+    # The degrees of freedom agree with the scatter: var(trace) = 1 / (n dof).
     assert 0.5 < np.mean((trace - 1) ** 2 * 3 * got.dof) < 2.0
     assert np.allclose(got.density, got.covariance * 2 / RATE)
 

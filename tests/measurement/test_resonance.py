@@ -62,7 +62,7 @@ def test_where_there_is_no_mode(rng):
     flat = measured(f, np.ones((f.size, 2, 2)), 0.01, rng)
     with pytest.raises(ComputationError, match="no mode found near 50 Hz"):
         resonance(flat, 50.0)
-    # One entry, whose pole takes four numbers more: noise passes for a mode no more often than it may.
+    # One entry, where the pole adds four real unknowns: noise passes for a mode no more often than allowed.
     found = 0
     for _ in range(60):
         with suppress(ComputationError):

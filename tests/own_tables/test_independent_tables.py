@@ -262,10 +262,10 @@ def test_floor_motion_is_one_motion():
 
 @pytest.mark.parametrize("name", tables.NOMINAL)
 def test_nominal_table_is_that_of_the_rig_file(name):
-    """Equations of motion, drives, and each sensor's response: a comparison on another table says nothing."""
+    """Equations of motion, drives, and each sensor's response: a comparison with another table would say nothing."""
     own, rig = tables.NOMINAL[name](), load_rig(str(Path(__file__).parents[2] / "designs" / "rigs" / f"{name}.toml"))
     equations = rig.equations_of_motion()
-    # The rig's coordinates are the motion of its geometric centre, the own ones that of the centre of mass.
+    # The rig's coordinates describe its geometric centre, those of the independent table its centre of mass.
     there = np.eye(6)
     there[:3, 3:] = cross_matrix(own.centre_of_mass_m)
     theirs = [there.T @ X @ there for X in (equations.M, equations.C, equations.K)] + [there.T @ equations.T]
@@ -289,10 +289,10 @@ def test_nominal_table_is_that_of_the_rig_file(name):
 
 
 def test_units_of_the_controllers_states_change_no_eigenvalue():
-    """States a thousand million times smaller, an output matrix as much larger: a finite step must not meet a limit."""
+    """States 1e9 times smaller and an output matrix 1e9 times larger: the finite differences must not reach a limit."""
     twelve = tables.NOMINAL["twelve_sensors"]()
     K = closed_loop.velocity_feedback(twelve, 500.0)
-    assert len(K.A)  # accelerometers are summed up
+    assert len(K.A)  # states: the integrators of the accelerometers
     other = replace(K, B=K.B * 1e-9, C=K.C * 1e9)
     one, two = (np.sort_complex(np.linalg.eigvals(closed_loop.lifted_map(twelve, c)[0])) for c in (K, other))
     assert np.abs(np.abs(one) - np.abs(two)).max() < 1e-5

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.robust.mu import mu, mu_upper
+from avis_ctrl.robust.mu_lower import is_singular
 from avis_ctrl.robust.mu_oracle import mu_upper_by_bisection
 from avis_ctrl.robust.slycot_adapter import mu_upper_slicot
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
@@ -286,6 +287,14 @@ def test_larger_sets_of_perturbations_have_larger_mu(seed):
     values = [mu_upper(M, blocks).upper for blocks in chain]
     assert np.all(np.diff(values) > -1e-5 * values[-1])
     assert mu_upper(M[:3, :3], [C()] * 3).upper <= values[4] * (1 + 1e-5)
+
+
+def test_round_off_makes_no_matrix_singular():
+    """I - M Delta with entries of 1e12 and a smallest singular value of 5e-7, below the round-off of M Delta."""
+    structure, delta = BlockStructure.of([F(2)]), np.eye(2, dtype=complex)[None]
+    differences = np.array([[[1e12, 1.0], [0.0, 5e-7]], [[1.0, 1.0], [0.0, 0.0]]])
+    found = [bool(is_singular(np.eye(2) - one[None], delta, structure)[0]) for one in differences]
+    assert found == [False, True]
 
 
 # -- input --------------------------------------------------------------------------------------------------

@@ -352,7 +352,7 @@ def test_worst_case_gain_of_an_unstable_family():
 
 
 def test_no_gain_is_proved_in_a_band_where_another_frequency_is_unstable():
-    """A resonance at 10 rad/s that a perturbation of norm 1 destabilises, asked about far below it."""
+    """A perturbation of norm 1 destabilises a resonance at 10 rad/s; the gain is asked for far below it."""
     N = append(tf([20.0], [1, 0.2, 100], ["w"], ["z"]), tf([1.0], [1, 1], ["d"], ["e"]))
     structure = [C()]
     assert mu_peak(N.select([0], [0]), structure).lower > 1

@@ -1,4 +1,4 @@
-"""Random problems that were answered wrongly once, each recomputed by the judge of benchmarks/random_plants.py."""
+"""Random problems whose answer was once wrong, each recomputed by the judge of benchmarks/random_plants.py."""
 
 import sys
 from pathlib import Path
@@ -16,7 +16,7 @@ from benchmarks.random_plants import plant, solve
 
 @pytest.mark.parametrize("seed", [(77, 26), (5, 3386)])
 def test_singular_filter_riccati_solution_is_no_indefinite_one(seed):
-    """The disturbance is measured exactly: Y is zero. The bracket has to hold the optimum of the inequalities."""
+    """The disturbance is measured exactly, so Y is zero. The bracket must contain the optimum of the inequalities."""
     P, base, ncon, nmeas, _ = plant(np.random.default_rng(seed))
     lower, upper = hinfsyn(P, nmeas, ncon).gamma_optimal_bounds
     other = lmi_gamma(base, nmeas, ncon)
@@ -27,14 +27,14 @@ def test_singular_filter_riccati_solution_is_no_indefinite_one(seed):
 
 @pytest.mark.parametrize("index", [1315, 1568, 1729, 1946])
 def test_optimum_of_zero(index):
-    """w does not reach z, or all of it can be cancelled: what is left is round-off, and no bound is above it."""
+    """w does not reach z, or can be cancelled completely: gamma is round-off, and no lower bound is above it."""
     row = solve(2026, index)
     assert row["wrong"] == []
     assert row["gamma"] < 1e-5
 
 
 def test_real_blocks_that_make_one_frequency_singular():
-    """A repeated real scalar: mu is zero but at a single frequency, and the bounds are those of that one."""
+    """A repeated real scalar: mu is zero except at a single frequency, and the bounds are those at this frequency."""
     row = solve(2026, 5019)
     assert row["wrong"] == [] and row["status"] == "proved"
     assert row["bounds"][0] == pytest.approx(0.0741486, rel=1e-5)
@@ -43,7 +43,7 @@ def test_real_blocks_that_make_one_frequency_singular():
 
 @pytest.mark.parametrize("index", range(12))
 def test_any_problem(index):
-    """A dozen of the campaign of 10 000."""
+    """A dozen problems like those of the benchmark."""
     assert solve(1, index)["wrong"] == []
 
 
@@ -55,6 +55,15 @@ def test_zero_is_said():
     assert any("zero to working precision" in note for note in found.notes)
     assert not any("zero to working" in note for note in hinfsyn(
         StateSpace([[1.0]], [[1.0, 1.0]], [[0.0], [1.0]], [[0.0, 1.0], [1.0, 0.0]]), 1, 1).notes)
+
+
+def test_a_small_optimum_that_is_proved_is_not_called_zero():
+    """A measured disturbance that u cancels, beside a direct term of 1e-7 that nothing changes."""
+    P = StateSpace([[-1.0]], [[1.0, 0.0, 0.0]], [[1.0], [0.0], [0.0]],
+                   [[0.0, 0.0, 1.0], [0.0, 1e-7, 0.0], [1.0, 0.0, 0.0]])
+    found = hinfsyn(P, 1, 1)
+    assert found.status is Status.OPTIMAL and found.gamma_optimal_bounds == pytest.approx((1e-7, 1e-7))
+    assert not any("zero to working" in note for note in found.notes)
 
 
 def test_no_perturbation_where_round_off_is_all_that_is_singular():

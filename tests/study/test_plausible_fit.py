@@ -1,4 +1,4 @@
-"""A wrong force constant is named where identified masses are far from the rig file's."""
+"""Identified masses far from the rig file's are reported; where all share one factor, the gains are blamed."""
 
 import numpy as np
 import pytest

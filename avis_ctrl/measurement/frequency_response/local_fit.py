@@ -25,14 +25,15 @@ from avis_ctrl.errors import ComputationError, InputError
 
 @dataclass(frozen=True)
 class LocalFitSettings:
-    """batch : lines whose least-squares problems are factored at once, which bounds the work arrays.
-    together_bytes : of spectra held at once: records are taken in together up to this size, which saves factorisations.
-    rank_tolerance : relative size of an input's own part (not explained by the others) below which it counts as
-        dependent: half the digits of double precision.
-    span_tolerance : the same where the inputs need not be told apart: what single precision rounds is no direction of
-        its own.
-    silent : amplitude relative to the band's r.m.s. below which an input counts as silent: 100 dB, more than
-        converters of 16 bits span.
+    """batch : number of lines whose least-squares problems are factored at once; it limits the size of the work arrays.
+    together_bytes : memory for the spectra held at once: records are processed together up to this size, which saves
+        factorisations.
+    rank_tolerance : relative size of the part of an input that the others do not explain, below which the input counts
+        as dependent: half the digits of double precision.
+    span_tolerance : the same where the responses to the inputs need not be separated: rounding to single precision must
+        not pass for an independent direction.
+    silent : amplitude relative to the band's r.m.s. below which an input counts as silent: -100 dB, below the range of
+        a 16-bit converter.
     """
 
     batch: int = 192

@@ -23,19 +23,22 @@ from avis_ctrl.measurement.frequency_response.spectra import Channels
 
 @dataclass(frozen=True)
 class PeriodicSettings:
-    """Of the methods for periodic records, here and in `best_linear` and `distortion_lines`.
+    """Settings of the methods for periodic records, here and in `best_linear` and `distortion_lines`.
 
-    block : lines over which powers of outputs are added before periods are compared: 16 degrees of freedom a record.
-    false_alarm : chance of dropping a settled period, over all blocks and outputs; small, for it costs data.
-    degree : of the transient's polynomials, as of the local polynomial method.
-    same_level : relative difference of r.m.s. levels that still counts as the same: realisations scatter.
-    excited_power, excited_over_noise : a line is excited where the mean power of an input exceeds this part of its
-        largest (60 dB below), and this many times its noise (which alone does so with probability e^-30).
-    excited_amplitude : the same of a single record without its noise, amplitude by that of the largest line.
-    repeated : difference of the inputs of two experiments by their power, below which they are repetitions of one: that
-        of other phases is 2.
-    dependent : eigenvalue of the inputs' Gram matrix, scaled to unit diagonal, below which responses cannot be told
-        apart: they would have 10^4 times the noise.
+    block : number of lines over which the power of an output is summed before periods are compared: 16 degrees of
+        freedom per record.
+    false_alarm : probability of dropping a settled period, over all blocks and outputs; small, because it costs data.
+    degree : degree of the transient's polynomials, that of the local polynomial method.
+    same_level : relative difference of r.m.s. levels up to which two records count as having the same level:
+        realisations scatter.
+    excited_power, excited_over_noise : a line is excited where the mean power of an input exceeds this fraction of its
+        largest value (-60 dB), and this many times its noise (noise alone does so with a probability of at most e^-30).
+    excited_amplitude : ratio of amplitudes that corresponds to `excited_power`, for a single record whose noise is not
+        known.
+    repeated : power of the difference between the inputs of two experiments, relative to their power, below which the
+        experiments are repetitions of one; inputs of independent phases differ by 2.
+    dependent : eigenvalue of the inputs' Gram matrix, scaled to unit diagonal, below which the responses cannot be
+        separated: they would have 10^4 times the noise.
     """
 
     block: int = 8

@@ -23,11 +23,12 @@ from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
 
 @dataclass(frozen=True)
 class ResonanceSettings:
-    """reach : half-power bandwidths to each side that the fit tries, narrow first.
+    """reach : half-widths of the bands that the fit tries, in half-power bandwidths, narrow first.
     misfit : weighted mean square residual up to which the wider band is kept: the background is still a straight line.
-    fewest_lines : of a fit: three times the complex unknowns of an entry.
-    search : part of near_Hz within which the mode is looked for: expected frequencies are off by some percent.
-    false_alarm : chance that noise passes for a mode; small, as the pole was searched for.
+    fewest_lines : smallest number of lines for a fit: three times the number of complex unknowns of an entry.
+    search : fraction of near_Hz, either way, within which the mode is searched: expected frequencies are off by a few
+        per cent.
+    false_alarm : probability that noise passes for a mode; small, because the pole is the best of many tried.
     """
 
     reach: tuple[float, ...] = (1.0, 2.0, 4.0)

@@ -38,9 +38,9 @@ Estimator = Literal["H1", "H2", "Hv"]
 
 @dataclass(frozen=True)
 class WelchSettings:
-    """samples_at_once : of segments transformed together, which bounds the memory.
-    dependent : eigenvalue of the inputs' spectra, scaled to unit diagonal, below which responses cannot be told apart:
-        they would have 10^5 times the noise.
+    """samples_at_once : number of samples in the segments transformed together; it limits the memory.
+    dependent : eigenvalue of the inputs' spectral matrix, scaled to unit diagonal, below which the responses cannot be
+        separated: they would have 10^5 times the noise.
     """
 
     samples_at_once: int = 1 << 20

@@ -36,7 +36,7 @@ class MapSettings:
         below it describes less than half the power of the data, and proves nothing. delay_s : range of delays that are
         fitted, from a u recorded late to the slowest loop. delay_step_s : a tenth of a turn at 100 Hz.
         closest : smallest value used for 1 - a^2: resonances 2.5 % away from the model's leave as much.
-    still : share of a drive in the excited directions up to which it does not move: round-off of their basis.
+    still : share of a drive in the excited directions up to which it counts as not driven: round-off of the basis.
     """
 
     chance: float = 1e-4

@@ -19,20 +19,20 @@ from scipy import signal
 
 from avis_ctrl.measurement.gates.excerpt import Excerpt
 
-# Independent segments that each of many half-overlapping Hann segments is worth: 1 / (1 + 2 rho^2), rho = 1/6 the
-# correlation of the window with itself shifted by half its length.
+# Number of independent segments that one of many half-overlapping Hann segments counts for: 1 / (1 + 2 rho^2), with
+# rho = 1/6 the correlation of the window with itself shifted by half its length.
 OVERLAP = 1 / 1.056
 
 
 @dataclass(frozen=True)
 class H1Settings:
-    """most_samples : of a record that are read, for speed: 31 segments for up to four inputs.
-    driven : power of u at a line by that at the strongest, below which the line counts as not driven: 30 dB down,
-        most of u and y is what leaks from others.
-    direction : power of a direction of the voltages by the strongest one's, each drive at equal r.m.s., below which it
-        is not excited: voltages rounded to four digits leave less.
-    at_line : the same at a single line, by the line's own strongest direction: a weaker one would have 100 times the
-        noise of that one.
+    """most_samples : largest number of samples read from a record, for speed: 31 segments for up to four inputs.
+    driven : power of u at a line relative to the strongest line, below which the line counts as not driven: at -30 dB
+        most of u and y has leaked from other lines.
+    direction : power of a direction of the voltages relative to the strongest direction, with all drives scaled to
+        equal r.m.s., below which it counts as not excited: voltages rounded to four digits leave less.
+    at_line : the same at a single line, relative to the line's own strongest direction: the response in a weaker one
+        would have more than 100 times the noise.
     """
 
     most_samples: int = 1 << 16
@@ -122,7 +122,7 @@ def spectra(u: np.ndarray, y: np.ndarray, rate_Hz: float, length: int, wrap: boo
 
 
 def directions(U: np.ndarray) -> np.ndarray:
-    """(n_u, rank) orthonormal basis of the real span of voltages U (..., n_u): what is excited."""
+    """(n_u, rank) orthonormal basis of the excited directions, in the real span of the voltages U (..., n_u)."""
     flat = U.reshape(-1, U.shape[-1])
     gram = np.real(flat.conj().T @ flat)
     size = np.sqrt(np.diag(gram))

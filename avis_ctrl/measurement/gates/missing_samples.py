@@ -17,12 +17,13 @@ from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, segment_length, spec
 
 @dataclass(frozen=True)
 class MissingSamplesSettings:
-    """block_rows : of the shortest repeated block, equal in every channel: noise in one alone makes that no chance.
-    jump_samples : smallest step of the delay that counts: rows are lost whole.
-    longest_samples : largest delay that is looked for, either way, and largest step: segments without a clear delay
-        scatter over all that is looked for.
-    explains : what undoing a step takes at least off the residual, mean logarithm: a tenth of its power, where steps
-        that come from a sine's sweep or from a model's delay over frequency put some on it.
+    """block_rows : rows of the shortest repeated block, equal in every channel: with noise in one channel that is no
+        coincidence.
+    jump_samples : smallest step of the delay that counts: only whole samples are lost.
+    longest_samples : largest delay in the search, either way, and largest step: segments without a clear delay scatter
+        over the whole range of the search.
+    explains : least decrease of the residual's mean logarithm when the step is undone: a tenth of its power. Steps that
+        come from a swept sine, or from a delay of the model that varies with frequency, increase it when undone.
     """
 
     block_rows: int = 16

@@ -28,13 +28,14 @@ from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 @dataclass(frozen=True)
 class ComparisonSettings:
     """common : cosine of the angle between directions of the voltages above which they count as common to two records:
-        1.4 mrad, more than voltages rounded to four digits turn them.
-    excited : power of u at a line by the median of the driven ones, below which it is the skirt of the band: u and y
-        are small there, and differ by what leaks into them.
-    told : T beyond this many times its limit is put in words: the number itself says nothing more.
-    notable, large : difference by the response that is worth a note, for gains are known to 1 % at best, or a warning.
-    blind : noise of the comparison by the response above which it hides changes that matter.
-    apart : smallest factor between levels that are compared: closer ones show leakage and drift, not nonlinearity.
+        1.4 mrad, more than rounding the voltages to four digits turns them.
+    excited : power of u at a line relative to the median of the driven lines, below which the line counts as the edge
+        of the band: u and y are small there, and leakage into them differs from record to record.
+    told : ratio of T to its limit above which the message says "far beyond chance" instead of the number.
+    notable, large : difference relative to the response that is worth a note, because gains are known to 1 % at best,
+        and one that is worth a warning.
+    blind : noise of the comparison relative to the response, above which it hides changes that matter.
+    apart : smallest ratio of two levels that are compared: closer ones show leakage and drift, not nonlinearity.
     """
 
     common: float = 1 - 1e-6
