@@ -17,10 +17,10 @@ from avis_ctrl.simulation.loop import simulate
 from avis_ctrl.simulation.prediction import sampled_response
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.companions import CompanionSettings, design_companions, until_stable
-from avis_ctrl.study.controllers import CUSTOMARY_CORNERS_HZ, classical_skyhook, critical_gains
 from avis_ctrl.study.design_file import design_from_table
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import bare_loop
+from avis_ctrl.study.skyhooks import CUSTOMARY_CORNERS_HZ, classical_skyhook, critical_gains
 
 RIG = Path(__file__).with_name("three_legs.toml")
 # Few candidates: the search is the same.
