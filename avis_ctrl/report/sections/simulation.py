@@ -36,13 +36,17 @@ def simulation(result: DesignResult) -> Section:
 
 
 def _plants(check: SimulationCheck) -> Table:
+    loop = check.first.loop
+    limits = dict(zip(loop.rig.equations_of_motion().actuators, loop.limits_V.tolist(), strict=True))
+    differ = len(set(limits.values())) > 1
     rows = [(p.name, Mark("pass", True) if p.passed else Mark("FAIL", False),
              Mark("yes", True) if p.stable else Mark("diverged" if p.diverged else "no", False), _agreement(p),
-             f"{words.number(p.peak_V)} V", str(p.clipped_dac + p.clipped_adc),
+             f"{words.number(p.peak_V)}{f' of {words.number(p.limit_V)}' if differ else ''} V",
+             str(p.clipped_dac + p.clipped_adc),
              ", ".join(f"{words.axis(a)} {words.number(1e6 * v)}" for a, v in p.payload_rms.items()))
             for p in check.plants]
-    limit = check.plants[0].limit_V
-    return table(f"Every simulated plant. Voltages as demanded, limit {words.number(limit)} V; clipped samples at "
+    nearest = "of the drive that comes nearest to its limit" if differ else "limit"
+    return table(f"Every simulated plant. Voltages as demanded, {nearest} {words.limits(limits)}; clipped samples at "
                  "drives and converter together.",
                  ("plant", "verdict", "stable", "bands that agree", "peak voltage", "clipped",
                   "velocity r.m.s. [µm/s]"), rows, "lcccrrl")
