@@ -61,7 +61,8 @@ def write_together(folder: Path, contents: Mapping[str, bytes], old: Iterable[Pa
     """Write several files of a folder, all of them or none; in their order, so that the last one says it is complete.
 
     All are on the disk under hidden names before the first takes its place and `old` ones are removed, so that a full
-    disk leaves the earlier results.
+    disk leaves the earlier results. Only where a file on the disk cannot be removed or renamed after that, the folder
+    is incomplete; the error then says which files are missing and which are new.
 
     Parameters
     ----------
@@ -72,6 +73,8 @@ def write_together(folder: Path, contents: Mapping[str, bytes], old: Iterable[Pa
     ------
     ComputationError : the disk refuses.
     """
+    removed: list[Path] = []
+    placed: list[Path] = []
     try:
         with tempfile.TemporaryDirectory(dir=folder, prefix=".new.", ignore_cleanup_errors=True) as hidden:
             for name, content in contents.items():
@@ -79,16 +82,33 @@ def write_together(folder: Path, contents: Mapping[str, bytes], old: Iterable[Pa
                 made.parent.mkdir(parents=True, exist_ok=True)
                 write_whole(made, content)
             for path in old:
-                path.unlink(missing_ok=True)
+                with contextlib.suppress(FileNotFoundError):
+                    path.unlink()
+                    removed.append(path)
             for name in contents:
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(Path(hidden) / name, folder / name)
+                placed.append(folder / name)
     except OSError as error:
+        if removed or placed:
+            raise _incomplete(folder, [folder / name for name in contents], removed, placed, error) from None
         raise not_written(folder, error) from None
     except ComputationError as error:
         raise ComputationError(f"{folder} was not written; what was there before is untouched", cause=error.cause,
                                next_step=error.next_step) from None
-    return [folder / name for name in contents]
+    return placed
+
+
+def _incomplete(folder: Path, asked: list[Path], removed: list[Path], placed: list[Path], error: OSError
+                ) -> ComputationError:
+    rest = [path for path in dict.fromkeys((*asked, *removed)) if path not in placed]
+    states = {"missing": [path for path in rest if not os.path.lexists(path)], "new": placed,
+              "of an earlier run": [path for path in rest if os.path.lexists(path)]}
+    said = "; ".join(f"{state}: {', '.join(os.path.relpath(path, folder) for path in paths)}"
+                     for state, paths in states.items() if paths)
+    return ComputationError(f"{folder} is incomplete, do not use what is in it ({said})",
+                            cause=str(error.strerror or error),
+                            next_step="run the command again, or choose another place with --out")
 
 
 def not_written(path: Path, error: OSError) -> ComputationError:

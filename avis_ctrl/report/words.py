@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 AXIS_WORDS = {"phi_x_edge": "phi_x (edge)", "phi_y_edge": "phi_y (edge)", "phi_z_edge": "phi_z (edge)"}
@@ -75,6 +77,13 @@ def micro(value: float, unit: str) -> str:
 def hertz(omega: float) -> str:
     """A frequency [rad/s] in Hz."""
     return f"{number(omega / (2 * np.pi))} Hz" if np.isfinite(omega) else "none"
+
+
+def limits(volts: Mapping[str, float]) -> str:
+    """Limits of drives by name: one voltage where all are alike."""
+    if len(set(volts.values())) == 1:
+        return f"{number(next(iter(volts.values())))} V"
+    return ", ".join(f"{name} {number(value)} V" for name, value in volts.items())
 
 
 def axis(name: str) -> str:

@@ -21,13 +21,20 @@ def quantise(voltage: float, lsb: float, lower: float, upper: float) -> float:
     return lsb * np.floor(voltage / lsb + 0.5)
 
 
+def bits_of(value: object) -> int:
+    """The number of bits of a converter, from 1 to 32: none that is made has more. Raises ValueError otherwise."""
+    if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 32:
+        return value
+    raise ValueError("expected a whole number of bits from 1 to 32")
+
+
 @dataclass(frozen=True)
 class Converter:
     """An n-bit two's-complement converter over +-range_V, sampled at sample_rate_Hz.
 
     Raises
     ------
-    InputError : fewer than 1 or more than 32 bits, or a range or rate that is not positive.
+    InputError : bits that `bits_of` refuses, or a range or rate that is not positive.
     """
 
     bits: int
@@ -35,8 +42,10 @@ class Converter:
     sample_rate_Hz: float
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.bits, int) and 1 <= self.bits <= 32):
-            raise InputError("a whole number of bits from 1 to 32", field="bits", value=self.bits)
+        try:
+            bits_of(self.bits)
+        except ValueError as error:
+            raise InputError(str(error), field="bits", value=self.bits) from None
         for field in ("range_V", "sample_rate_Hz"):
             require_positive(getattr(self, field), field)
 

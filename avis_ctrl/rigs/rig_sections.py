@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
+from avis_ctrl.rigs.converter import bits_of
 from avis_ctrl.rigs.floor_spectrum import shipped_spectra
 from avis_ctrl.rigs.instruments import Tolerances
 
@@ -157,7 +158,7 @@ class TolerancesSection(_Section):
 
 class AcquisitionSection(_Section):
     sample_rate_Hz: Positive
-    adc_bits: Annotated[int, Field(ge=1, le=64)]
+    adc_bits: Annotated[int, BeforeValidator(bits_of)]
     adc_range_V: Positive
     loop_delay_s: NotNegative
 

@@ -27,7 +27,8 @@ class PlantCheck:
     diverged : the nonlinear simulation left the stops.
     spectral_radius : of the linear sampled loop; an instability too slow for the simulated time shows here.
     spectrum : agreement with the linear prediction; None where the run diverged.
-    peak_V, rms_V : of the demanded voltages, over all drives; limit_V the limit.
+    peak_V, limit_V : largest demanded voltage of the drive that comes nearest to its limit, and that limit.
+    rms_V : of the demanded voltages, the largest of all drives.
     clipped_dac, clipped_adc : samples beyond the limits.
     payload_rms : r.m.s. velocity by controlled axis [m/s], rotations at the edge.
     """
@@ -126,7 +127,9 @@ def judge(record: SimulationRecord, band_Hz: tuple[float, float] = (1.0, 80.0),
     # Without a stable linear loop there is no stationary spectrum to predict.
     steady = not record.diverged and radius < 1.0
     spectrum = check_spectrum_agreement(record, band_Hz, false_alarm=false_alarm) if steady else None
-    return PlantCheck(loop.name, record.diverged, radius, spectrum, float(np.max(np.abs(record.demanded))),
-                      float(np.max(np.sqrt(np.mean(record.demanded ** 2, axis=0)))), loop.limit_V,
+    peaks = np.max(np.abs(record.demanded), axis=0)
+    nearest = int(np.argmax(peaks * (loop.limits_V.max() / loop.limits_V)))
+    return PlantCheck(loop.name, record.diverged, radius, spectrum, float(peaks[nearest]),
+                      float(np.max(np.sqrt(np.mean(record.demanded ** 2, axis=0)))), float(loop.limits_V[nearest]),
                       record.clipped_dac, record.clipped_adc,
                       {axis: float(np.sqrt(np.mean(record.velocity(axis) ** 2))) for axis in loop.axes})

@@ -83,19 +83,32 @@ class Companions:
 
     passive : (axis, reason) of those that have no loop.
     notes : what had to be reduced or left out, in words.
+    settings : with which the loops were designed.
     """
 
     loops: tuple[Companion, ...]
     passive: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
+    settings: CompanionSettings = CompanionSettings()
 
     def systems(self) -> dict[str, StateSpace]:
         """By axis, seen velocity [m/s] -> force [N]."""
         return {one.axis: one.loop() for one in self.loops}
 
     def scaled(self, factor: float) -> Companions:
-        """All gains times a factor."""
+        """All gains times a factor; the modulus margins are still those before."""
         return replace(self, loops=tuple(replace(one, gain=factor * one.gain) for one in self.loops))
+
+    def below_margin(self) -> tuple[Companion, ...]:
+        """The loops whose modulus margin, with all the others closed, is below the one asked."""
+        return tuple(one for one in self.loops if not one.modulus_margin >= self.settings.modulus_margin)
+
+    def remarks(self) -> tuple[str, ...]:
+        """The notes, and which loops miss the modulus margin."""
+        low = ", ".join(f"{one.axis} {one.modulus_margin:.2f}" for one in self.below_margin())
+        asked = (f"Loops of the other axes with a modulus margin below the {self.settings.modulus_margin:g} that was "
+                 f"asked, all loops closed: {low}.")
+        return (*self.notes, asked) if low else self.notes
 
 
 def free_axes(rig: Rig, keep: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
@@ -135,7 +148,23 @@ def design_companions(bare: SampledLoop, chain_error: Weight | None = None, band
             found = others if best is None else {**others, axis: best}
     reason = "no gain and corners tried are stable with the required margins"
     missing = tuple((axis, reason) for axis in axes if axis not in found)
-    return search.with_margins(Companions(tuple(found[axis] for axis in axes if axis in found), (*passive, *missing)))
+    loops = tuple(found[axis] for axis in axes if axis in found)
+    return _with_margins(Companions(loops, (*passive, *missing), settings=settings), bare)
+
+
+def _with_margins(companions: Companions, bare: SampledLoop) -> Companions:
+    """The same loops, each with its modulus margin as it is with all the others closed."""
+    omega, loops = _grid(bare, companions.settings), companions.systems()
+    G = open_response(bare, omega).sensed_volts
+
+    def characteristic(loops: dict[str, StateSpace]) -> np.ndarray:
+        """(n,) det(I - G C); closing one more loop multiplies it by the 1 + L of that loop."""
+        C = digital_controller(replace(bare, loops=loops)).frequency_response(omega)
+        return np.asarray(np.linalg.det(np.eye(G.shape[1]) - G @ C))
+    closed = characteristic(loops)
+    margins = [float(np.min(np.abs(closed / characteristic(loops | {axis: gain(0.0)})))) for axis in loops]
+    return replace(companions, loops=tuple(replace(one, modulus_margin=margin)
+                                           for one, margin in zip(companions.loops, margins, strict=True)))
 
 
 def _grid(bare: SampledLoop, settings: CompanionSettings) -> np.ndarray:
@@ -144,34 +173,32 @@ def _grid(bare: SampledLoop, settings: CompanionSettings) -> np.ndarray:
     return np.unique(np.concatenate([even, resonances(bare.rig.equations_of_motion().state_space().poles())]))
 
 
-def until_stable(companions: Companions, plants: Sequence[SampledLoop],
-                 settings: CompanionSettings = CompanionSettings()) -> Companions:
+def until_stable(companions: Companions, plants: Sequence[SampledLoop]) -> Companions:
     """The loops with gains lowered until the linear sampled loop of every plant is stable; without loops if that fails.
+
+    The modulus margins are those of the loops returned, with the nominal plant.
 
     plants : the loop of each plant, the nominal one first; its companion loops are replaced.
     """
     if not companions.loops:
         return companions
+    settings, bare = companions.settings, replace(plants[0], loops={})
     for step in range(settings.shrinks + 1):
         factor = settings.shrink ** step
         tried = companions.scaled(factor)
         if all(spectral_radius(replace(plant, loops=tried.systems())) < 1 for plant in plants):
             lowered = (f"The gains of the other axes' loops were lowered by {-20 * np.log10(factor):.0f} dB: with "
                        "higher gains a plant of the uncertainty set was unstable.")
-            if not step:
-                return tried
-            bare = replace(plants[0], loops={})
-            search = _Search(bare, _grid(bare, settings), None, (0.0, np.inf), settings)
-            return replace(search.with_margins(tried), notes=(*tried.notes, lowered))
+            return _with_margins(replace(tried, notes=(*tried.notes, lowered)) if step else tried, bare)
     # The loops as designed are kept if even leaving them out does not help: then they are not the cause.
     without = [spectral_radius(replace(plant, loops={})) for plant in plants]
     if max(without) < 1:
         lowest = -20 * settings.shrinks * np.log10(settings.shrink)
         reason = (f"with the other axes' loops, even with gains lowered by {lowest:.0f} dB, a plant of the uncertainty "
                   "set is unstable")
-        return Companions((), (*companions.passive, *((one.axis, reason) for one in companions.loops)),
-                          companions.notes)
-    return companions
+        return replace(companions, loops=(),
+                       passive=(*companions.passive, *((one.axis, reason) for one in companions.loops)))
+    return _with_margins(companions, bare)
 
 
 class _Search:
@@ -220,17 +247,6 @@ class _Search:
             if spectral_radius(replace(self.bare, loops=loops)) < 1:
                 return replace(candidate, modulus_margin=margin)
         return None
-
-    def with_margins(self, companions: Companions) -> Companions:
-        """The same loops, each with its modulus margin as it is with all the others closed."""
-        found = {one.axis: one for one in companions.loops}
-        return replace(companions, loops=tuple(replace(one, modulus_margin=self.margin(one.axis, found))
-                                               for one in companions.loops))
-
-    def margin(self, axis: str, found: dict[str, Companion]) -> float:
-        """Least |1 + L| of a loop with all the others closed."""
-        g, *_ = self._around(axis, {name: one for name, one in found.items() if name != axis})
-        return float(np.min(np.abs(1 - found[axis].gain * self._filter(found[axis]) * g)))
 
     def _candidates(self, axis: str) -> Iterator[Companion]:
         s = self.settings

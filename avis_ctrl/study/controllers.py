@@ -15,15 +15,10 @@ from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn import MuSynthesis, musyn
 from avis_ctrl.robust.reduction import reduce_controller, residualise_fast
-from avis_ctrl.study.candidate import Candidate as Candidate
+from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.model import ControllerResult
 from avis_ctrl.study.plant import DesignPlant
-from avis_ctrl.study.skyhooks import CUSTOMARY_CORNERS_HZ as CUSTOMARY_CORNERS_HZ
-from avis_ctrl.study.skyhooks import TUNING_HZ as TUNING_HZ
-from avis_ctrl.study.skyhooks import classical_skyhook as classical_skyhook
-from avis_ctrl.study.skyhooks import critical_gains as critical_gains
-from avis_ctrl.study.skyhooks import tuned_skyhook as tuned_skyhook
 
 # Coarse: it only ranks controllers of different order; what is reported is computed on the one chosen. The resonances
 # of the table at rest and the peak of mu join it, for both are narrower than its steps.

@@ -81,7 +81,9 @@ def _all_axes(loop: Simulated | None) -> dict[str, Any]:
         return {}
     culprit = None if loop.culprit is None else {**asdict(loop.culprit), "words": loop.culprit.words()}
     return {"companions": [asdict(one) for one in loop.companions.loops],
+            "modulus_margin_asked": loop.companions.settings.modulus_margin,
             "passive": [{"axis": axis, "reason": why} for axis, why in loop.companions.passive],
+            "notes": loop.companions.remarks(),
             "culprit": culprit}
 
 

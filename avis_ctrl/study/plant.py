@@ -33,6 +33,9 @@ from avis_ctrl.uncertainty.uncertain_rig import UncertainRig, uncertain_rig
 from avis_ctrl.uncertainty.weight_base import Weight
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
+# Of the weight on the drives in `DesignPlant.weights`; followed by the axis where the drives' limits differ.
+EFFORT = "control effort"
+
 
 @dataclass(frozen=True, eq=False)
 class DesignPlant:
@@ -82,6 +85,10 @@ class DesignPlant:
     def velocities(self) -> list[str]:
         return [f"{axis}_dot" for axis in self.axes]
 
+    def effort_weight(self, axis: str) -> Weight:
+        """The weight on the control effort of an axis; one for all where their drives have the same limit."""
+        return self.weights.get(EFFORT) or self.weights[f"{EFFORT} {axis}"]
+
     @property
     def volts(self) -> list[str]:
         return [f"{name}_command" for name in self.actuators]
@@ -122,8 +129,7 @@ def build_plant(design: Design, rig: Rig) -> DesignPlant:
     noises = _sensor_side(diagram, axes, seen, decoding, rows, reference, errors is not None)
     if errors is not None:
         _sensor_errors(diagram, errors, axes, decoder.sensors, rows, decoding, weights)
-    limits = rig.drive_limits_V()[used]
-    _performance(diagram, design, rig, axes, matrix[used] * (rig.drive_limit_V / limits)[:, None], weights)
+    _performance(diagram, design, axes, matrix[used], rig.limits_of(actuators), weights)
     w = [*(f"floor_{a}_dot" for a in axes), *noises, *(f"force_{a}" for a in axes)]
     weighted = [*(f"e_{a}" for a in axes), *(f"effort_{a}" for a in axes)]
     compliance = [f"compliance_{a}" for a in axes] if design.compliance else []
@@ -351,20 +357,22 @@ def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty, axes: tuple[
         diagram.means(f"chain_error_{axis}", "what neglected sensor dynamics add to the velocity", "m/s")
 
 
-def _performance(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, ...], allocation: np.ndarray,
+def _performance(diagram: Diagram, design: Design, axes: tuple[str, ...], allocation: np.ndarray, limits_V: np.ndarray,
                  weights: dict[str, Weight]) -> None:
-    """Weighted outputs, per m/s of floor velocity (compliance: per newton)."""
+    """Weighted outputs, per m/s of floor velocity (compliance: per newton); limits_V (n_actuators,)."""
     asked, effort = design.transmissibility, design.control_effort
     band = Band(asked.band_Hz[0], asked.band_Hz[1], asked.band_dB)
     weights["transmissibility"] = TransmissibilityBound(asked.peak_dB, (band,), asked.transition_octaves,
                                                         asked.tolerance_dB)
-    weights["control effort"] = ControlEffort(rig.drive_limit_V, effort.floor_velocity_m_per_s, effort.bandwidth_Hz,
-                                              effort.reduction)
+    load = np.abs(allocation) * (limits_V.max() / limits_V)[:, None]
     for k, axis in enumerate(axes):
         diagram.add(f"W_T {axis}", weights["transmissibility"].system(f"{axis}_dot", f"e_{axis}"), "weight")
-        # Volts on the channel that this axis loads most.
-        volts = weights["control effort"].system(f"command_{axis}", f"effort_{axis}").scaled(
-            right=float(np.max(np.abs(allocation[:, k]))))
+        # Volts on the channel that this axis brings to its limit first.
+        first = int(np.argmax(load[:, k]))
+        weight = ControlEffort(float(limits_V[first]), effort.floor_velocity_m_per_s, effort.bandwidth_Hz,
+                               effort.reduction)
+        weights[f"{EFFORT} {axis}" if np.ptp(limits_V) else EFFORT] = weight
+        volts = weight.system(f"command_{axis}", f"effort_{axis}").scaled(right=float(np.abs(allocation[first, k])))
         diagram.add(f"W_u {axis}", volts, "weight")
         diagram.means(f"e_{axis}", "payload velocity over its bound", "1")
         diagram.means(f"effort_{axis}", "drive over its limit", "1")

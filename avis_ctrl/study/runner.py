@@ -22,15 +22,8 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import MuSynthesis
 from avis_ctrl.study.analysis import analyse
-from avis_ctrl.study.controllers import (
-    Candidate,
-    best_of,
-    classical_skyhook,
-    mu_optimal,
-    nominal_hinf,
-    passive,
-    tuned_skyhook,
-)
+from avis_ctrl.study.candidate import Candidate
+from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
 from avis_ctrl.study.design_file import Design, read_study
 from avis_ctrl.study.limits import best_found
 from avis_ctrl.study.model import ControllerResult, DesignResult, FailedController, Simulated
@@ -38,6 +31,7 @@ from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.requirements import judge, judge_loop
 from avis_ctrl.study.sampling import random_perturbations
 from avis_ctrl.study.simulation import simulate_study, six_dof_check
+from avis_ctrl.study.skyhooks import classical_skyhook, tuned_skyhook
 from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
@@ -111,7 +105,7 @@ def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesi
         verdict = best_found(plant, mu, controllers) if mu.mu.upper >= 1 else ""
         unlike = [f"{one.title!r} is missing from the comparison: {one.reason}" for one in compared.failed]
         passive_axes = [f"The axis {axis} stays passive: {why}." for axis, why in compared.loop.companions.passive]
-        notes = tuple(text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.notes)
+        notes = tuple(text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.remarks())
                       if text)
     requirements = (*judge_loop(compared.loop.check), *judge(design, controllers))
     return DesignResult(design, rig, plant, controllers, synthesis.history, requirements, reduction, six_dof,

@@ -21,9 +21,9 @@ from avis_ctrl.classical.tuning import (
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import lft_lower
 from avis_ctrl.rigs.rig_file import load_rig
-from avis_ctrl.study.controllers import TUNING_HZ, critical_gains
 from avis_ctrl.study.design_file import read_design
 from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.study.skyhooks import TUNING_HZ, critical_gains
 from avis_ctrl.uncertainty.generalized_plant import sample_lft
 
 DESIGNS = Path(__file__).resolve().parents[2] / "designs"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import combinations
 
 import numpy as np
@@ -243,6 +244,10 @@ def channel_alarms(campaign, expectation):
     return [f for f in gate.conclude(kept, campaign, expectation) if f.severity in SEVERE]
 
 
+def told_chance(finding):
+    return float(re.search(r"probability by chance at most ([-\de.]+)\)", finding.sentence)[1])
+
+
 SHORT = multisine_campaign(1, period=2048, periods=4)
 PAIRS = [("y", pair) for pair in combinations(range(6), 2)] + [("u", pair) for pair in combinations(range(8), 2)]
 
@@ -260,6 +265,7 @@ def test_every_exchanged_pair_is_named(which, pair):
     found = channel_alarms(everywhere(SHORT, exchange), known())
     assert [(f.gate, set(f.channels)) for f in found] == [("channel order", {names[i], names[k]})]
     assert "are exchanged" in found[0].sentence
+    assert told_chance(found[0]) < 1e-5
 
 
 @pytest.mark.parametrize(("which", "k"), [("y", k) for k in range(6)] + [("u", k) for k in range(8)])
@@ -269,6 +275,7 @@ def test_every_flipped_channel_is_named(which, k):
         return u, y
 
     found = channel_alarms(everywhere(SHORT, flip), known())
+    assert told_chance(found[0]) < 1e-5
     assert [(f.gate, f.channels) for f in found] == [("polarity", ((Y_NAMES if which == "y" else U_NAMES)[k],))]
 
 

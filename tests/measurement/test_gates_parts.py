@@ -11,7 +11,7 @@ from scipy import signal
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.gates import Expectation, examine
-from avis_ctrl.measurement.gates.channel_faults import compare, explain
+from avis_ctrl.measurement.gates.channel_faults import MapSettings, compare, explain
 from avis_ctrl.measurement.gates.clipping import over_range, repeated_extreme
 from avis_ctrl.measurement.gates.dead_channel import equal_runs
 from avis_ctrl.measurement.gates.excerpt import excerpt
@@ -162,6 +162,32 @@ def test_faults_of_a_random_matrix_are_recovered(seed):
     faults = explain(compare([(measured, expected)]))
     assert np.array_equal(faults.p, p) and np.array_equal(faults.r, r)
     assert np.array_equal(faults.q, q) and np.all(faults.c > 0)
+
+
+def reversed_row(noise, delay_s=MapSettings.delay_s):
+    """Row 2 of four reversed, under noise; with the number of independent values in a row."""
+    rng, r = np.random.default_rng(1), np.array([1.0, 1.0, -1.0, 1.0])
+    E = rng.standard_normal((40, 4, 3)) + 1j * rng.standard_normal((40, 4, 3))
+    measured, U = spectra_of(rng, r[:, None] * E, noise)
+    expected = Spectra(measured.f, U, np.einsum("fij,kfj->kfi", E, U))
+    comparison = compare([(measured, expected)], settings=MapSettings(delay_s=delay_s))
+    return explain(comparison), comparison.N
+
+
+@pytest.mark.parametrize("noise", [1.0, 3.0, 6.0])
+def test_the_chance_that_is_told_is_the_one_found(noise):
+    """4 + 6 * 4 changes of rows, of columns 3 + 3 * 4 in each of four rows; in 38 Hz 25 ms hold 3 delays."""
+    faults, N = reversed_row(noise)
+    a = faults.other[2]
+    assert list(faults.chance) == [("row", 2)] and a > 0.9
+    assert faults.chance["row", 2] == pytest.approx(88 * 3 * max((1 - 0.9 * a**2) ** N, (1 - a**2) ** (N - 1)))
+
+
+def test_the_more_delays_are_tried_the_less_a_fault_proves():
+    """Under this noise the reversed row is proved for a known delay, but not where one of 8 was chosen."""
+    known, tried = reversed_row(9.0, (0.0, 0.0))[0], reversed_row(9.0, (-0.045, 0.045))[0]
+    assert known.r[2] == -1 and 1e-4 / 8 < known.chance["row", 2] < 1e-4
+    assert np.all(tried.r == 1) and not tried.chance and tried.doubtful == (("row", 2),)
 
 
 def rest(rng, samples=30000, rate=1000.0, channels=4, colour=(1.0,)):

@@ -195,6 +195,7 @@ def test_back_emf_without_a_velocity_signal_is_refused():
     (lambda: Geophone(-4.5, 0.5, 30.0), "corner_Hz"), (lambda: Geophone(4.5, np.nan, 30.0), "damping"),
     (lambda: Geophone(4.5, 0.5, 0.0), "sensitivity"), (lambda: Geophone(4.5, 0.5, 30.0, coil_ohm=-1.0), "coil_ohm"),
     (lambda: Converter(0, 10.0, 1000.0), "bits"), (lambda: Converter(14.5, 10.0, 1000.0), "bits"),
+    (lambda: Converter(33, 10.0, 1000.0), "bits = 33: expected a whole number of bits from 1 to 32"),
     (lambda: Converter(14, np.inf, 1000.0), "range_V"), (lambda: CompensationFilter(4.5, 0.5, 0.0, 0.7), "to_Hz"),
     (lambda: ActuatorChain("2"), "constant"), (lambda: ActuatorChain(2.0, delay_s=-1.0), "delay_s"),
     (lambda: pade_delay(1e-3, 0), "order"), (lambda: pade_delay(1e-3, 40), "order"),

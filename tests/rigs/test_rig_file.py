@@ -81,7 +81,9 @@ WRONG = [
      "isolators from 1 to 4"),
     ("avis", ('axis = ["y", "z", "x", "z", "y", "z", "x", "z"]', 'axis = ["y", "z", "x", "z", "y", "z", "x", "up"]'),
      "actuators.axis[8] = 'up'", "'x', 'y' or 'z'"),
-    ("avis", ("adc_bits = 14", "adc_bits = 14.5"), "acquisition.adc_bits = 14.5", "integer"),
+    *(("avis", ("adc_bits = 14", f"adc_bits = {wrong}"), f"acquisition.adc_bits = {shown}",
+       "expected a whole number of bits from 1 to 32")
+      for wrong, shown in (("14.5", "14.5"), ("0", "0"), ("33", "33"), ("true", "True"), ('"14"', "'14'"))),
     ("avis", ("sample_rate_Hz = 1000.0", "sample_rate_Hz = 0.0"), "acquisition.sample_rate_Hz = 0.0", "greater than 0"),
     ("avis", ('names = ["Sy1", "Sz1", "Sx2", "Sz2", "Sy3", "Sz3"]', 'names = ["Sy1", "Sz1", "Sx2", "Sz2", "Sy3"]'),
      "geophones.isolator", "expected 5 entries"),

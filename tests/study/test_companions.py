@@ -17,10 +17,10 @@ from avis_ctrl.simulation.loop import simulate
 from avis_ctrl.simulation.prediction import sampled_response
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.companions import CompanionSettings, design_companions, until_stable
-from avis_ctrl.study.controllers import CUSTOMARY_CORNERS_HZ, classical_skyhook, critical_gains
 from avis_ctrl.study.design_file import design_from_table
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import bare_loop
+from avis_ctrl.study.skyhooks import CUSTOMARY_CORNERS_HZ, classical_skyhook, critical_gains
 
 RIG = Path(__file__).with_name("three_legs.toml")
 # Few candidates: the search is the same.
@@ -93,6 +93,27 @@ def test_gains_are_lowered_until_every_plant_is_stable(bare, companions):
     lowered = until_stable(strong, [bare, late])
     assert lowered.notes and lowered.loops[0].gain < strong.loops[0].gain
     assert all(spectral_radius(replace(plant, loops=lowered.systems())) < 1 for plant in (bare, late))
+
+
+def test_a_modulus_margin_below_the_one_asked_is_told(bare, companions):
+    assert not companions.below_margin() and not companions.remarks()
+    strong = until_stable(companions.scaled(2.0), [bare])
+    low = strong.below_margin()
+    assert [one.axis for one in low] == ["y", "phi_y", "phi_z"] and strong.loops[0].modulus_margin > 0.5
+    said, = strong.remarks()
+    assert "below the 0.5 that was asked" in said
+    assert said.endswith(": " + ", ".join(f"{one.axis} {one.modulus_margin:.2f}" for one in low) + ".")
+    # Were the margins those before the gains were doubled, a loop could not be made unstable within them.
+    worst = min(low, key=lambda one: one.modulus_margin)
+    before = next(one for one in companions.loops if one.axis == worst.axis).modulus_margin
+    loops = strong.systems() | {worst.axis: replace(worst, gain=0.99 * worst.gain / (1 - before)).loop()}
+    assert spectral_radius(replace(bare, loops=loops)) >= 1
+
+
+def test_lowered_loops_carry_their_own_margins(bare, companions):
+    lowered = until_stable(companions.scaled(4.0), [bare, replace(bare, name="late", loop_delay_s=0.02)])
+    assert lowered.below_margin() and len(lowered.remarks()) == 2 and lowered.remarks()[0] == lowered.notes[0]
+    assert until_stable(replace(lowered, notes=()), [bare]).loops == lowered.loops
 
 
 def test_an_unstable_rival_says_so_instead_of_ending_the_command(table):

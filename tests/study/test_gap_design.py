@@ -18,7 +18,7 @@ from avis_ctrl.lti.connect import lft_lower, lft_upper
 from avis_ctrl.lti.statespace import gain
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.mu_peak import mu_peak
-from avis_ctrl.study.controllers import classical_skyhook, mu_optimal
+from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import read_study
 from avis_ctrl.study.gap_design import (
     PARAMETERS_PERCENT,
@@ -31,6 +31,7 @@ from avis_ctrl.study.gap_design import (
 from avis_ctrl.study.gap_plant import carried, plant_of, six_dof_is_stable
 from avis_ctrl.study.identification_design import default_design
 from avis_ctrl.study.plant import build_plant
+from avis_ctrl.study.skyhooks import classical_skyhook
 from avis_ctrl.uncertainty.blocks import RealScalar
 
 ROOT = Path(__file__).resolve().parents[2]

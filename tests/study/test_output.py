@@ -157,6 +157,48 @@ def test_several_files_are_all_written_or_none(tmp_path, monkeypatch):
     assert sorted(one.name for one in tmp_path.iterdir()) == ["controllers", "report.html", "result.json"]
 
 
+def refused_rename(monkeypatch, path):
+    """Renaming to this path fails."""
+    replace = os.replace
+
+    def refuse(source, target):
+        if Path(target) == path:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        replace(source, target)
+    monkeypatch.setattr(files.os, "replace", refuse)
+
+
+def test_a_rename_that_fails_after_old_files_went_says_what_is_missing(tmp_path, monkeypatch):
+    for name in ("result.json", "report.html", "old.pdf"):
+        (tmp_path / name).write_bytes(b"old")
+    refused_rename(monkeypatch, tmp_path / "report.html")
+    with pytest.raises(ComputationError) as caught:
+        write_together(tmp_path, {"controllers/mu.json": b"1", "report.html": b"2", "result.json": b"3"},
+                       [tmp_path / name for name in ("result.json", "report.html", "old.pdf", "absent")])
+    assert caught.value.failed == (
+        f"{tmp_path} is incomplete, do not use what is in it (missing: report.html, result.json, old.pdf; "
+        f"new: {os.path.join('controllers', 'mu.json')})")
+    assert caught.value.cause == os.strerror(errno.EIO)
+    assert [one for one in tmp_path.rglob("*") if one.is_file()] == [tmp_path / "controllers" / "mu.json"]
+
+
+def test_a_rename_that_fails_between_two_files_says_which_one_is_older(tmp_path, monkeypatch):
+    for name in ("a.json", "b.json"):
+        (tmp_path / name).write_bytes(b"old")
+    refused_rename(monkeypatch, tmp_path / "b.json")
+    with pytest.raises(ComputationError, match=r"incomplete.*\(new: a\.json; of an earlier run: b\.json\)"):
+        write_together(tmp_path, {"a.json": b"1", "b.json": b"2"})
+    assert (tmp_path / "b.json").read_bytes() == b"old"
+
+
+def test_a_rename_that_fails_before_anything_changed_leaves_all(tmp_path, monkeypatch):
+    (tmp_path / "a.json").write_bytes(b"old")
+    refused_rename(monkeypatch, tmp_path / "a.json")
+    with pytest.raises(ComputationError, match="before is untouched"):
+        write_together(tmp_path, {"a.json": b"1"})
+    assert [one.read_bytes() for one in tmp_path.iterdir()] == [b"old"]
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device")
 def test_a_device_is_not_replaced():
     with pytest.raises(InputError, match="not a regular file"):

@@ -31,10 +31,11 @@ from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1
 class MapSettings:
     """What counts as evidence.
 
-    chance : probability that a correct map is called wrong, shared over the alternatives; a stop ends the work, so it
-        is smaller than for other alarms. least_agreement : correlation of a channel with its assigned response; a model
-        below it describes less than half the power of the data, and proves nothing. delay_s : range of delays that are
-        fitted, from a u recorded late to the slowest loop. delay_step_s : a tenth of a turn at 100 Hz.
+    chance : probability that a correct map is called wrong, shared over the alternatives, each with each delay; a stop
+        ends the work, so it is smaller than for other alarms. least_agreement : correlation of a channel with its
+        assigned response; a model below it describes less than half the power of the data, and proves nothing.
+        delay_s : range of delays that are fitted, from a u recorded late to the slowest loop. delay_step_s : a tenth of
+        a turn at 100 Hz.
         closest : smallest value used for 1 - a^2: resonances 2.5 % away from the model's leave as much.
     still : share of a drive in the excited directions up to which it counts as not driven: round-off of the basis.
     """
@@ -46,6 +47,13 @@ class MapSettings:
     closest: float = 0.1
     still: float = 1e-9
 
+    @property
+    def delays_s(self) -> np.ndarray:
+        """(n,) the delays that are tried, none first: where all are alike it is taken."""
+        low, high = self.delay_s
+        steps = np.arange(round(low / self.delay_step_s), round(high / self.delay_step_s) + 1)
+        return self.delay_step_s * steps[np.argsort(np.abs(steps), kind="stable")]
+
 
 SETTINGS = MapSettings()
 
@@ -56,7 +64,8 @@ class Comparison:
 
     C : (n_y, n_y, n_u, n_u), index i, k, j, l, the delay of the pair (i, k) taken out. B : (n_y, n_u, n_u), of the
     expected entries (k, a) and (k, b). P : (n_u, n_u) projection onto what is excited. rows_M : (n_y,) norms.
-    delay_s : (n_y, n_y). N : independent complex numbers in a row.
+    delay_s : (n_y, n_y). delays : independent ones among those tried; closer than 1 / (2 bandwidth) they are one
+    hypothesis to the records. N : independent complex numbers in a row.
     """
 
     C: np.ndarray
@@ -64,6 +73,7 @@ class Comparison:
     P: np.ndarray
     rows_M: np.ndarray
     delay_s: np.ndarray
+    delays: int
     N: int
     measured: H1
     settings: MapSettings
@@ -93,6 +103,11 @@ class Comparison:
         by_chance = 1 - (self.settings.chance / alternatives) ** (1 / max(self.N - 1, 1))
         return max(self.settings.least_agreement, float(np.sqrt(by_chance)))
 
+    def by_chance(self, gain: float, agreement: float, alternatives: int) -> float:
+        """Probability, at most, that one of this many alternatives reaches a log-likelihood ratio and an agreement."""
+        unrelated = max(1 - agreement ** 2, 0.0) ** max(self.N - 1, 1)
+        return min(1.0, alternatives * max(float(np.exp(-gain)), unrelated))
+
 
 def compare(pairs: list[tuple[Spectra, Spectra]], response: Callable[[np.ndarray], np.ndarray] | None = None,
             settings: MapSettings = SETTINGS) -> Comparison | None:
@@ -120,16 +135,16 @@ def compare(pairs: list[tuple[Spectra, Spectra]], response: Callable[[np.ndarray
     B = np.einsum("f,fka,fkb->kab", w, E, E.conj(), optimize=True).real
     rows_M = np.sqrt(np.einsum("f,fij->i", w, np.abs(M) ** 2))
     thirds = len(np.unique(np.floor(3 * np.log2(measured.f / measured.f[0]))))
-    return Comparison(C, B, P, rows_M, delay_s, measured.rank + thirds - 1, measured, settings)
+    tried, span_s = len(settings.delays_s), settings.delay_s[1] - settings.delay_s[0]
+    delays = min(tried, 1 + int(np.ceil(2 * span_s * (measured.f[-1] - measured.f[0]))))
+    return Comparison(C, B, P, rows_M, delay_s, delays, measured.rank + thirds - 1, measured, settings)
 
 
 def _delays(f: np.ndarray, w: np.ndarray, M: np.ndarray, E: np.ndarray, settings: MapSettings
             ) -> tuple[np.ndarray, np.ndarray]:
     """(n_y, n_y) s by which measured row i is best behind expected row k, whatever the signs of the columns; and
     w e^(j omega delay) (n, n_y, n_y)."""
-    low, high = settings.delay_s
-    steps = np.arange(round(low / settings.delay_step_s), round(high / settings.delay_step_s) + 1)
-    trial = settings.delay_step_s * steps[np.argsort(np.abs(steps), kind="stable")]  # none where all are alike
+    trial = settings.delays_s
     turn = np.exp(2j * np.pi * f * trial[:, None])
     products = np.einsum("f,fij,fkj->fikj", w, M, E.conj(), optimize=True)
     found = np.abs(np.tensordot(turn, products, 1).real).sum(axis=-1)
@@ -143,7 +158,8 @@ class Faults:
 
     own, other : (n_y,) agreement of each row with its own expectation and with what was found for it, the rest as
     found. columns : for each drive that was exchanged or flipped, the row that says so, and its agreement without and
-    with that.
+    with that. chance : for each row and column that was exchanged or flipped, the probability, at most, of so much
+    evidence by chance, among all alternatives and delays.
     doubtful : rows ("row", i) and columns ("column", j) that would agree better in another order or sign, but without
     evidence that is strong in absolute terms; they are not called faults.
     """
@@ -155,6 +171,7 @@ class Faults:
     own: np.ndarray
     other: np.ndarray
     columns: dict[int, tuple[int, float, float]]
+    chance: dict[tuple[str, int], float]
     doubtful: tuple[tuple[str, int], ...]
 
 
@@ -165,8 +182,8 @@ def explain(comparison: Comparison) -> Faults:
     all steps, an exchange by twice that. For columns one row must make up half of it, since a wrong model makes all
     rows wrong a little. A symmetric rig turned about its axis is many exchanges at once: one by one, the simplest comes
     first. At the end every channel that was touched must agree with what it is said to be by more than
-    `Comparison.least`, and by more than chance better than with its own; otherwise that is doubtful, and nothing is
-    called a fault.
+    `Comparison.least`, and better than with its own by more than chance does among all steps, each with each of
+    the delays; otherwise that is doubtful, and nothing is called a fault.
     """
     n_y, n_u = len(comparison.rows_M), len(comparison.P)
     order, sign = {"row": np.arange(n_y), "column": np.arange(n_u)}, {"row": np.ones(n_y), "column": np.ones(n_u)}
@@ -188,7 +205,7 @@ def explain(comparison: Comparison) -> Faults:
             break
         order, sign = best[1:]
     r, c = _fewest(sign["row"], sign["column"], comparison.moving)
-    return _judged(comparison, order["row"], order["column"], r, c, alternatives)
+    return _judged(comparison, order["row"], order["column"], r, c, alternatives * comparison.delays)
 
 
 def _judged(comparison: Comparison, p: np.ndarray, q: np.ndarray, r: np.ndarray, c: np.ndarray,
@@ -202,6 +219,7 @@ def _judged(comparison: Comparison, p: np.ndarray, q: np.ndarray, r: np.ndarray,
     touched = [i for i in rows if p[i] != i or r[i] < 0]
     gain = comparison.likelihood(other) - np.maximum(comparison.likelihood(own), 0.0)
     doubtful = [("row", int(i)) for i in touched if other[i] < least or gain[i] < evidence]
+    chance = {("row", int(i)): comparison.by_chance(gain[i], other[i], alternatives) for i in touched}
     columns: dict[int, tuple[int, float, float]] = {}
     for j in map(int, straight[(q != straight) | (c < 0)]):
         cycle = cycle_of(q, j)
@@ -211,12 +229,13 @@ def _judged(comparison: Comparison, p: np.ndarray, q: np.ndarray, r: np.ndarray,
         better = comparison.likelihood(other) - np.maximum(comparison.likelihood(before), 0.0)
         best = int(np.argmax(better))
         columns[j] = best, float(before[best]), float(other[best])
+        chance["column", j] = comparison.by_chance(better.sum(), other[best], alternatives)
         if other[best] < least or 2 * better[best] < evidence or better.sum() < evidence:
             doubtful.append(("column", j))
     if doubtful:
         own = comparison.agreement(straight, np.ones(n_u))[rows, rows]
-        return Faults(rows, straight, ones, np.ones(n_u), own, own, {}, tuple(doubtful))
-    return Faults(p, q, r, c, own, other, columns, ())
+        return Faults(rows, straight, ones, np.ones(n_u), own, own, {}, {}, tuple(doubtful))
+    return Faults(p, q, r, c, own, other, columns, chance, ())
 
 
 def cycle_of(order: np.ndarray, start: int) -> list[int]:

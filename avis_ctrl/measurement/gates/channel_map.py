@@ -154,14 +154,14 @@ class ChannelOrder:
                 of, before, after = faults.columns[i]
                 gain = after - before
                 listed = f"exchanging them raises the correlation of {sensors[of]!r} from {before:.2f} to {after:.2f}"
+            chance = max(faults.chance[kind, j] for j in cycle)
             verb = "are exchanged" if len(pair) == 2 else "are mixed up"
             found.append(
                 Finding(
                     self.name,
                     "stop",
                     f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay do not"
-                    f" count; probability by chance below {comparison.settings.chance:g}). Exchange their names or"
-                    " their cables.",
+                    f" count; probability by chance at most {chance:.1g}). Exchange their names or their cables.",
                     pair,
                     value=float(gain),
                     limit=comparison.settings.least_agreement,
@@ -234,26 +234,27 @@ class Polarity:
         doubt = " It could as well be that all the other channels are flipped." if 2 * both == total else ""
         said = [
             (campaign.y_names[k], "Sensor", -float(faults.other[k]),
-             f"correlation {-faults.other[k]:.2f} where +1 is expected")
+             f"correlation {-faults.other[k]:.2f} where +1 is expected", faults.chance["row", int(k)])
             for k in np.flatnonzero(r < 0)
         ] + [
             (campaign.u_names[k], "Drive", faults.columns[k][1] - faults.columns[k][2],
              f"flipping it raises the correlation of sensor {campaign.y_names[faults.columns[k][0]]!r} from"
-             f" {faults.columns[k][1]:.2f} to {faults.columns[k][2]:.2f}")
+             f" {faults.columns[k][1]:.2f} to {faults.columns[k][2]:.2f}", faults.chance["column", k])
             for k in map(int, np.flatnonzero(c < 0))
         ]
         found = [
             Finding(
                 self.name,
                 "stop",
-                f"{what} {name!r} has the opposite sign of the model ({how}). Its leads are exchanged, or the model's"
-                f" axis points the other way; exchange them or flip the channel's sign.{doubt}",
+                f"{what} {name!r} has the opposite sign of the model ({how}; probability by chance at most"
+                f" {chance:.1g}). Its leads are exchanged, or the model's axis points the other way; exchange them or"
+                f" flip the channel's sign.{doubt}",
                 (name,),
                 value=value,
                 limit=-comparison.settings.least_agreement,
                 picture=picture,
             )
-            for name, what, value, how in said
+            for name, what, value, how, chance in said
         ]
         if not found:
             found.append(

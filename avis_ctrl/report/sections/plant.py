@@ -13,7 +13,7 @@ from avis_ctrl.report.sections.identified import identified
 from avis_ctrl.report.sections.transmissibility import asked_dB, upper_bound
 from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.model import ControllerResult, DesignResult
-from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.study.plant import EFFORT, DesignPlant
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
@@ -107,14 +107,18 @@ def _transmissibility_weight(result: DesignResult) -> Figure:
 def _effort(result: DesignResult) -> Figure:
     plant = result.plant
     omega = 2 * np.pi * HZ
-    weight = plant.weights["control effort"]
-    curves = [Curve(HZ, weight.bound(omega), "1/|W_u|, allowed", STYLES["limit"])]
+    curves = []
     for k, axis in enumerate(plant.axes):
+        weight = plant.effort_weight(axis)
+        if EFFORT not in plant.weights:
+            curves.append(Curve(HZ, weight.bound(omega), f"1/|W_u|, allowed, {words.axis(axis)}", STYLES["limit"]))
+        elif not k:
+            curves.append(Curve(HZ, weight.bound(omega), "1/|W_u|, allowed", STYLES["limit"]))
         closed = plant.full.closed(_mu(result).K).select([f"effort_{axis}"], plant.floor_velocities)
         gain = np.linalg.norm(closed.frequency_response(omega), ord=2, axis=(1, 2)) / weight.magnitude(omega)
         curves.append(Curve(HZ, gain, f"mu synthesis, {words.axis(axis)}", numbered(k)))
-    return Figure("weight_effort", "Control effort: volts on the most loaded channel per m/s of floor velocity, "
-                  "against what the weight allows; nominal plant.",
+    return Figure("weight_effort", "Control effort: volts per m/s of floor velocity on the drive that the axis brings "
+                  "to its limit first, against what the weight allows; nominal plant.",
                   (Panel(hertz(0.1, 500.0), Axis("V per m/s", "log"), tuple(curves)),))
 
 

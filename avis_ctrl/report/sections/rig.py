@@ -1,4 +1,4 @@
-"""The rig: drawing, parameters, natural frequencies, and what the model with few coordinates leaves out."""
+"""The rig: drawing, parameters, modes, drives and sensors, and what the model with few coordinates leaves out."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, decibels, hertz, numbered
 from avis_ctrl.report.pieces import Drawing, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.rig_drawing import rig_drawing
+from avis_ctrl.rigs.instruments import Sensor
 from avis_ctrl.rigs.rig import Parameter, Rig
 from avis_ctrl.rigs.subsystem import ReductionError
 from avis_ctrl.study.model import DesignResult
 
+# By what a sensor measures: its kind, the unit of its gain, and a factor with the unit of its limit.
+_KINDS = {"velocity": ("geophone", "V s/m", 1e3, "mm/s"), "acceleration": ("accelerometer", "V s²/m", 1.0, "m/s²"),
+         "displacement": ("position sensor", "V/m", 1e3, "mm")}
 _NUMBERED = re.compile(r"(?P<group>[A-Za-z_]+)(?P<number>\d+)\.(?P<rest>.+)")
 
 
@@ -23,7 +27,8 @@ def rig(result: DesignResult) -> Section:
     drawing = Drawing("rig", f"The rig {one.name} by its named points, to scale; the outline is drawn around the "
                       "points and is not the real contour. The edge lever turns the rotation phi_x into a "
                       "displacement.", rig_drawing(one), f"Top view and side view of the rig {one.name}")
-    pieces: list[Piece] = [drawing, *_parameters(one), _modes(one), _electronics(result), *_reduction(result)]
+    pieces: list[Piece] = [drawing, *_parameters(one), _modes(one), _drives(one), _sensors(one), _electronics(result),
+                           *_reduction(result)]
     return Section("The rig", "rig", tuple(pieces))
 
 
@@ -69,23 +74,66 @@ def _modes(one: Rig) -> Table:
                  ("frequency", "damping ratio", "moves mainly"), rows, "rrl")
 
 
+def _drives(one: Rig) -> Table:
+    actuators = one.mounted_body().actuators
+    rows = [(a.name, *_placed(a.position, a.direction), f"{words.number(a.constant_N_per_V)} N/V",
+             f"±{words.number(limit)} V", f"±{words.number(a.constant_N_per_V * limit)} N")
+            for a, limit in zip(actuators, one.limits_of([a.name for a in actuators]).tolist(), strict=True)]
+    return table("Drives: place from the geometric centre, direction of the force on the payload for a positive "
+                 "voltage.", ("name", "x, y, z [m]", "direction", "force constant", "limit", "largest force"), rows,
+                 "lllrrr")
+
+
+def _sensors(one: Rig) -> Table:
+    rows = []
+    for s in one.sensors():
+        kind, gain, scale, unit = _KINDS[s.quantity]
+        row = (s.name, kind, *_placed(np.array(s.position), np.array(s.direction)), f"{_value(s.gain)} {gain}",
+               _corner(s), f"{words.number(1e3 * s.noise_rms_V)} mV")
+        full = (f"±{words.number(scale * one.converter.range_V / s.gain)} {unit}",) if one.converter else ()
+        rows.append((*row, *full))
+    header = ("name", "kind", "x, y, z [m]", "direction", "gain", "corner", "noise", *(
+        ("limit",) if one.converter else ()))
+    return table("Sensors on the payload: place from the geometric centre, direction of the motion that gives a "
+                 "positive voltage, gain in the passband with preamplifier, corner with the damping ratio in brackets, "
+                 "r.m.s. of the white noise of one sample"
+                 + (", motion at the converter's limit" if one.converter else "") + ". Position sensors, if any, "
+                 "measure relative to the chassis.", header, rows, "llllrlrr")
+
+
+def _placed(position: np.ndarray, direction: np.ndarray) -> tuple[str, str]:
+    """Place and direction; a direction along an axis by its name."""
+    along = int(np.argmax(np.abs(direction)))
+    axis = ("−" if direction[along] < 0 else "+") + "xyz"[along]
+    skewed = abs(direction[along]) < 1 - 1e-9
+    return ", ".join(map(_value, position)), ", ".join(words.number(d) for d in direction) if skewed else axis
+
+
+def _corner(s: Sensor) -> str:
+    """Corner and damping ratio of the sensor with its filters, and of a geophone's suspension where that differs."""
+    if not s.poles:
+        return "none"
+    poles, side = np.array(s.poles), "high-pass" if s.zeros else "low-pass"
+    omega = float(np.prod(np.abs(poles)) ** (1 / len(poles)))
+    text = f"{side} {words.hertz(omega)}"
+    if len(poles) == 1:
+        return text
+    damping = float(-np.mean(poles.real) / omega)
+    text += f" ({words.number(damping, 2)})"
+    if s.suspension is None or np.allclose(s.suspension, (omega / (2 * np.pi), damping)):
+        return text
+    return f"{text}; suspension {words.number(s.suspension[0])} Hz ({words.number(s.suspension[1], 2)})"
+
+
 def _electronics(result: DesignResult) -> Table:
     one, loop = result.rig, result.design.loop
     rows = [("sample rate", f"{words.number(one.sample_rate_Hz, 4)} Hz"),
             ("delay from sample to voltage", f"{words.number(1e3 * one.loop_delay_s)} ms"),
-            ("largest voltage of an actuator", f"{words.number(one.drive_limit_V)} V"),
             ("amplifier corner", f"{words.number(loop.amplifier_corner_Hz)} Hz"),
             ("edge lever of phi_x", f"{words.number(one.edge_m)} m")]
-    if one.geophones is not None:
-        g = one.geophones
-        rows += [("geophones", ", ".join(g.names)),
-                 ("geophone corner, raw and compensated",
-                  f"{words.number(g.suspension_Hz)} Hz and {words.number(g.compensated_Hz)} Hz")]
-    elif one.accelerometers is not None:
-        rows.append(("accelerometers at", ", ".join(one.accelerometers.at)))
     if one.acquisition is not None:
         rows.append(("converter", f"{one.acquisition.adc_bits} bits, ±{words.number(one.acquisition.adc_range_V)} V"))
-    return table("Sensors, drives and clock.", ("what", "value"), rows, "ll")
+    return table("Clock, amplifiers, converter and edge lever.", ("what", "value"), rows, "ll")
 
 
 def _reduction(result: DesignResult) -> list[Piece]:

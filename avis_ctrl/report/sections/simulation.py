@@ -6,7 +6,7 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz
-from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, Table, table
 from avis_ctrl.simulation.campaign import PlantCheck, SimulationCheck
 from avis_ctrl.simulation.spectrum_check import SpectrumAgreement
 from avis_ctrl.study.companions import Companions
@@ -36,27 +36,34 @@ def simulation(result: DesignResult) -> Section:
 
 
 def _plants(check: SimulationCheck) -> Table:
+    loop = check.first.loop
+    limits = dict(zip(loop.rig.equations_of_motion().actuators, loop.limits_V.tolist(), strict=True))
+    differ = len(set(limits.values())) > 1
     rows = [(p.name, Mark("pass", True) if p.passed else Mark("FAIL", False),
              Mark("yes", True) if p.stable else Mark("diverged" if p.diverged else "no", False), _agreement(p),
-             f"{words.number(p.peak_V)} V", str(p.clipped_dac + p.clipped_adc),
+             f"{words.number(p.peak_V)}{f' of {words.number(p.limit_V)}' if differ else ''} V",
+             str(p.clipped_dac + p.clipped_adc),
              ", ".join(f"{words.axis(a)} {words.number(1e6 * v)}" for a, v in p.payload_rms.items()))
             for p in check.plants]
-    limit = check.plants[0].limit_V
-    return table(f"Every simulated plant. Voltages as demanded, limit {words.number(limit)} V; clipped samples at "
+    nearest = "of the drive that comes nearest to its limit" if differ else "limit"
+    return table(f"Every simulated plant. Voltages as demanded, {nearest} {words.limits(limits)}; clipped samples at "
                  "drives and converter together.",
                  ("plant", "verdict", "stable", "bands that agree", "peak voltage", "clipped",
                   "velocity r.m.s. [µm/s]"), rows, "lcccrrl")
 
 
 def _companions(companions: Companions) -> Table:
-    rows = [(words.axis(one.axis), f"{words.number(one.gain)} N s/m", f"{words.number(one.tilt_corner_Hz)} Hz",
-             f"{words.number(one.roll_off_Hz)} Hz", words.number(one.modulus_margin, 2)) for one in companions.loops]
+    asked, low = companions.settings.modulus_margin, companions.below_margin()
+    rows: list[tuple[Cell, ...]] = [
+        (words.axis(one.axis), f"{words.number(one.gain)} N s/m", f"{words.number(one.tilt_corner_Hz)} Hz",
+         f"{words.number(one.roll_off_Hz)} Hz", Mark(words.number(one.modulus_margin, 2), one not in low))
+        for one in companions.loops]
     rows += [(words.axis(axis), "passive", "", "", why) for axis, why in companions.passive]
     return table("Axes outside the mu controller. Each has a skyhook loop that was designed for this rig's sensors "
                  "with all other loops closed, or stays passive. The modulus margin is the least distance of the "
-                 "Nyquist curve from the critical point, for the nominal plant. sampled_controller.json holds these "
-                 "loops and the mu controller.", ("axis", "gain", "tilt corner", "roll-off", "modulus margin"), rows,
-                 "lrrrr")
+                 f"Nyquist curve from the critical point, for the nominal plant; at least {asked:g} was asked. "
+                 "sampled_controller.json holds these loops and the mu controller.",
+                 ("axis", "gain", "tilt corner", "roll-off", "modulus margin"), rows, "lrrrr")
 
 
 def _agreement(p: PlantCheck) -> Mark | str:

@@ -62,9 +62,11 @@ def _volts(result: DesignResult) -> Table:
     rows = [(c.title, *(f"{words.number(rms)} / {words.number(c.site.volts_peak[name])}"
                         for name, rms in c.site.volts_rms.items()))
             for c in _settled(result) if c.K is not None]
+    names = result.plant.actuators
+    limits = dict(zip(names, result.rig.limits_of(names).tolist(), strict=True))
     return table("Voltages on the site by channel, r.m.s. / peak [V]. The peak is what a Gaussian signal passes once "
-                 f"in ten minutes; the limit is {words.number(result.rig.drive_limit_V)} V.",
-                 ("controller", *result.plant.actuators), rows)
+                 f"in ten minutes; the limit is {words.limits(limits)}.",
+                 ("controller", *names), rows)
 
 
 def _compliance(result: DesignResult) -> Figure:
