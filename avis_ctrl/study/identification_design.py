@@ -19,6 +19,7 @@ from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.logical_axes import drivable, sensed
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.study.design_file import ChainUncertainty, Design, design_from_table, read_design
 from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE, UNCERTAINTY_FILE
@@ -60,7 +61,8 @@ def design_files(found: Identification, template: Path | Design | None = None) -
 
     Parameters
     ----------
-    template : design whose rig and uncertainty are replaced; by default z and phi_x as designs/*.toml have them.
+    template : design whose rig and uncertainty are replaced; by default z and phi_x as designs/*.toml have them, and
+        design.toml says in its first lines for which table those were chosen.
 
     Raises
     ------
@@ -80,6 +82,8 @@ def design_start(found: Identification, template: Path | Design | None = None) -
     content = uncertainty_content(found.rig, found.campaign_fit.fit.information, [spread], found.provenance)
     made = in_design(content, found.rig, design.keep, design.uncertainty.confidence_percent / 100)
     text = identification_design(content, design, found.rig)
+    if template is None:
+        text = assumed_weights(found.rig) + text
     return {UNCERTAINTY_FILE: uncertainty_json(content), DESIGN_FILE: text}, made
 
 
@@ -179,6 +183,20 @@ def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float]
     uncertainty = shape["uncertainty"] | {"parameters_percent": dict(parameters_percent or {})}
     return design_from_table(shape | {"title": title, "rig": RIG_FILE, "keep": default_keep(rig),
                                       "uncertainty": uncertainty})
+
+
+def assumed_weights(rig: Rig) -> str:
+    """Comment lines above a `default_design`: for which table its weights were chosen, and how this one compares."""
+    shipped = load_rig("avis" if isinstance(rig, AvisTable) else "halcyonics_loaded")
+    lines = ["The weights were not stated for this table. [loop], [uncertainty.actuator_chains], [transmissibility],",
+             "[control_effort] and [[requirement]] come from the shipped design for the first of these tables:"]
+    for what, one in (("shipped", shipped), ("this table", rig)):
+        eom = one.equations_of_motion()
+        modes = eom.natural_frequencies().frequencies_Hz
+        lines.append(f"  {what}: {_value(one.name)}, {eom.M[0, 0]:.4g} kg, modes from {modes.min():.3g} to "
+                     f"{modes.max():.3g} Hz")
+    lines.append("State here, and in [floor], what this table needs before you design.")
+    return "".join(f"# {line}\n" for line in lines)
 
 
 def _not_identified(ranges: dict[str, float], content: UncertaintyFile, known: Collection[str]) -> dict[str, float]:

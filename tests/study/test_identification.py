@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import tomllib
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -15,7 +17,10 @@ from avis_ctrl.measurement.frequency_response.local_polynomial import local_poly
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation import rehearse
 from avis_ctrl.study.campaign_plan import default_plan
+from avis_ctrl.study.design_file import design_from_table
 from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
+from avis_ctrl.study.identification_design import assumed_weights, design_files
+from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.identification_output import read_identified, write_identification, write_predictions
 
 FEW = IdentifyOptions(starts=1)
@@ -44,6 +49,25 @@ def test_the_truth_lies_within_the_standard_deviations(rehearsal, found):
     assert np.all(np.abs(information.values - truth)[alone] < 5 * information.standard_deviation[alone])
     start = np.array([found.start.parameters()[name].value for name in information.names])
     assert np.max(np.abs(start / truth - 1)) > 0.04
+
+
+def test_a_design_whose_weights_nobody_stated_says_for_which_table_they_are(found):
+    text = design_files(found)[DESIGN_FILE]
+    assert text.startswith("# The weights were not stated for this table.")
+    assert '\n#   shipped: "avis", 500 kg, modes from 1.94 to 5.24 Hz\n#   this table: "avis", ' in text
+    stated = design_from_table(tomllib.loads(text))
+    assert stated.rig == RIG_FILE
+    assert not design_files(found, stated)[DESIGN_FILE].startswith("#")
+
+
+@pytest.mark.parametrize(("name", "lines"), [
+    ("designs/rigs/skewed.toml", ('shipped: "avis", 500 kg, modes from 1.94 to 5.24 Hz',
+                                  'this table: "skewed", 120 kg, modes from 7.54 to 15.6 Hz')),
+    ("halcyonics", ('shipped: "halcyonics", 29.3 kg', 'this table: "halcyonics", 19.3 kg'))])
+def test_the_comparison_of_tables_is_a_comment(name, lines):
+    path = Path(__file__).resolve().parents[2] / name
+    text = assumed_weights(load_rig(path if path.is_file() else name))
+    assert all(line in text for line in lines) and tomllib.loads(text) == {}
 
 
 def test_a_result_says_what_it_is_made_of(found):
