@@ -39,6 +39,7 @@ class CampaignFitSettings:
         file.
     tail : share of an input's power that may lie below the band of the fit, and above it; the noise of a generator has
         a smaller share.
+    floor_tail : the same of a measured floor: it holds its sensor's noise at all frequencies, up to a per cent or two.
     """
 
     longest_piece: int = 1 << 18
@@ -46,6 +47,7 @@ class CampaignFitSettings:
     silent_line: float = 1e-3
     quiet_band_Hz: tuple[float, float] = (0.5, 60.0)
     tail: float = 5e-4
+    floor_tail: float = 0.02
 
 
 SETTINGS = CampaignFitSettings()
@@ -118,7 +120,8 @@ def divided(record: RecordSource) -> tuple[Portion, Portion]:
 def excited_band(campaign: Campaign) -> tuple[float, float]:
     """Lowest and highest frequency [Hz] that some record drives, within 0.2 Hz and a quarter of the sample rate.
 
-    Of each record the band that holds its input's power but for 0.05 % at either end.
+    Of each record the band that holds its input's power but for a small share at either end: `tail` of the settings,
+    `floor_tail` where only the measured floor moves.
     """
     ends: list[tuple[float, float]] = []
     for record in campaign.records:
@@ -128,7 +131,8 @@ def excited_band(campaign: Campaign) -> tuple[float, float]:
             continue
         power = np.cumsum(np.sum(np.abs(scipy.fft.rfft(drive - drive.mean(0), axis=0)) ** 2, axis=1))
         frequency = scipy.fft.rfftfreq(piece.header.samples, 1 / piece.header.sample_rate_Hz)
-        low, high = np.searchsorted(power, np.array([SETTINGS.tail, 1 - SETTINGS.tail]) * power[-1])
+        tail = SETTINGS.tail if drive is piece.u else SETTINGS.floor_tail
+        low, high = np.searchsorted(power, np.array([tail, 1 - tail]) * power[-1])
         ends.append((float(frequency[low]), float(frequency[high])))
     low, high = (min(e[0] for e in ends), max(e[1] for e in ends)) if ends else SETTINGS.quiet_band_Hz
     return max(low, 0.2), min(high, campaign.sample_rate_Hz / 4)

@@ -167,6 +167,11 @@ def _check(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> 
     if isinstance(measured, Campaign):
         for name in options.hold_out or ():
             measured.named(name)
+        if options.band_Hz is not None:
+            low, high = excited_band(measured)
+            if options.band_Hz[0] >= high or options.band_Hz[1] <= low:
+                raise InputError(f"the records are driven from {low:.3g} to {high:.3g} Hz; expected a band within",
+                                 field="band_Hz", value=options.band_Hz)
 
 
 def amplifier_corner(rig: Rig, stated_Hz: float | None) -> float | None:
@@ -210,8 +215,9 @@ def gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options:
         return ()
     kinds = ", ".join(sorted({record.header.excitation for record in measured.records}))
     progress(f"gates: {len(measured.records)} records of {kinds}")
-    records_fit(measured, model, options.despite_gates, progress)
-    findings = examine(measured, expectation(model))
+    doubts = records_fit(measured, model, options.despite_gates, progress)
+    findings = (*(Finding("units", "warning", one.sentence, one.sensors) for one in doubts),
+                *examine(measured, expectation(model)))
     stops = [finding for finding in findings if finding.severity == "stop"]
     raised = stops[0] if stops and not options.despite_gates else None
     for finding in findings:

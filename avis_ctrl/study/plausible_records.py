@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,7 @@ class RecordPlausibility:
     hopeless : distance at which records are refused although no single error explains them: a factor of ten or more.
     rare : penalty added to the distance for an error other than three decades. scope : penalty for an error that is
         not a common gain; half of it for one of a single channel, so that the simplest of similar ones is named.
+    like_g : decades within which a factor is taken for 9.81, the acceleration of gravity.
     rate : ratio of the sample rates of records and rig from which one of them is taken for an error.
     """
 
@@ -52,6 +54,7 @@ class RecordPlausibility:
     hopeless: float = 1.5
     rare: float = 0.02
     scope: float = 0.02
+    like_g: float = 0.06
     rate: float = 20.0
 
 
@@ -109,19 +112,31 @@ def distance(decades: np.ndarray, cap: float = SETTINGS.cap) -> float:
     return float(np.mean([size[there[:, k], k].mean() for k in np.flatnonzero(columns)]))
 
 
-def records_fit(measured: Campaign, model: ResponseModel, despite: bool, progress: Callable[[str], None]) -> None:
+class Doubt(NamedTuple):
+    """Sensors that read a multiple of what the model predicts, and a sentence that says so."""
+
+    sensors: tuple[str, ...]
+    sentence: str
+
+
+def records_fit(measured: Campaign, model: ResponseModel, despite: bool, progress: Callable[[str], None]
+                ) -> tuple[Doubt, ...]:
     """`check_records`; if the user continues `despite` the gates, its message is only a line of progress."""
     try:
-        check_records(measured, model)
+        return check_records(measured, model)
     except InputError as error:
         if not despite:
             raise InputError(f"{error.expected}; --despite-gates continues anyway", field=error.field,
                              value=error.value) from None
         progress(f"  stop: {error}")
+        return ()
 
 
-def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlausibility = SETTINGS) -> None:
+def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlausibility = SETTINGS
+                  ) -> tuple[Doubt, ...]:
     """Refuse records that a single unit error explains, or that no table like the rig could have produced.
+
+    Returns what is doubtful and no reason to stop: sensors that are off by one factor in all bands.
 
     Raises
     ------
@@ -135,7 +150,7 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
                          field="sample_rate_Hz of the records", value=measured.sample_rate_Hz)
     seen = look(measured, settings)
     if seen is None:
-        return
+        return ()
 
     def response(of: ResponseModel) -> np.ndarray:
         G = of.response(seen.omega)
@@ -144,8 +159,9 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
     now = seen.decades(G)
     before = distance(now)
     worst = _worst_channel(now, settings)
+    doubts = _doubts(now, measured, model, settings)
     if not (before > settings.far or worst > settings.far):
-        return
+        return doubts
     found = sorted(_candidates(seen, G, now, measured, model, response, settings), key=lambda one: one[0])
     left = [one for one in found if one[0] <= settings.fits and one[0] <= settings.share * max(before, worst)]
     if left:
@@ -156,6 +172,29 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
         raise InputError(f"the recorded y is {_said(now)} what the rig's model predicts for these voltages, and no "
                          "single wrong unit explains it; check the units of y and u, sensitivities, gains and force "
                          "constants", field="records")
+    return doubts
+
+
+def _doubts(decades: np.ndarray, measured: Campaign, model: ResponseModel, settings: RecordPlausibility
+            ) -> tuple[Doubt, ...]:
+    """Sensors of a kind that read one and the same multiple of what is predicted, in all bands."""
+    off: dict[str, list[tuple[str, float]]] = {}
+    kinds = {one.name: one.quantity for one in model.rig.sensors()}
+    for name, column in zip(measured.y_names, decades.T, strict=True):
+        there = column[np.isfinite(column)]
+        if there.size >= 3 and abs(middle := float(np.median(there))) > settings.far and (
+                np.median(np.abs(there - middle)) < settings.fits):
+            off.setdefault(kinds.get(name, ""), []).append((name, 10.0 ** middle))
+    found = []
+    for kind, sensors in off.items():
+        factor = float(np.median([one[1] for one in sensors]))
+        names = tuple(one[0] for one in sensors)
+        likely = " (9.81 is g: a sensitivity in V/g where V s^2/m is expected, or the reverse)" if (
+            kind == "acceleration" and settings.like_g > abs(abs(np.log10(factor)) - np.log10(9.80665))) else ""
+        found.append(Doubt(names, f"{', '.join(names)} {'reads' if len(names) == 1 else 'read'} {factor:.3g} times "
+                                  f"what the rig's model predicts for these voltages, over all bands{likely}. Check "
+                                  f"sensitivity, gain and unit before the fit is believed."))
+    return tuple(found)
 
 
 def _said(decades: np.ndarray) -> str:

@@ -89,7 +89,19 @@ def only(n: int, k: int, factor: float) -> np.ndarray:
 
 def test_sound_records_pass(sound):
     rig, measured = sound
-    check_records(measured, model_of(rig, measured))
+    assert check_records(measured, model_of(rig, measured)) == ()
+
+
+def test_volts_per_g_are_doubted(sound):
+    """A factor of 9.81 is no slip of decades: it is told, with what it may be, and the fit goes on."""
+    rig, measured = sound
+    wrong = changed(measured, y=9.80665)
+    doubt, = check_records(wrong, model_of(rig, wrong))
+    assert set(doubt.sensors) == set(measured.y_names) and "9.8" in doubt.sentence
+    assert ("V/g" in doubt.sentence) == (rig.accelerometers is not None)
+    one = changed(measured, y=only(len(measured.y_names), 2, 0.2))
+    doubt, = check_records(one, model_of(rig, one))
+    assert doubt.sensors == (measured.y_names[2],) and "reads 0.2" in doubt.sentence
 
 
 @pytest.mark.parametrize("change, said", [

@@ -320,7 +320,7 @@ def test_whole_study_of_a_shipped_design(name, tmp_path):
     stored = check_folder(tmp_path)
     assert {row["name"] for row in stored["controllers"]} >= {"passive", "skyhook", "hinf", "mu"}
     assert len(stored["dk_history"]) >= 1
-    assert len(stored["requirements"]) == len(design.requirement)
+    assert len(stored["requirements"]) == 3 + len(design.requirement)  # stability, limits and agreement belong to each
     assert all(path.stat().st_size > 0 for path in files)
     assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
     assert any("D-K iteration" in line for line in said)
