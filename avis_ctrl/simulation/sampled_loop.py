@@ -173,7 +173,8 @@ class SampledLoop:
         self._check()
         periods = Fraction(self.loop_delay_s * self.sample_rate_Hz).limit_denominator(MAX_SUBSTEPS)
         if abs(float(periods) - self.loop_delay_s * self.sample_rate_Hz) > 1e-6:
-            raise InputError(f"a delay of n/m sample periods with m up to {MAX_SUBSTEPS}", field="loop_delay_s",
+            raise InputError(f"expected n/m sample periods with whole n and m, m up to {MAX_SUBSTEPS}; the nearest is "
+                             f"{float(periods) / self.sample_rate_Hz:.6g} s", field="loop_delay_s of the rig",
                              value=self.loop_delay_s)
         object.__setattr__(self, "substeps", periods.denominator)
 

@@ -70,8 +70,8 @@ def in_design(content: UncertaintyFile, rig: Rig, keep: Sequence[str], confidenc
     spread = next((one for one in content.spread if sorted(one.keep) == sorted(keep)), None)
     if spread is None:
         known = "; ".join(", ".join(one.keep) for one in content.spread)
-        raise InputError(f"the uncertainty file holds the spread for {known}; identify again for these coordinates",
-                         field="keep", value=list(keep))
+        raise InputError(f"the uncertainty file holds the spread for {known}; identify again with "
+                         "--design FILE, a design file that keeps these coordinates", field="keep", value=list(keep))
     values, own = spread.values(), [name in rig.parameters() for name in content.names]
     names = [name for name, here in zip(content.names, own, strict=True) if here]
     # Sensors and delay are no parameters of the rig's equations: the measured spread covers their errors.

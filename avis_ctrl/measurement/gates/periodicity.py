@@ -124,14 +124,16 @@ class Periodicity(Gate):
         late = {r: d for r, d in drops.items() if d[0] > 0}
         if late:
             most, k, limit, picture = max(late.values(), key=lambda d: d[0])
+            periods = f"{most} period{'s' if most > 1 else ''}"
             assert k.relative is not None and k.T is not None
             found.append(
                 Finding(
                     self.name,
                     "note",
-                    f"The transient of the start fills {most} period{'s' if most > 1 else ''} of {k.period_s:g} s"
+                    f"The transient of the start fills {periods} of {k.period_s:g} s"
                     f" (record {k.record}: the first differs from the last ones by {100 * k.relative[0].max():.2g} % of"
-                    f" the signal). Drop the first {most} of each record.",
+                    f" the signal). A fit that has the transient beside the response, as avis identify's has,"
+                    f" needs no change; for others drop the first {periods} of each record.",
                     (),
                     tuple(late),
                     float(most),
