@@ -110,6 +110,7 @@ def test_a_long_record_is_predicted_piece_by_piece_as_in_one(rehearsal, found, t
     assert np.allclose(again, y, rtol=0, atol=1e-9 * np.ptp(y))
 
 
+@pytest.mark.slow
 def test_frequency_responses_serve_as_well_as_records(rehearsal):
     """The campaign reduced to frequency responses: a third of the lines is held out."""
     rig = load_rig("avis")

@@ -120,6 +120,7 @@ def test_a_design_reads_it_beside_itself(folder, content):
     assert len(hashes) == 2
 
 
+@pytest.mark.slow
 def test_a_higher_confidence_widens_everything(rig, content):
     low, high = (in_design(content, rig, ("z", "phi_x"), confidence) for confidence in (0.8, 0.99))
     assert high.found.box > low.found.box and np.all(high.weight.data > low.weight.data)
