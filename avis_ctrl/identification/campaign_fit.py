@@ -13,15 +13,13 @@ from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, Prior, fit
 from avis_ctrl.identification.noise import relative_noise, residual_noise
 from avis_ctrl.identification.portion import Portion
-from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.response import MOMENTS, ResponseModel
 from avis_ctrl.identification.second_order import chosen_turning, terms, without
 from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import noise_covariance
 
-# Names of the parameters that are moments of inertia.
-MOMENTS = ("J1", "J2", "J3", "Ixx", "Iyy", "Izz")
 Progress = Callable[[str], None]
 
 
@@ -39,7 +37,8 @@ class CampaignFitSettings:
         file.
     tail : share of an input's power that may lie below the band of the fit, and above it; the noise of a generator has
         a smaller share.
-    floor_tail : the same of a measured floor: it holds its sensor's noise at all frequencies, up to a per cent or two.
+    floor_tail : the same of a measured floor: up to a per cent or two of its power is its sensor's noise, at all
+        frequencies.
     """
 
     longest_piece: int = 1 << 18
@@ -290,8 +289,8 @@ def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:
 
 def _bounds(found: LikelihoodFit) -> tuple[str, ...]:
     """Sentences about parameters that ended at a physical limit."""
-    moments = [name for name in found.held if name in MOMENTS]
-    low = [name for name in found.held if name not in MOMENTS]
+    moments = [name for name in found.held if any(name in names for names in MOMENTS)]
+    low = [name for name in found.held if name not in moments]
     said = []
     if low:
         said.append(f"the best fit would need values below the physical limit for {', '.join(low)}: held just above "

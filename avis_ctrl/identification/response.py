@@ -398,6 +398,11 @@ class ResponseModel:
         return a[:, None, None], folded[:, :, None]
 
 
+# Names of parameters: the moments of inertia of a payload, and with its mass and its load's all that is inertia.
+MOMENTS = (("J1", "J2", "J3"), ("Ixx", "Iyy", "Izz"))
+INERTIAL = ("mass", "load.mass", *MOMENTS[0], *MOMENTS[1])
+
+
 def moment_rows(names: Sequence[str]) -> np.ndarray:
     """(k, n_p) rows r: r @ theta > 0 for all of them where no moment of inertia exceeds the sum of the other two.
 
@@ -405,7 +410,7 @@ def moment_rows(names: Sequence[str]) -> np.ndarray:
     inertia are assumed to be small.
     """
     rows = []
-    for moments in (("J1", "J2", "J3"), ("Ixx", "Iyy", "Izz")):
+    for moments in MOMENTS:
         if set(moments) <= set(names):
             at = [list(names).index(name) for name in moments]
             for largest in at:
@@ -424,8 +429,7 @@ def positive(name: str) -> bool:
     if "@" in name:
         return False
     last = name.rpartition(".")[2]
-    inertia = ("mass", "load.mass", "J1", "J2", "J3", "Ixx", "Iyy", "Izz")
-    if name.startswith(("sensor.", "actuator.")) or name in inertia:
+    if name.startswith(("sensor.", "actuator.")) or name in INERTIAL:
         return True
     return last.startswith(("k_", "c_")) or (len(last) == 2 and last[0] in "de" and last[1].isdigit())
 

@@ -199,22 +199,25 @@ def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: fl
     scan = _Scan.of(N, band, lambda M: upper_bound(M, structure, accuracy), slack)
     # One stage draws the curve; the search goes on at the peaks only.
     lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9, stages=1)
-
-    def covered(level: float, first: Array) -> Cover:
-        return cover(N, structure, lambda system, level: system.scaled(left=1 / level),
-                     lambda M: upper_bound(M, structure, accuracy).beta, level, band, first, slack=slack)
     if known_upper is not None and known_upper <= (1 + KNOWN_SLACK) * scan.level:
         done = Cover(known_upper)
     else:
-        done = covered(scan.level, scan.peak)
+        done = _cover_mu(N, structure, scan.level, band, scan.peak, accuracy, slack)
     best, at, delta = _best_singular(N, structure, scan.omega, scan.bound, lower, done, band)
     if best > done.level:
         # mu of real blocks can jump at a single frequency that no grid contains; the search for it found one.
-        done = covered(best * (1 + slack), np.array([at]))
+        done = _cover_mu(N, structure, best * (1 + slack), band, np.array([at]), accuracy, slack)
     if best == 0.0:
         at = float(scan.peak[0])
     return MuPeak(done.level, best, at, delta, not done.gaps, _in_words(done, band), scan.omega,
                   scan.bound.beta, lower.beta)
+
+
+def _cover_mu(N: StateSpace, structure: BlockStructure, level: float, band: Interval, first: Array, accuracy: float,
+              slack: float) -> Cover:
+    """Intervals on which constant scalings prove mu below a level, from the frequencies `first` (n,) on."""
+    return cover(N, structure, lambda system, level: system.scaled(left=1 / level),
+                 lambda M: upper_bound(M, structure, accuracy).beta, level, band, first, slack=slack)
 
 
 def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found: UpperBound, lower: LowerBound,
@@ -274,9 +277,8 @@ def _robustly_stable(N: StateSpace, structure: BlockStructure, band: Interval) -
     """Whether mu < 1 is proved at all frequencies; a cover of all of them with performance proves it on its own."""
     if band == ALL_FREQUENCIES:
         return True
-    done = cover(N, structure, lambda system, level: system.scaled(left=1 / level),
-                 lambda M: upper_bound(M, structure, 1e-4).beta, 1.0 - 1e-6, ALL_FREQUENCIES,
-                 first_frequencies(N, ALL_FREQUENCIES, 0), slack=0.0)
+    first = first_frequencies(N, ALL_FREQUENCIES, 0)
+    done = _cover_mu(N, structure, 1.0 - 1e-6, ALL_FREQUENCIES, first, accuracy=1e-4, slack=0.0)
     return not done.gaps and done.level < 1.0
 
 

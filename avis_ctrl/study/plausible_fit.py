@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit
-from avis_ctrl.identification.response import ResponseModel
-
-INERTIAL = ("mass", "load.mass", "J1", "J2", "J3", "Ixx", "Iyy", "Izz")
+from avis_ctrl.identification.response import INERTIAL, ResponseModel
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
                   ) -> tuple[Doubt, ...]:
     """Refuse records that a single unit error explains, or that no table like the rig could have produced.
 
-    Returns what is doubtful and no reason to stop: sensors that are off by one factor in all bands.
+    Returns doubts that are no reason to stop: sensors that are off by one factor in all bands.
 
     Raises
     ------
@@ -193,7 +193,7 @@ def _doubts(decades: np.ndarray, measured: Campaign, model: ResponseModel, setti
             kind == "acceleration" and settings.like_g > abs(abs(np.log10(factor)) - np.log10(9.80665))) else ""
         found.append(Doubt(names, f"{', '.join(names)} {'reads' if len(names) == 1 else 'read'} {factor:.3g} times "
                                   f"what the rig's model predicts for these voltages, over all bands{likely}. Check "
-                                  f"sensitivity, gain and unit before the fit is believed."))
+                                  f"sensitivity, gain and unit before you trust the fit."))
     return tuple(found)
 
 

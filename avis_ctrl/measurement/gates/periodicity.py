@@ -132,8 +132,8 @@ class Periodicity(Gate):
                     "note",
                     f"The transient of the start fills {periods} of {k.period_s:g} s"
                     f" (record {k.record}: the first differs from the last ones by {100 * k.relative[0].max():.2g} % of"
-                    f" the signal). A fit that has the transient beside the response, as avis identify's has,"
-                    f" needs no change; for others drop the first {periods} of each record.",
+                    f" the signal). A fit that includes the transient, as in avis identify, needs no change;"
+                    f" otherwise drop the first {periods} of each record.",
                     (),
                     tuple(late),
                     float(most),
