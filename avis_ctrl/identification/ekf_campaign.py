@@ -67,7 +67,7 @@ def flat_floor(samples: int, rate: float, rms: float, rng: np.random.Generator) 
 
 def _record(rig: Rig, name: str, samples: int, rng: np.random.Generator, noise: bool, floor_rms: float) -> Record:
     assert rig.geophones is not None and rig.acquisition is not None
-    u = np.clip(logical_drive(rig, samples, rng), -rig.drive_limit_V, rig.drive_limit_V)
+    u = np.clip(logical_drive(rig, samples, rng), -rig.drive_limits_V(), rig.drive_limits_V())
     floor = flat_floor(samples + 1, rig.sample_rate_Hz, floor_rms, rng) if floor_rms else np.zeros((samples + 1, 3))
     y = sensor_volts(rig, u, floor)
     if noise:

@@ -114,7 +114,7 @@ def candidates(model: ResponseModel, drive: Drive) -> tuple[Experiment, ...]:
     low, high = drive.band_Hz
     rate = 1 / model.period_s if model.period_s else 1000.0
     found = [Experiment("Record four times as long", replace(drive, duration_s=3 * drive.duration_s))]
-    level = min(3 * drive.level_V, model.rig.drive_limit_V / 4)
+    level = min(3 * drive.level_V, float(np.min(model.rig.drive_limits_V())) / 4)
     if level > drive.level_V:
         found.append(Experiment(f"Record once more with {number(level)} V r.m.s. at each actuator",
                                 replace(drive, level_V=level)))

@@ -102,6 +102,13 @@ class AvisTable(Rig):
     def drive_limits_V(self) -> np.ndarray:
         return np.array([drive.limit_V or self.limit_V for drive in self.all_drives])
 
+    def with_drives_limited(self, limit_V: float) -> AvisTable:
+        drives = tuple(replace(one, limit_V=min(one.limit_V, limit_V)) if one.limit_V else one for one in self.drives)
+        return replace(self, limit_V=min(self.limit_V, limit_V), drives=drives)
+
+    def with_loop_delay(self, delay_s: float) -> AvisTable:
+        return replace(self, acquisition=replace(self.acquisition, loop_delay_s=delay_s))
+
     @property
     def sample_rate_Hz(self) -> float:
         return self.acquisition.sample_rate_Hz

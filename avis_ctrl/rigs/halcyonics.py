@@ -144,6 +144,13 @@ class Halcyonics(Rig):
     def drive_limit_V(self) -> float:
         return self.accelerometers.drive_limit_V
 
+    def with_drives_limited(self, limit_V: float) -> Halcyonics:
+        return replace(self, accelerometers=replace(self.accelerometers,
+                                                    drive_limit_V=min(self.drive_limit_V, limit_V)))
+
+    def with_loop_delay(self, delay_s: float) -> Halcyonics:
+        return replace(self, accelerometers=replace(self.accelerometers, loop_delay_s=delay_s))
+
     @property
     def sample_rate_Hz(self) -> float:
         return self.accelerometers.sample_rate_Hz

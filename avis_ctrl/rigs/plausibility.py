@@ -252,7 +252,7 @@ def _drives(rig: Rig, eom: Any, radius: float, judge: Judge) -> None:
         return
     k = driven[int(np.argmax(force[driven] / mass))]
     a, travel = force[k] / mass, force[k] / stiffness[k]
-    together = f"all drives together, {force[k]:.3g} N at {rig.drive_limit_V:g} V,"
+    together = f"all drives at their limits, {force[k]:.3g} N together,"
     judge("acceleration", a, f"{together} accelerate the payload by {a:.2g} m/s^2")
     judge("travel_m", travel, f"{together} move the payload by {travel:.2g} m")
     if radius > 0:

@@ -68,6 +68,14 @@ class Rig(ABC):
         known = dict(zip(self.equations_of_motion().actuators, self.drive_limits_V().tolist(), strict=True))
         return np.array([known[name] for name in names])
 
+    @abstractmethod
+    def with_drives_limited(self, limit_V: float) -> Self:
+        """The rig with no drive beyond this voltage; lower limits stay."""
+
+    @abstractmethod
+    def with_loop_delay(self, delay_s: float) -> Self:
+        """The rig with another delay from sample to drive voltage."""
+
     @property
     @abstractmethod
     def sample_rate_Hz(self) -> float:

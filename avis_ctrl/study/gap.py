@@ -26,11 +26,11 @@ from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.gates import Finding, examine
+from avis_ctrl.measurement.gates import Finding
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.gap_design import DesignEffect, design_effect
-from avis_ctrl.study.identification import amplifier_corner, amplifier_words, expectation
-from avis_ctrl.study.plausible_records import records_fit
+from avis_ctrl.study.identification import amplifier_corner, amplifier_words
+from avis_ctrl.study.record_checks import check_campaign
 from avis_ctrl.study.rig_channels import in_words_of
 from avis_ctrl.study.workers import each
 
@@ -129,18 +129,9 @@ def _require_records(measured: Campaign, rig: Rig) -> None:
 
 
 def _gates(measured: Campaign, rig: Rig, options: GapOptions, progress: Progress) -> tuple[Finding, ...]:
-    """What the gates say; raises InputError where one stops that `gap` has no name for."""
     progress("gates")
     model = ResponseModel.of(rig, (), measured.y_unit, measured.y_names, measured.u_names)
-    records_fit(measured, model, options.despite_gates, progress)
-    findings = examine(measured, expectation(model))
-    stops = [one for one in findings if one.severity == "stop" and one.gate not in NAMED_HERE]
-    for one in stops:
-        progress(f"  stop: {one.sentence}")
-    if stops and not options.despite_gates:
-        raise InputError(f"{stops[0].sentence.rstrip('.')}; --despite-gates continues anyway", field="measurement",
-                         value=stops[0].gate)
-    return findings
+    return check_campaign(measured, model, options.despite_gates, progress, NAMED_HERE)
 
 
 def _design(gap: Gap, options: GapOptions, progress: Progress) -> tuple[DesignEffect | None, str]:

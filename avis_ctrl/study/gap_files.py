@@ -190,7 +190,7 @@ def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
 def _predicted(model: TableModel, record: Record, clock: tuple[float, float]) -> np.ndarray:
     """(samples, n_y) in the model's order."""
     if len(record.u) > MOST_SAMPLES and not model.effects:
-        limit = model.rig.drive_limit_V
+        limit = model.rig.limits_of(record.header.u_names)
         return predict(model.base, replace(record, u=np.clip(record.u, -limit, limit)), large_motion=False)
     u, floor = model_inputs(model.base, record)
     h = record.header

@@ -86,7 +86,7 @@ def _loop(rig: Rig, design: Design, model: TableModel) -> tuple[Rig, Design]:
     """
     delay, corner = loop_lag(model)
     limits = [one.by_name["limit_V"] for one in model.effects if one.effect.name == "actuator_saturation"]
-    rig = _with_equipment(rig, delay, min([rig.drive_limit_V, *limits]))
+    rig = rig.with_loop_delay(delay).with_drives_limited(min(limits, default=np.inf))
     order, _ = delay_order(design, rig)
     changes = {"pade_order": order} | ({} if corner is None else {"amplifier_corner_Hz": corner})
     return rig, design.model_copy(update={"loop": design.loop.model_copy(update=changes)})
@@ -96,16 +96,6 @@ def delay_order(design: Design, rig: Rig) -> tuple[int, float]:
     """Order of the design's delay, at least its own, and the error that is left at the bandwidth of its drives."""
     omega = 2 * np.pi * design.control_effort.bandwidth_Hz
     return sufficient_order(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, omega, DELAY_ERROR, 6, design.loop.pade_order)
-
-
-def _with_equipment(rig: Any, delay_s: float, limit_V: float) -> Any:
-    if delay_s != rig.loop_delay_s:
-        holder = "acquisition" if hasattr(rig, "limit_V") else "accelerometers"
-        rig = replace(rig, **{holder: replace(getattr(rig, holder), loop_delay_s=delay_s)})
-    if limit_V != rig.drive_limit_V:
-        rig = replace(rig, limit_V=limit_V) if hasattr(rig, "limit_V") else replace(
-            rig, accelerometers=replace(rig.accelerometers, drive_limit_V=limit_V))
-    return rig
 
 
 def _with_allocation(plant: DesignPlant, allocation: np.ndarray) -> DesignPlant:

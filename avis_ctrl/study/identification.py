@@ -37,11 +37,11 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.validation import Validation, validate
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.gates import Expectation, Finding, examine
+from avis_ctrl.measurement.gates import Finding
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
 from avis_ctrl.study.plausible_fit import far_from_file
-from avis_ctrl.study.plausible_records import records_fit
+from avis_ctrl.study.record_checks import check_campaign
 from avis_ctrl.study.rig_channels import in_words_of
 
 Progress = Callable[[str], None]
@@ -101,22 +101,6 @@ class Identification:
         return self.campaign_fit.fit.model
 
 
-def expectation(model: ResponseModel) -> Expectation:
-    """What the gates may hold the records against."""
-    rig, acquisition = model.rig, model.rig.acquisition
-    volts = model.sensors.unit == "V" and acquisition is not None
-
-    def response(omega: np.ndarray, inputs: tuple[str, ...]) -> np.ndarray:
-        return model.response(omega)[:, :, [model.inputs.index(name) for name in inputs]]
-    return Expectation(
-        y_range_V=(-acquisition.adc_range_V, acquisition.adc_range_V * (1 - 2.0 ** (1 - acquisition.adc_bits)))
-        if volts and acquisition else None,
-        y_lsb_V=2 * acquisition.adc_range_V / 2 ** acquisition.adc_bits if volts and acquisition else None,
-        drive_limit_V=rig.drive_limit_V,
-        sensor_noise_rms_V=rig.ambient.sensor_noise_rms_V if volts and rig.ambient else None,
-        u_names=model.actuators, y_names=model.sensors.names, u_unit="V", y_unit=model.sensors.unit, response=response)
-
-
 def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions | None = None,
              progress: Progress = lambda text: None) -> Identification:
     """Identify a rig.
@@ -131,7 +115,7 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
     _check(measured, options)
     with threadpool_limits(1):
         model = start_model(measured, rig, options)
-        findings = gates(measured, model, options, progress)
+        findings = _gates(measured, model, options, progress)
         progress("which records to fit, which to hold out, and the band")
         split, fitted, held_out, band = _divide(measured, options)
         unplayed = excited_space(split.fitted, band).sentence if split else ""
@@ -208,26 +192,14 @@ def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: Ident
     return ResponseModel.of(rig, names, unit, sensors, actuators, sampled, corner)
 
 
-def gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options: IdentifyOptions,
-          progress: Progress) -> tuple[Finding, ...]:
-    """What the gates say; raises InputError where one says stop and the user did not ask to go on."""
+def _gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options: IdentifyOptions,
+           progress: Progress) -> tuple[Finding, ...]:
+    """What is found in the records before any fit; nothing for frequency responses."""
     if not isinstance(measured, Campaign):
         return ()
     kinds = ", ".join(sorted({record.header.excitation for record in measured.records}))
     progress(f"gates: {len(measured.records)} records of {kinds}")
-    doubts = records_fit(measured, model, options.despite_gates, progress)
-    findings = (*(Finding("units", "warning", one.sentence, one.sensors) for one in doubts),
-                *examine(measured, expectation(model)))
-    stops = [finding for finding in findings if finding.severity == "stop"]
-    raised = stops[0] if stops and not options.despite_gates else None
-    for finding in findings:
-        if finding.severity in ("warning", "stop") and finding is not raised:
-            progress(f"  {finding.severity}: {finding.sentence}")
-    if raised is not None:
-        more = f" (and {len(stops) - 1} more, above)" if len(stops) > 1 else ""
-        raise InputError(f"{raised.sentence.rstrip('.')}{more}; --despite-gates continues anyway",
-                         field="measurement", value=raised.gate)
-    return findings
+    return check_campaign(measured, model, options.despite_gates, progress)
 
 
 def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions):

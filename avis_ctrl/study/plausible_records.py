@@ -11,13 +11,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.gates import Finding
 from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.h1 import h1, segment_length, spectra, usable
 from avis_ctrl.rigs.plausible_ranges import RANGES
@@ -76,11 +76,12 @@ UNITS = ("kg", "kg m^2", "N/m", "N s/m", "N m/rad", "N m s/rad")
 class Seen:
     """What was recorded, at some lines of some records.
 
-    peak_u, peak_y : largest of all drives and of all sensors. omega : (n,) rad/s. U : (K, n, n_u) spectra of segments.
+    peak_u : (n_u,) largest voltage of each drive. peak_y : largest of all sensors. omega : (n,) rad/s.
+    U : (K, n, n_u) spectra of segments.
     power : (bands, n_y) of y over the segments, nan where it is not an answer to the drives. bands : (bands, n) masks.
     """
 
-    peak_u: float
+    peak_u: np.ndarray
     peak_y: float
     omega: np.ndarray
     U: np.ndarray
@@ -112,15 +113,8 @@ def distance(decades: np.ndarray, cap: float = SETTINGS.cap) -> float:
     return float(np.mean([size[there[:, k], k].mean() for k in np.flatnonzero(columns)]))
 
 
-class Doubt(NamedTuple):
-    """Sensors that read a multiple of what the model predicts, and a sentence that says so."""
-
-    sensors: tuple[str, ...]
-    sentence: str
-
-
 def records_fit(measured: Campaign, model: ResponseModel, despite: bool, progress: Callable[[str], None]
-                ) -> tuple[Doubt, ...]:
+                ) -> tuple[Finding, ...]:
     """`check_records`; if the user continues `despite` the gates, its message is only a line of progress."""
     try:
         return check_records(measured, model)
@@ -133,10 +127,10 @@ def records_fit(measured: Campaign, model: ResponseModel, despite: bool, progres
 
 
 def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlausibility = SETTINGS
-                  ) -> tuple[Doubt, ...]:
+                  ) -> tuple[Finding, ...]:
     """Refuse records that a single unit error explains, or that no table like the rig could have produced.
 
-    Returns doubts that are no reason to stop: sensors that are off by one factor in all bands.
+    Returns warnings, which are no reason to stop: sensors that are off by one factor in all bands.
 
     Raises
     ------
@@ -176,7 +170,7 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
 
 
 def _doubts(decades: np.ndarray, measured: Campaign, model: ResponseModel, settings: RecordPlausibility
-            ) -> tuple[Doubt, ...]:
+            ) -> tuple[Finding, ...]:
     """Sensors of a kind that read one and the same multiple of what is predicted, in all bands."""
     off: dict[str, list[tuple[str, float]]] = {}
     kinds = {one.name: one.quantity for one in model.rig.sensors()}
@@ -191,9 +185,10 @@ def _doubts(decades: np.ndarray, measured: Campaign, model: ResponseModel, setti
         names = tuple(one[0] for one in sensors)
         likely = " (9.81 is g: a sensitivity in V/g where V s^2/m is expected, or the reverse)" if (
             kind == "acceleration" and settings.like_g > abs(abs(np.log10(factor)) - np.log10(9.80665))) else ""
-        found.append(Doubt(names, f"{', '.join(names)} {'reads' if len(names) == 1 else 'read'} {factor:.3g} times "
-                                  f"what the rig's model predicts for these voltages, over all bands{likely}. Check "
-                                  f"sensitivity, gain and unit before you trust the fit."))
+        found.append(Finding("units", "warning", f"{', '.join(names)} {'reads' if len(names) == 1 else 'read'} "
+                             f"{factor:.3g} times what the rig's model predicts for these voltages, over all bands"
+                             f"{likely}. Check sensitivity, gain and unit before you trust the fit.", names,
+                             value=factor, limit=10.0 ** settings.far))
     return tuple(found)
 
 
@@ -213,14 +208,14 @@ def look(measured: Campaign, settings: RecordPlausibility = SETTINGS) -> Seen | 
     """Spectra of the first records with drive voltages; None if there are none, or too few samples."""
     driven = [one for one in measured.records if one.header.level_V > 0 or one.header.excitation in ("multisine",
                                                                                                       "noise", "sine")]
-    parts, peak_u, peak_y = [], 0.0, 0.0
+    parts, peak_u, peak_y = [], np.zeros(len(measured.u_names)), 0.0
     length = 0
     for record in driven[:settings.records]:
         seen = excerpt(record, settings.samples)
         if not seen.driven:
             continue
         u, y, wrap = usable(seen)
-        peak_u, peak_y = max(peak_u, float(np.abs(u).max())), max(peak_y, float(np.abs(y).max()))
+        peak_u, peak_y = np.maximum(peak_u, np.abs(u).max(axis=0)), max(peak_y, float(np.abs(y).max()))
         length = length or segment_length(len(u), int(np.count_nonzero(np.ptp(u, axis=0))))
         if len(u) >= length:
             parts.append(spectra(u, y, seen.header.sample_rate_Hz, length, wrap))
@@ -315,16 +310,17 @@ def _common_gain(factor: float, seen: Seen, measured: Campaign, model: ResponseM
     """A factor common to all channels: force constants, sensitivities, units of u and y. A value beyond a limit is
     named first, then one that the factor would make usual."""
     rig, unit = model.rig, measured.y_unit
-    limit, full = rig.drive_limit_V, rig.acquisition.adc_range_V if rig.acquisition else np.inf
-    if factor == 1e-3 and seen.peak_u > 3 * limit:
-        return ("u of the records", float(f"{seen.peak_u:.4g}"), f"the drives' limit is {limit:g} V: did you mean "
-                f"{seen.peak_u / 1e3:.4g} V (given in mV)?")
+    limits, full = rig.limits_of(measured.u_names), rig.acquisition.adc_range_V if rig.acquisition else np.inf
+    k = int(np.argmax(seen.peak_u / limits))
+    if factor == 1e-3 and seen.peak_u[k] > 3 * limits[k]:
+        return ("u of the records", float(f"{seen.peak_u[k]:.4g}"), f"the limit of drive {measured.u_names[k]} is "
+                f"{limits[k]:g} V: did you mean {seen.peak_u[k] / 1e3:.4g} V (given in mV)?")
     if factor == 1e3 and unit == "V" and seen.peak_y > 3 * full:
         return ("y of the records", float(f"{seen.peak_y:.4g}"), f"the converter's range is {full:g} V: did you mean "
                 f"{seen.peak_y / 1e3:.4g} V (given in mV)?")
     options: list[tuple[float, str, object, str]] = []
     mass = float(rig.equations_of_motion().M[0, 0])
-    push = float(np.max(np.abs(rig.equations_of_motion().T[:3]).sum(axis=1))) * rig.drive_limit_V / mass
+    push = float(np.max(np.abs(rig.equations_of_motion().T[:3]) @ rig.drive_limits_V())) / mass
     constants = [p.value for p in rig.parameters().values() if p.unit == "N/V"]
     if constants:
         options.append((_gained(RANGES.acceleration, push, factor), "actuators.constant_N_per_V", constants[0],

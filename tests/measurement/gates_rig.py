@@ -140,7 +140,7 @@ def known(**changes):
     given = {
         "y_range_V": (-10.0, 10.0 - LSB),
         "y_lsb_V": LSB,
-        "drive_limit_V": 10.0,
+        "drive_limits_V": dict.fromkeys(U_NAMES, 10.0),
         "sensor_noise_rms_V": 1e-3,
         "u_names": U_NAMES,
         "y_names": Y_NAMES,

@@ -142,7 +142,9 @@ def test_drive_at_its_limit():
     campaign = multisine_campaign(1, levels=(0.2,))
     limit = 0.9 * float(np.max(np.abs(campaign.records[0].u)))
     clip = everywhere(campaign, lambda u, y: (np.clip(u, -limit, limit), y))
-    assert gates(alarms(clip, known(drive_limit_V=limit, response=None))) == {"clipping"}
+    assert gates(alarms(clip, known(drive_limits_V=dict.fromkeys(U_NAMES, limit), response=None))) == {"clipping"}
+    one = known(drive_limits_V={U_NAMES[0]: 10.0, U_NAMES[1]: limit}, response=None)
+    assert {f.channels for f in alarms(clip, one)} == {(U_NAMES[1],)}
 
 
 @pytest.mark.parametrize("count", [1, 3, 20])

@@ -14,7 +14,8 @@ from avis_ctrl.measurement.gates.clipping import repeated_extreme
 from avis_ctrl.measurement.gates.spikes import spikes
 from avis_ctrl.report.identification.pictures import figure_of
 from avis_ctrl.rigs.rig_file import load_rig
-from avis_ctrl.study.identification import IdentifyOptions, gates, start_model
+from avis_ctrl.study.identification import IdentifyOptions, start_model
+from avis_ctrl.study.record_checks import check_campaign
 
 SEVERE = ("warning", "stop")
 seeds = st.integers(0, 2**32 - 1)
@@ -160,7 +161,7 @@ def test_a_stop_is_said_once_and_without_a_second_full_stop(clean):
     campaign = limited(clean, 0.6)[0]
     lines: list[str] = []
     with pytest.raises(InputError) as error:
-        gates(campaign, start_model(campaign, load_rig("avis"), IdentifyOptions()), IdentifyOptions(), lines.append)
+        check_campaign(campaign, start_model(campaign, load_rig("avis"), IdentifyOptions()), False, lines.append)
     assert ".;" not in str(error.value) and "--despite-gates" in str(error.value)
     assert not [line for line in lines if "stop:" in line]
 

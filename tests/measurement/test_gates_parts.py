@@ -248,7 +248,7 @@ def test_long_records_are_looked_at_in_pieces_and_that_is_said(rng):
     assert all("only pieces of 8000 samples" in f.sentence for f in findings)
 
 
-@pytest.mark.parametrize("field", [{"y_range_V": (1.0, -1.0)}, {"y_lsb_V": 0.0}, {"drive_limit_V": np.nan}])
+@pytest.mark.parametrize("field", [{"y_range_V": (1.0, -1.0)}, {"y_lsb_V": 0.0}, {"drive_limits_V": {"Ay1": np.nan}}])
 def test_expectation_refuses_what_cannot_be(field):
     with pytest.raises(InputError, match=next(iter(field))):
         Expectation(**field)

@@ -15,9 +15,10 @@ from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.rigs.rig_file import load_rig
-from avis_ctrl.study.gap import find_gap
+from avis_ctrl.study.gap import NAMED_HERE, find_gap
 from avis_ctrl.study.identification import IdentifyOptions, identify
 from avis_ctrl.study.plausible_records import SETTINGS, check_records, look, records_fit
+from avis_ctrl.study.record_checks import check_campaign
 
 FS, SAMPLES = 1000.0, 20000
 
@@ -97,15 +98,15 @@ def test_volts_per_g_are_doubted(sound):
     rig, measured = sound
     wrong = changed(measured, y=9.80665)
     doubt, = check_records(wrong, model_of(rig, wrong))
-    assert set(doubt.sensors) == set(measured.y_names) and "9.8" in doubt.sentence
+    assert set(doubt.channels) == set(measured.y_names) and "9.8" in doubt.sentence
     assert ("V/g" in doubt.sentence) == (rig.accelerometers is not None)
     one = changed(measured, y=only(len(measured.y_names), 2, 0.2))
     doubt, = check_records(one, model_of(rig, one))
-    assert doubt.sensors == (measured.y_names[2],) and "reads 0.2" in doubt.sentence
+    assert doubt.channels == (measured.y_names[2],) and "reads 0.2" in doubt.sentence
 
 
 @pytest.mark.parametrize("change, said", [
-    (lambda m: changed(m, u=1e3), r"^u of the records = .*limit is 10 V: did you mean .*\(given in mV\)"),
+    (lambda m: changed(m, u=1e3), r"^u of the records = .*limit of drive A\w+ is 10 V: did you mean .*\(given in mV\)"),
     (lambda m: changed(m, u=1e-3), "all channels are off alike: are the records' y in mV or u in kV"),
     (lambda m: changed(m, y=1e-3), "all channels are off alike: are the records' y in kV or u in mV"),
     (lambda m: changed(m, y=only(len(m.y_names), 2, 1e3)), "sensitivity of (Sx2|acc_A3) = .*only (Sx2|acc_A3) is off"),
@@ -184,11 +185,19 @@ def test_records_that_fit_nothing_are_refused_without_a_name():
         check_records(wrong, model_of(rig, wrong))
 
 
+@pytest.mark.parametrize("named_later", [(), NAMED_HERE])
+def test_the_warning_is_among_the_findings_of_identify_and_of_gap(sound, monkeypatch, named_later):
+    rig, measured = sound
+    monkeypatch.setattr("avis_ctrl.study.record_checks.examine", lambda *of: ())
+    wrong, said = changed(measured, y=9.80665), []
+    finding, = check_campaign(wrong, model_of(rig, wrong), False, said.append, named_later)
+    assert finding.gate == "units" and finding.severity == "warning" and said == [f"  warning: {finding.sentence}"]
+
+
 def test_identify_and_gap_ask_before_anything_else(monkeypatch):
     rig = load_rig("avis")
     wrong = changed(campaign(rig), u=1e3)
-    for module in ("identification", "gap"):
-        monkeypatch.setattr(f"avis_ctrl.study.{module}.examine", lambda *of: pytest.fail("gates came first"))
+    monkeypatch.setattr("avis_ctrl.study.record_checks.examine", lambda *of: pytest.fail("gates came first"))
     for ask in (identify, find_gap):
         with pytest.raises(InputError, match=r"given in mV.*--despite-gates"):
             ask(wrong, rig)

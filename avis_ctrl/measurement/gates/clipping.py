@@ -78,9 +78,9 @@ class Clipping(Gate):
         u = np.concatenate([p.u for p in seen.pieces])
         y = np.concatenate([p.y for p in seen.pieces])
         t = np.concatenate([p.time for p in seen.pieces]) - h.start_s
-        limit, periods = expectation.drive_limit_V, max(1, h.periods)
-        ends = []
+        periods, ends = max(1, h.periods), []
         for k, name in enumerate(h.u_names):
+            limit = expectation.drive_limits_V.get(name)
             bounds = (-limit, limit) if limit else None
             ends.append(_ends(h.name, name, t, u[:, k], bounds, 2e-9 * limit if limit else None, free=False))
         for k, name in enumerate(h.y_names):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -84,7 +84,7 @@ class Expectation:
     ----------
     y_range_V : lowest and highest value that the converter reports, unit of y.
     y_lsb_V : its step.
-    drive_limit_V : largest commanded voltage.
+    drive_limits_V : largest commanded voltage of each drive, by name.
     sensor_noise_rms_V : of each channel, white at the sample rate, unit of y.
     u_names, y_names : channels that the rig has.
     u_unit, y_unit : their units.
@@ -98,7 +98,7 @@ class Expectation:
 
     y_range_V: tuple[float, float] | None = None
     y_lsb_V: float | None = None
-    drive_limit_V: float | None = None
+    drive_limits_V: Mapping[str, float] = field(default_factory=dict)
     sensor_noise_rms_V: float | None = None
     u_names: tuple[str, ...] | None = None
     y_names: tuple[str, ...] | None = None
@@ -109,10 +109,11 @@ class Expectation:
     def __post_init__(self) -> None:
         if self.y_range_V is not None and not self.y_range_V[0] < self.y_range_V[1]:
             raise InputError("expected the lower end below the upper end", field="y_range_V", value=self.y_range_V)
-        for field in ("y_lsb_V", "drive_limit_V", "sensor_noise_rms_V"):
-            value = getattr(self, field)
+        positive = {"y_lsb_V": self.y_lsb_V, "sensor_noise_rms_V": self.sensor_noise_rms_V,
+                    **{f"drive_limits_V[{name}]": value for name, value in self.drive_limits_V.items()}}
+        for name, value in positive.items():
             if value is not None and not (np.isfinite(value) and value > 0):
-                raise InputError("expected a positive number", field=field, value=value)
+                raise InputError("expected a positive number", field=name, value=value)
 
 
 def worst(severities: list[str]) -> str:
