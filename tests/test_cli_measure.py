@@ -183,3 +183,11 @@ def test_single_axis_says_what_it_took_the_columns_for(data):
     assert plain.stdout.splitlines()[0] == ("taken: force = vir in N, position = qm in m, t in s (as in the file; "
                                             "--scale force=FACTOR for another unit)")
     assert "force = vir times 35.15 in N" in scaled.stdout
+
+
+def test_what_the_rig_cannot_play_names_the_plan_and_its_record(tmp_path):
+    plan = tmp_path / "plan.toml"
+    plan.write_text('title = "t"\nduration_s = 20.0\n[[record]]\nexcitation = "noise"\nband_Hz = [10.0, 600.0]\n')
+    done = avis("simulate-campaign", "--rig", "avis", "--plan", str(plan), "--out", str(tmp_path / "c.h5"))
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"avis: {plan}: record[1].band_Hz = "), done.stderr

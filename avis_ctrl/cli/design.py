@@ -45,9 +45,11 @@ def design(
 def _verdict(console, result) -> None:
     from rich.table import Table
 
-    from avis_ctrl.study.verdict import first_sentence
+    from avis_ctrl.study.verdict import all_axes, first_sentence
 
     console.print(first_sentence(result))
+    if result.stable:
+        console.print(all_axes(result))
     table = Table("requirement", "asked", "measured", "", title=result.design.title)
     for r in result.requirements:
         unit = f" {r.unit}" if r.unit else ""

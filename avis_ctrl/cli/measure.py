@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -102,8 +103,13 @@ def simulate_campaign(
     chosen = read_plan(plan) if plan else default_plan(table, "orthogonal" if orthogonal else "zippered",
                                                        perturbed=perturbed, duration_s=duration_s)
     with Progress(console) as progress:
-        rehearsal = rehearse(table, chosen, seed,
-                             lambda k, total, name: progress(f"record {name}, {k} of {total}"))
+        try:
+            rehearsal = rehearse(table, chosen, seed,
+                                 lambda k, total, name: progress(f"record {name}, {k} of {total}"))
+        except InputError as error:
+            section = re.split(r"\W", error.field or "")[0]
+            of_plan = plan and not error.file and section in type(chosen).model_fields
+            raise (error.in_file(plan) if of_plan else error) from None
         write_campaign(out, rehearsal.campaign)
     for path, text in ((write_plan, plan_toml(chosen)), (truth, rehearsal.truth_toml())):
         if path:

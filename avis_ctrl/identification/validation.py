@@ -324,7 +324,14 @@ def _overlay(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
 def _verdict(figures: list[HeldOut]) -> str:
     """Of the record that fits worst."""
     worst = max(figures, key=lambda one: one.chi2_per_dof / one.chi2_interval[1])
-    return (f"the identified model leaves {_percent(worst.nrms_all)} on held-out record {worst.name} where noise alone "
+    if worst.chi2_per_dof <= worst.chi2_interval[1]:
+        judged = "the identified model agrees with the held-out data"
+    elif worst.nrms_all <= worst.nrms_all_interval[1]:
+        judged = ("the identified model predicts the held-out data as well as their noise allows, but chi-square shows "
+                  "a small systematic error")
+    else:
+        judged = "the identified model does not agree with the held-out data (avis gap searches for the cause)"
+    return (f"{judged}: on record {worst.name} it leaves {_percent(worst.nrms_all)} where noise alone "
             f"leaves {_percent(worst.nrms_all_interval[0])} to {_percent(worst.nrms_all_interval[1])} "
             f"and the start model left {_percent(worst.nrms_all_start)}; chi-square per degree of "
             f"freedom {worst.chi2_per_dof:.4g} ({worst.chi2_interval[0]:.4g} to "

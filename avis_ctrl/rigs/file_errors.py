@@ -33,7 +33,7 @@ def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputErro
         absent = [str(one["loc"][-1]) for one in problems if one["type"] == "missing" and [*one["loc"][:-1]] == parents]
         return InputError(_unknown_key(str(last), absent, _known_keys(model, parents)), field=field, value=value)
     if problem["type"] == "missing":
-        return InputError("this key is missing", field=field)
+        return InputError(f"this {_kind_of_entry(model, parents, str(last))} is missing", field=field)
     value = problem["input"]
     if problem["type"] in ("model_type", "dict_type", "model_attributes_type"):
         return InputError("expected a section of keys", field=field, value=value)
@@ -76,6 +76,17 @@ def _known_keys(model: type[BaseModel], parents: Sequence[int | str]) -> list[st
                 return []
             model = inner
     return list(model.model_fields)
+
+
+def _kind_of_entry(model: type[BaseModel], parents: Sequence[int | str], key: str) -> str:
+    """What is missing: a key with a value, or a section of keys."""
+    for part in (one for one in (*parents, key) if isinstance(one, str)):
+        annotation = model.model_fields[part].annotation if part in model.model_fields else None
+        inner = _model_within(annotation)
+        if inner is None:
+            return "key"
+        model = inner
+    return "section"
 
 
 def _model_within(annotation: Any) -> type[BaseModel] | None:

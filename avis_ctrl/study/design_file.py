@@ -244,10 +244,25 @@ def read_design(path: str | Path) -> Design:
 def design_from_table(table: dict, file: object = None) -> Design:
     """Check a design given as a table."""
     try:
-        return Design.model_validate(table)
+        design = Design.model_validate(table)
+        _require_band_below_crossovers(design)
     except ValidationError as error:
         complaint = first_complaint(error, Design)
         raise (complaint.in_file(file) if file is not None else complaint) from None
+    except InputError as complaint:
+        raise (complaint.in_file(file) if file is not None else complaint) from None
+    return design
+
+
+def _require_band_below_crossovers(design: Design) -> None:
+    """Above its crossover a chain is 100 % uncertain, so that no controller can do anything there."""
+    low = design.transmissibility.band_Hz[0]
+    for name in ("actuator_chains", "sensor_chains"):
+        chains: ChainUncertainty | None = getattr(design.uncertainty, name)
+        if chains is not None and chains.crossover_Hz <= low:
+            raise InputError(f"expected a crossover above {low:g} Hz, the lower end of transmissibility.band_Hz: the "
+                             "chains are 100 % uncertain above it", field=f"uncertainty.{name}.crossover_Hz",
+                             value=chains.crossover_Hz)
 
 
 def read_study(path: str | Path) -> tuple[Design, Rig]:

@@ -86,8 +86,10 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress 
         rivals.append(classical_skyhook(plant, rig, design))
 
         def shown(row: Any) -> None:
-            progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.4f}, peak mu {row.mu_upper:.4f}, "
-                     f"order {row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
+            progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, "
+                     f"order {row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s"
+                     + (" (large values are usual before the first D-scales)" if row.iteration == 1 and row.gamma > 10
+                        else ""))
         mu, made = mu_optimal(design, plant, rig, shown, rivals)
         progress(mu.notes[-1])
         return [mu, *rivals, passive()], failed, made

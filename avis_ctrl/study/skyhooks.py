@@ -97,7 +97,7 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
                                         "times critical damping",
                                cause="the phase of the sensors and the delay turns damping into excitation",
                                next_step="change the corners in [skyhook], or use sensors with a lower corner")
-    notes = [in_words(loops)]
+    notes = [in_words(loops), *at_limits(loops, task.search)]
     if loops is classical:
         notes.append("this is critical damping with the usual corners: no better tuning was found for the whole set")
     if not best.meets:
@@ -199,6 +199,19 @@ def in_words(loops: Skyhook) -> str:
     """Gains and corners of the loops."""
     gains = ", ".join(f"{axis} {gain:.4g} N s/m" for axis, gain in zip(loops.axes, loops.gains, strict=True))
     return f"gains {gains}; tilt corner {loops.tilt_corner_Hz:.3g} Hz, roll-off {loops.roll_off_Hz:.3g} Hz"
+
+
+def at_limits(loops: Skyhook, search: TuningRange) -> list[str]:
+    """A sentence on the tuned values at an end of their range, where the best of a wider range may be better."""
+    values = [*((f"the gain of {axis}", gain / critical, search.gain_factor) for axis, gain, critical in
+                zip(loops.axes, loops.gains, search.critical, strict=True)),
+              ("the tilt corner", loops.tilt_corner_Hz, search.tilt_corner_Hz),
+              ("the roll-off", loops.roll_off_Hz, search.roll_off_Hz)]
+    found = [name for name, value, ends in values if min(abs(np.log(value / end)) for end in ends) < 1e-6]
+    if not found:
+        return []
+    return [f"{' and '.join(found)} {'is' if len(found) == 1 else 'are'} at the end of the range searched: a wider "
+            "range may give a better skyhook"]
 
 
 def _pair(limits: list[float]) -> tuple[float, float]:

@@ -1,8 +1,11 @@
-"""The first sentence of a design's result: whether the loop is stable, and which requirements are met."""
+"""The first sentences of a design's result: whether the loop is stable, and which requirements are met."""
 
 from __future__ import annotations
 
+import numpy as np
+
 from avis_ctrl.errors import ComputationError
+from avis_ctrl.identification.identifiability_words import listed
 from avis_ctrl.study.model import DesignResult
 
 
@@ -19,6 +22,27 @@ def unstable(result: DesignResult) -> str:
     bad = sum(not plant.stable for plant in plants)
     why = f": {result.loop.culprit.words()}" if result.loop.culprit else ""
     return f"UNSTABLE: the closed loop of all axes is unstable in {bad} of {len(plants)} plants{why}."
+
+
+def all_axes(result: DesignResult) -> str:
+    """What the sampled loop of all six degrees of freedom reaches, beside the bounds of the design model.
+
+    The bounds are those of the kept coordinates with the others locked. If the nominal loop of all axes exceeds them,
+    the sentence says so.
+    """
+    mu, six = result.controller("mu"), result.six_dof
+    low, high = result.design.transmissibility.band_Hz
+    inside = (six.omega >= 2 * np.pi * low) & (six.omega <= 2 * np.pi * high)
+    peak, band = (20 * float(np.log10(np.max(sigma))) for sigma in (six.kept, six.kept[inside]))
+    beyond = [f"{value:+.1f} dB {where} exceeds the bound of {20 * np.log10(bound.upper):+.1f} dB"
+              for value, bound, where in ((peak, mu.worst_peak, "at the peak"),
+                                          (band, mu.worst_band, f"from {low:g} to {high:g} Hz"))
+              if np.isfinite(bound.upper) and value > 20 * np.log10(bound.upper)]
+    if beyond:
+        return (f"These bounds hold for {listed(result.design.keep)} with the other coordinates locked; with all six "
+                f"degrees of freedom the nominal loop does not keep them: {listed(beyond)}.")
+    return (f"These bounds hold for {listed(result.design.keep)} with the other coordinates locked; with all six "
+            f"degrees of freedom the nominal sampled loop reaches {peak:+.1f} dB and {band:+.1f} dB.")
 
 
 def refuse_unstable(result: DesignResult) -> None:

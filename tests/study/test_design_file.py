@@ -80,6 +80,7 @@ def test_a_wrong_unit_in_a_key_is_named(place, value, expected):
     ("uncertainty/parameters_percent/mass", 100.0, "uncertainty.parameters_percent.mass = 100.0"),
     ("uncertainty/parameters_percent/mass", 250.0, "uncertainty.parameters_percent.mass = 250.0"),
     ("uncertainty/actuator_chains/low_percent", 150.0, "uncertainty.actuator_chains.low_percent = 150.0"),
+    ("uncertainty/actuator_chains/crossover_Hz", 0.08, "uncertainty.actuator_chains.crossover_Hz = 0.08"),
     ("uncertainty/actuator_chains/high_percent", 50.0, "uncertainty.actuator_chains.high_percent = 50.0"),
     ("uncertainty/parameters_absolute", {"com_y": -0.1}, "uncertainty.parameters_absolute.com_y = -0.1"),
     ("simulation/duration_s", 1e9, "simulation.duration_s = 1000000000.0"),
@@ -125,8 +126,8 @@ def test_bands_rise(place, value, field):
     ("control_effort/bandwidth_Hz", True, ["control_effort.bandwidth_Hz = True", "number"]),
     ("title", 3, ["title = 3", "string"]), ("transmissibility", "low", ["transmissibility = 'low'", "section"]),
     ("uncertainty/parameters_percent", [10.0], ["uncertainty.parameters_percent", "section"]),
-    ("title", ABSENT, ["title", "missing"]), ("transmissibility", ABSENT, ["transmissibility", "missing"]),
-    ("control_effort/bandwidth_Hz", ABSENT, ["control_effort.bandwidth_Hz", "missing"]),
+    ("title", ABSENT, ["title", "missing"]), ("transmissibility", ABSENT, ["transmissibility", "section is missing"]),
+    ("control_effort/bandwidth_Hz", ABSENT, ["control_effort.bandwidth_Hz", "key is missing"]),
 ])
 def test_wrong_words_types_and_missing_keys(place, value, words):
     text = complaint(changed(place, value))

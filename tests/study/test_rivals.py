@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.classical.skyhook import Skyhook
+from avis_ctrl.classical.tuning import TuningRange
 from avis_ctrl.lti import gain
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.mu_peak import worst_case_gain
@@ -18,7 +19,7 @@ from avis_ctrl.study.controllers import best_of, mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
 from avis_ctrl.study.model import Bound, ControllerResult
 from avis_ctrl.study.plant import DesignPlant, build_plant
-from avis_ctrl.study.skyhooks import classical_skyhook, critical_gains, tuned_skyhook
+from avis_ctrl.study.skyhooks import at_limits, classical_skyhook, critical_gains, tuned_skyhook
 
 DESIGN = Path(__file__).resolve().parents[2] / "designs" / "avis_z_phix.toml"
 
@@ -69,6 +70,13 @@ def test_a_limit_out_of_reach_is_said_and_the_least_peak_is_taken(one_axis):
     assert any("no skyhook found keeps the worst-case peak below -1.00 dB" in note for note in tuned.notes)
     peak, _ = bounds(design, plant, tuned.K)
     assert 1.0 <= peak <= bounds(design, plant, classical_skyhook(plant, load_rig("avis"), design).K)[0]
+
+
+@pytest.mark.parametrize(("gain", "roll", "said"), [(1.0, 100.0, []), (0.05, 100.0, ["the gain of z is at"]),
+                                                    (20.0, 400.0, ["the gain of z and the roll-off are at"])])
+def test_values_at_an_end_of_the_range_searched_are_told(gain, roll, said):
+    found = at_limits(Skyhook(("z",), (gain * 300.0,), 0.1, roll), TuningRange((300.0,)))
+    assert [text[:len(start)] for text, start in zip(found, said, strict=True)] == said
 
 
 def test_mu_controller_is_never_worse_than_a_rival(one_axis):

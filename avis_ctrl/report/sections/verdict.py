@@ -9,7 +9,7 @@ import numpy as np
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Section, table
 from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
-from avis_ctrl.study.verdict import first_sentence
+from avis_ctrl.study.verdict import all_axes, first_sentence
 
 
 def verdict(result: DesignResult) -> Section:
@@ -40,7 +40,7 @@ def _achieved(result: DesignResult) -> str:
     return (f"For every plant of the uncertainty set the mu controller keeps the transmissibility at or below "
             f"{words.decibel(mu.worst_peak.upper)} at any frequency and {words.decibel(mu.worst_band.upper)} from "
             f"{low:g} to {high:g} Hz{sure}; without control the table amplifies by "
-            f"{words.decibel(result.controller('passive').peak_transmissibility)} at its resonance.")
+            f"{words.decibel(result.controller('passive').peak_transmissibility)} at its resonance. {all_axes(result)}")
 
 
 def comparison(result: DesignResult) -> Section:
