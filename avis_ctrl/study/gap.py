@@ -137,6 +137,8 @@ def _gates(measured: Campaign, rig: Rig, options: GapOptions, progress: Progress
 def _design(gap: Gap, options: GapOptions, progress: Progress) -> tuple[DesignEffect | None, str]:
     if not options.design:
         return None, ""
+    if options.design_file is None:
+        progress("no design file given: controllers with the weights of the shipped AVIS design")
     try:
         return design_effect(gap, options.design_file, progress), ""
     except AvisError as error:

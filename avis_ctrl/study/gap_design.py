@@ -30,7 +30,7 @@ from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
 from avis_ctrl.study.gap_plant import CARRIED, carried, delay_order, plant_of, six_dof_is_stable
-from avis_ctrl.study.identification_design import default_design, design_toml
+from avis_ctrl.study.identification_design import default_design, default_keep, design_toml
 from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.plant import DesignPlant
 
@@ -178,7 +178,9 @@ def design_for(rig: Rig, design: Path | Design | None = None) -> Design:
     if design is None:
         if not isinstance(rig, AvisTable):
             raise InputError(f"there is a default for the AVIS only: give a design file for {rig.name}", field="design")
-        return default_design(rig, f"{rig.name}: z and phi_x under one controller", PARAMETERS_PERCENT)
+        keep = " and ".join(default_keep(rig))
+        return default_design(rig, f"{rig.name}: {keep} under one controller, weights chosen for the AVIS",
+                              PARAMETERS_PERCENT)
     asked = design if isinstance(design, Design) else read_study(design)[0]
     if asked.uncertainty.identified is not None:
         complaint = InputError("it belongs to the parameters of one identification; expected a design whose ranges are "
