@@ -221,6 +221,8 @@ def run(rig_name: str, form: str, floor: str, seed: int, duration_s: float, perc
     seconds, text = time.monotonic() - began, done.stdout + done.stderr
     (case / "said.txt").write_text(text)
     said = [line.strip() for line in text.splitlines() if any(word in line for word in REFUSALS)]
+    if done.returncode != 0:
+        said += done.stderr.splitlines()[-1:]
     ratio: dict[str, float] = {}
     relative: dict[str, float] = {}
     if done.returncode == 0:

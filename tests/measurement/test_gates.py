@@ -31,7 +31,7 @@ from avis_ctrl.measurement.gates.channel_map import ChannelMap
 from avis_ctrl.measurement.gates.examine import after_missing_samples
 from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.finding import Finding
-from avis_ctrl.measurement.gates.missing_samples import MissingSamples
+from avis_ctrl.measurement.gates.missing_samples import MissingSamples, delays, explained
 from avis_ctrl.measurement.gates.repeatability import beyond_chance
 
 SEVERE = ("warning", "stop")
@@ -332,6 +332,19 @@ def test_a_swept_sine_lacks_no_samples():
     gate = MissingSamples()
     (said,) = gate.conclude([gate.look(excerpt(whole), known())], Campaign("avis", (whole,)), known())
     assert said.severity == "ok", said.sentence
+
+
+def test_a_sweep_shows_no_step_of_the_delay():
+    """Each line is driven once, before an instant or after it: of sound records one in a hundred was called faulty."""
+    t = np.arange(30000) / RATE
+    phase = 2 * np.pi * 0.5 * 27 / np.log(160) * (160 ** np.minimum(t / 27, 1) - 1)
+    u = np.outer(np.sin(phase) * (t < 27), np.eye(8)[5])
+    seen = excerpt(record("00", u, measured(np.random.default_rng(3), u), "noise", 0.7, 0.0))
+    t, _ = delays(seen)
+    assert {explained(seen, t, k, size) for k in (4, 9, 20) for size in (-30.0, 4.3)} == {-np.inf}
+    noise = SHORT.records[0]
+    seen = excerpt(noise)
+    assert np.isfinite(explained(seen, delays(seen)[0], 4, 4.3))
 
 
 def test_parameter_errors_are_no_channel_faults():
