@@ -435,9 +435,10 @@ def _moved(model: ResponseModel, spread: float, rng: np.random.Generator) -> Res
 
 
 def _held_rows(first: ResponseModel) -> np.ndarray:
-    """`moment_rows` without those that the starting values violate."""
+    """`moment_rows` without those that the starting values violate by more than `edge`: a thin plate starts at the sum
+    itself."""
     rows = moment_rows(first.names)
-    return rows[rows @ first.values > 0]
+    return rows[rows @ first.values >= -SETTINGS.edge * np.abs(rows) @ np.abs(first.values)]
 
 
 def _check(model: ResponseModel, blocks, priors, starts: int) -> None:

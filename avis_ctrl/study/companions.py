@@ -9,8 +9,10 @@ Loops are closed one after the other around the sampled table with six degrees o
 sensor dynamics and the design's own controller included, and once more with all the others closed. Of a grid of
 gains and corners each loop takes the one with the smallest payload velocity r.m.s. in the site's band, under floor
 motion and sensor noise, among those that keep a modulus margin (the distance of the Nyquist curve from the critical
-point) and that the neglected dynamics of the drives do not make unstable. Critical damping with customary corners, the
-classical rule, keeps neither with 1 Hz geophones: below its corner a geophone turns the phase by 180 degrees.
+point) and that the neglected dynamics of the drives do not make unstable, as far as they act on this loop's own
+voltages; what they do to all voltages together is left to the plants that are simulated. Critical damping with
+customary corners, the classical rule, keeps neither with 1 Hz geophones: below its corner a geophone turns the phase by
+180 degrees.
 """
 
 from __future__ import annotations

@@ -172,17 +172,24 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
 def _doubts(decades: np.ndarray, measured: Campaign, model: ResponseModel, settings: RecordPlausibility
             ) -> tuple[Finding, ...]:
     """Sensors of a kind that read one and the same multiple of what is predicted, in all bands."""
-    off: dict[str, list[tuple[str, float]]] = {}
+    off: list[tuple[str, float, str]] = []
     kinds = {one.name: one.quantity for one in model.rig.sensors()}
     for name, column in zip(measured.y_names, decades.T, strict=True):
         there = column[np.isfinite(column)]
         if there.size >= 3 and abs(middle := float(np.median(there))) > settings.far and (
                 np.median(np.abs(there - middle)) < settings.fits):
-            off.setdefault(kinds.get(name, ""), []).append((name, 10.0 ** middle))
+            off.append((kinds.get(name, ""), middle, name))
+    alike: list[list[tuple[str, float, str]]] = []
+    for one in sorted(off):
+        if alike and alike[-1][0][0] == one[0] and one[1] - alike[-1][0][1] < settings.fits:
+            alike[-1].append(one)
+        else:
+            alike.append([one])
     found = []
-    for kind, sensors in off.items():
-        factor = float(np.median([one[1] for one in sensors]))
-        names = tuple(one[0] for one in sensors)
+    for sensors in alike:
+        kind = sensors[0][0]
+        factor = 10.0 ** float(np.median([one[1] for one in sensors]))
+        names = tuple(name for name in measured.y_names if name in [one[2] for one in sensors])
         likely = " (9.81 is g: a sensitivity in V/g where V s^2/m is expected, or the reverse)" if (
             kind == "acceleration" and settings.like_g > abs(abs(np.log10(factor)) - np.log10(9.80665))) else ""
         found.append(Finding("units", "warning", f"{', '.join(names)} {'reads' if len(names) == 1 else 'read'} "

@@ -28,7 +28,7 @@ def all_axes(result: DesignResult) -> str:
     """What the sampled loop of all six degrees of freedom reaches, beside the bounds of the design model.
 
     The bounds are those of the kept coordinates with the others locked. If the nominal loop of all axes exceeds them,
-    the sentence says so.
+    the sentence says so; where there are no bounds it speaks of none.
     """
     mu, six = result.controller("mu"), result.six_dof
     low, high = result.design.transmissibility.band_Hz
@@ -41,6 +41,9 @@ def all_axes(result: DesignResult) -> str:
     if beyond:
         return (f"These bounds hold for {listed(result.design.keep)} with the other coordinates locked; with all six "
                 f"degrees of freedom the nominal loop does not keep them: {listed(beyond)}.")
+    if not (np.isfinite(mu.worst_peak.upper) and np.isfinite(mu.worst_band.upper)):
+        return (f"With all six degrees of freedom the nominal sampled loop reaches {peak:+.1f} dB at its peak and "
+                f"{band:+.1f} dB from {low:g} to {high:g} Hz; for other plants of the set there is no bound.")
     return (f"These bounds hold for {listed(result.design.keep)} with the other coordinates locked; with all six "
             f"degrees of freedom the nominal sampled loop reaches {peak:+.1f} dB and {band:+.1f} dB.")
 

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block
-from avis_ctrl.identification.validation import _floor_interval, validate
+from avis_ctrl.identification.validation import _floor_interval, _verdict, validate
 from avis_ctrl.identification.whiteness import whiteness
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -79,6 +80,24 @@ def test_an_identified_rig_leaves_what_noise_leaves(checked):
         assert one.whiteness is not None and one.whiteness.white
     assert "expected" in checked.verdict and checked.verdict.startswith("the identified model agrees with the held-out")
     json.dumps(checked.as_dict(), allow_nan=False)
+
+
+def test_one_record_beyond_its_noise_is_enough(checked):
+    """The record of largest chi-square is predicted as well as noise allows, another one is not: that one is told."""
+    one, other = checked.held_out
+    high = one.nrms_all_interval[1]
+    first = replace(one, chi2_per_dof=9.0 * one.chi2_interval[1], nrms_all=0.9 * high)
+    second = replace(other, chi2_per_dof=5.0 * other.chi2_interval[1], nrms_all=3.0 * other.nrms_all_interval[1])
+    assert "small systematic error" in _verdict([first, one]) and "record 04" in _verdict([first, one])
+    assert "does not agree" in _verdict([first, second]) and "record 05" in _verdict([first, second])
+
+
+def test_a_residual_that_is_not_white_is_in_the_verdict(checked):
+    """The colour of the verdict is that of `passed`, and the words say the same."""
+    one = checked.held_out[0]
+    coloured = replace(one, whiteness=SimpleNamespace(white=False, sentences=()))
+    assert one.whiteness.white and "not white" not in _verdict([one])
+    assert not replace(checked, held_out=(coloured,)).passed and "not white" in _verdict([coloured])
 
 
 def test_errors_in_time_and_by_frequency_agree(checked):

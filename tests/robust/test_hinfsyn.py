@@ -163,6 +163,33 @@ class TestAgainstMatrixInequalities:
         bound = hinf_lower_bound(P, 1, 1)
         assert bound.gamma <= lmi_gamma(P, 1, 1).upper * (1 + 1e-6)
 
+    def test_the_lower_bound_does_not_depend_on_the_units_of_u_and_y(self, rng):
+        """A control in units 1e10 times larger acts all the same: its column is small, not zero."""
+        D = np.zeros((5, 5))
+        D[1:3, 3:] = D[3:, 1:3] = np.eye(2)
+        for _ in range(4):
+            P = StateSpace(rng.standard_normal((4, 4)) - 3 * np.eye(4), rng.standard_normal((4, 5)),
+                           rng.standard_normal((5, 4)), D)
+            other = P.scaled(left=[1, 1, 1, 1, 1e-10], right=[1, 1, 1, 1, 1e-10])
+            assert hinf_lower_bound(other, 2, 2).gamma == pytest.approx(hinf_lower_bound(P, 2, 2).gamma, rel=1e-6)
+
+    @pytest.mark.parametrize("order, corner", [(3, 1e4), (5, 1e3)])
+    def test_a_control_that_has_rolled_off_still_counts(self, order, corner):
+        """z1 = u1 + w2 / 10, z2 = h w1 + g u2, y = w, with g = 1/(s + 1)^order and h a lag beyond its roll-off.
+
+        u1 = -y2 / 10 and u2 = -(h/g) (s/a + 1)^-order y1 leave z2 = h (1 - (s/a + 1)^-order) w1, small for a large a.
+        """
+        g, h, a = tf([1], np.poly(-np.ones(order))), tf([corner], [1, corner]), 1e6
+        B, C = np.zeros((order + 1, 4)), np.zeros((4, order + 1))
+        B[:order, 3], C[1, :order], B[order, 0], C[1, order] = g.B[:, 0], g.C[0], h.B[0, 0], h.C[0, 0]
+        P = StateSpace(la.block_diag(g.A, h.A), B, C, np.array([[0, 0.1, 1, 0], [0, 0, 0, 0], [1, 0, 0, 0],
+                                                                [0, 1, 0, 0]]))
+        s = 1j * np.geomspace(1e-2, 1e9, 5000)
+        reached = np.max(np.abs(corner / (s + corner) * (1 - (s / a + 1) ** -order)))
+        assert reached < 0.1
+        assert hinf_lower_bound(P, 2, 2).gamma <= reached
+        assert hinfsyn(P, 2, 2).gamma_optimal_bounds[0] <= reached
+
 
 class TestWhichWeightForbids:
     def test_elasticities_add_up_to_one(self):

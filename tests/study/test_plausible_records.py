@@ -105,6 +105,16 @@ def test_volts_per_g_are_doubted(sound):
     assert doubt.channels == (measured.y_names[2],) and "reads 0.2" in doubt.sentence
 
 
+def test_sensors_that_are_off_by_different_factors_are_told_apart(sound):
+    """One reads three times too much, one a third: no factor between the two is told of both."""
+    rig, measured = sound
+    n = len(measured.y_names)
+    wrong = changed(measured, y=only(n, 1, 3.0) * only(n, 2, 1 / 3.0))
+    said = {one.channels: one.value for one in check_records(wrong, model_of(rig, wrong))}
+    assert said == {(measured.y_names[1],): pytest.approx(3.0, rel=0.1),
+                    (measured.y_names[2],): pytest.approx(1 / 3.0, rel=0.1)}
+
+
 @pytest.mark.parametrize("change, said", [
     (lambda m: changed(m, u=1e3), r"^u of the records = .*limit of drive A\w+ is 10 V: did you mean .*\(given in mV\)"),
     (lambda m: changed(m, u=1e-3), "all channels are off alike: are the records' y in mV or u in kV"),

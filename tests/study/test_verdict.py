@@ -67,3 +67,13 @@ def test_all_six_degrees_of_freedom_stand_beside_the_bounds_of_the_design_model(
     design = SimpleNamespace(transmissibility=SimpleNamespace(band_Hz=[1.0, 10.0]), keep=["z", "phi_x"])
     found = all_axes(SimpleNamespace(controller=lambda name: mu, six_dof=six, design=design))
     assert said in found and "z and phi_x" in found and "locked" in found
+
+
+def test_without_bounds_none_are_said_to_hold():
+    """Robust stability is not proved: the worst cases are infinite, and the nominal loop alone can be told."""
+    nothing = SimpleNamespace(upper=np.inf)
+    six = SimpleNamespace(omega=2 * np.pi * np.array([0.5, 2.0, 20.0]), kept=np.array([2.0, 0.4, 1.0]))
+    design = SimpleNamespace(transmissibility=SimpleNamespace(band_Hz=[1.0, 10.0]), keep=["z", "phi_x"])
+    mu = SimpleNamespace(worst_peak=nothing, worst_band=nothing)
+    found = all_axes(SimpleNamespace(controller=lambda name: mu, six_dof=six, design=design))
+    assert "bounds hold" not in found and "+6.0 dB" in found and "-8.0 dB from 1 to 10 Hz" in found
