@@ -88,6 +88,11 @@ def test_errors_in_time_and_by_frequency_agree(checked):
         assert np.allclose(one.nrms_time_start, one.nrms_start, rtol=0.3)
 
 
+def test_the_overlay_reaches_the_lines_at_the_edges_of_the_band(checked):
+    """0.5 and 30 Hz are lines of records of 20 s, whatever 30 / 0.05 rounds to."""
+    assert checked.overlay.frequency_Hz[[0, -1]] == pytest.approx(BAND, rel=1e-12)
+
+
 def test_the_prediction_in_time_is_that_of_scipy(found, records, checked):
     """The identified rig by matrix exponentials and scipy's discrete simulation, and what the simulator of closed loops
     has beside its linear table; error without a filter."""
