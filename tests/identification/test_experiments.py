@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.experiment_plan import Experiment, compare, needed_experiment, plan
+from avis_ctrl.identification.experiment_plan import Experiment, candidates, compare, needed_experiment, plan
 from avis_ctrl.identification.experiments import (
     AddedSensor,
     Drive,
@@ -139,6 +139,15 @@ def test_sentences_and_the_plan(avis):
     said = needed_experiment(now, model, DRIVE, NOISE, [longer, bench])
     assert any("Nothing in the list determines" in s and "isolator3.k_x" in s for s in said)
     assert any("determine nothing new" in s and "record twice as long" in s for s in said)
+
+
+def test_channels_are_added_at_the_corner_opposite_the_first_mount(avis):
+    """A known mass goes on that mount, the new channels point-symmetric to it: far from all that is there."""
+    rig = avis.with_parameters({f"isolator1.p_{axis}": value for axis, value in zip("xyz", CORNER, strict=True)})
+    said = [one.words for one in candidates(ResponseModel.of(rig, ["mass"]), DRIVE)]
+    assert any("known mass of 50 kg fixed at (0.4, 0.3, 0.1) m" in words for words in said)
+    for axis in "xyz":
+        assert any(f"sensor along {axis} on the payload at (-0.4, -0.3, -0.1) m" in words for words in said)
 
 
 @pytest.mark.parametrize("make", [

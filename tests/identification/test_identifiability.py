@@ -155,6 +155,15 @@ def test_ranks_are_those_of_rational_algebra(avis, count, rank):
     assert information(model).rank == rank
 
 
+@pytest.mark.parametrize("factor", [1e-6, 0.0])
+def test_a_weak_actuator_tells_as_much_as_a_strong_one(avis, factor):
+    """The structural rank is that of exact algebra, whatever the size of a response; a broken drive moves nothing."""
+    name = f"actuator.{avis.motors[0].name}"
+    rig = avis.with_parameters({name: factor * avis.parameters()[name].value})
+    null = structural_null_space(ResponseModel.of(rig, sets(rig)[42]))
+    assert 42 - null.shape[1] == exact_rank(rig, sets(rig)[42])
+
+
 def test_eight_stiffness_numbers_not_twelve(avis):
     """The 12 stiffnesses span 8 dimensions of K; those of one horizontal axis two, the vertical ones four."""
     _, _, dD, _, _ = exact_model(avis)

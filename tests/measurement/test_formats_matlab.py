@@ -164,6 +164,19 @@ def test_frequency_responses(path, rng, version, lines):
     assert response.outputs == ("S1", "S2", "S3") and response.output_unit == "m/s"
 
 
+@pytest.mark.parametrize("named", ["inputs", "outputs"])
+def test_channels_without_names_are_numbered(path, rng, named):
+    """The shape of H tells how many there are, where only the others have names."""
+    names = {"inputs": ["A1", "A2"], "outputs": ["S1", "S2", "S3"]}
+    G = rng.normal(size=(7, 3, 2))
+    scipy.io.savemat(path, {"frequency_Hz": np.arange(1.0, 8.0), "H": G, "variance": np.ones((7, 3, 2)),
+                            named: cells(names[named])})
+    response = read_measurements(path)
+    expected = {"inputs": ["u1", "u2"], "outputs": ["y1", "y2", "y3"]} | {named: names[named]}
+    assert [list(response.inputs), list(response.outputs)] == [expected["inputs"], expected["outputs"]]
+    np.testing.assert_array_equal(response.value, G)
+
+
 def test_as_many_lines_as_channels_are_refused(path, rng):
     scipy.io.savemat(path, {"frequency_Hz": np.arange(1.0, 3.0), "H": rng.normal(size=(2, 2, 2)),
                             "variance": np.ones((2, 2, 2)), "inputs": cells(["a", "b"]), "outputs": cells(["c", "d"])})

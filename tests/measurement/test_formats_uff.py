@@ -106,6 +106,15 @@ def test_units_by_data_type_and_data_set_164(path):
     assert read_measurements(path, y_unit="mm/s").records[0].y[0, 0] == pytest.approx(1e-3)
 
 
+def test_what_another_function_refers_to_is_an_input(path, rng):
+    """A reference without node is none: the response beside it may be at node 0, as where nodes were never given."""
+    u, y = rng.normal(size=(2, 20))
+    path.write_bytes(data_set(u, node=7, direction=-3, ordinate=(1, "V"))
+                     + data_set(y, ordinate=(12, "m/s^2"), reference=("NONE", 7, -3)))
+    campaign = read_measurements(path, excitation="noise")
+    assert (campaign.u_names, campaign.y_names) == (("node 7 -Z",), ("node 0",))
+
+
 def test_the_second_function_of_a_channel_is_the_second_record(path, rng):
     u = rng.normal(size=(2, 20))
     path.write_bytes(b"".join(data_set(u[i], name=name, ordinate=(1, "V")) for name in ("A1", "S1") for i in (0, 1)))

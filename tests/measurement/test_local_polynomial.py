@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import product
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy import stats
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
-from avis_ctrl.measurement.frequency_response.local_fit import LocalFit, local_model
+from avis_ctrl.measurement.frequency_response.local_fit import LocalFit, least_half_width, local_model
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial, local_rational, noise_covariance
 from avis_ctrl.measurement.frequency_response.pooling import pool
 
@@ -92,6 +93,27 @@ def test_the_same_rational_estimate_as_lstsq_with_all_unknowns(rng):
         inverse += np.linalg.inv(K.conj().T @ K)[:2, :2] / 2
     assert found.dof == K.shape[0] - K.shape[1]
     assert np.allclose(np.linalg.inv(found.gram[0]).T, inverse)
+
+
+def test_the_default_window_is_the_smallest_with_equations_to_spare():
+    """Lines less unknowns, counted: of G, of each record's transient and of a denominator; 2 n_y + 4 are left."""
+    for records, n_u, n_y, order, rational in product((1, 2, 5), (0, 1, 8), (1, 6), (2, 3), (False, True)):
+        def spare(w, records=records, n_u=n_u, n_y=n_y, order=order, rational=rational):
+            unknowns = (order + 1) * n_u + (order + 1) * records + (order if rational else 0)
+            return records * (2 * w + 1) - unknowns - (2 * n_y + 4)
+        w = least_half_width(records, n_u, n_y, order, rational)
+        assert spare(w) >= 0 and w > order
+        assert w == order + 1 or spare(w - 1) < 0
+
+
+def test_the_window_of_a_periodic_record_holds_enough_excited_lines():
+    """As many as G has coefficients of an input, in all records as many as it has unknowns; one to spare at most."""
+    for records, n_u, order, spacing in product((1, 2, 5), (1, 2, 8), (2, 3), (2, 5, 6)):
+        w, plain = (least_half_width(records, n_u, 1, order, spacing=each) for each in (spacing, 1))
+        excited, wanted = (2 * w + 1) // spacing, (order + 1) * n_u
+        assert w >= plain and excited > order and excited * records >= wanted
+        enough = max(order, wanted / records) + 2
+        assert w == plain or 2 * w - 1 <= spacing * enough
 
 
 def test_records_taken_in_one_by_one_give_the_same_as_together(rng):
