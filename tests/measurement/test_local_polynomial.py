@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from itertools import product
 
@@ -364,6 +365,37 @@ def test_inputs_that_depend_on_each_other_tell_what_they_span(rng):
     of_three, of_two = (noise_covariance(campaign([(one, y)], RATE), at, band_Hz=(5, 80)) for one in (u, two))
     assert np.allclose(of_three.covariance, of_two.covariance, rtol=1e-6)
     assert np.array_equal(of_three.dof, of_two.dof)
+
+
+def test_an_input_90_dB_down_in_part_of_the_band_is_not_silent(rng):
+    """Without noise the response is exact there too, alone and beside an input that follows another."""
+    f = np.arange(1, 61) * 0.5
+    G = sum(rng.standard_normal((2, 2)) * (f[:, None, None] / 30) ** s for s in range(3))
+    U = rng.standard_normal((4, 60, 2)) + 1j * rng.standard_normal((4, 60, 2))
+    U[:, 30:, 1] *= 3e-5
+    Y = (G @ U[..., None])[..., 0]
+    assert np.allclose(local_model(U, Y, f).value, G, atol=1e-9)
+    fit = LocalFit(f, 3, 2, 2, 8, 4.0)
+    fit.add(np.concatenate([U, 2 * U[..., :1]], axis=2), Y, f)
+    value = fit.estimate(partial=True).value
+    assert np.allclose(value[:, :, 0] + 2 * value[:, :, 2], G[:, :, 0], atol=1e-9)
+    assert np.allclose(value[:, :, 1], G[:, :, 1], atol=1e-9)
+
+
+def test_silence_is_measured_against_the_band(rng):
+    """A line with 1e-15 of the band's r.m.s.: its own part over -100 dB of the band's part of a window, by lstsq."""
+    records, order, w = 3, 2, 4
+    U = rng.standard_normal((records, 60, 1)) + 1j * rng.standard_normal((records, 60, 1))
+    U[:, 30:] *= 1e-15
+    with pytest.raises(ComputationError, match="are not excited") as caught:
+        local_model(U, U, np.arange(60.0), np.array([45.0]), order, w)
+    d = np.arange(-w, w + 1.0)
+    powers, here = d[:, None] ** np.arange(order + 1), U[:, 45 - w:45 + w + 1, 0].ravel()
+    others = np.hstack([here[:, None] * np.tile(powers[:, 1:], (records, 1)), np.kron(np.eye(records), powers)])
+    own = np.linalg.norm(here - others @ np.linalg.lstsq(others, here, rcond=1e-25)[0])
+    rms = np.sqrt(np.mean(np.abs(U) ** 2))
+    said = float(re.search(r"own part (\S+?)[;,\s]", f"{caught.value} ")[1])
+    assert said == pytest.approx(own / (1e-5 * rms * np.sqrt(records * (2 * w - order))), rel=0.05)
 
 
 def test_an_input_silent_in_part_of_the_band_is_named_with_the_frequencies(rng):
