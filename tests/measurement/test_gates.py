@@ -154,6 +154,7 @@ def test_lost_samples_are_counted(make, count):
     found = [f for f in alarms(changed(campaign, 0, y=y), known(response=None)) if f.gate == "missing samples"]
     assert [f.records for f in found] == [("00",)]
     assert found[0].value == pytest.approx(-count, abs=0.3)
+    assert "samples earlier behind" in found[0].sentence and f"about {count} samples were lost" in found[0].sentence
 
 
 def test_rows_lost_from_u_and_y(clean):
