@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -208,16 +210,25 @@ def test_false_alarms_of_hum(colour):
     assert hits <= 4
 
 
+@pytest.mark.parametrize("off", [0.9975, 1.003])
 @pytest.mark.parametrize("mains", [50.0, 60.0])
-def test_hum_names_mains_and_channel(rng, mains):
+def test_hum_names_mains_channel_and_size(rng, mains, off):
+    """Anywhere in the tolerance; the frequency to half a bin of 1/4 Hz, the size within the noise of its bins."""
     record = rest(rng)
     y = record.y.copy()
-    y[:, 2] += 0.1 * np.sin(2 * np.pi * (mains * 1.001) * np.arange(len(y)) / 1000)
+    y[:, 2] += 0.4 * np.sin(2 * np.pi * (mains * off) * np.arange(len(y)) / 1000)
     record = Record(record.header, record.u, y)
     gate = Hum()
     found = gate.conclude([gate.look(excerpt(record), Expectation())], Campaign("x", (record,)), Expectation())
     assert [(f.channels, f.severity) for f in found] == [(("y2",), "warning")]
     assert f"carries mains hum at {mains:g} Hz:" in found[0].sentence
+    said = re.search(r"Hz: at (\S+) Hz (\S+) V r\.m\.s\.", found[0].sentence)
+    assert float(said[1]) == pytest.approx(mains * off, abs=0.13)
+    assert float(said[2]) == pytest.approx(0.4 / np.sqrt(2), rel=0.1)
+    # Over the louder of 16 bins on either side, three bins away from the tolerance of one bin.
+    P, middle = signal.welch(y[:, 2], 1000, "hann", 4000, 0, detrend="linear")[1], round(4 * mains)
+    floor = max(P[middle - 20:middle - 4].mean(), P[middle + 5:middle + 21].mean())
+    assert found[0].value == pytest.approx(P[middle - 1:middle + 2].max() / floor)
 
 
 def test_false_alarms_of_periodicity(rng):
