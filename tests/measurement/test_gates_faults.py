@@ -55,6 +55,19 @@ def test_clipping_below_the_known_range(either, part):
     assert f"{level:.4g}"[:4] in found.sentence and "below the end of the known range" in found.sentence
 
 
+@pytest.mark.parametrize("samples", [1, 2])
+def test_two_samples_at_the_end_of_the_range_are_clipped_and_one_is_not(samples):
+    campaign = everywhere(noise_campaign(1, 8000, (0.2,) * 4), lambda u, y: (u, 0.1 * y))
+    y = campaign.records[0].y.copy()
+    y[:, 1] *= 10
+    k, top = int(np.argmax(y[:, 1])), float(np.max(y[:, 1]))
+    y[k:k + samples, 1] = top
+    found = examine(changed(campaign, 0, y=y), known(y_range_V=(-10.0, top), response=None))
+    (said,) = [f for f in found if f.gate == "clipping"]
+    assert said.severity == ("ok" if samples == 1 else "warning")
+    assert samples == 1 or (said.value, said.channels) == (2, ("Sz1",))
+
+
 def test_clipping_before_the_noise_of_the_converter(either):
     """A flat top that is rounded by noise of one step."""
     (found,) = alarms(limited(either, 0.7, noise=1e-3)[0], "clipping")
