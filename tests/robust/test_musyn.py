@@ -14,6 +14,7 @@ from avis_ctrl.lti import StateSpace, connect, gain, hinf_norm, lft_lower, summi
 from avis_ctrl.robust.gamma_descent import (
     ScaledProblem,
     gamma_and_gradient,
+    grown,
     parameters,
     with_parameters,
 )
@@ -248,6 +249,28 @@ def test_slope_of_gamma_is_its_derivative():
 
     numeric = [np.log(optimum(theta + h * e) / optimum(theta - h * e)) / (2 * h) for e in np.eye(theta.size)]
     assert np.allclose(slope, numeric, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(("d", "orders"), [((1.0, 1.0), (1, 1, 0)), ((0.3, 3.0), (1, 0, 0))])
+def test_a_root_pair_is_added_where_gamma_falls_most(d, orders):
+    """The optimum of every pair that could be tried, bisected; both blocks where the two inputs count alike."""
+    P, structure = distillation(), BlockStructure.of(DISTILLATION_BLOCKS).with_performance(2, 2)
+    problem = ScaledProblem.of(P, 2, 2)
+    start = Scalings(structure, tuple(map(ScalarScaling.constant, (*d, 1.0))))
+
+    def optimum(scalings):
+        return find_gamma(problem.normal(scalings).plant, 1e-9).upper.gamma
+
+    larger = grown(P, 2, 2, start, (1e-2, 1e2), 60)
+    assert larger.orders == orders
+    tried = []
+    for place in np.geomspace(1e-2, 1e2, 8)[1:-1]:
+        for split in (-0.02, 0.02):
+            tried += [start.replace(k, start.parts[k].with_neutral_pair(place, split)) for k in (0, 1)]
+            if orders[1]:
+                tried.append(tried[-2].replace(1, tried[-1].parts[1]))
+    assert optimum(larger) == pytest.approx(min(map(optimum, tried)), rel=1e-7)
+    assert optimum(larger) < 0.995 * optimum(start)
 
 
 def test_gamma_reported_is_measured(distilled):
