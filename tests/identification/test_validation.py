@@ -1,6 +1,7 @@
 """Validation on held-out data against the exact simulation, known laws, finite differences and Monte Carlo."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -138,6 +139,18 @@ def test_the_interval_is_fishers():
     inside = np.mean((ratio / ratio.mean() >= low) & (ratio / ratio.mean() <= high))
     assert inside == pytest.approx(0.95, abs=0.006)
     assert interval(1.0, 300, np.inf) == pytest.approx(tuple(stats.chi2(300).ppf([0.025, 0.975]) / 300))
+
+
+def test_the_interval_of_chi_square_allows_for_the_noise_estimated(found, checked, rng):
+    """Fisher's law; the inverse of a covariance is known as the inverse of a Wishart matrix scatters, drawn."""
+    one = checked.held_out[0]
+    dof = int(re.search(r"(\d+) degrees of freedom a line", one.noise)[1])
+    X = rng.normal(size=(4000, 6, dof)) + 1j * rng.normal(size=(4000, 6, dof))
+    trace = np.trace(np.linalg.inv(X @ np.conj(X.swapaxes(1, 2))), axis1=1, axis2=2).real
+    worth = 2 * np.mean(trace) ** 2 / np.var(trace)
+    law = stats.f(2 * 6 * one.lines, worth * found.fit.dof / (2 * 6 * dof))
+    low, high = one.chi2_interval
+    assert np.log(high / low) == pytest.approx(np.log(law.ppf(0.975) / law.ppf(0.025)), rel=0.01)
 
 
 def white_error(rng, n=400, n_y=3, n_u=2, white=None):
