@@ -249,15 +249,15 @@ def test_what_cannot_be_estimated_is_said(rng):
     with pytest.raises(InputError, match="multisine records"):
         best_linear_approximation(noise)
     two = Campaign("test", tuple(campaign([(r.u * k, r.y) for r, k in zip(data.records, (1, 1, 3, 3), strict=True)],
-                                          RATE, "multisine", N / RATE, levels=[1, 1, 3, 3]).records))
+                                          RATE, "multisine", N / RATE, levels=[0.01, 0.01, 0.03, 0.03]).records))
     wrong = campaign([(rng.standard_normal((4 * N, 1)), rng.standard_normal((4 * N, 1)))], RATE, "multisine", N / RATE)
     with pytest.raises(InputError, match="is the period right"):
         best_linear_approximation(wrong)
     with pytest.raises(InputError, match="level_V = "):
         best_linear_approximation(two)
-    assert best_linear_approximation(two, level_V=3).value.shape == (len(LINES), 1, 2)
-    with pytest.raises(InputError, match=r"level_V = 2.*one of the levels"):
-        best_linear_approximation(two, level_V=2)
+    assert best_linear_approximation(two, level_V=0.03).value.shape == (len(LINES), 1, 2)
+    with pytest.raises(InputError, match=r"level_V = 0.02.*one of the levels"):
+        best_linear_approximation(two, level_V=0.02)
     with pytest.raises(InputError, match="periods"):
         best_linear_approximation(data, drop=2)
     with pytest.raises(InputError, match="transient = 'cut'"):

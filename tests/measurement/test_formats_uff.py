@@ -138,6 +138,9 @@ def test_pyuff_writes_ascii_that_is_read_alike(path, rng):
     read = pyuff.UFF(str(path)).read_sets(1)
     np.testing.assert_allclose(response.value[:, 1, 0], read["data"], rtol=1e-12)
     np.testing.assert_allclose(response.value[:, 0, 0], G, rtol=1e-11)
+    for wrong in (0.0, -0.02):
+        with pytest.raises(InputError, match=r"relative_standard_deviation = .*: expected a positive number"):
+            read_measurements(path, relative_standard_deviation=wrong)
 
 
 def test_real_samples(data):
