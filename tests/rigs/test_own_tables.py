@@ -10,6 +10,7 @@ import pytest
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import load_rig
+from avis_ctrl.rigs.logical_axes import drivable
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.rigs.sensing import conditioning
@@ -129,6 +130,15 @@ def changed(change):
 def test_what_is_wrong_is_named(change, message):
     with pytest.raises(InputError, match=message):
         rig_from(changed(change))
+
+
+@pytest.mark.parametrize(("tilt_rad", "driven"), [(0.0, ("z",)), (0.01, ("z",)), (0.04, ()), (0.1, ())])
+def test_a_drive_that_stands_askew_drives_no_coordinate_by_itself(tilt_rad, driven):
+    """One drive at the centre of mass: drawings give directions to 0.005 rad, beyond 0.02 rad it is meant."""
+    content = content_of("four_vertical")
+    content["drive"] = [{**content["drive"][0], "position_m": [0.0, 0.0, 0.0],
+                         "direction": [float(np.sin(tilt_rad)), 0.0, float(np.cos(tilt_rad))]}]
+    assert drivable(rig_from(content)) == driven
 
 
 @pytest.mark.parametrize("name", NAMES)

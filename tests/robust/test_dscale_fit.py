@@ -195,9 +195,13 @@ def test_bad_input_is_named(change, field):
         fit_magnitude(**(good | change))
 
 
-def test_matrix_that_is_not_positive_is_refused():
-    with pytest.raises(InputError, match="positive definite"):
-        fit_hermitian(np.array([1.0]), np.diag([1.0, -1.0])[None].astype(complex), 0)
+@pytest.mark.parametrize(("X", "degree", "message"), [
+    ([[1.0, 0.0], [0.0, -1.0]], 0, "positive definite"), ([[1.0, 0.2], [0.1, 1.0]], 0, "finite Hermitian"),
+    ([[1.0, 0.1j], [0.1j, 1.0]], 0, "finite Hermitian"), ([[1.0, 0.0], [0.0, np.inf]], 0, "finite Hermitian"),
+    ([[1.0, 0.0]], 0, "do not fit"), ([[1.0]], -1, "whole number"), ([[1.0]], 0.5, "whole number")])
+def test_matrix_that_cannot_be_fitted_is_refused(X, degree, message):
+    with pytest.raises(InputError, match=message):
+        fit_hermitian(np.array([1.0]), np.array([X], complex), degree)
 
 
 @pytest.fixture
