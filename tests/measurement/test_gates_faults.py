@@ -105,6 +105,9 @@ def test_millivolts_are_a_wrong_unit(clean):
     found = alarms(everywhere(clean, lambda u, y: (u, 1000 * y)))
     assert [f.gate for f in found] == ["clipping"] and len(found[0].channels) == 6
     assert "mV" in found[0].sentence and "unit or scale is probably wrong" in found[0].sentence
+    assert " are so. The unit" in found[0].sentence
+    (alone,) = alarms(everywhere(clean, lambda u, y: (u, y * np.where(np.arange(6) == 1, 1000, 1))), "clipping")
+    assert alone.channels == ("Sz1",) and " is so. The unit" in alone.sentence
 
 
 @pytest.mark.parametrize("sample", [4, 12345, -5])
@@ -115,6 +118,23 @@ def test_a_single_spike_is_named(either, sample):
     (found,) = alarms(changed(either, 1, y=y))
     assert (found.gate, found.channels, found.records) == ("spikes", ("Sz2",), ("01",))
     assert f"sample {sample}" in found.sentence and f"{sample / RATE:.6g} s" in found.sentence
+
+
+def test_a_spike_in_a_later_piece_has_its_place_in_the_record():
+    campaign = noise_campaign(1, 24000, (0.2,))
+    y = campaign.records[0].y.copy()
+    y[21000, 3] += 3.0
+    found = examine(changed(campaign, 0, y=y), known(), longest=16000)
+    (said,) = [f for f in found if f.gate == "spikes"]
+    assert "at 21 s (sample 21000)" in said.sentence
+
+
+def test_a_drive_that_never_moves_is_noted(clean):
+    (said,) = [f for f in examine(clean, known()) if f.gate == "dead channel"]
+    assert said.severity == "ok"
+    idle = everywhere(clean, lambda u, y: (u * (np.arange(8) != 2), y))
+    (said,) = [f for f in examine(idle, known(response=None)) if f.gate == "dead channel"]
+    assert (said.severity, said.channels) == ("note", ("Ax2",)) and "'Ax2' never moves" in said.sentence
 
 
 def test_false_alarms_of_spikes():

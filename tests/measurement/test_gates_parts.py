@@ -231,6 +231,23 @@ def test_hum_names_mains_channel_and_size(rng, mains, off):
     assert found[0].value == pytest.approx(P[middle - 1:middle + 2].max() / floor)
 
 
+@pytest.mark.parametrize("excitation", ["multisine", "noise"])
+def test_signal_to_noise_is_what_was_put_in(rng, excitation):
+    """20 dB and 0 dB on every line, of six periods or of white noise, in each octave within what few lines scatter."""
+    lines, N = np.arange(1, 1024), 2048
+    U = np.zeros(N // 2 + 1, complex)
+    U[lines] = np.sqrt(N) * np.exp(2j * np.pi * rng.random(lines.size))  # the power of white noise of r.m.s. 1
+    u = np.tile(np.fft.irfft(U, N), 6) if excitation == "multisine" else rng.standard_normal(60000)
+    y = u[:, None] * [1.0, 0.1] + 0.1 * rng.standard_normal((len(u), 2))
+    header = RecordHeader("00", 1000.0, len(u), ("u",), ("a", "b"), excitation, 1.0, 0.0,
+                          N / 1000 if excitation == "multisine" else None)
+    campaign = Campaign("x", (Record(header, u[:, None], y),))
+    (said,) = [f for f in examine(campaign) if f.gate == "signal to noise" and f.picture.series]
+    for series, dB in zip(said.picture.series, (20.0, 0.0), strict=True):
+        wide = series.x > 10
+        assert wide.sum() > 3 and np.all(np.abs(series.y[wide] - dB) < 1.5)
+
+
 def test_false_alarms_of_periodicity(rng):
     """T of pure noise is 1 on average, and its largest over periods stays under the F limit."""
     from scipy import stats
