@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from scipy import signal
@@ -266,6 +268,17 @@ def test_an_oscillator_is_recovered_from_a_piece_of_record(rng):
     assert np.all(np.abs(fit.values - [2.0, 4.0, 5000.0]) < 4 * fit.standard_deviation)
     assert resonance_Hz(fit)[0] == pytest.approx(np.sqrt(2500) / 2 / np.pi, rel=1e-3)
     assert damping_ratio(fit)[0] == pytest.approx(0.02, rel=0.03)
+
+
+@pytest.mark.parametrize(("m", "k"), [(2.0, -5000.0), (-2.0, 5000.0), (-2.0, -5000.0)])
+def test_an_oscillator_of_negative_mass_or_stiffness_is_none(rng, m, k):
+    """Without noise, over whole periods: the fit finds the numbers that were put in, and refuses them."""
+    n, rate = 4096, 100.0
+    s, U = 2j * np.pi * np.fft.rfftfreq(n, 1 / rate), np.fft.rfft(rng.standard_normal(n))
+    U[np.abs(s) > 2 * np.pi * 30] = 0
+    u, y = np.fft.irfft(U), np.fft.irfft(U / (m * s ** 2 + 40.0 * s + k))
+    with pytest.raises(ComputationError, match=re.escape(f"measured: m {m:.3g}, k {k:.3g};")):
+        fit_oscillator(u, y, rate, (0.5, 18.0))
 
 
 def test_deviations_of_an_oscillator_hold_over_repeated_records():
