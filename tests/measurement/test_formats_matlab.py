@@ -110,6 +110,20 @@ def test_one_record_and_the_same_content_in_hdf5(path, tmp_path, rng, version):
 
 
 @both
+def test_names_as_the_rows_of_a_char_matrix(path, rng, version):
+    """Padded to one length; stored by columns."""
+    names = ["A1", "A12"]
+    save(path, version, {"records": fields(rng, u_names=np.array(names) if version == "v5" else "x"), "rig": "avis"})
+    if version == "v7.3":
+        with h5py.File(path, "r+") as file:
+            del file["records/u_names"]
+            file["records/u_names"] = np.array([[ord(letter) for letter in name.ljust(3)] for name in names],
+                                               np.uint16).T
+            file["records/u_names"].attrs["MATLAB_class"] = np.bytes_("char")
+    assert list(read_measurements(path).u_names) == names
+
+
+@both
 @pytest.mark.parametrize("shape", ["row", "column"])
 def test_flat_vectors_either_way_round(path, rng, version, shape):
     u, y = rng.normal(size=(2, 50))

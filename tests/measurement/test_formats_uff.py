@@ -143,6 +143,17 @@ def test_pyuff_writes_ascii_that_is_read_alike(path, rng):
             read_measurements(path, relative_standard_deviation=wrong)
 
 
+@pytest.mark.parametrize("double", [True, False])
+def test_numbers_that_run_together_are_told_apart_by_their_width(path, double):
+    """-1.0E+100 fills its field."""
+    G = -1e100 * (1 + 1j) * np.arange(1.0, 9.0)
+    path.write_bytes(data_set(G, kind=4, node=1, ordinate=(12, "m/s^2"), denominator=(13, "N"), abscissa=(18, "Hz"),
+                              double=double, start=1.0, step=1.0))
+    assert b"E+100-" in path.read_bytes()
+    response = read_measurements(path, relative_standard_deviation=0.1)
+    np.testing.assert_allclose(response.value[:, 0, 0], G, rtol=1e-5)
+
+
 def test_real_samples(data):
     sample = data / "uff" / "Sample_UFF58_ascii.uff"
     with pytest.raises(InputError, match=r"no channel is known as an input; the file has Mic 01"):

@@ -311,10 +311,20 @@ class TestUse:
         assert "slow enough" in hinfsyn(P, 1, 1, sample_rate_Hz=20 * result.fastest_pole).notes[-1]
 
     @pytest.mark.parametrize("a", [-1.0, 1.0, 3.0])
+    def test_matrix_inequalities_that_hold_are_confirmed(self, a):
+        """The plant below: no gamma under its optimum is called an upper bound, and eigenvalues confirm that one."""
+        found, exact = lmi_gamma(StateSpace(*self.self_dual(a)), 1, 1), a + np.sqrt(a * a + 2)
+        assert found.lower <= exact * (1 + 1e-9) and exact <= found.upper < exact * (1 + 1e-5)
+        assert found.violation <= 0
+
+    @staticmethod
+    def self_dual(a):
+        return ([[a]], [[1.0, 0.0, 1.0]], [[1.0], [0.0], [1.0]], [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+
+    @pytest.mark.parametrize("a", [-1.0, 1.0, 3.0])
     def test_only_what_rounding_cannot_undo_is_forbidden(self, a):
         """x' = a x + w1 + u, y = x + w2, z = (x, u): its own dual, so that X = Y = gamma at a + sqrt(a^2 + 2)."""
-        plant = Plant.of(StateSpace([[a]], [[1.0, 0.0, 1.0]], [[1.0], [0.0], [1.0]],
-                                    [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]), 1, 1)
+        plant = Plant.of(StateSpace(*self.self_dual(a)), 1, 1)
         low, high = 0.1, 100.0
         while low < (middle := (low + high) / 2) < high:
             low, high = (low, middle) if gamma_test(plant, middle).feasible else (middle, high)
