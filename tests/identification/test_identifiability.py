@@ -155,6 +155,15 @@ def test_ranks_are_those_of_rational_algebra(avis, count, rank):
     assert information(model).rank == rank
 
 
+@pytest.mark.parametrize("factor", [1e-6, 0.0])
+def test_a_weak_actuator_tells_as_much_as_a_strong_one(avis, factor):
+    """The structural rank is that of exact algebra, whatever the size of a response; a broken drive moves nothing."""
+    name = f"actuator.{avis.motors[0].name}"
+    rig = avis.with_parameters({name: factor * avis.parameters()[name].value})
+    null = structural_null_space(ResponseModel.of(rig, sets(rig)[42]))
+    assert 42 - null.shape[1] == exact_rank(rig, sets(rig)[42])
+
+
 def test_eight_stiffness_numbers_not_twelve(avis):
     """The 12 stiffnesses span 8 dimensions of K; those of one horizontal axis two, the vertical ones four."""
     _, _, dD, _, _ = exact_model(avis)
@@ -333,6 +342,14 @@ def test_a_small_share_in_a_weak_direction_counts():
         exact = np.sqrt(np.linalg.inv(F)[0, 0])
         assert info.standard_deviation[0] == pytest.approx(exact, rel=1e-6)
         assert exact > 100e-4
+
+
+@pytest.mark.parametrize("sigma", [0.9, 0.01])
+def test_the_worst_known_direction_is_said_where_it_is_weak(sigma):
+    """a known to 1e-4, b to sigma."""
+    info = Information(("a", "b"), np.ones(2), ("m", "m"), np.diag([1e8, sigma ** -2]), np.ones(2))
+    said = [one for one in identifiability_report(info).sentences if "worst known combination" in one]
+    assert [("b by +90 %" in one, "a by" in one) for one in said] == ([(True, False)] if sigma == 0.9 else [])
 
 
 def test_the_covariance_of_a_filter_gives_its_data_information_back(avis):

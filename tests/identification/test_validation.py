@@ -1,6 +1,7 @@
 """Validation on held-out data against the exact simulation, known laws, finite differences and Monte Carlo."""
 
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,7 +12,7 @@ from scipy import stats
 from scipy.signal import dlsim
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.identification.campaign_fit import fit_campaign
+from avis_ctrl.identification.campaign_fit import excited_band, fit_campaign
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.modes import measured_modes, mode_table, model_modes
 from avis_ctrl.identification.noise import residual_noise
@@ -107,6 +108,17 @@ def test_errors_in_time_and_by_frequency_agree(checked):
         assert np.allclose(one.nrms_time_start, one.nrms_start, rtol=0.3)
 
 
+def test_the_band_that_is_driven_leaves_out_an_offset(records):
+    """Of a flat spectrum from 0.5 to 30 Hz 0.05 % of the power may lie outside at either end: within a line."""
+    shifted = replace(records[0], u=records[0].u + 0.5)
+    assert excited_band(Campaign("avis", (shifted,))) == pytest.approx(BAND, abs=0.051)
+
+
+def test_the_overlay_reaches_the_lines_at_the_edges_of_the_band(checked):
+    """0.5 and 30 Hz are lines of records of 20 s, whatever 30 / 0.05 rounds to."""
+    assert checked.overlay.frequency_Hz[[0, -1]] == pytest.approx(BAND, rel=1e-12)
+
+
 def test_the_prediction_in_time_is_that_of_scipy(found, records, checked):
     """The identified rig by matrix exponentials and scipy's discrete simulation, and what the simulator of closed loops
     has beside its linear table; error without a filter."""
@@ -152,6 +164,18 @@ def test_the_interval_is_fishers():
     inside = np.mean((ratio / ratio.mean() >= low) & (ratio / ratio.mean() <= high))
     assert inside == pytest.approx(0.95, abs=0.006)
     assert interval(1.0, 300, np.inf) == pytest.approx(tuple(stats.chi2(300).ppf([0.025, 0.975]) / 300))
+
+
+def test_the_interval_of_chi_square_allows_for_the_noise_estimated(found, checked, rng):
+    """Fisher's law; the inverse of a covariance is known as the inverse of a Wishart matrix scatters, drawn."""
+    one = checked.held_out[0]
+    dof = int(re.search(r"(\d+) degrees of freedom a line", one.noise)[1])
+    X = rng.normal(size=(4000, 6, dof)) + 1j * rng.normal(size=(4000, 6, dof))
+    trace = np.trace(np.linalg.inv(X @ np.conj(X.swapaxes(1, 2))), axis1=1, axis2=2).real
+    worth = 2 * np.mean(trace) ** 2 / np.var(trace)
+    law = stats.f(2 * 6 * one.lines, worth * found.fit.dof / (2 * 6 * dof))
+    low, high = one.chi2_interval
+    assert np.log(high / low) == pytest.approx(np.log(law.ppf(0.975) / law.ppf(0.025)), rel=0.01)
 
 
 def white_error(rng, n=400, n_y=3, n_u=2, white=None):
@@ -239,6 +263,9 @@ def test_modes_that_cannot_be_measured_are_answered(true, records):
     heavy = true.at(np.where([".c_" in name for name in true.names], 40 * true.values, true.values))
     with pytest.raises(ComputationError, match="oscillates"):
         mode_table(heavy, np.eye(len(true.names)), heavy, None)
+    free = true.rig.with_parameters({f"isolator{i}.{kind}_x": 0.0 for i in (1, 2, 3, 4) for kind in "kc"})
+    with pytest.raises(ComputationError, match="5 of 6 modes do"):
+        model_modes(ResponseModel.of(free, ["mass"]))
 
 
 @pytest.mark.parametrize("name", ["mass", "isolator1.k_z", "isolator1.c_z"])

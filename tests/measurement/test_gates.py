@@ -25,8 +25,8 @@ from gates_rig import (
 )
 from scipy import signal
 
-from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.measurement.gates import GATES, examine
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
+from avis_ctrl.measurement.gates import GATES, Expectation, examine
 from avis_ctrl.measurement.gates.channel_map import ChannelMap
 from avis_ctrl.measurement.gates.examine import after_missing_samples
 from avis_ctrl.measurement.gates.excerpt import excerpt
@@ -156,6 +156,7 @@ def test_lost_samples_are_counted(make, count):
     found = [f for f in alarms(changed(campaign, 0, y=y), known(response=None)) if f.gate == "missing samples"]
     assert [f.records for f in found] == [("00",)]
     assert found[0].value == pytest.approx(-count, abs=0.3)
+    assert "samples earlier behind" in found[0].sentence and f"about {count} samples were lost" in found[0].sentence
 
 
 def test_rows_lost_from_u_and_y(clean):
@@ -279,6 +280,22 @@ def test_every_flipped_channel_is_named(which, k):
     found = channel_alarms(everywhere(SHORT, flip), known())
     assert told_chance(found[0]) < 1e-5
     assert [(f.gate, f.channels) for f in found] == [("polarity", ((Y_NAMES if which == "y" else U_NAMES)[k],))]
+
+
+@pytest.mark.parametrize("flips", [1, 2])
+def test_half_of_the_channels_flipped_could_be_the_other_half(rng, flips):
+    """Two drives and two sensors by a random response of eight samples; a sensor is flipped, and a drive with it."""
+    h, u = rng.standard_normal((8, 2, 2)), rng.standard_normal((16000, 2))
+    y = sum(np.vstack([np.zeros((k, 2)), u[:len(u) - k]]) @ h[k].T for k in range(8))
+    y += 0.01 * rng.standard_normal(y.shape)
+    y[:, 0] *= -1
+    u[:, 0] *= (-1) ** (flips - 1)
+    header = RecordHeader("00", RATE, len(u), ("u1", "u2"), ("y1", "y2"), "noise", 1.0)
+    expectation = Expectation(response=lambda omega, inputs: np.tensordot(
+        np.exp(-1j * np.outer(omega, np.arange(8)) / RATE), h, 1))
+    found = channel_alarms(Campaign("", (Record(header, u, y),)), expectation)
+    assert [f.gate for f in found] == ["polarity"] * flips
+    assert all(("all the other channels are flipped" in f.sentence) == (flips == 2) for f in found)
 
 
 @pytest.mark.parametrize("late", [4, 8, 15])

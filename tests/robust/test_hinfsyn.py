@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import scipy.linalg as la
@@ -21,6 +23,8 @@ from avis_ctrl.lti import (
 from avis_ctrl.lti.realisation import hankel_singular_values
 from avis_ctrl.robust.hinf_bounds import hinf_lower_bound, limiting_weights
 from avis_ctrl.robust.hinf_lmi import lmi_gamma
+from avis_ctrl.robust.hinf_plant import Plant
+from avis_ctrl.robust.hinf_riccati import gamma_test
 from avis_ctrl.robust.hinfsyn import Status, hinf_suboptimal, hinfsyn
 
 DISTURBANCE_PROCESS = ([200], np.polymul([10, 1], np.polymul([0.05, 1], [0.05, 1])))
@@ -329,7 +333,32 @@ class TestUse:
         P = mixed_sensitivity(([1 / 1.5, 10.0], [1, 1e-3]))
         result = hinfsyn(P, 1, 1, sample_rate_Hz=10.0)
         assert result.fastest_pole == pytest.approx(np.max(np.abs(result.K.poles())))
-        assert "too fast" in result.notes[-1]
+        share = float(re.search(r"is (\S+) of half the sample rate: too fast", result.notes[-1])[1])
+        assert share == pytest.approx(result.fastest_pole / (2 * np.pi * 10.0 / 2), rel=0.05)
+        assert "slow enough" in hinfsyn(P, 1, 1, sample_rate_Hz=20 * result.fastest_pole).notes[-1]
+
+    @pytest.mark.parametrize("a", [-1.0, 1.0, 3.0])
+    def test_matrix_inequalities_that_hold_are_confirmed(self, a):
+        """The plant below: no gamma under its optimum is called an upper bound, and eigenvalues confirm that one."""
+        found, exact = lmi_gamma(StateSpace(*self.self_dual(a)), 1, 1), a + np.sqrt(a * a + 2)
+        assert found.lower <= exact * (1 + 1e-9) and exact <= found.upper < exact * (1 + 1e-5)
+        assert found.violation <= 0
+
+    @staticmethod
+    def self_dual(a):
+        return ([[a]], [[1.0, 0.0, 1.0]], [[1.0], [0.0], [1.0]], [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+
+    @pytest.mark.parametrize("a", [-1.0, 1.0, 3.0])
+    def test_only_what_rounding_cannot_undo_is_forbidden(self, a):
+        """x' = a x + w1 + u, y = x + w2, z = (x, u): its own dual, so that X = Y = gamma at a + sqrt(a^2 + 2)."""
+        plant = Plant.of(StateSpace(*self.self_dual(a)), 1, 1)
+        low, high = 0.1, 100.0
+        while low < (middle := (low + high) / 2) < high:
+            low, high = (low, middle) if gamma_test(plant, middle).feasible else (middle, high)
+        assert high == pytest.approx(a + np.sqrt(a * a + 2), rel=1e-14)
+        assert gamma_test(plant, low).forbidden == 0.0
+        clear = low * (1 - 1e-12)
+        assert gamma_test(plant, clear).forbidden == clear
 
     @pytest.mark.parametrize("hidden", ["unreached", "unseen"])
     def test_hidden_stable_states_do_not_matter(self, rng, hidden):

@@ -153,7 +153,7 @@ class Clipping(Gate):
         """Of the records in which one channel is clipped."""
         row = max(of, key=lambda r: r.count)
         part = row.count / row.samples
-        severity: Severity = "note" if row.count < 2 else "stop" if part > 1e-3 else "warning"
+        severity: Severity = "stop" if part > 1e-3 else "warning"
         assert row.t is not None and row.x is not None
         t, x = thinned(row.t, row.x)
         picture = Picture(
