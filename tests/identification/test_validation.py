@@ -160,7 +160,7 @@ def test_what_is_not_white_is_found(kind):
                "input": lambda U: plain + 0.3 * U[:, 1:2] * np.exp(-0.3j * omega)[:, None, None]}[kind]
     said = whiteness(white_error(rng, white=planted), ("a", "b", "c"), ("u", "v"), np.zeros((1, 1)))
     which = {"lines": said.over_frequency, "time": said.over_time, "input": said.with_inputs}[kind]
-    assert which.beyond and "beyond" in which.sentence
+    assert which.beyond and "values exceed their limit" in which.sentence
     row, lag = np.unravel_index(np.argmax(which.value / which.limit), which.value.shape)
     assert which.lags[lag] == pytest.approx({"lines": 3, "time": 0.5, "input": 0.3}[kind], abs=0.03)
     if kind == "input":
