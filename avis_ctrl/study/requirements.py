@@ -68,7 +68,7 @@ def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requ
         "passive_peak_transmissibility_dB": (
             "passive peak transmissibility, nominal", lambda: decibel(passive.peak_transmissibility), ""),
         "advantage_over_skyhook_dB": (
-            f"improvement of the worst case {band} over the tuned skyhook",
+            f"worst case {band}: improvement on the tuned skyhook",
             lambda: _advantage(skyhook, mu) if skyhook else np.nan,
             f"worst case of the skyhook: {decibel(skyhook.worst_band.lower):+.1f} dB in this band, "
             f"{decibel(skyhook.worst_peak.lower):+.1f} dB at its peak" if skyhook else "no skyhook to compare with"),
