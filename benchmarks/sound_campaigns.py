@@ -43,7 +43,7 @@ from avis_ctrl.study.campaign_plan import plan_from_table
 
 BAND_Hz, PERIOD_s, SETTLE_s = (0.5, 80.0), 10.0, 10.0
 # Words in what `avis identify` prints that a sound campaign gives no reason for.
-REFUSALS = ("stop:", "warning:", "cannot be told apart", "no measured noise", "no uncertainty.json", "not excited")
+REFUSALS = ("stop:", "warning:", "cannot be distinguished", "no measured noise", "no uncertainty.json", "not excited")
 
 
 @dataclass(frozen=True)

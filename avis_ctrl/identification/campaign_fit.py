@@ -80,7 +80,7 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
             raise InputError(f"expected some of the records {', '.join(names)}, but not all", field="hold out",
                              value=list(hold_out))
         return Split(campaign.only(rest), campaign.only(tuple(hold_out)),
-                     f"records {', '.join(hold_out)} held out, as asked")
+                     f"records {', '.join(hold_out)} held out, as specified")
     driven = {record.header.name: driven_inputs(record) for record in campaign.records}
     active = [name for name in names if driven[name]]
     for name in reversed(active):
@@ -92,7 +92,7 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
     parts = [divided(record) for record in campaign.records]
     return Split(replace(campaign, records=tuple(first for first, _ in parts)),
                  replace(campaign, records=tuple(last for _, last in parts)),
-                 "the last third of every record held out, for too few records excite every input")
+                 "the last third of every record held out, because too few records excite every input")
 
 
 def driven_inputs(record: RecordSource) -> set[str]:
@@ -160,17 +160,18 @@ def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[flo
             if piece.header.duration_s * width > 10:
                 blocks.append(_fewer(record_block(piece, model, band_Hz), share, crowded, rng))
     if not blocks:
-        raise InputError("expected a band that holds more than 10 lines of a record", field="band_Hz", value=band_Hz)
+        raise InputError("expected a band with more than 10 lines of a record", field="band_Hz", value=band_Hz)
     # A record without input or measured floor says nothing of the response.
     useful = [block for block in blocks if np.any(block.U)]
     if not useful:
         raise InputError("expected a record that drives an actuator, or one with the floor measured", field="records")
     quiet = sorted({b.name for b in blocks} - {b.name for b in useful})
-    said = [f"records at rest with the floor not measured ({', '.join(quiet)}) tell of the noise only"] if quiet else []
+    said = [f"records at rest without measured floor motion ({', '.join(quiet)}) are used for the noise only"
+            ] if quiet else []
     if crowded:
-        chosen = f", {100 * share:.3g} % of them drawn at random" if share < 1 else ""
-        said.append(f"{sum(len(block.omega) for block in useful)} of {sum(lines):.0f} lines are fitted: those "
-                    f"that are excited{chosen}")
+        chosen = f", of which {100 * share:.3g} % were drawn at random" if share < 1 else ""
+        said.append(f"{sum(len(block.omega) for block in useful)} of {sum(lines):.0f} spectral lines are fitted: the "
+                    f"excited ones{chosen}")
     return useful, said
 
 
@@ -189,9 +190,10 @@ def weighted(blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple
             assert like.noise is not None
             found.append(block.with_noise(like.noise[np.searchsorted(omega, block.omega)], like.dof))
     except AvisError as error:
-        return relative_noise(blocks), f"no measured noise covariance ({error}); lines weigh alike at first", False
-    return found, (f"noise covariance measured by a local polynomial model, {found[0].dof:.0f} degrees of freedom a "
-                   "line"), True
+        return relative_noise(blocks), (f"no measured noise covariance ({error}); the first fit gives all lines equal "
+                                        "weight"), False
+    return found, (f"noise covariance estimated with a local polynomial model, {found[0].dof:.0f} degrees of freedom "
+                   "per line"), True
 
 
 def _lines_only(block: SpectralBlock, omega: np.ndarray) -> SpectralBlock:
@@ -284,7 +286,7 @@ def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:
     """How large the second-order terms are against the outputs, in words."""
     share = [np.linalg.norm(one, axis=(0, 2)) / np.linalg.norm(block.Y, axis=(0, 2)) for block, one in
              zip(blocks, added, strict=True)]
-    return f"they are up to {100 * float(np.max(share)):.2g} % of a sensor's signal in a record"
+    return f"they contribute up to {100 * float(np.max(share)):.2g} % of a sensor's signal in a record"
 
 
 def _bounds(found: LikelihoodFit) -> tuple[str, ...]:
@@ -293,10 +295,10 @@ def _bounds(found: LikelihoodFit) -> tuple[str, ...]:
     low = [name for name in found.held if name not in moments]
     said = []
     if low:
-        said.append(f"the best fit would need values below the physical limit for {', '.join(low)}: held just above "
-                    "zero, where standard deviations say little")
+        said.append(f"the best fit would need values below the physical limit for {', '.join(low)}; they are held just "
+                    "above zero, where their standard deviations are not meaningful")
     if moments:
-        said.append(f"the best fit would need a larger {', '.join(moments)} than a rigid body can have: held at the "
-                    "sum of the other two moments of inertia; either a value that was taken as known is wrong, or "
-                    "these data hardly determine it")
+        said.append(f"the best fit would need a larger {', '.join(moments)} than a rigid body can have; the value is "
+                    "held at the sum of the other two moments of inertia. Either a value that was taken as known is "
+                    "wrong, or these data hardly determine this moment of inertia")
     return tuple(said)

@@ -137,8 +137,8 @@ def test_sentences_and_the_plan(avis):
     assert ranked[1].alone["isolator1.k_x"] == pytest.approx(0.02, rel=1e-3)
     assert [one.experiment for one in plan(now, model, [longer, bench, raised], NOISE)] == [raised]
     said = needed_experiment(now, model, DRIVE, NOISE, [longer, bench])
-    assert any("Nothing in the list determines" in s and "isolator3.k_x" in s for s in said)
-    assert any("determine nothing new" in s and "record twice as long" in s for s in said)
+    assert any("None of these experiments determines" in s and "isolator3.k_x" in s for s in said)
+    assert any("determine no further combination" in s and "record twice as long" in s for s in said)
 
 
 def test_channels_are_added_at_the_corner_opposite_the_first_mount(avis):

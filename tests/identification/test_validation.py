@@ -169,7 +169,7 @@ def test_the_interval_is_fishers():
 def test_the_interval_of_chi_square_allows_for_the_noise_estimated(found, checked, rng):
     """Fisher's law; the inverse of a covariance is known as the inverse of a Wishart matrix scatters, drawn."""
     one = checked.held_out[0]
-    dof = int(re.search(r"(\d+) degrees of freedom a line", one.noise)[1])
+    dof = int(re.search(r"(\d+) degrees of freedom per line", one.noise)[1])
     X = rng.normal(size=(4000, 6, dof)) + 1j * rng.normal(size=(4000, 6, dof))
     trace = np.trace(np.linalg.inv(X @ np.conj(X.swapaxes(1, 2))), axis1=1, axis2=2).real
     worth = 2 * np.mean(trace) ** 2 / np.var(trace)
@@ -203,7 +203,7 @@ def test_what_is_not_white_is_found(kind):
                "input": lambda U: plain + 0.3 * U[:, 1:2] * np.exp(-0.3j * omega)[:, None, None]}[kind]
     said = whiteness(white_error(rng, white=planted), ("a", "b", "c"), ("u", "v"), np.zeros((1, 1)))
     which = {"lines": said.over_frequency, "time": said.over_time, "input": said.with_inputs}[kind]
-    assert which.beyond and "beyond" in which.sentence
+    assert which.beyond and "values exceed their limit" in which.sentence
     row, lag = np.unravel_index(np.argmax(which.value / which.limit), which.value.shape)
     assert which.lags[lag] == pytest.approx({"lines": 3, "time": 0.5, "input": 0.3}[kind], abs=0.03)
     if kind == "input":

@@ -243,7 +243,7 @@ def test_inputs_one_after_the_other(rng):
 def test_what_cannot_be_estimated_is_said(rng):
     system = Modal(rng, 1, 2, [40.0], 0.3, RATE)
     data = experiments(rng, system.simulate, 2, 2, 2, lead=2)
-    with pytest.raises(ComputationError, match=r"u1, u2 cannot be told apart"):
+    with pytest.raises(ComputationError, match=r"u1, u2 cannot be distinguished"):
         best_linear_approximation(data.only(("00",)))
     noise = campaign([(rng.standard_normal((400, 1)), rng.standard_normal((400, 1)))], RATE)
     with pytest.raises(InputError, match="multisine records"):

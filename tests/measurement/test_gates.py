@@ -217,7 +217,8 @@ def test_lines_beside_the_band_are_not_compared():
     assert "level dependence" not in gates(found)
 
 
-@pytest.mark.parametrize(("T", "said"), [(46358975614.2, "far beyond chance"), (3.04, "3.0 times what chance")])
+@pytest.mark.parametrize(("T", "said"), [(46358975614.2, "far more than noise explains"),
+                                         (3.04, "3.0 times the 1 % limit of noise alone")])
 def test_statistics_are_said_in_words_that_one_can_read(T, said):
     assert beyond_chance(T).startswith(said)
 
@@ -226,7 +227,7 @@ def test_records_of_different_voltages_say_how_little_their_comparison_tells():
     """Short segments leak: 5 % of stiffness stays hidden, and the sentence says how much could."""
     found = examine(multisine_campaign(4, sims=(Simulator(), stiffer(0.05)), levels=(0.2, 0.2)), known())
     (said,) = [f for f in found if f.gate == "repeatability"]
-    assert said.severity == "note" and "would not show" in said.sentence
+    assert said.severity == "note" and "would not be detected" in said.sentence
 
 
 def test_the_transient_is_counted_in_periods(clean):
@@ -248,7 +249,7 @@ def channel_alarms(campaign, expectation):
 
 
 def told_chance(finding):
-    return float(re.search(r"probability by chance at most ([-\de.]+)\)", finding.sentence)[1])
+    return float(re.search(r"p-value at most ([-\de.]+)\)", finding.sentence)[1])
 
 
 SHORT = multisine_campaign(1, period=2048, periods=4)

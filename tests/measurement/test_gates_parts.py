@@ -273,7 +273,7 @@ def test_long_records_are_looked_at_in_pieces_and_that_is_said(rng):
     record = Watched(short.header, short.u, short.y)
     findings = examine(Campaign("x", (record,)), longest=8000)
     assert sum(Watched.sizes) <= 8000
-    assert all("only pieces of 8000 samples" in f.sentence for f in findings)
+    assert all("only pieces with 8000 samples" in f.sentence for f in findings)
 
 
 @pytest.mark.parametrize("field", [{"y_range_V": (1.0, -1.0)}, {"y_lsb_V": 0.0}, {"drive_limits_V": {"Ay1": np.nan}}])

@@ -334,7 +334,7 @@ def test_inputs_that_cannot_be_told_apart_are_named(rng):
     system = Modal(rng, 1, 3, [25.0], 0.3, RATE)
     u = rng.standard_normal((2000, 3))
     u[:, 2] = 2 * u[:, 0]
-    with pytest.raises(ComputationError, match=r"u1, u3 cannot be told apart"):
+    with pytest.raises(ComputationError, match=r"u1, u3 cannot be distinguished"):
         local_polynomial(campaign([(u, system.simulate(u))], RATE))
     u[:, 2] = 0
     got = local_polynomial(campaign([(u, system.simulate(u))], RATE), band_Hz=(5, 80))

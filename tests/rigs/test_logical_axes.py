@@ -63,7 +63,7 @@ def test_axes_out_of_reach_are_named():
         actuator_axes(rig, ("x", "z"), ["Az1", "Az2", "Az3", "Az4"], quiet=[])
     with pytest.raises(InputError, match="cannot be pushed independently"):
         actuator_axes(rig, ("z", "phi_x", "phi_y"), ["Az1", "Az2"], quiet=[])
-    with pytest.raises(InputError, match="cannot be told apart by the sensors"):
+    with pytest.raises(InputError, match="cannot be distinguished by the sensors"):
         sensor_axes(rig, COORDINATES, ["Sz1", "Sz2", "Sz3", "Sx2", "Sy1"])
     with pytest.raises(InputError, match="out of"):
         sensor_axes(rig, ("z",), ["Sz9"])

@@ -198,4 +198,4 @@ def test_words_quote_the_rigs_own_numbers():
     equations = rig.equations_of_motion()
     f = np.sqrt(np.sort(eigh(equations.K, equations.M, eigvals_only=True))) / (2 * np.pi)
     words = next(one.words for one in judged(CONTENT["avis"], rig) if one.kind == "spread")
-    assert words == f"natural frequencies {f[0]:.3g} to {f[-1]:.3g} Hz, a ratio of {f[-1] / f[0]:.3g}"
+    assert words == f"natural frequencies {f[0]:.3g} to {f[-1]:.3g} Hz, ratio {f[-1] / f[0]:.3g}"

@@ -106,8 +106,8 @@ class ChannelOrder:
                 self.name,
                 "warning",
                 f"Sensor {quoted(alone)} agrees with no response of the model (correlation as low as"
-                f" {faults.other[worst]:.2f}), while the others do: its signal is more than {1000 * high:g} ms late or"
-                f" {-1000 * low:g} ms early, is not what the channel list says, or the model lacks an effect there.",
+                f" {faults.other[worst]:.2f}), while the others do. Its signal is more than {1000 * high:g} ms late or"
+                f" {-1000 * low:g} ms early, or the channel list is wrong, or the model lacks an effect there.",
                 alone,
                 value=float(faults.other[worst]),
                 limit=enough,
@@ -117,9 +117,9 @@ class ChannelOrder:
         if faults.doubtful:
             names = [(campaign.y_names if what == "row" else campaign.u_names)[k] for what, k in faults.doubtful]
             sentence = (
-                f"Model and records agree too little to check the order of the channels ({least}; another order or sign"
-                f" of {quoted(names)} would agree better, but an inaccurate model can do that by chance). Check the"
-                " channel list by hand."
+                "The agreement of model and records is too poor to check the order of the channels"
+                f" ({least}; another order or sign of {quoted(names)} would agree better, but an inaccurate model can"
+                " cause that, too). Check the channel list by hand."
             )
         else:
             sentence = f"No other order of the channels agrees better with the model ({least})."
@@ -160,8 +160,8 @@ class ChannelOrder:
                 Finding(
                     self.name,
                     "stop",
-                    f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay do not"
-                    f" count; probability by chance at most {chance:.1g}). Exchange their names or their cables.",
+                    f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay are"
+                    f" fitted; p-value at most {chance:.1g}). Exchange their names or their cables.",
                     pair,
                     value=float(gain),
                     limit=comparison.settings.least_agreement,
@@ -231,14 +231,14 @@ class Polarity:
         )
         both = np.count_nonzero(r < 0) + np.count_nonzero(c < 0)
         total = len(r) + np.count_nonzero(comparison.moving)
-        doubt = " It could as well be that all the other channels are flipped." if 2 * both == total else ""
+        doubt = " It is equally possible that all other channels are reversed." if 2 * both == total else ""
         said = [
             (campaign.y_names[k], "Sensor", -float(faults.other[k]),
              f"correlation {-faults.other[k]:.2f} where +1 is expected", faults.chance["row", int(k)])
             for k in np.flatnonzero(r < 0)
         ] + [
             (campaign.u_names[k], "Drive", faults.columns[k][1] - faults.columns[k][2],
-             f"flipping it raises the correlation of sensor {campaign.y_names[faults.columns[k][0]]!r} from"
+             f"reversing it raises the correlation of sensor {campaign.y_names[faults.columns[k][0]]!r} from"
              f" {faults.columns[k][1]:.2f} to {faults.columns[k][2]:.2f}", faults.chance["column", k])
             for k in map(int, np.flatnonzero(c < 0))
         ]
@@ -246,9 +246,9 @@ class Polarity:
             Finding(
                 self.name,
                 "stop",
-                f"{what} {name!r} has the opposite sign of the model ({how}; probability by chance at most"
-                f" {chance:.1g}). Its leads are exchanged, or the model's axis points the other way; exchange them or"
-                f" flip the channel's sign.{doubt}",
+                f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {chance:.1g}). Its leads"
+                f" are exchanged, or the model's axis has the opposite direction. Exchange the leads or reverse the"
+                f" sign of the channel.{doubt}",
                 (name,),
                 value=value,
                 limit=-comparison.settings.least_agreement,
@@ -261,7 +261,8 @@ class Polarity:
                 Finding(
                     self.name,
                     "note" if faults.doubtful else "ok",
-                    "The signs could not be checked: model and records agree too little." if faults.doubtful else
+                    "The signs could not be checked: the agreement of model and records is too poor."
+                    if faults.doubtful else
                     f"All signs agree with the model (lowest correlation of a sensor {faults.other.min():.2f}).",
                     value=float(faults.other.min()),
                     limit=comparison.settings.least_agreement,

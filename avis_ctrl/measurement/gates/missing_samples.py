@@ -119,9 +119,9 @@ class MissingSamples(Gate):
                     Finding(
                         self.name,
                         "stop",
-                        f"In record {name} the measured channels come {abs(size):.1f} samples"
-                        f" {'earlier' if size < 0 else 'later'} behind the commanded voltage from about"
-                        f" {k.t[at] - k.header.start_s:.4g} s on: about {max(1, round(abs(size)))} samples were"
+                        f"In record {name} the delay of the measured channels after the commanded voltage becomes"
+                        f" {abs(size):.1f} samples {'shorter' if size < 0 else 'longer'} at about"
+                        f" {k.t[at] - k.header.start_s:.4g} s: about {max(1, round(abs(size)))} samples were"
                         f" {'lost' if size < 0 else 'doubled'}. Repeat the record, or use only the part before.",
                         (),
                         (name,),
@@ -136,7 +136,7 @@ class MissingSamples(Gate):
             vague = sum(len(k.t) > 3 for k in kept) - len(told)
             scatter = float(max((np.std(k.delay[0]) for k in told), default=np.nan))
             said = f"; the delay scatters by at most {scatter:.2g} samples r.m.s." if told else ""
-            said += f"; in {vague} y follows u too loosely to tell" if vague else ""
+            said += f"; in {vague} the correlation of y with u is too low for this check" if vague else ""
             found.append(
                 Finding(
                     self.name,
