@@ -156,7 +156,7 @@ def test_lost_samples_are_counted(make, count):
     found = [f for f in alarms(changed(campaign, 0, y=y), known(response=None)) if f.gate == "missing samples"]
     assert [f.records for f in found] == [("00",)]
     assert found[0].value == pytest.approx(-count, abs=0.3)
-    assert "samples earlier behind" in found[0].sentence and f"about {count} samples were lost" in found[0].sentence
+    assert "samples shorter" in found[0].sentence and f"about {count} samples were lost" in found[0].sentence
 
 
 def test_rows_lost_from_u_and_y(clean):
@@ -296,7 +296,7 @@ def test_half_of_the_channels_flipped_could_be_the_other_half(rng, flips):
         np.exp(-1j * np.outer(omega, np.arange(8)) / RATE), h, 1))
     found = channel_alarms(Campaign("", (Record(header, u, y),)), expectation)
     assert [f.gate for f in found] == ["polarity"] * flips
-    assert all(("all the other channels are flipped" in f.sentence) == (flips == 2) for f in found)
+    assert all(("all other channels are reversed" in f.sentence) == (flips == 2) for f in found)
 
 
 @pytest.mark.parametrize("late", [4, 8, 15])
