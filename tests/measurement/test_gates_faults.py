@@ -135,7 +135,8 @@ def test_a_drive_that_never_moves_is_noted(clean):
     assert said.severity == "ok"
     idle = everywhere(clean, lambda u, y: (u * (np.arange(8) != 2), y))
     (said,) = [f for f in examine(idle, known(response=None)) if f.gate == "dead channel"]
-    assert (said.severity, said.channels) == ("note", ("Ax2",)) and "'Ax2' is constant in every driven record" in said.sentence
+    assert (said.severity, said.channels) == ("note", ("Ax2",))
+    assert "'Ax2' is constant in every driven record" in said.sentence
 
 
 def test_false_alarms_of_spikes():
