@@ -375,3 +375,29 @@ def test_parameter_errors_are_no_channel_faults():
                 wrong[name] = p.value * (1 + (0.05 if p.unit == "N/m" else 0.2) * rng.choice([-1, 1]))
         assert len(wrong) == 24
         assert not channel_alarms(SHORT, known(response=response_of(RIG.with_parameters(wrong))))
+
+
+def test_sensors_that_a_motion_makes_read_alike_are_no_copies():
+    """A table driven along one axis after the other: symmetric sensors agree in some records, a copy in all."""
+    rng = np.random.default_rng(12)
+    one, two = (signal.sosfilt(signal.butter(2, [2, 40], "bandpass", fs=RATE, output="sos"), rng.standard_normal(6000))
+                for _ in range(2))
+    shapes = np.array([[1.0, 1.0, 0.3], [1.0, -1.0, 0.5]])
+
+    def campaign(doubled: bool, records: int) -> Campaign:
+        made = []
+        for k in range(records):
+            y = np.outer(one, shapes[k]) + 1e-5 * rng.standard_normal((6000, 3))
+            y[:, 2] = 2 * y[:, 0] if doubled else y[:, 2]
+            header = RecordHeader(f"{k:02d}", RATE, 6000, ("u1", "u2"), ("y1", "y2", "y3"), "noise", 1.0, 10.0 * k)
+            made.append(Record(header, np.outer(two if k else one, np.eye(2)[k]), y))
+        return Campaign("", tuple(made))
+
+    def said(measured: Campaign, model=None) -> list[tuple[str, tuple[str, ...]]]:
+        found = examine(measured, Expectation(response=model))
+        return [(f.severity, f.channels) for f in found if "times" in f.sentence and len(f.channels) == 2]
+    assert said(campaign(False, 2)) == []
+    assert said(campaign(True, 2)) == [("stop", ("y1", "y3"))]
+    assert said(campaign(False, 1)) == [("stop", ("y1", "y2")), ("stop", ("y1", "y3")), ("stop", ("y2", "y3"))]
+    assert said(campaign(False, 1), lambda omega, inputs: np.tensordot(np.ones(len(omega)), shapes.T, 0)) == [
+        ("note", ("y1", "y2")), ("note", ("y1", "y3")), ("note", ("y2", "y3"))]
