@@ -262,7 +262,7 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
         notes = [*notes, said]
     found = fit(model, blocks, priors, starts, seed=seed, progress=progress)
     first = found
-    if isinstance(campaign, FrequencyResponse) or not blocks[0].transient:
+    if isinstance(campaign, FrequencyResponse):
         return CampaignFit(found, first, band_Hz, (*notes, *_bounds(found)), model)
     turning, added = chosen_turning(campaign, blocks, found.model)
     found = fit(replace(found.model, turning=turning), without(blocks, added), priors, seed=seed, about=model)

@@ -1,5 +1,7 @@
 """The response against the exact discretisation, its derivatives against differences, transients against records."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from exact import discrete_avis, multisine, record
@@ -38,6 +40,15 @@ def test_against_the_exact_discretisation(avis):
 def test_what_must_be_positive(words, expected):
     """Masses, moments of inertia, stiffness, damping and gains; no product of inertia, no place, no effect's own."""
     assert {name: positive(name) for name in words.split()} == dict.fromkeys(words.split(), expected)
+
+
+def test_an_amplifier_lags_by_its_corner(avis):
+    """In continuous time the response to a voltage is that without amplifier times 1 / (1 + j f / corner)."""
+    plain = replace(ResponseModel.of(avis, ["mass"]), period_s=0.0, delay_s=0.0)
+    f = np.array([0.5, 3.0, 50.0, 400.0])
+    lag = 1 / (1 + 1j * f[:, None, None] / 50.0)
+    slow = replace(plain, amplifier_corner_Hz=50.0).response(2 * np.pi * f)[:, :, :8]
+    np.testing.assert_allclose(slow, lag * plain.response(2 * np.pi * f)[:, :, :8], rtol=1e-12)
 
 
 def test_aliases_matter(avis):

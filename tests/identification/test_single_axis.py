@@ -205,6 +205,9 @@ def test_the_ground_response_at_the_corner():
     names, values = ("corner_Hz", "damping", "sensitivity"), np.array([0.5, 0.7, 100.0])
     at_corner = response(np.array([0.5]), names, values)["ground"]
     assert at_corner[0] == pytest.approx(1j * 100.0 / 1.4)
+    # g s / (s^2 + 2 zeta w s + w^2) of the coil: all force against the damping alone.
+    at_corner = response(np.array([0.5]), ("corner_Hz", "damping", "gain"), np.array([0.5, 0.7, 3.0]))["coil"]
+    assert at_corner[0] == pytest.approx(3.0 / (1.4 * 2 * np.pi * 0.5))
 
 
 def test_the_band_of_a_fit_is_the_scatter_of_its_parameters(rng):

@@ -178,6 +178,13 @@ def test_the_interval_of_chi_square_allows_for_the_noise_estimated(found, checke
     assert np.log(high / low) == pytest.approx(np.log(law.ppf(0.975) / law.ppf(0.025)), rel=0.01)
 
 
+def test_chi_square_is_consistent_inside_its_interval_and_at_its_ends(checked):
+    one = checked.held_out[0]
+    low, high = one.chi2_interval
+    for value, inside in ((0.99 * low, False), (low, True), (1.0, True), (high, True), (1.01 * high, False)):
+        assert replace(one, chi2_per_dof=value).consistent == inside
+
+
 def white_error(rng, n=400, n_y=3, n_u=2, white=None):
     omega = 2 * np.pi * np.linspace(1, 41, n)
     U = rng.normal(size=(n, n_u, 1)) + 1j * rng.normal(size=(n, n_u, 1))

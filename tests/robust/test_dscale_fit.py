@@ -176,6 +176,20 @@ def test_scaled_plant_is_the_product_of_its_parts(rng):
     assert np.allclose(again.scale(P).frequency_response(omega), expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_roots_beyond_the_band_move_to_its_edge_and_leave_the_magnitude(order):
+    """Zeros fast and poles slow, and the other way round: d is known far inside, where each is a constant or a slope.
+    """
+    fast, slow = -(10.0 ** np.arange(5.0, 5.0 + order)), -(10.0 ** -np.arange(5.0, 5.0 + order))
+    inside = np.geomspace(0.1, 10.0, 7)
+    for zeros, poles in ((fast, slow), (slow, fast), (fast, -np.ones(order)), (-np.ones(order), fast)):
+        d = ScalarScaling.from_roots(2.0, zeros, poles)
+        moved = d.within((1e-4, 1e4))
+        sizes = np.abs(np.concatenate([moved.zeros, moved.poles]))
+        assert np.all((sizes > 0.999e-4 / 100) & (sizes < 1.001e4 * 100))
+        assert np.allclose(poly_magnitude(moved, inside) / poly_magnitude(d, inside), 1.0, rtol=0.1)
+
+
 def test_slopes_of_the_magnitude_are_its_derivatives(rng):
     d = rational(rng, 5)
     h = 1e-6
@@ -262,3 +276,24 @@ def test_a_repeated_block_is_fitted_where_its_misfit_costs_most():
     step = d_step(PointwiseScalings.of(omega, N.frequency_response(omega), structure), N,
                   Scalings.identity(structure), allowed_cost=0.05)
     assert step.cost < 0.05 and min(step.scalings.orders[:2]) > 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_constants_are_refined_to_the_best_there_are(seed):
+    """Two blocks, from 0.3 off in log d, against Nelder and Mead; steps that promise 0.1 % or less are not taken."""
+    rng = np.random.default_rng(seed)
+    N = StateSpace(-np.diag(10.0 ** rng.uniform(-1, 1, 4)), rng.normal(size=(4, 3)), rng.normal(size=(3, 4)),
+                   0.1 * rng.normal(size=(3, 3)))
+    structure = BlockStructure.of([ComplexFull(1, 1), ComplexFull(1, 1)]).with_performance(1, 1)
+    omega = np.geomspace(1e-2, 1e2, 30)
+    M = N.frequency_response(omega)
+
+    def peak(log_d):
+        d = np.exp([*log_d, 0.0])
+        return np.max(np.linalg.norm(d[:, None] * M / d, ord=2, axis=(1, 2)))
+
+    best = min((so.minimize(peak, rng.normal(size=2), method="Nelder-Mead") for _ in range(3)), key=lambda x: x.fun)
+    start = Scalings(structure, tuple(map(ScalarScaling.constant, np.exp([*(best.x + 0.3), 0.0]))))
+    step = tightened(PointwiseScalings.of(omega, M, structure), N, start, np.inf, 0)
+    found = peak([part.theta[0] for part in step.scalings.parts[:2]])
+    assert found < 1.003 * best.fun < 0.99 * peak(best.x + 0.3)
