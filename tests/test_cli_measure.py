@@ -192,3 +192,6 @@ def test_what_the_rig_cannot_play_names_the_plan_and_its_record(tmp_path):
     done = avis("simulate-campaign", "--rig", "avis", "--plan", str(plan), "--out", str(tmp_path / "c.h5"))
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert done.stderr.startswith(f"avis: {plan}: record[1].band_Hz = "), done.stderr
+    for option in ("--perturbed", "--orthogonal"):
+        done = avis("simulate-campaign", "--rig", "avis", "--plan", str(plan), option, "--out", str(tmp_path / "c.h5"))
+        assert done.returncode == 2 and "belong to the default plan" in done.stderr

@@ -183,7 +183,9 @@ def _summary(console, found) -> None:
     from avis_ctrl.study.identification import CAUTION
 
     console.print(table)
-    for sentence in (CAUTION, *found.campaign_fit.notes, *found.identifiability.sentences, *found.validation.sentences):
+    verdict, *validation = found.validation.sentences
+    console.print(f"{verdict[:1].upper()}{verdict[1:]}.")
+    for sentence in (CAUTION, *found.campaign_fit.notes, *validation, *found.identifiability.sentences, *found.advice):
         console.print(f"- {sentence}")
 
 

@@ -102,6 +102,9 @@ def simulate_campaign(
     for written in (out, write_plan, truth):
         if written is not None:
             require_other(written, plan, rig)
+    if plan and (perturbed or orthogonal):
+        raise InputError("these belong to the default plan; in a plan, write perturb_percent under [truth] and scheme "
+                         "under [multisine]", field="--perturbed, --orthogonal")
     console = Console(highlight=False)
     table = load_rig(rig)
     chosen = read_plan(plan) if plan else default_plan(table, "orthogonal" if orthogonal else "zippered",
