@@ -185,8 +185,10 @@ def _summary(console, found) -> None:
     console.print(table)
     verdict, *validation = found.validation.sentences
     console.print(f"{verdict[:1].upper()}{verdict[1:]}.")
-    for sentence in (CAUTION, *found.campaign_fit.notes, *validation, *found.identifiability.sentences, *found.advice):
+    for sentence in (CAUTION, *found.campaign_fit.notes, *validation, *found.identifiability.sentences):
         console.print(f"- {sentence}")
+    if found.advice:
+        console.print(f"- {found.advice[0]} (Other records that would help are in section 5 of the report.)")
 
 
 def single_axis(

@@ -77,8 +77,8 @@ class HeldOut:
 
     @property
     def consistent(self) -> bool:
-        """Whether chi-square is inside its interval."""
-        return self.chi2_interval[0] <= self.chi2_per_dof <= self.chi2_interval[1]
+        """Whether chi-square is not above its interval. Below it the record has less noise than the fitted ones."""
+        return self.chi2_per_dof <= self.chi2_interval[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ class Validation:
 
     @property
     def passed(self) -> bool:
-        """Chi-square inside its interval and residuals white in every held-out record."""
+        """Chi-square not above its interval and residuals white in every held-out record."""
         return all(one.consistent and (one.whiteness is None or one.whiteness.white) for one in self.held_out)
 
     def as_dict(self) -> dict[str, Any]:

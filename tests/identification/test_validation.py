@@ -178,10 +178,11 @@ def test_the_interval_of_chi_square_allows_for_the_noise_estimated(found, checke
     assert np.log(high / low) == pytest.approx(np.log(law.ppf(0.975) / law.ppf(0.025)), rel=0.01)
 
 
-def test_chi_square_is_consistent_inside_its_interval_and_at_its_ends(checked):
+def test_chi_square_is_consistent_up_to_the_end_of_its_interval(checked):
+    """Below it the record has less noise than the fitted ones, which is no error of the model."""
     one = checked.held_out[0]
     low, high = one.chi2_interval
-    for value, inside in ((0.99 * low, False), (low, True), (1.0, True), (high, True), (1.01 * high, False)):
+    for value, inside in ((0.99 * low, True), (low, True), (1.0, True), (high, True), (1.01 * high, False)):
         assert replace(one, chi2_per_dof=value).consistent == inside
 
 

@@ -49,8 +49,8 @@ def _records(found: Identification) -> Table:
     return table(f"Chi-square per degree of freedom of the held-out data, with its 95 % interval if only noise and the "
                  f"parameters' uncertainty are left. Noise: {noise}. \"Local noise\" is the same chi-square with the "
                  "noise covariance of a local polynomial model.",
-                 ("record", "lines", "chi-square", "expected", "start model", "local noise", "inside", "white"), rows,
-                 "lrrrrrcc")
+                 ("record", "lines", "chi-square", "expected", "start model", "local noise", "consistent", "white"),
+                 rows, "lrrrrrcc")
 
 
 def _places(outputs: tuple[str, ...]) -> tuple[np.ndarray, Axis]:
