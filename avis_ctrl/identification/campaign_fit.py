@@ -33,6 +33,9 @@ class CampaignFitSettings:
         into frequency responses would flatten the resonances.
     silent_line : ratio of the drive's amplitude at a line to that at the record's strongest line, below which the line
         counts as silent: -60 dB, a millionth of the power.
+    least_excited : ratio of the power in the other records to that in a record, for each combination of drives that it
+        excites, above which the record may be held out: at a tenth of its amplitude the others still determine what
+        the response to that combination is.
     quiet_band_Hz : band of the fit where no input shows what band is excited: the band of the floor velocity in a rig
         file.
     tail : share of an input's power that may lie below the band of the fit, and above it; the noise of a generator has
@@ -44,6 +47,7 @@ class CampaignFitSettings:
     longest_piece: int = 1 << 18
     most_lines: int = 60_000
     silent_line: float = 1e-3
+    least_excited: float = 0.01
     quiet_band_Hz: tuple[float, float] = (0.5, 60.0)
     tail: float = 5e-4
     floor_tail: float = 0.02
@@ -81,18 +85,35 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
                              value=list(hold_out))
         return Split(campaign.only(rest), campaign.only(tuple(hold_out)),
                      f"records {', '.join(hold_out)} held out, as specified")
-    driven = {record.header.name: driven_inputs(record) for record in campaign.records}
-    active = [name for name in names if driven[name]]
+    active = {record.header.name: power for record in campaign.records if np.any(power := drive_power(record))}
     for name in reversed(active):
-        others = [driven[other] for other in active if other != name]
-        # One record alone seldom tells several inputs apart: never less than two are left.
-        if len(others) >= 2 and driven[name] <= set().union(*others):
+        others = [power for other, power in active.items() if other != name]
+        # The response to several inputs can seldom be separated with one record: never less than two are left.
+        if len(others) >= 2 and excites_as_well(np.sum(others, axis=0), active[name]):
             rest = tuple(other for other in names if other != name)
             return Split(campaign.only(rest), campaign.only((name,)), f"record {name} held out")
     parts = [divided(record) for record in campaign.records]
     return Split(replace(campaign, records=tuple(first for first, _ in parts)),
                  replace(campaign, records=tuple(last for _, last in parts)),
                  "the last third of every record held out, because too few records excite every input")
+
+
+def drive_power(record: RecordSource) -> np.ndarray:
+    """(n_u, n_u) sum of u u^T over the first quarter of a million samples."""
+    u = record.load(0, min(record.header.samples, SETTINGS.longest_piece)).u
+    return u.T @ u
+
+
+def excites_as_well(others: np.ndarray, one: np.ndarray) -> bool:
+    """Whether every combination of drives that one record excites, with power `one` (n_u, n_u), is excited by others.
+
+    Records along the logical axes drive the same motors in other combinations: without the one that turns the table,
+    nothing is known of that turn.
+    """
+    power, V = np.linalg.eigh(one)
+    excited = power > SETTINGS.silent_line ** 2 * power[-1]
+    whitened = V[:, excited] / np.sqrt(power[excited])
+    return bool(np.linalg.eigvalsh(whitened.T @ others @ whitened)[0] > SETTINGS.least_excited)
 
 
 def driven_inputs(record: RecordSource) -> set[str]:
