@@ -24,7 +24,7 @@ def clutter_table(cases: Sequence[Judged]) -> Table:
     rows = tuple((name, *(column[name] for column in columns)) for name in columns[0]) if columns else ()
     return Table("Clean and cluttered tables", ("", *groups), rows,
                  "A trace of a cluttered table (hum, friction, stiffening, loss) is there, so that its name is no "
-                 "false one; neither is what the answer itself lists under traces. Best possible: the true table with its "
+                 "false one; nor is what the answer lists under its own traces. Best possible: the true table with its "
                  "traces and all that is random switched off, against the same measured records.")
 
 

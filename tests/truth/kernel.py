@@ -263,7 +263,8 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
                 o = o_fri + 8 * h + j
                 z, s0, level = x[o], P.fric_s0[h, j], P.fric_Fc[h, j]
                 if P.fric_jenkins > 0:
-                    zd = 0.0 if abs(s0 * z) >= level and z * v > 0 else v
+                    # Slipping, it stays at its force; what a step carried it beyond is taken back within a millisecond.
+                    zd = 1e3 * (np.sign(z) * level / s0 - z) if abs(s0 * z) >= level and z * v > 0 else v
                     force -= min(max(s0 * z, -level), level)
                 else:
                     level += (P.fric_Fs[h, j] - level) * np.exp(-(v / P.fric_vs) ** 2)
