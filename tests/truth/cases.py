@@ -23,7 +23,7 @@ import numpy as np
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordHeader
 from avis_ctrl.rigs import AvisTable, load_rig
 
-from .clutter import Pilot, disturb, draw_traces, tolerances
+from .clutter import Pilot, add_trace, disturb, draw_traces, tolerances
 from .effect import STRENGTHS, Draw, Effect, Hidden
 from .kernel import integrate, state_size
 from .library_mechanics import MECHANICS
@@ -157,7 +157,9 @@ def build_plant(case: Case) -> Plant:
     plant = draw_plant(rig(), _rng(case.seed, _PARAMETERS))
     if case.clutter:
         disturb(plant, tolerances(rig()), _rng(case.seed, _CLUTTER))
-    for hidden in (*case.traces, *case.effects):
+    for trace in case.traces:
+        add_trace(plant, trace, LIBRARY)
+    for hidden in case.effects:
         (LIBRARY | OUTSIDE_LIBRARY)[hidden.name].apply(plant, hidden)
     return plant
 

@@ -2,7 +2,8 @@
 
 A trace is sized by what it leaves unexplained: of the change that it makes in the response, the part that no small
 change of mass, inertia, stiffness and damping takes away, over the response, both r.m.s. (mean square over channels,
-each in units of its own r.m.s.).
+each in units of its own r.m.s.). The other part is taken from mass, inertia, stiffness and damping when the trace is
+added, so that the table without its traces is the best model of it that knows nothing of them.
 """
 
 from __future__ import annotations
@@ -79,8 +80,10 @@ class Pilot:
         self.u = multisine(rng, n, 8, n, band_Hz, rate, 1.0)
         self.y = self._responses(build(), self.levels)
         # The table alone is linear in the level, so that one level tells what refitting changes at all of them.
-        changes = [np.outer(self.levels / self.levels[1], self._changed(nudge, slice(1, 2))) for nudge in NUDGES]
-        self.refit = np.linalg.qr(np.stack(changes, axis=-1).reshape(-1, len(NUDGES)))[0]
+        changes = [np.outer(self.levels / self.levels[1],
+                            self._changed(lambda plant, one=one: nudge(plant, one, NUDGE), slice(1, 2)))
+                   for one in RIGID]
+        self.refit, self.size = np.linalg.qr(np.stack(changes, axis=-1).reshape(-1, len(RIGID)))
 
     def _responses(self, plant: Plant, levels: np.ndarray) -> np.ndarray:
         return np.array([self.run(plant, level * self.u) for level in levels])
@@ -91,31 +94,31 @@ class Pilot:
         apply(plant)
         return (self._responses(plant, self.levels[levels]) - self.y[levels]) / self.y.std(axis=(0, 1))
 
-    def unexplained(self, apply: Callable[[Plant], None]) -> float:
-        """The r.m.s. of the part of that change that no refit takes away."""
+    def explained(self, apply: Callable[[Plant], None]) -> tuple[float, np.ndarray]:
+        """The r.m.s. of the part of that change that no refit takes away, and the refit (relative, as RIGID)."""
         change = self._changed(apply, slice(None)).ravel()
-        return float(np.sqrt(np.mean((change - self.refit @ (self.refit.T @ change)) ** 2)))
+        parts = self.refit.T @ change
+        return float(np.sqrt(np.mean((change - self.refit @ parts) ** 2))), NUDGE * np.linalg.solve(self.size, parts)
 
 
-def _nudges() -> tuple[Callable[[Plant], None], ...]:
-    """Small changes of mass, moments of inertia, and the 8 stiffnesses and 8 dampings that motion tells apart."""
-    def mass(plant: Plant) -> None:
-        plant.m *= 1.001
-
-    def inertia(axis: int) -> Callable[[Plant], None]:
-        def nudge(plant: Plant) -> None:
-            plant.J[axis, axis] *= 1.001
-        return nudge
-
-    def mount(name: str, i: int, axis: int) -> Callable[[Plant], None]:
-        def nudge(plant: Plant) -> None:
-            getattr(plant, name)[i, axis] *= 1.001
-        return nudge
-    told = ((0, 0), (2, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (3, 2))
-    return (mass, *(inertia(axis) for axis in range(3)), *(mount(name, i, axis) for name in "kc" for i, axis in told))
+# Mass, moments of inertia, and the 8 stiffnesses and 8 dampings that payload motion tells apart: attribute, index.
+RIGID = (("m", ()), *(("J", (a, a)) for a in range(3)),
+         *((name, at) for name in "kc" for at in ((0, 0), (2, 0), (0, 1), (1, 1), *((i, 2) for i in range(4)))))
+NUDGE = 1e-3
 
 
-NUDGES = _nudges()
+def nudge(plant: Plant, which: tuple[str, tuple[int, ...]], relative: float) -> None:
+    """One of RIGID larger by a relative amount."""
+    value = np.array(getattr(plant, which[0]))
+    value[which[1]] *= 1 + relative
+    setattr(plant, which[0], value if which[1] else float(value))
+
+
+def add_trace(plant: Plant, trace: Hidden, library: dict[str, Effect]) -> None:
+    """The effect, and out of the table what a refit would put it down to."""
+    library[trace.name].apply(plant, trace)
+    for which, relative in zip(RIGID, trace.details["refit"], strict=True):
+        nudge(plant, which, -relative)
 
 
 def _friction(d: Draw) -> tuple[str, dict[str, float], dict[str, Any]]:
@@ -171,7 +174,8 @@ def draw_traces(d: Draw, pilot: Pilot, library: dict[str, Effect], leave_out: tu
     for name, fraction in zip(names, each, strict=True):
         trace = Hidden(name, *(drawn := TRACES[name][0](d))[:2], "trace", drawn[2])
         for _ in range(2):      # nearly linear in its size: the second step is small already
-            left = pilot.unexplained(lambda plant, trace=trace: library[trace.name].apply(plant, trace))
+            left, refit = pilot.explained(lambda plant, trace=trace: library[trace.name].apply(plant, trace))
             trace = scaled(trace, float(fraction) / left)
-        found.append(replace(trace, details=trace.details | {"unexplained": float(fraction)}))
+        refit *= fraction / left
+        found.append(replace(trace, details=trace.details | {"unexplained": float(fraction), "refit": refit.tolist()}))
     return tuple(found)
