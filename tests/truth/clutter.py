@@ -94,7 +94,7 @@ class Pilot:
         apply(plant)
         return (self._responses(plant, self.levels[levels]) - self.y[levels]) / self.y.std(axis=(0, 1))
 
-    def explained(self, apply: Callable[[Plant], None]) -> tuple[float, np.ndarray]:
+    def after_refit(self, apply: Callable[[Plant], None]) -> tuple[float, np.ndarray]:
         """The r.m.s. of the part of that change that no refit takes away, and the refit (relative, as RIGID)."""
         change = self._changed(apply, slice(None)).ravel()
         parts = self.refit.T @ change
@@ -174,7 +174,7 @@ def draw_traces(d: Draw, pilot: Pilot, library: dict[str, Effect], leave_out: tu
     for name, fraction in zip(names, each, strict=True):
         trace = Hidden(name, *(drawn := TRACES[name][0](d))[:2], "trace", drawn[2])
         for _ in range(2):      # nearly linear in its size: the second step is small already
-            left, refit = pilot.explained(lambda plant, trace=trace: library[trace.name].apply(plant, trace))
+            left, refit = pilot.after_refit(lambda plant, trace=trace: library[trace.name].apply(plant, trace))
             trace = scaled(trace, float(fraction) / left)
         refit *= fraction / left
         found.append(replace(trace, details=trace.details | {"unexplained": float(fraction), "refit": refit.tolist()}))

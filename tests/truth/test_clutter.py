@@ -200,8 +200,8 @@ def test_no_refit_takes_a_trace_away(traced):
     """Mass, inertia, stiffness and damping have given what they could already."""
     pilot = cases._pilot_of(traced)
     for one in traced.traces:
-        bare = pilot.explained(lambda plant, one=one: cases.LIBRARY[one.name].apply(plant, one))[0]
-        left = pilot.explained(lambda plant, one=one: clutter.add_trace(plant, one, cases.LIBRARY))[0]
+        bare = pilot.after_refit(lambda plant, one=one: cases.LIBRARY[one.name].apply(plant, one))[0]
+        left = pilot.after_refit(lambda plant, one=one: clutter.add_trace(plant, one, cases.LIBRARY))[0]
         plant = pilot.build()
         clutter.add_trace(plant, one, cases.LIBRARY)
         changed = np.array([response_to(plant, level * pilot.u)[0] for level in pilot.levels]) - pilot.y
