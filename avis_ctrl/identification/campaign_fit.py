@@ -34,8 +34,8 @@ class CampaignFitSettings:
     silent_line : ratio of the drive's amplitude at a line to that at the record's strongest line, below which the line
         counts as silent: -60 dB, a millionth of the power.
     least_excited : ratio of the power in the other records to that in a record, for each combination of drives that it
-        excites, above which the record may be held out: at a tenth of its amplitude the others still determine what
-        the response to that combination is.
+        excites and as far as the others can separate it, above which the record may be held out: at a tenth of its
+        amplitude they still determine the response to that combination.
     quiet_band_Hz : band of the fit where no input shows what band is excited: the band of the floor velocity in a rig
         file.
     tail : share of an input's power that may lie below the band of the fit, and above it; the noise of a generator has
@@ -108,12 +108,16 @@ def excites_as_well(others: np.ndarray, one: np.ndarray) -> bool:
     """Whether every combination of drives that one record excites, with power `one` (n_u, n_u), is excited by others.
 
     Records along the logical axes drive the same motors in other combinations: without the one that turns the table,
-    nothing is known of that turn.
+    nothing is known of that turn. Least squares from the others would know the response to d, a combination, with the
+    variance d^T inv(others) d; from the record itself with d^T inv(one) d. The worst ratio decides.
     """
     power, V = np.linalg.eigh(one)
     excited = power > SETTINGS.silent_line ** 2 * power[-1]
-    whitened = V[:, excited] / np.sqrt(power[excited])
-    return bool(np.linalg.eigvalsh(whitened.T @ others @ whitened)[0] > SETTINGS.least_excited)
+    root = V[:, excited] * np.sqrt(power[excited])
+    # What the others do not excite at all has a large variance, not an infinite one.
+    rest = others + SETTINGS.silent_line ** 2 * np.linalg.eigvalsh(others)[-1] * np.eye(len(others))
+    ratio = np.linalg.eigvalsh(root.T @ np.linalg.solve(rest, root))[-1]
+    return bool(ratio * SETTINGS.least_excited < 1)
 
 
 def driven_inputs(record: RecordSource) -> set[str]:
