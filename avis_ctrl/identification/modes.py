@@ -250,7 +250,9 @@ class _Poles:
             size = np.linalg.norm(A, axis=0) + np.finfo(float).tiny
             Q, R = np.linalg.qr(A / size)
             b = _real(weight * y)
-            c = (np.linalg.lstsq(R, Q.T @ b, rcond=1e-12)[0] / size)[:poles.shape[0] * n * self.through.shape[1]]
+            # By QR with pivots: the divide-and-conquer SVD of numpy's lstsq may end without an answer.
+            c = la.lstsq(R, Q.T @ b, cond=1e-12, lapack_driver="gelsy")[0] / size
+            c = c[:poles.shape[0] * n * self.through.shape[1]]
             filtered = np.einsum("akc,amc->km", powers * self.through, c.reshape(2, n, -1))
             slope = _real(weight[:, None] * np.tile(filtered, 2) * slopes)
             left.append(b - Q @ (Q.T @ b))
