@@ -348,8 +348,8 @@ def test_a_small_share_in_a_weak_direction_counts():
 def test_the_worst_known_direction_is_said_where_it_is_weak(sigma):
     """a known to 1e-4, b to sigma."""
     info = Information(("a", "b"), np.ones(2), ("m", "m"), np.diag([1e8, sigma ** -2]), np.ones(2))
-    said = [one for one in identifiability_report(info).sentences if "worst known combination" in one]
-    assert [("b by +90 %" in one, "a by" in one) for one in said] == ([(True, False)] if sigma == 0.9 else [])
+    said = [one for one in identifiability_report(info).sentences if "least precise combination" in one]
+    assert [("changing b by +90 %" in one, " a by" in one) for one in said] == ([(True, False)] if sigma == 0.9 else [])
 
 
 def test_the_covariance_of_a_filter_gives_its_data_information_back(avis):

@@ -167,10 +167,10 @@ def test_combinations_of_drives_that_no_record_plays_are_told():
     assert space(drives).full and not space(drives).sentence
     drives[:, 2] = 0
     assert space(drives).full
-    assert "no record drives Ax2: its own response is unknown, and the rig file's values for it are" in space(
+    assert "no record drives Ax2: its response is not measured, and the rig file's values for it are" in space(
         drives).sentence
     drives[:, 3] = 0
-    assert "Ax2, Az2: their own response is unknown, and the rig file's values for them are" in space(drives).sentence
+    assert "Ax2, Az2: their response is not measured, and the rig file's values for them are" in space(drives).sentence
     drives[:, 2], drives[:, 3] = drives[:, 0], 2 * drives[:, 1]
     assert "excite 6 of 8" in space(drives).sentence
     # Either way round, and of any size.

@@ -191,7 +191,7 @@ def test_of_too_many_lines_some_driven_ones_are_fitted(avis, monkeypatch):
     campaign = Campaign("avis", (one, replace(one, header=replace(one.header, name="01"))))
     monkeypatch.setattr(campaign_fit, "SETTINGS", campaign_fit.CampaignFitSettings(most_lines=100))
     blocks, said = campaign_fit.campaign_blocks(campaign, model, (10.0, 30.0))
-    assert [len(block.omega) for block in blocks] == [50, 50] and "100 of 400 lines" in said[0]
+    assert [len(block.omega) for block in blocks] == [50, 50] and "100 of 400 spectral lines" in said[0]
     lines = np.rint(blocks[0].omega * 10 / (2 * np.pi)).astype(int)
     assert np.all(lines % 2 == 0) and np.all(np.diff(lines) > 0)
     monkeypatch.setattr(campaign_fit, "SETTINGS", campaign_fit.CampaignFitSettings(most_lines=1000))
@@ -210,7 +210,7 @@ def test_eight_drives_played_along_six_axes_are_fitted_like_any(avis, monkeypatc
     monkeypatch.setattr(campaign_fit, "SETTINGS", campaign_fit.CampaignFitSettings(most_lines=300))
     found = campaign_fit.fit_campaign(Campaign("avis", tuple(records)), ResponseModel.of(avis, BODY), (2.0, 25.0),
                                       reweights=1)
-    assert found.measured and any("of 552 lines are fitted" in note for note in found.notes)
+    assert found.measured and any("of 552 spectral lines are fitted" in note for note in found.notes)
     assert 0.6 < found.first.chi2_per_dof < 1.4
     assert np.allclose(found.fit.values, true.values, rtol=1e-3)
 

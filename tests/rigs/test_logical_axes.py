@@ -81,7 +81,7 @@ def test_two_sensors_on_a_line_read_z_unless_the_roll_is_to_be_told_apart():
     found = sensor_axes(rig, ("z",), ["Sz1", "Sz2"])
     assert np.allclose(found.decoding, [[0.5, 0.5]], atol=1e-12)
     assert np.allclose(found.leftover[0], [0, 0, -0.375 / rig.edge_m, 0, 0], atol=1e-12)
-    with pytest.raises(InputError, match="z and phi_x cannot be told apart"):
+    with pytest.raises(InputError, match="z and phi_x cannot be distinguished"):
         sensor_axes(rig, ("z",), ["Sz1", "Sz2"], resolved=["phi_x"])
 
 
