@@ -128,6 +128,9 @@ class Rig(ABC):
         raise InputError("a rig file of this kind has one sensitivity for all; leave these out", field="parameters",
                          value=[f"sensor.{name}" for name in gains])
 
+    def channel_slope(self, name: str) -> tuple[str, str, np.ndarray] | None:
+        return None
+
     def sensor_rows(self) -> tuple[tuple[str, ...], np.ndarray]:
         """Sensor names and the (n, 6) matrix from q to the displacement along each sensor's axis."""
         axes = self.sensor_axes()
