@@ -1,0 +1,75 @@
+"""The parameters of a rig with their priors: what is re-identified, and the tolerances of what the rig file states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.gap_engine.settings import GapSettings
+from avis_ctrl.identification.parameter_sets import default_parameters
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.rigs.instruments import Tolerances
+from avis_ctrl.rigs.rig import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """Normal priors of free parameters: value = mean + sigma z, z standard normal; of positive ones log value is so.
+
+    names : (n,). mean, sigma : (n,), units of the parameters; of a positive one sigma is that of the logarithm.
+    positive : (n,) bool.
+    """
+
+    names: tuple[str, ...]
+    mean: np.ndarray
+    sigma: np.ndarray
+    positive: np.ndarray
+
+    def values(self, z: np.ndarray) -> np.ndarray:
+        """(n,) of the parameters at standardised values z (n,)."""
+        return np.where(self.positive, self.mean * np.exp(np.where(self.positive, self.sigma, 0.0) * z),
+                        self.mean + self.sigma * z)
+
+    def slopes(self, z: np.ndarray) -> np.ndarray:
+        """(n,) derivative of the values by z."""
+        return np.where(self.positive, self.sigma * self.values(z), self.sigma)
+
+
+def re_identified(rig: Rig, settings: GapSettings = GapSettings()) -> Priors:
+    """Mass, moments of inertia, stiffness and damping: what every identification leaves free."""
+    known, names = rig.parameters(), default_parameters(rig)
+    mean = np.array([known[name].value for name in names])
+    damping = np.array([known[name].unit.startswith("N s") or known[name].unit.startswith("N m s") for name in names])
+    sigma = np.where(damping, settings.damping_percent, settings.stiffness_percent) / 100
+    return Priors(names, mean, sigma, np.ones(len(names), bool))
+
+
+def with_tolerances(model: ResponseModel, tolerances: Tolerances, settings: GapSettings = GapSettings()) -> Priors:
+    """The same and every value of the rig file that has a tolerance; the model has its channels apart."""
+    first, known = re_identified(model.rig, settings), model.all_parameters()
+    rest = {name: sigma for name in known if name not in first.names and (sigma := _sigma(name, tolerances))}
+    mean = np.array([known[name].value for name in rest])
+    relative = np.array([name.partition(".")[0] in _RELATIVE for name in rest])
+    sigma = np.array(list(rest.values()))
+    return Priors((*first.names, *rest), np.concatenate([first.mean, mean]), np.concatenate([first.sigma, sigma]),
+                  np.concatenate([first.positive, relative]))
+
+
+_RELATIVE: Mapping[str, str] = {"actuator": "actuator_gain_percent", "sensor": "sensor_gain_percent",
+                                "corner": "sensor_corner_percent", "damping": "sensor_damping_percent"}
+
+
+def _sigma(name: str, t: Tolerances) -> float:
+    """Standard deviation of a parameter, relative for gains, corners and damping ratios; 0 without a tolerance."""
+    kind = name.partition(".")[0]
+    if kind in _RELATIVE:
+        return float(getattr(t, _RELATIVE[kind])) / 100
+    if kind == "place" or ".p_" in name:
+        return t.place_m
+    if kind == "direction":
+        return t.direction_rad
+    if name.startswith("com_"):
+        return t.centre_of_mass_m
+    return t.product_of_inertia_kgm2 if name in ("J12", "J13", "J23") else 0.0
