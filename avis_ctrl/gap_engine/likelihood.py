@@ -15,7 +15,7 @@ import numpy as np
 
 from avis_ctrl.gap_engine.settings import GapSettings
 from avis_ctrl.gap_engine.tolerances import Priors
-from avis_ctrl.gap_engine.weights import Group, Variances, Weights, bands, estimated, weigh
+from avis_ctrl.gap_engine.weights import Variances, Weights, bands, estimated, path_contributions, weigh
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened
 from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns, transient_parts
 
@@ -45,14 +45,6 @@ class Fitted:
     iterations: int
     e: np.ndarray
     J: np.ndarray
-
-
-def path_contributions(model: Any, block: SpectralBlock) -> np.ndarray:
-    """(n, n_y, n_in): what each input of a record contributes to each sensor."""
-    U = np.zeros((*block.U.shape[:2], block.U.shape[1]), complex)
-    k = np.arange(block.U.shape[1])
-    U[:, k, k] = block.U[:, :, 0]
-    return model.driven(block.omega, U, derivative=False).Y
 
 
 def first_variances(data: Data, settings: GapSettings) -> Variances:

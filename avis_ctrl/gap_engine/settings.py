@@ -22,6 +22,13 @@ class GapSettings:
     first_error : relative error of the paths in the first fit [1], before any residual is known.
     rounds : estimates of the variances, each from the fit before it.
     iterations : Gauss-Newton steps between two estimates of the variances.
+    effect_sizes : prior standard deviation of an effect's strength, in units of its parameter's size; broad, so that it
+        costs some nats and bends nothing.
+    shape_spread : prior standard deviation of a parameter that shapes an effect (a frequency), relative to its start.
+    refits : effects that are refitted at each step of the search, the best by the score test.
+    longest : most effects that are named together.
+    certain : gain of log evidence [nats] that a name needs beside the logarithm of the number of candidates: odds of
+        a hundred.
     converged : change of the penalised sum of squares, relative to the number of data, below which a fit has converged.
     """
 
@@ -34,4 +41,9 @@ class GapSettings:
     first_error: float = 0.05
     rounds: int = 4
     iterations: int = 6
+    effect_sizes: float = 100.0
+    shape_spread: float = 1.0
+    refits: int = 6
+    longest: int = 3
+    certain: float = 4.6
     converged: float = 1e-4

@@ -26,11 +26,25 @@ class Priors:
     mean: np.ndarray
     sigma: np.ndarray
     positive: np.ndarray
+    low: np.ndarray | float = -np.inf
+    high: np.ndarray | float = np.inf
 
     def values(self, z: np.ndarray) -> np.ndarray:
         """(n,) of the parameters at standardised values z (n,)."""
-        return np.where(self.positive, self.mean * np.exp(np.where(self.positive, self.sigma, 0.0) * z),
-                        self.mean + self.sigma * z)
+        found = np.where(self.positive, self.mean * np.exp(np.where(self.positive, self.sigma, 0.0) * z),
+                         self.mean + self.sigma * z)
+        return np.clip(found, self.low, self.high)
+
+    def z(self, values: np.ndarray) -> np.ndarray:
+        """(n,) standardised values; the inverse of `values`."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.positive, np.log(values / self.mean) / self.sigma, (values - self.mean) / self.sigma)
+
+    def followed_by(self, other: Priors) -> Priors:
+        """Both, one after the other."""
+        def both(name: str) -> np.ndarray:
+            return np.concatenate([np.broadcast_to(getattr(one, name), len(one.names)) for one in (self, other)])
+        return Priors((*self.names, *other.names), *(both(name) for name in ("mean", "sigma", "positive", "low", "high")))
 
     def slopes(self, z: np.ndarray) -> np.ndarray:
         """(n,) derivative of the values by z."""

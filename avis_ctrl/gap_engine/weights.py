@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -72,19 +73,33 @@ class Weights:
         return out
 
 
+def path_contributions(model: Any, block: SpectralBlock) -> np.ndarray:
+    """(n, n_y, n_in): what each input of a record contributes to each sensor."""
+    U = np.zeros((*block.U.shape[:2], block.U.shape[1]), complex)
+    k = np.arange(block.U.shape[1])
+    U[:, k, k] = block.U[:, :, 0]
+    return model.driven(block.omega, U, derivative=False).Y
+
+
+def with_distortion(block: SpectralBlock, level: float, variances: Variances, settings: GapSettings) -> SpectralBlock:
+    """The block with noise and distortion as its covariance."""
+    assert block.noise is not None
+    own = bands(block.omega, settings.bands_per_octave)
+    s = np.array([variances.distortion[level, int(band)] for band in own])
+    return block.with_noise(block.noise[:, 0] + s[:, :, None] * np.eye(s.shape[1]))
+
+
 def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Sequence[np.ndarray], variances: Variances,
           settings: GapSettings) -> Weights:
     """Weights of blocks; paths : (n, n_y, n_in) G_cj u_j of each block by the present model."""
     L, total, start = [], 0.0, 0
     members: dict[Group, list[tuple[np.ndarray, np.ndarray]]] = {}
     for block, level, path in zip(blocks, levels, paths, strict=True):
-        assert block.noise is not None
         n, n_y, n_in = path.shape
         own = bands(block.omega, settings.bands_per_octave)
-        s = np.zeros((n, n_y))
-        for band in np.unique(own):
-            s[own == band] = variances.distortion[level, int(band)]
-        factor = np.linalg.cholesky(block.noise[:, 0] + s[:, :, None] * np.eye(n_y))
+        whole = with_distortion(block, level, variances, settings).noise
+        assert whole is not None
+        factor = np.linalg.cholesky(whole[:, 0])
         total += 4 * float(np.sum(np.log(np.real(np.einsum("kii->ki", factor)))))
         white = np.sqrt(2) * np.linalg.inv(factor)
         L.append(white)
