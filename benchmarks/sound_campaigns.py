@@ -43,7 +43,7 @@ from avis_ctrl.study.campaign_plan import plan_from_table
 
 BAND_Hz, PERIOD_s, SETTLE_s = (0.5, 80.0), 10.0, 10.0
 # Words in what `avis identify` prints that a sound campaign gives no reason for.
-REFUSALS = ("stop:", "warning:", "cannot be told apart", "no measured noise", "no uncertainty.json", "not excited")
+REFUSALS = ("stop:", "warning:", "cannot be distinguished", "no measured noise", "no uncertainty.json", "not excited")
 
 
 @dataclass(frozen=True)
@@ -221,6 +221,8 @@ def run(rig_name: str, form: str, floor: str, seed: int, duration_s: float, perc
     seconds, text = time.monotonic() - began, done.stdout + done.stderr
     (case / "said.txt").write_text(text)
     said = [line.strip() for line in text.splitlines() if any(word in line for word in REFUSALS)]
+    if done.returncode != 0:
+        said += done.stderr.splitlines()[-1:]
     ratio: dict[str, float] = {}
     relative: dict[str, float] = {}
     if done.returncode == 0:

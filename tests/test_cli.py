@@ -92,7 +92,7 @@ def test_a_folder_that_cannot_be_written_is_code_2(tmp_path):
      "avis: d.toml: mass = -1: expected a positive number\n"),
     (ComputationError("no controller found", measured="gamma 7", cause="too much asked", next_step="ask less"), 3,
      "avis: no controller found; measured: gamma 7; likely cause: too much asked; next: ask less\n"),
-    (KeyboardInterrupt(), 130, "avis: stopped; nothing half-written is left\n")])
+    (KeyboardInterrupt(), 130, "avis: interrupted; no partial results were written\n")])
 def test_errors_end_in_their_line_and_code(raised, code, words, monkeypatch, capsys):
     def stop(*args, **kwargs):
         raise raised
@@ -148,7 +148,7 @@ def test_interrupt_leaves_nothing_half_written(tmp_path):
     finally:
         child.kill()
     assert child.returncode == 130
-    assert complained.splitlines()[-1] == "avis: stopped; nothing half-written is left"
+    assert complained.splitlines()[-1] == "avis: interrupted; no partial results were written"
     assert "Traceback" not in complained + said
     assert not out.exists()
 
@@ -179,7 +179,7 @@ def test_an_interrupt_that_is_lost_comes_again():
     finally:
         child.kill()
     assert child.returncode == 130
-    assert complained == "avis: stopped; nothing half-written is left\n"
+    assert complained == "avis: interrupted; no partial results were written\n"
 
 
 def test_public_names_load_on_first_use():

@@ -141,19 +141,20 @@ def test_a_flat_file_without_names_is_held_against_the_rig(flat, tmp_path):
     """The order of the rig is taken with a note, and the gate stops what it is not."""
     done = avis("identify", str(flat[1]), "--rig", "avis", "--out", str(tmp_path / "out"))
     words = " ".join(done.stdout.split())
-    assert "y: the file names no channels; taken in the order of the rig avis: Sy1, Sz1" in words
-    assert "the file names no rig; taken as avis" in words
+    assert "y: the file does not name its channels; assumed to be in the order of the rig avis: Sy1, Sz1" in words
+    assert "the file does not name its rig; assumed to be avis" in words
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert "Sensors 'Sy1' and 'Sz1' are exchanged" in done.stderr
     named = avis("identify", str(flat[1]), "--rig", "avis", "--out", str(tmp_path / "out"), "--band", "0.01", "0.011",
                  "--columns", "y_names=Sz1+Sy1+Sx2+Sz2+Sy3+Sz3")
-    assert "exchanged" not in named.stderr and "y: the file names no channels" not in " ".join(named.stdout.split())
+    assert "exchanged" not in named.stderr
+    assert "y: the file does not name its channels" not in " ".join(named.stdout.split())
 
 
 @pytest.mark.parametrize(("arguments", "said"), [
     (("identify", "F", "--rig", "avis", "--out", "o", "--columns", "y_names=a+b+c+d+e+f"),
      "--columns y_names=Sy1+Sz1+..."),
-    (("identify", "C", "--rig", "halcyonics", "--out", "o"), "the file says it is a campaign of avis"),
+    (("identify", "C", "--rig", "halcyonics", "--out", "o"), "the file is a campaign of avis"),
     (("convert", "F", "o.h5", "--excitation", "chirp"), "excitation = 'chirp': expected one of multisine"),
     (("convert", "F", "o.h5", "--unit-y", "Pa"), "y unit = 'Pa'"),
     (("convert", "F", "o.h5", "--sample-rate", "500"), "expected 1000 Hz, as the time vector says"),
@@ -180,8 +181,8 @@ def test_what_the_file_does_not_say_may_be_said(flat, tmp_path):
 def test_single_axis_says_what_it_took_the_columns_for(data):
     drive = ("single-axis", "drive", str(data / "emps" / "DATA_EMPS.mat"), "--columns", "force=vir,position=qm,t=t")
     plain, scaled = avis(*drive), avis(*drive, "--scale", "force=35.15")
-    assert plain.stdout.splitlines()[0] == ("taken: force = vir in N, position = qm in m, t in s (as in the file; "
-                                            "--scale force=FACTOR for another unit)")
+    assert plain.stdout.splitlines()[0] == ("assumed units: force = vir in N, position = qm in m, t in s "
+                                            "(not scaled; if the file has another unit: --scale force=FACTOR)")
     assert "force = vir times 35.15 in N" in scaled.stdout
 
 
@@ -191,3 +192,6 @@ def test_what_the_rig_cannot_play_names_the_plan_and_its_record(tmp_path):
     done = avis("simulate-campaign", "--rig", "avis", "--plan", str(plan), "--out", str(tmp_path / "c.h5"))
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert done.stderr.startswith(f"avis: {plan}: record[1].band_Hz = "), done.stderr
+    for option in ("--perturbed", "--orthogonal"):
+        done = avis("simulate-campaign", "--rig", "avis", "--plan", str(plan), option, "--out", str(tmp_path / "c.h5"))
+        assert done.returncode == 2 and "belong to the default plan" in done.stderr

@@ -46,7 +46,7 @@ def _commands(version: Annotated[bool, typer.Option("--version", callback=_versi
 
 @app.command()
 def doctor() -> None:
-    """Versions, solvers, threads: what works here and what does not."""
+    """Check the installation: versions, solvers, threads."""
     from rich.console import Console
     from rich.table import Table
 
@@ -125,5 +125,5 @@ def main() -> None:
     if hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_REAL, 0)
     if code == INTERRUPTED:
-        print("avis: stopped; nothing half-written is left", file=sys.stderr)
+        print("avis: interrupted; no partial results were written", file=sys.stderr)
     sys.exit(code)

@@ -12,14 +12,14 @@ from avis_ctrl.cli.console import Progress
 
 
 def design(
-    file: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="what to design; start from designs/*.toml")],
+    file: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="design file; start from designs/*.toml")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for controllers and report")],
 ) -> None:
-    """From a rig to certified controllers, checks and a design report.
+    """Design certified controllers for a rig, check them in simulation, and write a report.
 
-    Writes report.html, report.pdf, controllers/NAME.json, sampled_controller.json (all axes, sensor volts to drive
-    volts, as a processor runs it), plant.json and result.json into DIR. Exit code 3 where the loop is unstable in any
-    of the plants simulated: the first sentence names the cause.
+    Writes report.html, report.pdf, controllers/NAME.json, sampled_controller.json (the controller for the processor,
+    sensor volts to drive volts, all axes), plant.json and result.json into DIR. Exit code 3 if the closed loop is
+    unstable for any simulated plant; the first sentence names the cause.
     """
     from rich.console import Console
 
@@ -50,7 +50,7 @@ def _verdict(console, result) -> None:
     console.print(first_sentence(result))
     if result.stable:
         console.print(all_axes(result))
-    table = Table("requirement", "asked", "measured", "", title=result.design.title)
+    table = Table("requirement", "limit", "result", "", title=result.design.title)
     for r in result.requirements:
         unit = f" {r.unit}" if r.unit else ""
         asked = "yes" if r.comparison == "is" else f"{r.comparison} {r.limit:.4g}{unit}"

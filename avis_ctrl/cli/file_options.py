@@ -6,13 +6,14 @@ from typing import Annotated, Any
 
 import typer
 
-# Of `convert` and `identify`: what a file may not say.
-PERIOD = Annotated[float | None, typer.Option("--period", metavar="SECONDS", help="of a multisine, where the file does "
-                                              "not say")]
+# Of `convert` and `identify`: what a file may lack.
+PERIOD = Annotated[float | None, typer.Option("--period", metavar="SECONDS", help="period of a multisine, if the file "
+                                              "does not state it")]
 EXCITATION = Annotated[str | None, typer.Option("--excitation", metavar="KIND", help="multisine, noise, rest, floor or "
-                                                "sine, where the file does not say")]
-SAMPLE_RATE = Annotated[float | None, typer.Option("--sample-rate", metavar="HZ", help="where the file has no time")]
-UNIT_Y = Annotated[str | None, typer.Option("--unit-y", metavar="UNIT", help="of the file's y: V, mV, m/s, mm/s, "
+                                                "sine, if the file does not state it")]
+SAMPLE_RATE = Annotated[float | None, typer.Option("--sample-rate", metavar="HZ", help="sample rate, if the file has "
+                                                   "no time column")]
+UNIT_Y = Annotated[str | None, typer.Option("--unit-y", metavar="UNIT", help="unit of y in the file: V, mV, m/s, mm/s, "
                                             "m/s^2, g, m, ...; V by default")]
 
 

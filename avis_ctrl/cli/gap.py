@@ -23,23 +23,23 @@ def gap(
     sample_rate_Hz: SAMPLE_RATE = None,
     unit_y: UNIT_Y = None,
     band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default "
-                                                                "what is excited")] = None,
-    amplifier_Hz: Annotated[float | None, typer.Option("--amplifier-corner", help="first-order lag that the amplifiers "
-                                                       "are known to have [Hz]")] = None,
-    design: Annotated[bool, typer.Option("--design", help="also design controllers on both models: what the effect "
-                                         "does to mu (about a minute more)")] = False,
-    design_file: Annotated[Path | None, typer.Option("--design-file", metavar="DESIGN.toml", help="with --design: "
-                                                     "whose axes, uncertainty and weights; by default z and "
-                                                     "phi_x")] = None,
+                                                                "the excited band")] = None,
+    amplifier_Hz: Annotated[float | None, typer.Option("--amplifier-corner", help="corner of the amplifiers' "
+                                                       "first-order lag, if it is known [Hz]")] = None,
+    design: Annotated[bool, typer.Option("--design", help="also design controllers on both models, to show the "
+                                         "influence of the effect on mu (about a minute more)")] = False,
+    design_file: Annotated[Path | None, typer.Option("--design-file", metavar="DESIGN.toml", help="as --design, with "
+                                                     "the axes, uncertainty and weights of this file instead of the "
+                                                     "default design for z and phi_x")] = None,
     effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="Python file with effects of "
                                                  "your own, run before the search (docs/own_effect.md)")] = None,
-    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="go on where a gate says stop")] = False,
+    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="continue even if a gate says stop")] = False,
     seed: Annotated[int, typer.Option("--seed")] = 1,
 ) -> None:
-    """Find where model and measurement disagree, name the missing effect, show the gap close.
+    """Find where model and measurement disagree, and name the physical effect that the model lacks.
 
-    Writes gap.json, gap.html, gap.pdf and the models baseline and updated (.json, .toml) into DIR; then `avis predict
-    DIR OTHER --out PRED.h5` simulates another campaign with both.
+    Writes gap.json, gap.html, gap.pdf and the models baseline and updated (.json, .toml) into DIR. Then `avis predict
+    DIR OTHER --out PRED.h5` predicts another campaign with both models.
     """
     from rich.console import Console
 
@@ -99,7 +99,7 @@ def _summary(console, found) -> None:
     gap = found.gap
     console.print(f"[bold]{gap.verdict}[/]: {gap.sentences[0]}")
     table = Table("stage", "error of held-out y, r.m.s.", "chi-square per degree of freedom",
-                  title="gap on records that no fit has seen")
+                  title="gap on held-out records")
     for stage in gap.stages:
         table.add_row(stage.name, f"{100 * stage.nrmse:.3g} %", f"{stage.chi2_per_dof:.4g}")
     table.add_row("[dim]noise alone[/]", f"[dim]{100 * gap.noise_nrmse:.3g} %[/]", "[dim]1[/]")
@@ -109,7 +109,7 @@ def _summary(console, found) -> None:
     if gap.next_experiment:
         console.print(f"- next: {gap.next_experiment}")
     elif gap.effects and found.design is None and not found.design_note:
-        console.print("- next: --design shows what this does to the controller; avis predict tries the updated model "
+        console.print("- next: --design shows the influence on the controller; avis predict tests the updated model "
                       "on another campaign")
     if found.design is not None:
         for sentence in found.design.sentences:

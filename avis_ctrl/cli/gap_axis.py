@@ -20,16 +20,16 @@ def gap_axis(
     columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="drive: force, position, "
                                                 "reference; oscillator: u, y; seismometer: drive, coil and/or "
                                                 "displacement; each also t; levels: none")] = None,
-    scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="to SI units")] = None,
+    scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="factors to SI units")] = None,
     sample_rate_Hz: SAMPLE_RATE = None,
-    band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; of an "
-                                                                "oscillator or of levels")] = None,
+    band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; for an "
+                                                                "oscillator or for levels")] = None,
     cutoff_Hz: Annotated[float | None, typer.Option("--cutoff", metavar="HZ", help="low-pass of a drive's data; 60 Hz "
                                                     "by default")] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="folder for gap.json")] = None,
     seed: Annotated[int, typer.Option("--seed")] = 1,
 ) -> None:
-    """What a model of one axis lacks: its name, its size, how sure that is, and the gap before and after.
+    """Name the effect that a model of one axis lacks, with its size, its probability, and the gap before and after.
 
     For example: avis gap-axis drive drive.mat --columns force=vir,position=qm,reference=qg,t=t --scale force=35.15
     """
@@ -57,7 +57,8 @@ def gap_axis(
         console.print(sentence, soft_wrap=True, markup=False)
     for stage in (*found.stages, *found.references):
         noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
-        console.print(f"- {stage.stage}: {100 * stage.nrmse:.3g} % on unseen data{noise}", soft_wrap=True, markup=False)
+        console.print(f"- {stage.stage}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True,
+                      markup=False)
     if folder:
         console.print(f"{folder / 'gap.json'}")
 

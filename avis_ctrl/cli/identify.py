@@ -15,7 +15,7 @@ from avis_ctrl.errors import AvisError, InputError
 def identify(
     measurement: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="HDF5 campaign, .mat, UFF 58, CSV or a "
                                                 "folder of CSV; records or frequency responses")],
-    rig: Annotated[str, typer.Option("--rig", metavar="RIG", help="where to start: avis, halcyonics, "
+    rig: Annotated[str, typer.Option("--rig", metavar="RIG", help="rig to start from: avis, halcyonics, "
                                      "halcyonics_loaded or a rig.toml")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for rig, report and uncertainty")],
     columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="which variable of the file "
@@ -25,29 +25,32 @@ def identify(
     excitation: EXCITATION = None,
     sample_rate_Hz: SAMPLE_RATE = None,
     unit_y: UNIT_Y = None,
-    parameters: Annotated[list[str] | None, typer.Option("--parameter", metavar="NAME", help="what is free, such as "
-                                                         "'isolator*.k_z' (repeatable); by default mass, inertia, "
+    parameters: Annotated[list[str] | None, typer.Option("--parameter", metavar="NAME", help="parameter to fit, such "
+                                                         "as 'isolator*.k_z' (repeatable); by default mass, inertia, "
                                                          "stiffness, damping")] = None,
-    priors: Annotated[list[str] | None, typer.Option("--prior", metavar="NAME=MEAN+-STD", help="what is known of a "
-                                                     "parameter beforehand (repeatable)")] = None,
-    hold_out: Annotated[list[str] | None, typer.Option("--hold-out", metavar="RECORD", help="kept for validation "
-                                                       "(repeatable); chosen by default")] = None,
+    priors: Annotated[list[str] | None, typer.Option("--prior", metavar="NAME=MEAN+-STD", help="prior knowledge of a "
+                                                     "parameter (repeatable)")] = None,
+    hold_out: Annotated[list[str] | None, typer.Option("--hold-out", metavar="RECORD", help="record kept for "
+                                                       "validation (repeatable); chosen automatically by default"
+                                                       )] = None,
     band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default "
-                                                                "what is excited")] = None,
-    starts: Annotated[int, typer.Option("--starts", help="starting points of the fit")] = 3,
-    amplifier_Hz: Annotated[float | None, typer.Option("--amplifier-corner", help="first-order lag of the amplifiers "
-                                                       "[Hz], where there is one")] = None,
-    kalman: Annotated[bool, typer.Option("--kalman", help="run the extended Kalman filter beside it")] = False,
+                                                                "the excited band")] = None,
+    starts: Annotated[int, typer.Option("--starts", help="number of starting points of the fit")] = 3,
+    amplifier_Hz: Annotated[float | None, typer.Option("--amplifier-corner", help="corner of the amplifiers' "
+                                                       "first-order lag [Hz]; by default none, or 300 Hz on a rig with "
+                                                       "accelerometers")] = None,
+    kalman: Annotated[bool, typer.Option("--kalman", help="also run the extended Kalman filter, for comparison")
+                      ] = False,
     design: Annotated[Path | None, typer.Option("--design", metavar="DESIGN.toml", help="design file whose rig and "
-                                                "uncertainty are replaced by what is identified; by default z and "
-                                                "phi_x")] = None,
-    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="go on where a gate says stop")] = False,
+                                                "uncertainty are replaced by the identified ones; by default a design "
+                                                "for z and phi_x with the weights of the shipped examples")] = None,
+    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="continue even if a gate says stop")] = False,
     seed: Annotated[int, typer.Option("--seed")] = 1,
 ) -> None:
-    """From measurements to an identified rig with known uncertainty, and a report.
+    """Identify a rig and its uncertainty from measurements, and write a report.
 
-    Writes rig.toml, uncertainty.json, design.toml, report.html, report.pdf and result.json into DIR; then
-    `avis design DIR/design.toml --out DIR2` designs controllers for it.
+    Writes rig.toml, uncertainty.json, design.toml, report.html, report.pdf and result.json into DIR. Then
+    `avis design DIR/design.toml --out DIR2` designs controllers for the identified rig.
     """
     from rich.console import Console
 
@@ -84,7 +87,7 @@ def identify(
             more, made = design_start(found, design)
             then = f"; next: avis design {folder / 'design.toml'} --out {folder / 'design'}"
         except AvisError as error:
-            # What was identified stands without it.
+            # The identification is valid without them.
             more, made, then = {}, None, f"; no uncertainty.json and design.toml: {error}"
         progress("report")
         files = write_identification(found, folder, identification_html(found, made), identification_pdf(found, made),
@@ -97,12 +100,13 @@ def predict(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="output folder of avis identify or avis gap")],
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="another campaign of the same rig")],
     out: Annotated[Path, typer.Option("--out", metavar="PRED.h5", help="file to write")],
-    effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="file of own effects that the "
-                                                 "models of avis gap hold")] = None,
+    effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="file with your own effects, if "
+                                                 "the models of avis gap contain them")] = None,
 ) -> None:
-    """What a found model would have measured, from the campaign's u and floor alone, and how far that is from its y.
+    """Predict the sensor signals of another campaign from its voltages and floor motion, and compare them with its y.
 
-    Of the identified rig /records/NN/y; of the models of avis gap /records/NN/y_baseline and /records/NN/y_updated.
+    Writes /records/NN/y for an identified rig, or /records/NN/y_baseline and /records/NN/y_updated for the models of
+    avis gap.
     """
     from rich.console import Console
     from rich.table import Table
@@ -138,16 +142,16 @@ def predict(
     assert isinstance(measured, Campaign)  # as it was
     with Progress(console) as progress:
         write(folder, measured, out, progress)
-        progress("errors")
+        progress("prediction errors")
         errors = list(prediction_errors(out, measured))
     if errors:
         names = list(errors[0].relative)
         noisy = any(one.noise is not None for one in errors)
         table = Table("record", *names, *["noise between periods"] * noisy,
-                      title="error over measured y, r.m.s.; records are predicted from rest")
+                      title="r.m.s. error relative to measured y; each record is predicted from rest")
         for one in errors:
-            told = "" if one.noise is None else f"{100 * one.noise:.3g} %"
-            table.add_row(one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names), *[told] * noisy)
+            noise = "" if one.noise is None else f"{100 * one.noise:.3g} %"
+            table.add_row(one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names), *[noise] * noisy)
         console.print(table)
         if note := compared(errors):
             console.print(note)
@@ -179,8 +183,12 @@ def _summary(console, found) -> None:
     from avis_ctrl.study.identification import CAUTION
 
     console.print(table)
-    for sentence in (CAUTION, *found.campaign_fit.notes, *found.identifiability.sentences, *found.validation.sentences):
+    verdict, *validation = found.validation.sentences
+    console.print(f"{verdict[:1].upper()}{verdict[1:]}.")
+    for sentence in (CAUTION, *found.campaign_fit.notes, *validation, *found.identifiability.sentences):
         console.print(f"- {sentence}")
+    if found.advice:
+        console.print(f"- {found.advice[0]} (Other records that would help are in section 5 of the report.)")
 
 
 def single_axis(
@@ -190,10 +198,10 @@ def single_axis(
     columns: Annotated[str, typer.Option("--columns", metavar="ROLE=NAME,..", help="seismometer: drive, coil and/or "
                                          "displacement; decay: y; drive: force, position, reference; oscillator: u, "
                                          "y; each also t")],
-    scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="to SI units")] = None,
-    sample_rate_Hz: Annotated[float | None, typer.Option("--sample-rate", help="Hz, where the file has none")] = None,
+    scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="factors to SI units")] = None,
+    sample_rate_Hz: Annotated[float | None, typer.Option("--sample-rate", help="Hz, if the file has none")] = None,
 ) -> None:
-    """A small model of one axis: a seismometer, a drive with friction, an oscillator."""
+    """Fit a small model of one axis: a seismometer, a free decay, a drive with friction, an oscillator."""
     from rich.console import Console
 
     from avis_ctrl.identification.single_axis.identify import identify_single_axis
@@ -228,8 +236,8 @@ def _assumed_units(kind: str, roles: dict[str, str], factors: dict[str, float]) 
             for role, unit in UNITS[kind].items() if role in roles]
     unscaled = [role for role in roles if role in UNITS[kind] and role not in factors
                 and UNITS[kind][role] != "any unit"]
-    change = f" (as in the file; --scale {unscaled[0]}=FACTOR for another unit)" if unscaled else ""
-    return f"taken: {', '.join(said)}, t in s{change}"
+    change = f" (not scaled; if the file has another unit: --scale {unscaled[0]}=FACTOR)" if unscaled else ""
+    return f"assumed units: {', '.join(said)}, t in s{change}"
 
 
 def _pair(text: str, option: str) -> tuple[str, str]:

@@ -23,16 +23,18 @@ def excite(
     kind: Annotated[str, typer.Option("--kind", help="multisine or noise")] = "multisine",
     band_Hz: Annotated[tuple[float, float], typer.Option("--band", metavar="LOW HIGH", help="Hz")] = (0.5, 60.0),
     period_s: Annotated[float, typer.Option("--period", help="period of a multisine, length of noise [s]")] = 10.0,
-    periods: Annotated[int, typer.Option("--periods", help="how often a multisine is played; the first period holds "
+    periods: Annotated[int, typer.Option("--periods", help="number of periods of a multisine; the first one contains "
                                          "the transient")] = 6,
-    rms_V: Annotated[float | None, typer.Option("--rms", help="of each drive [V]; by default half of the largest at "
-                                                "which neither drives nor converter clip on the rig's file")] = None,
-    lines: Annotated[str, typer.Option("--lines", help="full, odd or odd_detection")] = "full",
-    scheme: Annotated[str, typer.Option("--scheme", help="orthogonal (one record a drive, all lines) or zippered (one "
-                                        "record, lines dealt to the drives)")] = "orthogonal",
+    rms_V: Annotated[float | None, typer.Option("--rms", help="r.m.s. voltage of each drive [V]; by default half of "
+                                                "the largest level at which neither the drives nor the converter clip, "
+                                                "computed for the rig file")] = None,
+    lines: Annotated[str, typer.Option("--lines", help="full, odd or odd_detection (odd lines, one in each group not "
+                                       "excited)")] = "full",
+    scheme: Annotated[str, typer.Option("--scheme", help="orthogonal (one record per drive, all drives on all lines) "
+                                        "or zippered (one record, each drive has its own lines)")] = "orthogonal",
     seed: Annotated[int, typer.Option("--seed")] = 1,
 ) -> None:
-    """Signals to play on the rig: multisines of low crest factor, or noise, within its voltage limit."""
+    """Generate excitation signals for the rig: multisines of low crest factor, or noise, within its voltage limit."""
     from rich.console import Console
     from rich.table import Table
 
@@ -56,12 +58,13 @@ def excite(
         else:
             raise InputError("expected multisine or noise", field="--kind", value=kind)
         if rms_V is None:
-            progress("level: a noise-free run of the rig, so that its sensors do not clip")
+            progress("level: a noise-free simulation of the rig, to find the level at which the sensors clip")
             plan = plan_from_table({"title": "level", "duration_s": period_s, "record": [{"excitation": "rest"}]})
             most = largest_level(open_loop(table, plan), signals, signals.u.shape[1] * (periods if periods < 4 else 4))
             signals = signals.scaled_to(LEVEL_SHARE * most)
         write_signals(signals, out, periods if kind == "multisine" else 1, table.name)
-    shown = Table("record", "r.m.s. [V]", "peak [V]", "crest factor", "before", title="largest over the drives")
+    shown = Table("record", "r.m.s. [V]", "peak [V]", "crest factor", "before optimisation",
+                  title="largest value over the drives")
     for k in range(len(signals.u)):
         shown.add_row(str(k), *(f"{values[k].max():.3g}" for values in (signals.rms_V, signals.peak_V, signals.crest,
                                                                         signals.crest_before)))
@@ -74,18 +77,19 @@ def simulate_campaign(
     out: Annotated[Path, typer.Option("--out", metavar="CAMPAIGN.h5", help="file to write")],
     plan: Annotated[Path | None, typer.Option("--plan", metavar="PLAN.toml", help="records, levels, floor; by default "
                                               "multisines at three levels, noise, rest and a shaken floor")] = None,
-    write_plan: Annotated[Path | None, typer.Option("--write-plan", metavar="FILE", help="also write the plan used, to "
-                                                    "start from")] = None,
-    truth: Annotated[Path | None, typer.Option("--truth", metavar="FILE", help="also write the rig that was simulated "
-                                               "(perturbed if the plan says so)")] = None,
-    perturbed: Annotated[bool, typer.Option("--perturbed", help="default plan with parameters up to 5 % off, damping "
-                                            "20 %")] = False,
+    write_plan: Annotated[Path | None, typer.Option("--write-plan", metavar="FILE", help="also write the plan used, as "
+                                                    "a starting point")] = None,
+    truth: Annotated[Path | None, typer.Option("--truth", metavar="FILE", help="also write the rig that was simulated, "
+                                               "with its perturbed values")] = None,
+    perturbed: Annotated[bool, typer.Option("--perturbed", help="default plan with stiffness, mass and inertia up to "
+                                            "5 % off, damping up to 20 %")] = False,
     orthogonal: Annotated[bool, typer.Option("--orthogonal", help="default plan with orthogonal multisines")] = False,
-    duration_s: Annotated[float, typer.Option("--duration", help="of each record of the default plan [s]")] = 60.0,
-    seed: Annotated[int, typer.Option("--seed", help="of excitation, floor and noise, and of --perturbed: for another "
-                                      "campaign of the same table give --rig the --truth file")] = 1,
+    duration_s: Annotated[float, typer.Option("--duration", help="length of each record of the default plan "
+                                           "[s]")] = 60.0,
+    seed: Annotated[int, typer.Option("--seed", help="seed of excitation, floor, noise and perturbation; for another "
+                                      "campaign of the same table, use the file written by --truth as --rig")] = 1,
 ) -> None:
-    """A measurement campaign from the nonlinear model, to plan and rehearse an identification."""
+    """Simulate a measurement campaign with the nonlinear model, to plan and rehearse an identification."""
     from rich.console import Console
 
     from avis_ctrl.files import write_whole
@@ -98,6 +102,9 @@ def simulate_campaign(
     for written in (out, write_plan, truth):
         if written is not None:
             require_other(written, plan, rig)
+    if plan and (perturbed or orthogonal):
+        raise InputError("these belong to the default plan; in a plan, write perturb_percent under [truth] and scheme "
+                         "under [multisine]", field="--perturbed, --orthogonal")
     console = Console(highlight=False)
     table = load_rig(rig)
     chosen = read_plan(plan) if plan else default_plan(table, "orthogonal" if orthogonal else "zippered",
@@ -125,13 +132,13 @@ def convert(
     columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="which variable is what, "
                                                 "such as u=vir,y=qm,t=t; names of the channels: y_names=Sy1+Sz1"
                                                 )] = None,
-    rig: Annotated[str | None, typer.Option("--rig", help="name of the rig, where the file has none")] = None,
+    rig: Annotated[str | None, typer.Option("--rig", help="name of the rig, if the file has none")] = None,
     period_s: PERIOD = None,
     excitation: EXCITATION = None,
     sample_rate_Hz: SAMPLE_RATE = None,
     unit_y: UNIT_Y = None,
 ) -> None:
-    """Any measurement file as a campaign in HDF5, with what had to be assumed."""
+    """Convert any measurement file to a campaign in HDF5, and print the assumptions."""
     from rich.console import Console
 
     from avis_ctrl.measurement.campaign import Campaign, in_short

@@ -10,7 +10,13 @@ import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.identification.campaign_fit import divided, driven_inputs, measured_noise
+from avis_ctrl.identification.campaign_fit import (
+    divided,
+    drive_power,
+    driven_inputs,
+    excites_as_well,
+    measured_noise,
+)
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.prediction_error import prediction_error
@@ -73,7 +79,9 @@ def divide(campaign: Campaign) -> Halves:
     several = [group for group in groups if len(group) > 1]
     order = several[:1] + several[:0:-1]
     chosen = [group[-1].header.name for group in order][:max(len(driven) // 3, 1)]
-    if chosen and len(driven) - len(chosen) >= 2:
+    power = {record.header.name: drive_power(record) for record in driven}
+    left = np.sum([value for name, value in power.items() if name not in chosen], axis=0)
+    if chosen and len(driven) - len(chosen) >= 2 and all(excites_as_well(left, power[name]) for name in chosen):
         rest = tuple(record.header.name for record in campaign.records if record.header.name not in chosen)
         return Halves(campaign.only(rest), campaign.only(tuple(sorted(chosen))),
                       f"records {', '.join(sorted(chosen))} held out, each beside a fitted one of its level")

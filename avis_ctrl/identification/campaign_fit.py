@@ -33,6 +33,9 @@ class CampaignFitSettings:
         into frequency responses would flatten the resonances.
     silent_line : ratio of the drive's amplitude at a line to that at the record's strongest line, below which the line
         counts as silent: -60 dB, a millionth of the power.
+    least_excited : ratio of the power in the other records to that in a record, for each combination of drives that it
+        excites and as far as the others can separate it, above which the record may be held out: at a tenth of its
+        amplitude they still determine the response to that combination.
     quiet_band_Hz : band of the fit where no input shows what band is excited: the band of the floor velocity in a rig
         file.
     tail : share of an input's power that may lie below the band of the fit, and above it; the noise of a generator has
@@ -44,6 +47,7 @@ class CampaignFitSettings:
     longest_piece: int = 1 << 18
     most_lines: int = 60_000
     silent_line: float = 1e-3
+    least_excited: float = 0.01
     quiet_band_Hz: tuple[float, float] = (0.5, 60.0)
     tail: float = 5e-4
     floor_tail: float = 0.02
@@ -80,19 +84,40 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
             raise InputError(f"expected some of the records {', '.join(names)}, but not all", field="hold out",
                              value=list(hold_out))
         return Split(campaign.only(rest), campaign.only(tuple(hold_out)),
-                     f"records {', '.join(hold_out)} held out, as asked")
-    driven = {record.header.name: driven_inputs(record) for record in campaign.records}
-    active = [name for name in names if driven[name]]
+                     f"records {', '.join(hold_out)} held out, as specified")
+    active = {record.header.name: power for record in campaign.records if np.any(power := drive_power(record))}
     for name in reversed(active):
-        others = [driven[other] for other in active if other != name]
-        # One record alone seldom tells several inputs apart: never less than two are left.
-        if len(others) >= 2 and driven[name] <= set().union(*others):
+        others = [power for other, power in active.items() if other != name]
+        # The response to several inputs can seldom be separated with one record: never less than two are left.
+        if len(others) >= 2 and excites_as_well(np.sum(others, axis=0), active[name]):
             rest = tuple(other for other in names if other != name)
             return Split(campaign.only(rest), campaign.only((name,)), f"record {name} held out")
     parts = [divided(record) for record in campaign.records]
     return Split(replace(campaign, records=tuple(first for first, _ in parts)),
                  replace(campaign, records=tuple(last for _, last in parts)),
-                 "the last third of every record held out, for too few records excite every input")
+                 "the last third of every record held out, because too few records excite every input")
+
+
+def drive_power(record: RecordSource) -> np.ndarray:
+    """(n_u, n_u) sum of u u^T over the first quarter of a million samples."""
+    u = record.load(0, min(record.header.samples, SETTINGS.longest_piece)).u
+    return u.T @ u
+
+
+def excites_as_well(others: np.ndarray, one: np.ndarray) -> bool:
+    """Whether every combination of drives that one record excites, with power `one` (n_u, n_u), is excited by others.
+
+    Records along the logical axes drive the same motors in other combinations: without the one that turns the table,
+    nothing is known of that turn. Least squares from the others would know the response to d, a combination, with the
+    variance d^T inv(others) d; from the record itself with d^T inv(one) d. The worst ratio decides.
+    """
+    power, V = np.linalg.eigh(one)
+    excited = power > SETTINGS.silent_line ** 2 * power[-1]
+    root = V[:, excited] * np.sqrt(power[excited])
+    # What the others do not excite at all has a large variance, not an infinite one.
+    rest = others + SETTINGS.silent_line ** 2 * np.linalg.eigvalsh(others)[-1] * np.eye(len(others))
+    ratio = np.linalg.eigvalsh(root.T @ np.linalg.solve(rest, root))[-1]
+    return bool(ratio * SETTINGS.least_excited < 1)
 
 
 def driven_inputs(record: RecordSource) -> set[str]:
@@ -160,17 +185,18 @@ def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[flo
             if piece.header.duration_s * width > 10:
                 blocks.append(_fewer(record_block(piece, model, band_Hz), share, crowded, rng))
     if not blocks:
-        raise InputError("expected a band that holds more than 10 lines of a record", field="band_Hz", value=band_Hz)
+        raise InputError("expected a band with more than 10 lines of a record", field="band_Hz", value=band_Hz)
     # A record without input or measured floor says nothing of the response.
     useful = [block for block in blocks if np.any(block.U)]
     if not useful:
         raise InputError("expected a record that drives an actuator, or one with the floor measured", field="records")
     quiet = sorted({b.name for b in blocks} - {b.name for b in useful})
-    said = [f"records at rest with the floor not measured ({', '.join(quiet)}) tell of the noise only"] if quiet else []
+    said = [f"records at rest without measured floor motion ({', '.join(quiet)}) are used for the noise only"
+            ] if quiet else []
     if crowded:
-        chosen = f", {100 * share:.3g} % of them drawn at random" if share < 1 else ""
-        said.append(f"{sum(len(block.omega) for block in useful)} of {sum(lines):.0f} lines are fitted: those "
-                    f"that are excited{chosen}")
+        chosen = f", of which {100 * share:.3g} % were drawn at random" if share < 1 else ""
+        said.append(f"{sum(len(block.omega) for block in useful)} of {sum(lines):.0f} spectral lines are fitted: the "
+                    f"excited ones{chosen}")
     return useful, said
 
 
@@ -189,9 +215,10 @@ def weighted(blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple
             assert like.noise is not None
             found.append(block.with_noise(like.noise[np.searchsorted(omega, block.omega)], like.dof))
     except AvisError as error:
-        return relative_noise(blocks), f"no measured noise covariance ({error}); lines weigh alike at first", False
-    return found, (f"noise covariance measured by a local polynomial model, {found[0].dof:.0f} degrees of freedom a "
-                   "line"), True
+        return relative_noise(blocks), (f"no measured noise covariance ({error}); the first fit gives all lines equal "
+                                        "weight"), False
+    return found, (f"noise covariance estimated with a local polynomial model, {found[0].dof:.0f} degrees of freedom "
+                   "per line"), True
 
 
 def _lines_only(block: SpectralBlock, omega: np.ndarray) -> SpectralBlock:
@@ -260,7 +287,7 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
         notes = [*notes, said]
     found = fit(model, blocks, priors, starts, seed=seed, progress=progress)
     first = found
-    if isinstance(campaign, FrequencyResponse) or not blocks[0].transient:
+    if isinstance(campaign, FrequencyResponse):
         return CampaignFit(found, first, band_Hz, (*notes, *_bounds(found)), model)
     turning, added = chosen_turning(campaign, blocks, found.model)
     found = fit(replace(found.model, turning=turning), without(blocks, added), priors, seed=seed, about=model)
@@ -284,7 +311,7 @@ def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:
     """How large the second-order terms are against the outputs, in words."""
     share = [np.linalg.norm(one, axis=(0, 2)) / np.linalg.norm(block.Y, axis=(0, 2)) for block, one in
              zip(blocks, added, strict=True)]
-    return f"they are up to {100 * float(np.max(share)):.2g} % of a sensor's signal in a record"
+    return f"they contribute up to {100 * float(np.max(share)):.2g} % of a sensor's signal in a record"
 
 
 def _bounds(found: LikelihoodFit) -> tuple[str, ...]:
@@ -293,10 +320,10 @@ def _bounds(found: LikelihoodFit) -> tuple[str, ...]:
     low = [name for name in found.held if name not in moments]
     said = []
     if low:
-        said.append(f"the best fit would need values below the physical limit for {', '.join(low)}: held just above "
-                    "zero, where standard deviations say little")
+        said.append(f"the best fit would need values below the physical limit for {', '.join(low)}; they are held just "
+                    "above zero, where their standard deviations are not meaningful")
     if moments:
-        said.append(f"the best fit would need a larger {', '.join(moments)} than a rigid body can have: held at the "
-                    "sum of the other two moments of inertia; either a value that was taken as known is wrong, or "
-                    "these data hardly determine it")
+        said.append(f"the best fit would need a larger {', '.join(moments)} than a rigid body can have; the value is "
+                    "held at the sum of the other two moments of inertia. Either a value that was taken as known is "
+                    "wrong, or these data hardly determine this moment of inertia")
     return tuple(said)

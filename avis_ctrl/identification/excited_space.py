@@ -41,7 +41,7 @@ class ExcitedSpace:
         """What is not excited, in words; empty if everything is."""
         said = []
         if silent := [name for name in self.names if name not in self.driven]:
-            said.append(f"no record drives {', '.join(silent)}: {_its(silent)} own response is unknown, and the rig "
+            said.append(f"no record drives {', '.join(silent)}: {_its(silent)} response is not measured, and the rig "
                         f"file's values for {'them' if len(silent) > 1 else 'it'} are taken as exact")
         if not self.full:
             k, d = len(self.driven), len(self.unplayed)

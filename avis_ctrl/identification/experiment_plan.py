@@ -26,8 +26,8 @@ from avis_ctrl.identification.structure import size_of, structural_null_space, s
 
 _FLOOR_SHAKEN = 1e-4
 _BENCH = 0.02
-CAUTION = ("Predicted from noise alone: added masses, moved places and added channels count as known exactly, and the "
-           "model as right.")
+CAUTION = ("These predictions include noise only: added masses, changed positions and added channels count as exactly "
+           "known, and the model as correct.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +85,9 @@ class Outcome:
     @property
     def words(self) -> str:
         if not self.gained:
-            sharper = f"what is known becomes {number(self.tighter)} times as precise" if self.tighter > 1.005 \
-                else "nothing becomes more precise"
-            return f"{self.experiment.words}: determines nothing new; {sharper}."
+            sharper = f"the known standard deviations decrease by a factor of {number(self.tighter)}" \
+                if self.tighter > 1.005 else "no standard deviation decreases"
+            return f"{self.experiment.words}: determines no further combination; {sharper}."
         many = "combination" if self.gained == 1 else "combinations"
         return f"{self.experiment.words}: determines {self.gained} more {many}{_alone_text(self.alone)}."
 
@@ -98,7 +98,7 @@ def _alone_text(alone: Mapping[str, float]) -> str:
     shown = [f"{name} to {number(100 * share)} %" for name, share in list(alone.items())[:6]]
     if len(alone) > 6:
         shown.append(f"{len(alone) - 6} more parameters (the worst to {number(100 * max(alone.values()))} %)")
-    return f", so that these become known by themselves: {listed(shown)}"
+    return f", so that these parameters are determined individually: {listed(shown)}"
 
 
 Added = list[tuple[Experiment, Information]]
@@ -149,7 +149,7 @@ def _changed_rigs(model: ResponseModel, drive: Drive) -> list[Experiment]:
             shifts = {f"isolator{i}.p_{axis}": 0.05 for i in picked}
             who = f"isolator{'s' if len(picked) > 1 else ''} {listed([str(i) for i in picked])}"
             how = "raised by 50 mm" if axis == "z" else f"moved by 50 mm along {axis}"
-            found.append(Experiment(f"Record once more with {who} {how}, what is mounted in it included", drive,
+            found.append(Experiment(f"Record once more with {who} {how}, with the motors and sensors in it", drive,
                                     _Change(shifts)))
     return found
 
@@ -269,22 +269,22 @@ def needed_experiment(information: Information, model: ResponseModel, drive: Dri
     said = [one.words for one in outcomes if one.gained]
     useless = [_kind(one.experiment.words) for one in outcomes if not one.gained]
     if useless:
-        said.append(f"These determine nothing new: {'; '.join(dict.fromkeys(useless))}.")
+        said.append(f"These determine no further combination: {'; '.join(dict.fromkeys(useless))}.")
     steps = _planned(information, added)
     if steps:
         after = steps[-1].information
         order = " Then: ".join(one.experiment.words + "." for one in steps)
         worst = np.max(after.standard_deviation / after.scale)
         rest = len(after.names) - after.rank
-        said.append(f"Fewest found, in order: {order} "
-                    + (f"Every parameter is then known by itself, the worst to {number(100 * worst)} %." if not rest
-                       else f"{rest} combinations stay unknown."))
+        said.append(f"Shortest sequence found: {order} "
+                    + (f"Every parameter is then determined individually, the least precise to {number(100 * worst)} %."
+                       if not rest else f"{rest} combinations remain undetermined."))
         left = after
     else:
         left = information
     if left.rank < len(left.names):
         still = identifiability_report(left)
-        said.append("Nothing in the list determines: " + "; ".join(
+        said.append("None of these experiments determines: " + "; ".join(
             " ".join(f"{weight:+g} {name}" for name, weight in row.items()) for row in still.unseen[:8]) + ".")
     return (*said, CAUTION)
 

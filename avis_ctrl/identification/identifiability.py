@@ -218,13 +218,14 @@ def _sentences(information: Information, structure: Structure, combinations: Seq
                rows: Sequence[ParameterRow]) -> tuple[str, ...]:
     names, count = information.names, len(information.names)
     alone = [row for row in rows if row.known == "alone"]
-    said = [f"{information.rank} combinations of the {count} parameters are determined; the best and the worst known "
-            f"of them differ by a factor {number(np.sqrt(information.condition))} in relative standard deviation."
-            if information.rank else f"Not one combination of the {count} parameters is determined."]
+    said = [f"The data determine {information.rank} combinations of the {count} parameters; the relative standard "
+            f"deviations of the most and the least precise one differ by a factor of "
+            f"{number(np.sqrt(information.condition))}."
+            if information.rank else f"The data determine none of the combinations of the {count} parameters."]
     if len(alone) == count:
-        said.append("Every parameter is determined by itself.")
+        said.append("Every parameter is determined individually.")
     elif alone:
-        said.append(f"Determined by themselves ({len(alone)}): {', '.join(row.name for row in alone)}.")
+        said.append(f"Determined individually ({len(alone)}): {', '.join(row.name for row in alone)}.")
     said += [scaling_sentence(one, information) for one in structure.scalings]
     if structure.scalings:
         shared = [text for text in (_combination(information, structure, row).words
@@ -237,8 +238,8 @@ def _sentences(information: Information, structure: Structure, combinations: Seq
         said.append(group_sentence([names[j] for j in group.members], own))
     poor = [one for one in combinations if not one.determined]
     if poor:
-        said.append(f"The equations show these, but the data do not (standard deviation above the value itself): "
-                    f"{', '.join(one.words for one in poor)}.")
+        said.append(f"Identifiable by the equations, but not determined by these data (standard deviation above the "
+                    f"value itself): {', '.join(one.words for one in poor)}.")
     weak = sorted((one for one in combinations if one.determined and one.relative > WEAK),
                   key=lambda one: -one.relative)
     said += [weak_sentence(one) for one in weak]
@@ -251,8 +252,8 @@ def _sentences(information: Information, structure: Structure, combinations: Seq
 
 def _prior_sentence(count: int, priors: Mapping[str, float]) -> str:
     named = f" on {', '.join(priors)}" if 0 < len(priors) <= 6 else ""
-    return (f"{count} of the combinations stand on what was known beforehand{named} alone: "
-            f"these data say nothing of them, and never will.")
+    return (f"{count} of the combinations are determined by the priors{named} alone: these data contain no information "
+            "on them, and more data of the same kind would not, either.")
 
 
 def information_from_covariance(names: Sequence[str], P: np.ndarray, P0: np.ndarray, values: np.ndarray,

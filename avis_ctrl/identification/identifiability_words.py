@@ -63,16 +63,17 @@ def known_text(one: Combination) -> str:
 
 def group_sentence(members: Sequence[str], seen: Sequence[Combination]) -> str:
     if not seen:
-        return (f"{listed(members)} {'acts' if len(members) == 1 else 'act'} on no response to these inputs: "
-                "nothing is known of it.")
+        one = len(members) == 1
+        return (f"{listed(members)} {'has' if one else 'have'} no influence on the responses to these inputs and "
+                f"{'is' if one else 'are'} not determined.")
     few = listed(members) if len(members) <= 8 else f"{', '.join(members[:7])} and {len(members) - 7} more"
     if len(seen) == 1:
         plain = all(weight in seen[0].words for weight in members) and " - " not in seen[0].words
         sort = "their sum" if plain and not any(ch.isdigit() and ch != "0" for ch in _coefficients(seen[0])) \
             else "one combination"
-        return f"{few} only as {sort}: {known_text(seen[0])}."
+        return f"{few} {'is' if len(members) == 1 else 'are'} determined only as {sort}: {known_text(seen[0])}."
     shown = "; ".join(known_text(one) for one in seen[:8]) + ("; .." if len(seen) > 8 else "")
-    return f"{few} ({len(members)}) only through {len(seen)} combinations: {shown}."
+    return f"{few} ({len(members)}) are determined only through {len(seen)} combinations: {shown}."
 
 
 def _coefficients(one: Combination) -> str:
@@ -105,21 +106,23 @@ def kinds(exponents: np.ndarray, information: Information, of: float) -> list[st
 def scaling_sentence(scaling: Scaling, information: Information) -> str:
     sizes = sorted(set(scaling.exponents[scaling.exponents != 0].tolist()), reverse=True)
     if sizes == [1.0]:
-        return (f"{_upper(listed(kinds(scaling.exponents, information, 1.0)))} only as ratios: a common factor of "
-                f"all of them changes no response. With {information.names[scaling.pin]} known, that is settled.")
+        return (f"{_upper(listed(kinds(scaling.exponents, information, 1.0)))} are determined only as ratios: a common "
+                f"factor of all of them changes no response. If {information.names[scaling.pin]} is known, the factor "
+                "is known.")
     if sizes == [1.0, -1.0]:
         up, down = (kinds(scaling.exponents, information, sign) for sign in (1.0, -1.0))
-        return (f"{_upper(listed(up))} and {listed(down)} only as products: larger {listed(up)} with smaller "
-                f"{listed(down)} change no response. With {information.names[scaling.pin]} known, that is settled.")
+        return (f"{_upper(listed(up))} and {listed(down)} are determined only as products: larger {listed(up)} with "
+                f"smaller {listed(down)} change no response. If {information.names[scaling.pin]} is known, the factor "
+                "is known.")
     parts = [f"{listed(kinds(scaling.exponents, information, size))} by the factor"
              + (f" to the power {size:g}" if size != 1 else "") for size in sizes]
-    return (f"A factor on {'; '.join(parts)} changes no response. With {information.names[scaling.pin]} known, "
-            "that is settled.")
+    return (f"Multiplying {'; '.join(parts)} changes no response. If {information.names[scaling.pin]} is known, the "
+            "factor is known.")
 
 
 def weak_sentence(one: Combination) -> str:
     unit = "" if one.unit in ("1", "", "mixed units") else f" {one.unit}"
-    return (f"{one.words} is known only to {number(100 * one.relative)} %: {one.value:.4g} +- "
+    return (f"{one.words} is determined only to {number(100 * one.relative)} %: {one.value:.4g} +- "
             f"{number(one.standard_deviation)}{unit}.")
 
 
@@ -128,4 +131,4 @@ def weak_direction_sentence(names: Sequence[str], direction: np.ndarray, sigma: 
     count = min(int(np.searchsorted(np.cumsum(direction[order] ** 2), 0.9)) + 1, 6)
     sign = np.sign(direction[order[0]])
     moved = [f"{names[j]} by {100 * sigma * sign * direction[j]:+.2g} %" for j in order[:count]]
-    return f"The worst known combination: {listed(moved)} together lie within one standard deviation."
+    return f"The least precise combination: changing {listed(moved)} together is one standard deviation."

@@ -147,9 +147,9 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
             progress(f"start {k + 1} of {starts}: chi-square {reached[-1][0]:.6g}")
     chi2, best = min(reached, key=lambda pair: pair[0])
     if best is None or not np.isfinite(chi2):
-        raise ComputationError("no start of the fit came to a finite chi-square", measured=f"{chi2}",
+        raise ComputationError("no starting point of the fit reached a finite chi-square", measured=f"{chi2}",
                                cause="data that are zero or far from this rig",
-                               next_step="look at the gates, and start nearer")
+                               next_step="check the findings of the gates, and start from better values")
     last = best.evaluate(best.model, residuals=True)
     scale = about.scales()
     unknown = sum(_unknowns(block, model) for block in blocks)
@@ -435,9 +435,10 @@ def _moved(model: ResponseModel, spread: float, rng: np.random.Generator) -> Res
 
 
 def _held_rows(first: ResponseModel) -> np.ndarray:
-    """`moment_rows` without those that the starting values violate."""
+    """`moment_rows` without those that the starting values violate by more than `edge`: a thin plate starts at the sum
+    itself."""
     rows = moment_rows(first.names)
-    return rows[rows @ first.values > 0]
+    return rows[rows @ first.values >= -SETTINGS.edge * np.abs(rows) @ np.abs(first.values)]
 
 
 def _check(model: ResponseModel, blocks, priors, starts: int) -> None:

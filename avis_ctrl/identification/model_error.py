@@ -74,7 +74,7 @@ def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[f
     rows = [left.outputs.index(name) for name in model.sensors.names]
     value = left.value.copy()
     value[:, rows] += response
-    return replace(left, value=value, method=f"response of the model with what it leaves: {left.method}")
+    return replace(left, value=value, method=f"response of the model plus its residual: {left.method}")
 
 
 def _local(campaign: Campaign, band_Hz: tuple[float, float], longest_piece: int | None,

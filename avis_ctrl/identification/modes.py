@@ -108,7 +108,7 @@ def model_modes(model: ResponseModel, covariance: np.ndarray | None = None) -> M
     if len(keep) < N_Q:
         raise ComputationError("not every mode of the rig oscillates", measured=f"{len(keep)} of {N_Q} modes do",
                                cause="damping above critical, or a stiffness that is not positive",
-                               next_step="look at damping and stiffness of the rig")
+                               next_step="check damping and stiffness of the rig")
     keep = keep[np.argsort(np.abs(poles[keep]))]
     poles, X = poles[keep], vectors[:N_Q, keep]
     words = tuple(_in_words(M, x) for x in X.T)
@@ -179,9 +179,9 @@ def measured_modes(blocks: Sequence[SpectralBlock], model: ResponseModel) -> Mea
     best = least_squares(lambda z: problem.evaluate(tuple(z))[0], x, lambda z: problem.evaluate(tuple(z))[1],
                          bounds=(x - reach, x + reach), x_scale="jac", ftol=1e-10, xtol=1e-8, max_nfev=40)
     if np.any(np.abs(best.x - x) > 0.99 * reach) or not best.success:
-        raise ComputationError("the search for the measured modes did not come to an end",
+        raise ComputationError("the fit of the measured modes did not converge",
                                measured=f"modes at {np.round(np.exp(best.x[:n]), 3).tolist()} Hz",
-                               cause="modes hidden by noise, or not excited", next_step="look at the responses")
+                               cause="modes hidden by noise, or not excited", next_step="check the responses")
     frequency, damping = np.exp(best.x[:n]), np.exp(best.x[n:])
     misfit = 2 * best.cost / (best.fun.size - problem.unknowns - 2 * n)
     scale = np.concatenate([frequency, damping])
@@ -218,7 +218,7 @@ class _Poles:
         self.modes, self.n_y = modes, len(model.sensors.names)
         if not blocks:
             raise ComputationError("the modes cannot be measured", measured="no lines near them",
-                                   cause="a band that leaves the modes out", next_step="give a wider band")
+                                   cause="a band that does not contain the modes", next_step="use a wider band")
         total = np.sum([np.sum(np.abs(block.U) ** 2, axis=(0, 2)) for block in blocks], axis=0)
         driven = np.flatnonzero(total > 1e-12 * total.max())
         parts = [_rows(block, model, driven) for block in blocks]
@@ -229,7 +229,7 @@ class _Poles:
         columns = 2 * modes * self.through.shape[1] + self.beside.shape[1]
         if 2 * len(self.omega) < FEWEST_PER_UNKNOWN * columns:
             raise ComputationError("the modes cannot be measured without the rig's equations",
-                                   measured=f"{2 * len(self.omega)} numbers an output for {columns} unknown residues",
+                                   measured=f"{2 * len(self.omega)} numbers per output for {columns} unknown residues",
                                    cause="too few lines near the modes for so many inputs", next_step="longer records")
         self.unknowns = columns * self.n_y
         self.evaluate = lru_cache(maxsize=2)(self._evaluate)

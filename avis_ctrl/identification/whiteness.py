@@ -57,9 +57,9 @@ class Correlation:
         at = f"{self.lags[lag]:.3g} {self.lag_unit}"
         largest = f"{self.value[row, lag]:.3g} against a limit of {self.limit[row, lag]:.3g}, {self.rows[row]} at {at}"
         if self.beyond:
-            return (f"{self.what}: {self.beyond} of {ratio.size} values are beyond limits that noise alone exceeds "
-                    f"anywhere in 1 % of validations; the farthest is {largest}")
-        return f"{self.what}: none of {ratio.size} values is beyond its limit; the nearest is {largest}"
+            return (f"{self.what}: {self.beyond} of {ratio.size} values exceed their limit (noise alone exceeds any "
+                    f"limit in 1 % of all validations); the largest is {largest}")
+        return f"{self.what}: none of {ratio.size} values exceeds its limit; the closest is {largest}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,7 +73,12 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
 
 
 def _best(system: StateSpace, omegas: np.ndarray) -> tuple[float, float]:
-    gains = np.linalg.norm(system.frequency_response(omegas), ord=2, axis=(1, 2))
+    response = system.frequency_response(omegas)
+    if not np.all(np.isfinite(response)):
+        lost = int(np.sum(~np.all(np.isfinite(response), axis=(1, 2))))
+        raise ComputationError("the response overflows", measured=f"at {lost} of {len(omegas)} frequencies",
+                               cause="a badly scaled realisation", next_step="balance the system first")
+    gains = np.linalg.norm(response, ord=2, axis=(1, 2))
     best = int(np.argmax(gains))
     return float(omegas[best]), float(gains[best])
 

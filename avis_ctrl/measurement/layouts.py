@@ -1,7 +1,7 @@
 """Which files are read, in words for `--help`: this module imports nothing, so that help answers at once."""
 
 FORMATS = """\
-Measurement files, told apart by their content:
+Measurement files, recognised by their content:
 
 HDF5 campaign: /records/NN with u, y, floor; or /frf with frequency_Hz, value and variance or coherence.
 
@@ -9,7 +9,7 @@ MATLAB .mat (v5 to v7.3), flat: u, y (samples by channels, either way round) and
 Optional: u_names, y_names (cell arrays), u_unit, y_unit, floor (three velocities), excitation, period_s, level_V,
 start_s, rig.
 
-MATLAB .mat, records: a struct array `records` with the fields of the flat layout, one element a record; u, y and t or
+MATLAB .mat, records: a struct array `records` with the fields of the flat layout, one element per record; u, y and t or
 sample_rate_Hz (or fs) are required, all else is optional: excitation (multisine, noise, rest, floor or sine; by default
 multisine with period_s, rest where u is zero, otherwise noise), period_s (empty, 0 or NaN where not periodic), start_s
 (by default one record after the other), level_V (from u), name. Names, units and rate that all records share may stand

@@ -99,9 +99,10 @@ def plausible(content: dict[str, Any], build: Build, ranges: PlausibleRanges = R
         hint = f"; {likely[0].field}: {_asked(likely)}" if likely else ""
         return f"unusual for a table: {said}{hint}"
     if likely:
-        raise InputError(f"{said}: no table has that; {_asked(likely)}", field=likely[0].field, value=likely[0].value)
-    raise InputError(f"{said}: no table has that, and no single wrong unit explains it; check the units of the keys",
-                     field=odd[0].field or "payload, isolators or drives", value=odd[0].value)
+        raise InputError(f"{said}: not possible for a real table; {_asked(likely)}", field=likely[0].field,
+                         value=likely[0].value)
+    raise InputError(f"{said}: not possible for a real table, and no single wrong unit explains it; check the units of "
+                     "the keys", field=odd[0].field or "payload, isolators or drives", value=odd[0].value)
 
 
 def _of_numbers(value: Any) -> bool:
@@ -216,15 +217,15 @@ def _modes(eom: Any, modes: Any, judge: Judge) -> None:
     judge("slowest_Hz", f[0], said)
     judge("mode_Hz", f[0], said)
     judge("mode_Hz", f[-1], said)
-    judge("spread", f[-1] / f[0], f"{said}, a ratio of {f[-1] / f[0]:.3g}")
+    judge("spread", f[-1] / f[0], f"{said}, ratio {f[-1] / f[0]:.3g}")
     rises = modes.shapes[2] ** 2 * np.diag(eom.M)[2]
     vertical = f[rises > 0.2]
     if len(vertical):
         sag = G / (2 * np.pi * vertical[0]) ** 2
-        judge("sag_m", sag, f"a static sag of {sag:.2g} m")
+        judge("sag_m", sag, f"static sag {sag:.2g} m")
     damping = np.diag(modes.shapes.T @ eom.C @ modes.shapes) / (4 * np.pi * f)
     for zeta in (np.min(damping), np.max(damping)):
-        judge("damping", zeta, f"a damping ratio of {zeta:.2g}")
+        judge("damping", zeta, f"damping ratio {zeta:.2g}")
 
 
 def _shape(rig: Rig, body: Any, centre: np.ndarray, radius: float, judge: Judge) -> None:
@@ -232,15 +233,15 @@ def _shape(rig: Rig, body: Any, centre: np.ndarray, radius: float, judge: Judge)
     judge("slab_kg_per_m2", slab, f"{slab:.3g} kg per m^2 of the area between the mounts")
     for J in np.linalg.eigvalsh(body.inertia):
         r = np.sqrt(max(J, 0.0) / body.mass)
-        judge("gyration", r / radius, f"a radius of gyration of {r:.3g} m, {r / radius:.2g} times the mounts' "
-                                           f"distance from their centre ({radius:.3g} m)")
+        judge("gyration", r / radius, f"radius of gyration {r:.3g} m, {r / radius:.2g} times the mounts' distance from "
+                                      f"their centre ({radius:.3g} m)")
     away = float(np.linalg.norm(body.centre_of_mass - centre))
-    judge("mounts_height", away / radius, f"a centre of mass {away:.3g} m from the mounts' centre, {away / radius:.2g}"
-                                               " times the radius on which they stand")
+    judge("mounts_height", away / radius, f"centre of mass {away:.3g} m from the mounts' centre, {away / radius:.2g} "
+                                          "times the radius of the circle of the mounts")
     near = np.median([np.linalg.norm(mount.position - centre) for mount in body.mounts])
     for name, place in rig.points().items():
         distance = float(np.linalg.norm(place.position - centre)) / max(near, 1e-12)
-        judge("outlier", distance, f"{name} {distance:.2g} times as far from the centre as the mounts")
+        judge("outlier", distance, f"{name} is {distance:.2g} times as far from the centre as the mounts")
 
 
 def _drives(rig: Rig, eom: Any, radius: float, judge: Judge) -> None:
@@ -257,7 +258,7 @@ def _drives(rig: Rig, eom: Any, radius: float, judge: Judge) -> None:
     judge("travel_m", travel, f"{together} move the payload by {travel:.2g} m")
     if radius > 0:
         judge("travel_share", travel / radius, f"{together} move the payload by {travel:.2g} m, {travel / radius:.2g} "
-                                               "times the radius on which the mounts stand")
+                                               "times the radius of the circle of the mounts")
 
 
 def _alike(numbers: Sequence[Entry], body: Any, judge: Judge) -> None:
@@ -284,7 +285,7 @@ def _unequal(values: np.ndarray, names: list[str], judge: Judge) -> None:
 def _clock(rig: Rig, f: float, judge: Judge) -> None:
     judge("samples_per_cycle", rig.sample_rate_Hz / f, f"{rig.sample_rate_Hz / f:.2g} samples per cycle of the "
                                                             f"fastest mode at {f:.3g} Hz")
-    judge("delay_cycles", rig.loop_delay_s * f, f"a loop delay of {rig.loop_delay_s:g} s "
+    judge("delay_cycles", rig.loop_delay_s * f, f"loop delay {rig.loop_delay_s:g} s "
           f"({rig.loop_delay_s * rig.sample_rate_Hz:.3g} samples), {rig.loop_delay_s * f:.2g} cycles of the "
           "fastest mode")
 
@@ -301,13 +302,13 @@ def _hearing(content: dict[str, Any], judge: Judge) -> None:
     floor = of("ambient", "floor_velocity_rms_m_per_s")
     for name, gain in _velocity_sensors(content):
         if full is not None:
-            judge("full_scale_m_per_s", full / gain, f"a full scale of {full / gain:.2g} m/s at {name}")
+            judge("full_scale_m_per_s", full / gain, f"full scale {full / gain:.2g} m/s of {name}")
         if full is not None and floor is not None:
             share = floor * gain / full
-            judge("floor_share", share, f"the floor motion alone, {floor:.2g} m/s, fills {share:.2g} of the "
-                                             f"converter's range at {name}")
+            judge("floor_share", share, f"the floor motion alone, {floor:.2g} m/s, uses a fraction of {share:.2g} of "
+                                        f"the converter's range at {name}")
             own = max(noise, full * 2.0 ** (1 - bits) / np.sqrt(12)) / gain
-            judge("deaf", own / floor, f"noise of {name}, {own:.2g} m/s, {own / floor:.3g} times the floor motion")
+            judge("deaf", own / floor, f"noise of {name} {own:.2g} m/s, {own / floor:.3g} times the floor motion")
 
 
 def _velocity_sensors(content: dict[str, Any]) -> Iterator[tuple[str, float]]:

@@ -89,7 +89,7 @@ def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcy
     rig: AvisTable | Halcyonics
     if "isolator" in content:
         if loaded:
-            raise InputError("a rig with isolators has no [load] section to put on it", field="load")
+            raise InputError("a table on isolators has no [load] section", field="load")
         rig = _avis(_checked(AvisFile, content))
     elif "suspension" in content:
         rig = _halcyonics(_checked(HalcyonicsFile, content), loaded)
@@ -116,7 +116,7 @@ def _check_support(rig: AvisTable | Halcyonics) -> None:
     softest, motion = (part[..., 0] for part in np.linalg.eigh(K / np.outer(size, size)))
     if softest < 1e-9:
         most = COORDINATES[int(np.argmax(np.abs(motion)))]
-        raise InputError(f"expected springs that hold every motion; nothing resists one that is mostly {most}",
+        raise InputError(f"expected a positive definite stiffness; no spring resists motion mainly along {most}",
                          field="isolator" if isinstance(rig, AvisTable) else "suspension")
 
 
@@ -216,7 +216,7 @@ def _halcyonics(file: HalcyonicsFile, loaded: bool) -> Halcyonics:
     _check_inertia(np.diag(plate.inertia_kgm2), "payload.inertia_kgm2", plate.inertia_kgm2)
     load = _load(file.load, plate) if file.load else None
     if loaded and load is None:
-        raise InputError("the loaded table was asked for, but the file has no [load] section", field="load")
+        raise InputError("the loaded table was requested, but the rig file has no [load] section", field="load")
     stiffness = {name.partition("_N")[0]: value for name, value in suspension.model_dump().items()}
     k_s, each = stiffness.pop("k_s"), stiffness.pop("k_s_each")
     lengths = {name.removesuffix("_m"): getattr(plate, name) for name in ("L1_m", "L2_m", "L3_m", "L4_plus_L5_m",

@@ -39,7 +39,7 @@ Percent = Annotated[float, Field(ge=0, le=100)]
 
 def _rising(band: list[float]) -> list[float]:
     if band[0] >= band[1]:
-        raise ValueError("expected the lower end first, the upper one after it")
+        raise ValueError("expected the lower limit first, then the upper one")
     return band
 
 

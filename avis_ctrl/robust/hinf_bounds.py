@@ -25,9 +25,9 @@ from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.hinf_plant import (
     Plant,
     as_plant,
-    channel_sizes,
+    in_usual_units,
     normal_form,
-    parrott,
+    parrott_at_infinity,
     pointwise,
     posed_plant,
     rank_margins,
@@ -104,15 +104,14 @@ def _optimum(P: StateSpace, nmeas: int, ncon: int) -> float:
 
 def pointwise_bound(plant: Plant, omega: np.ndarray | None = None) -> LowerBound:
     """Largest Parrott bound over the imaginary axis (sampled) and the zeros in the right half plane."""
+    plant = in_usual_units(plant)
     if omega is None:
         poles = np.abs(plant.sample_points())
         omega = np.geomspace(1e-2 * np.min(poles), 1e2 * np.max(poles), 400)
-    sizes = channel_sizes(plant)
-    best = LowerBound(parrott(plant.D11, plant.D12, plant.D21, sizes), complex(np.inf),
-                      "directions free at infinite frequency")
+    best = LowerBound(parrott_at_infinity(plant), complex(np.inf), "directions free at infinite frequency")
     for s, source in [*((1j * w, "directions free at one frequency") for w in omega),
                       *((z, "a right-half-plane zero of u -> z or w -> y") for z in right_zeros(plant))]:
-        value = pointwise(plant, s, sizes)
+        value = pointwise(plant, s, at_zero=s.real > 0)
         if value > best.gamma:
             best = LowerBound(value, complex(s), source)
     return best

@@ -168,16 +168,26 @@ def channel_scales(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
     return plant.size(plant.B2, plant.C1, plant.D12, 0), plant.size(plant.B1, plant.C2, plant.D21, 1)
 
 
+def in_usual_units(plant: Plant) -> Plant:
+    """The same problem with every u of typical size one on z, and so w on every y.
+
+    No bound depends on the units of u and y; rank that is judged against the largest channel would.
+    """
+    of_u, of_y = channel_scales(plant)
+    return replace(plant, B2=plant.B2 / of_u, D12=plant.D12 / of_u, C2=plant.C2 / of_y[:, None],
+                   D21=plant.D21 / of_y[:, None], D22=plant.D22 / of_u / of_y[:, None])
+
+
 def rank_margins(plant: Plant) -> tuple[float, float]:
     """Smallest singular values of D12 (columns of unit length) and D21 (rows of unit length).
 
-    A column below 1e-12 of its input's typical effect on z counts as zero; 0 where there are too few rows.
+    A column below `no_column` of its input's typical effect on z counts as zero; 0 where there are too few rows.
     """
     of_u, of_y = channel_scales(plant)
 
     def margin(D: np.ndarray, sizes: np.ndarray) -> float:
         length = la.norm(D, axis=0)
-        if D.shape[0] < D.shape[1] or np.any(length <= 1e-12 * sizes):
+        if D.shape[0] < D.shape[1] or np.any(length <= SETTINGS.no_column * sizes):
             return 0.0
         return float(la.svdvals(D / length)[-1])
     return margin(plant.D12, of_u), margin(plant.D21.T, of_y)
@@ -209,33 +219,78 @@ def _typical(matrix: np.ndarray) -> float:
     return float(la.norm(matrix, 2)) if np.any(matrix) else 1.0
 
 
-def parrott(P11: np.ndarray, P12: np.ndarray, P21: np.ndarray, sizes: tuple[float, float] = (0.0, 0.0)) -> float:
+def parrott(P11: np.ndarray, of_u: np.ndarray, of_y: np.ndarray) -> float:
     """min over Q of sigma(P11 + P12 Q P21), exactly (Parrott 1978).
 
-    sizes : yardsticks of P12 and P21, against which a singular value of 1e-9 counts as lost rank.
+    of_u, of_y : orthonormal bases of the directions of z that u does not move, and of those of w that y does not see.
     """
-    left, right = _kernel(P12.conj().T, sizes[0]).conj().T @ P11, P11 @ _kernel(P21, sizes[1])
+    left, right = of_u.conj().T @ P11, P11 @ of_y
     return float(max(la.norm(left, 2) if left.size else 0.0, la.norm(right, 2) if right.size else 0.0))
 
 
-def channel_sizes(plant: Plant) -> tuple[float, float]:
-    """Typical sizes of u -> z and w -> y."""
-    return float(plant.size(plant.B2, plant.C1, plant.D12)), float(plant.size(plant.B1, plant.C2, plant.D21))
+def parrott_at_infinity(plant: Plant) -> float:
+    """Parrott's bound of the direct terms; for a plant `in_usual_units`."""
+    bases = []
+    for rows in (plant.D12.T, plant.D21):
+        there = rows[la.norm(rows, axis=1) > SETTINGS.no_column]
+        bases.append(_kernel(there / la.norm(there, axis=1)[:, None], SETTINGS.no_column))
+    return parrott(plant.D11, *bases)
 
 
-def pointwise(plant: Plant, s: complex, sizes: tuple[float, float] | None = None) -> float:
-    """Parrott's bound at one point of the closed right half plane (see `hinf_bounds`); 0 where P has a pole."""
-    sizes = sizes or channel_sizes(plant)
+def pointwise(plant: Plant, s: complex, at_zero: bool = False) -> float:
+    """Parrott's bound at one point of the closed right half plane (see `hinf_bounds`).
+
+    0 where P has a pole, or where round-off leaves in doubt which directions u moves or y sees.
+
+    at_zero : s is a computed zero of u -> z or w -> y, where that channel loses rank.
+    """
     resolvent = s * np.eye(plant.n) - plant.A
     if plant.n and 1 / np.linalg.cond(resolvent) < 1e-13:
         return 0.0
-    x1, x2 = np.linalg.solve(resolvent, plant.B1), np.linalg.solve(resolvent, plant.B2)
-    return parrott(plant.C1 @ x1 + plant.D11, plant.C1 @ x2 + plant.D12, plant.C2 @ x1 + plant.D21,
-                   sizes)
+    R = np.linalg.inv(resolvent) if plant.n else np.zeros((0, 0))
+    x1, x2 = (np.linalg.solve(resolvent, B) if plant.n else np.zeros(B.shape) for B in (plant.B1, plant.B2))
+    P12, P21 = plant.C1 @ x2 + plant.D12, plant.C2 @ x1 + plant.D21
+    bases = []
+    for rows, noise in ((P12.conj().T, _rounding(plant.C1, R, resolvent, plant.B2, x2, plant.D12).T),
+                        (P21, _rounding(plant.C2, R, resolvent, plant.B1, x1, plant.D21))):
+        basis = _kernel_at_zero(rows, noise) if at_zero else _known_kernel(rows, noise)
+        if basis is None:
+            return 0.0
+        bases.append(basis)
+    return parrott(plant.C1 @ x1 + plant.D11, *bases)
 
 
-def _kernel(matrix: np.ndarray, size: float) -> np.ndarray:
-    """Orthonormal basis of the null space of a matrix, singular values judged against `size` and their largest."""
-    _, s, Vh = la.svd(matrix)
-    rank = int(np.sum(s > SETTINGS.rank_at_point * max(size, float(s[0])))) if s.size and s[0] > 0 else 0
-    return Vh[rank:].conj().T
+def _rounding(C: np.ndarray, R: np.ndarray, resolvent: np.ndarray, B: np.ndarray, x: np.ndarray, D: np.ndarray
+              ) -> np.ndarray:
+    """By how much round-off may have changed the entries of C x + D, x = R B (Higham 2002, section 7.2)."""
+    of_x = np.abs(R) @ (np.abs(resolvent) @ np.abs(x) + np.abs(B))
+    return (len(R) + 1) * np.finfo(float).eps * (np.abs(C) @ (np.abs(x) + of_x) + np.abs(D))
+
+
+def _known_kernel(rows: np.ndarray, noise: np.ndarray) -> np.ndarray | None:
+    """Null space of rows that are known to an error of `noise`; None where it is not known to `known_direction`."""
+    length, error = la.norm(rows, axis=1), la.norm(noise, axis=1)
+    there = (length > 0) | (error > 0)
+    rows, length, error = rows[there], length[there], error[there]
+    if np.any(error > SETTINGS.known_direction * length):
+        return None
+    rows = rows / length[:, None]
+    least = float(la.svdvals(rows)[-1]) if len(rows) else 1.0
+    if len(rows) < rows.shape[1] and la.norm(error / length) > SETTINGS.known_direction * least:
+        return None
+    return _kernel(rows, 0.0)
+
+
+def _kernel_at_zero(rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Null space of rows at a zero of theirs: what is round-off there has vanished."""
+    length = la.norm(rows, axis=1)
+    there = length > SETTINGS.rank_at_zero / np.finfo(float).eps * la.norm(noise, axis=1)
+    return _kernel(rows[there] / length[there, None], SETTINGS.rank_at_zero)
+
+
+def _kernel(rows: np.ndarray, least: float) -> np.ndarray:
+    """Orthonormal basis of the null space of rows; singular values up to `least` count as zero."""
+    if not len(rows):
+        return np.eye(rows.shape[1])
+    _, s, Vh = la.svd(rows)
+    return Vh[int(np.sum(s > least)):].conj().T

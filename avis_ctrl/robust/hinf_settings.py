@@ -13,8 +13,13 @@ class HinfSettings:
         counts as rank deficient: the formulas divide by it, which costs half the digits.
     pbh_tolerance : smallest singular value of the PBH matrix relative to the norm of [A B], or of [A; C], below which a
         mode counts as uncontrollable, or unobservable: well above the round-off of its pole.
-    rank_at_point : singular value of a channel at one frequency, relative to its typical size, below which the channel
-        counts as rank deficient there: only just above the round-off of a response, because lost rank raises a bound.
+    no_column : length of a column of D12, or row of D21, relative to its channel's typical size, below which it counts
+        as zero: round-off of the plant's data.
+    rank_at_zero : singular value of a channel at its own zero, its columns or rows of unit length, below which it is
+        one that vanishes there: the accuracy of a computed zero.
+    known_direction : largest relative error of the directions in which a control acts, or a measurement sees, at one
+        frequency; with more, the response there gives no bound. Rank is never taken for lost because it is small: a
+        control that has rolled off acts all the same, and a lost direction raises the bound.
     response_tolerance : largest difference of two responses off the imaginary axis, relative to their size, that counts
         as round-off.
     axis_tolerance : real part of an eigenvalue of the Hamiltonian relative to its magnitude, up to which it counts as
@@ -37,7 +42,9 @@ class HinfSettings:
 
     rank_tolerance: float = 1e-8
     pbh_tolerance: float = 1e-10
-    rank_at_point: float = 1e-9
+    no_column: float = 1e-12
+    rank_at_zero: float = 1e-9
+    known_direction: float = 1e-6
     response_tolerance: float = 1e-9
     axis_tolerance: float = 1e-10
     lagrangian_tolerance: float = 1e-6

@@ -128,10 +128,10 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
         bounds = bounds[0], max(bounds[1], result.gamma)
     zero = 200 * SETTINGS.zero_gamma * natural_gamma(form.plant)
     bounds, status, notes = _consistent(bounds, result.gamma, tolerance, zero, status, notes)
-    if status is not Status.OPTIMAL:
-        notes = (*notes, *_doubt_of_gamma(P, result))
-    elif result.gamma <= zero and bounds[1] - bounds[0] >= 2 * tolerance * bounds[1]:
+    if status is Status.OPTIMAL and result.gamma <= zero and bounds[1] - bounds[0] >= 2 * tolerance * bounds[1]:
         notes = (*notes, f"the optimum is zero to working precision (gamma {result.gamma:.2g})")
+    else:
+        notes = (*notes, *_doubt_of_gamma(P, result))
     rate = _rate_note(result, sample_rate_Hz)
     return replace(result, gamma_optimal_bounds=(float(bounds[0]), float(bounds[1])), status=status,
                    limited_by=bracket.limited_by, notes=(*notes, *result.notes, *rate))
@@ -302,9 +302,12 @@ def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
     p, k = (one.frequency_response(np.concatenate([[peak], at_poles[at_poles > 0]])) for one in (P, result.K))
     u, y = k.shape[1:]
     w, z = P.ninputs - u, P.noutputs - y
+    # On a pole of P or K, an integrator at rest say, they have no response.
+    there = np.all(np.isfinite(p), axis=(1, 2)) & np.all(np.isfinite(k), axis=(1, 2))
+    p, k = p[there], k[there]
     loop = p[:, :z, :w] + p[:, :z, w:] @ np.linalg.solve(np.eye(u) - k @ p[:, z:, w:], k @ p[:, z:, :w])
     again = np.linalg.norm(loop, 2, axis=(1, 2))
-    at_peak, highest = float(again[0]), float(np.max(again))
+    at_peak, highest = float(again[0]) if there[0] else result.gamma, float(np.max(again, initial=0.0))
     other = highest if highest > (1 + SETTINGS.same_gamma) * result.gamma else at_peak
     if abs(other - result.gamma) <= SETTINGS.same_gamma * result.gamma:
         return ()

@@ -92,8 +92,9 @@ def mu(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: float = 1e
     M : (n_z, n_w) or (n_omega, n_z, n_w) complex; n_z = sum of the blocks' cols, n_w = sum of their rows.
     tolerance : relative accuracy in upper^2 at which the scalings' optimisation stops.
 
-    The lower bound is local: the search may miss the least perturbation, what it returns is verified (smallest
-    singular value of I - M delta below 1e-9, with M balanced). Up to three full complex blocks the two meet.
+    The lower bound is local: the search may miss the least perturbation, what it returns is verified (with M balanced,
+    smallest singular value of I - M delta below 1e-9 and an eigenvalue of M delta within 1e-6 of 1). Up to three full
+    complex blocks the two meet.
 
     Raises
     ------

@@ -34,10 +34,15 @@ class MuLowerSettings:
         M Delta: an error of this size in Delta changes no digit of mu that is printed.
     meaningless : round-off of M Delta above which a small singular value proves nothing, and I - M Delta never counts
         as singular.
+    eigenvalue : distance from 1 of the nearest eigenvalue of M Delta, up to which I - M Delta counts as singular. Where
+        M Delta is far from normal, a small singular value alone proves nothing: I - d J of a nilpotent J has the
+        determinant 1 for every d, but a smallest singular value that falls as a power of 1/d. Dividing Delta by the
+        eigenvalue makes I - M Delta singular, so this is the relative error of the bound, one in the printed digits.
     """
 
     singular: float = 1e-9
     meaningless: float = 1e-6
+    eigenvalue: float = 1e-6
 
 
 SETTINGS = MuLowerSettings()
@@ -182,7 +187,8 @@ def block_norm(delta: Array, structure: BlockStructure) -> Array:
 
 
 def is_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
-    """Whether I - M Delta is singular (B,): smallest singular value below 1e-9 plus the round-off of M Delta.
+    """Whether I - M Delta is singular (B,): smallest singular value below 1e-9 plus the round-off of M Delta, and an
+    eigenvalue of M Delta within 1e-6 of 1.
 
     Judged on the balanced M, which has the same determinant: a badly scaled M looks singular to any Delta.
     """
@@ -196,7 +202,10 @@ def _balanced_is_singular(M: Array, delta: Array) -> Array:
     A = M @ delta
     least = np.linalg.svd(np.eye(A.shape[-1]) - A, compute_uv=False)[:, -1]
     round_off = 1e-14 * np.linalg.norm(A, ord=2, axis=(1, 2))
-    return (least < SETTINGS.singular + round_off) & (round_off < SETTINGS.meaningless)
+    found = (least < SETTINGS.singular + round_off) & (round_off < SETTINGS.meaningless)
+    away = np.min(np.abs(np.linalg.eigvals(A[found]) - 1), axis=1, initial=np.inf)
+    found[found] = away < SETTINGS.eigenvalue
+    return found
 
 
 def _complex_part(structure: BlockStructure) -> Array:

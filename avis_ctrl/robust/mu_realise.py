@@ -77,7 +77,7 @@ def _rank_one(value: Array, omega: float) -> StateSpace:
     row = _unique([_all_pass(entry, omega) for entry in vh])
     spread = append(*column) @ gain(np.ones((u.size, 1)))
     collect = gain(np.ones((1, vh.size))) @ append(*row)
-    return (spread @ collect).scaled(left=float(sigma[0]) if sigma[0] > 0 else 0.0)
+    return (spread @ collect).scaled(left=float(sigma[0]))
 
 
 def _unique(parts: list[StateSpace]) -> list[StateSpace]:

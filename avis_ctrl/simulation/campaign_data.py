@@ -108,7 +108,7 @@ def _ambient(rig: Rig, plan: CampaignPlan) -> SpectrumModel | None:
     rms = plan.ambient.velocity_rms_m_per_s
     if rms is None:
         if rig.ambient is None:
-            raise InputError(f"missing; the file of the rig {rig.name} does not say how much its floor moves",
+            raise InputError(f"missing; the file of the rig {rig.name} does not state its floor motion ([ambient])",
                              field="ambient.velocity_rms_m_per_s")
         rms = rig.ambient.floor_velocity_rms_m_per_s
     if rms == 0:
@@ -150,8 +150,8 @@ def _signals(loop: SampledLoop, plan: CampaignPlan, seed: int) -> Iterator[_Plan
 def _check_floor_band(band_Hz: list[float], samples: int, fs: float, field: str) -> None:
     low, high = band_Hz
     if high >= fs / 2 or np.floor(high * samples / fs) < max(np.ceil(low * samples / fs), 1):
-        raise InputError(f"expected a band below half the sample rate ({fs / 2:g} Hz) with a multiple of 1/duration = "
-                         f"{fs / samples:.4g} Hz inside", field=field, value=band_Hz)
+        raise InputError(f"expected a band below half the sample rate ({fs / 2:g} Hz) that contains a multiple of "
+                         f"1/duration = {fs / samples:.4g} Hz", field=field, value=band_Hz)
 
 
 def _drawn(loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int, dealt: int,
@@ -164,7 +164,7 @@ def _drawn(loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int,
         return noise(NoiseSettings(names, fs, samples / fs, (low, high), limit_V, None, one.records, seed))
     m = plan.multisine
     if samples < 2 * m.period_s * fs * (1 - 1e-9):
-        raise InputError(f"expected at least two periods of {m.period_s:g} s: the first holds the transient",
+        raise InputError(f"expected at least two periods of {m.period_s:g} s: the first contains the transient",
                          field="duration_s", value=samples / fs)
     return multisine(MultisineSettings(names, fs, m.period_s, (low, high), limit_V, None, m.lines, m.spacing,
                                        m.group, m.scheme, one.records, dealt, None, m.compensate_hold, m.low_crest,
@@ -212,7 +212,8 @@ def _record(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: Spect
     floor = _floor(loop, plan, one, ambient, settle, _rng(*seed, _FLOOR))
     run = _run(loop, one.u, settle, floor, (*seed, _NOISE), plan.truth.nonlinear)
     if run.diverged:
-        raise ComputationError(f"record {name}: the table left its stops", cause="a level or a floor far too large",
+        raise ComputationError(f"record {name}: the table moved beyond its stops",
+                               cause="the level or the floor motion is far too large",
                                measured=f"{np.max(np.abs(run.q[-1, :3])):.3g} m from rest",
                                next_step="lower the level of this record in the plan")
     converter = loop.sensors.converter
@@ -271,15 +272,15 @@ def _assumptions(loop: SampledLoop, plan: CampaignPlan, seed: int, ambient: Spec
     low, high = plan.ambient.band_Hz
     floor = (f"ambient floor {rms:.4g} m/s r.m.s. from {low:g} to {high:g} Hz along each of x, y, z, shape "
              f"{plan.ambient.spectrum}" if ambient else "floor at rest")
-    noises = (f"sensor noise {_span(bank.noise_rms_V)} V r.m.s. a sample, "
-              + (f"quantiser {bank.converter.lsb_V:.4g} V" if bank.converter
-                 else f"no quantiser, levels chosen for a range of {ASSUMED_RANGE_V:g} V"))
+    noises = (f"sensor noise {_span(bank.noise_rms_V)} V r.m.s. per sample, "
+              + (f"quantisation step {bank.converter.lsb_V:.4g} V" if bank.converter
+                 else f"no quantisation, levels chosen for a range of {ASSUMED_RANGE_V:g} V"))
     lag = (f"amplifiers with a first-order lag of {loop.amplifier_corner_Hz:g} Hz" if loop.amplifier_corner_Hz
            else "amplifiers without lag")
     return [f"Simulated with the {table} table in open loop, seed {seed}: {floor}; {noises}; {lag}; delay "
             f"{loop.loop_delay_s:g} s.",
-            f"Before each record the drives are silent for {plan.settle_s:g} s: a multisine's first period holds a "
-            "transient."]
+            f"Before each record the drives are silent for {plan.settle_s:g} s: the first period of a multisine "
+            "contains a transient."]
 
 
 def _rng(*seed: int) -> np.random.Generator:

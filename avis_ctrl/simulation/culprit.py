@@ -43,8 +43,8 @@ class Culprit:
         at = f"(plant \"{self.plant}\", spectral radius {self.radius:.6f})"
         if self.kind == "nonlinear":
             return f"the nonlinear simulation diverges although the linear loop is stable {at}"
-        how = (f"the motion along {_joined(self.axes)} grows at {self.frequency_Hz:.3g} Hz with a time constant of "
-               f"{1 / max(self.growth_per_s, 1e-12):.3g} s {at}")
+        how = (f"a motion at {self.frequency_Hz:.3g} Hz, mainly along {_joined(self.axes)}, grows with a time constant "
+               f"of {1 / max(self.growth_per_s, 1e-12):.3g} s {at}")
         loops = f"the skyhook loop{'s' if len(self.loops) > 1 else ''} of {_joined(self.loops)}"
         without = f"without {'these loops' if len(self.loops) > 1 else 'that loop'} this plant is stable"
         who = {"table": "the table is unstable even without control",

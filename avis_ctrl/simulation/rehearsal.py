@@ -43,7 +43,8 @@ class Rehearsal:
     def truth_toml(self) -> str:
         """The truth as a rig file, the changed lines marked with the change."""
         values = {name: f"{name} x {factor:.6f}" for name, factor in self.factors.items()}
-        return rig_toml(self.truth, values, "The table that moved in a rehearsal; what identification should find.")
+        return rig_toml(self.truth, values, "The simulated table of a campaign: the values that an identification "
+                                            "should find.")
 
 
 def rehearse(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | None = None) -> Rehearsal:
@@ -90,8 +91,8 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
             refused = error
         else:
             return truth
-    raise InputError(f"{ATTEMPTS} draws gave no body that can exist; the last: {refused}", field="perturb_percent",
-                     value=percent)
+    raise InputError(f"none of {ATTEMPTS} random draws gives a physically possible table; the last error: {refused}",
+                     field="perturb_percent", value=percent)
 
 
 def within_tolerances(rig: AvisTable, rng: np.random.Generator) -> AvisTable:

@@ -139,7 +139,7 @@ class SampledLoop:
         None where each drive acts by itself.
     amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
     sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage. By
-        default each drive has its own limit; a given limit_V is for all drives.
+        default each drive has its own limit; a given limit_V, other than the rig's largest, is for all drives.
 
     Raises
     ------

@@ -9,8 +9,10 @@ Loops are closed one after the other around the sampled table with six degrees o
 sensor dynamics and the design's own controller included, and once more with all the others closed. Of a grid of
 gains and corners each loop takes the one with the smallest payload velocity r.m.s. in the site's band, under floor
 motion and sensor noise, among those that keep a modulus margin (the distance of the Nyquist curve from the critical
-point) and that the neglected dynamics of the drives do not make unstable. Critical damping with customary corners, the
-classical rule, keeps neither with 1 Hz geophones: below its corner a geophone turns the phase by 180 degrees.
+point) and that the neglected dynamics of the drives do not make unstable, as far as they act on this loop's own
+voltages; what they do to all voltages together is left to the plants that are simulated. Critical damping with
+customary corners, the classical rule, keeps neither with 1 Hz geophones: below its corner a geophone turns the phase by
+180 degrees.
 """
 
 from __future__ import annotations
@@ -106,9 +108,9 @@ class Companions:
     def remarks(self) -> tuple[str, ...]:
         """The notes, and which loops miss the modulus margin."""
         low = ", ".join(f"{one.axis} {one.modulus_margin:.2f}" for one in self.below_margin())
-        asked = (f"Loops of the other axes with a modulus margin below the {self.settings.modulus_margin:g} that was "
-                 f"asked, all loops closed: {low}.")
-        return (*self.notes, asked) if low else self.notes
+        missed = (f"Loops of the other axes with a modulus margin below the required {self.settings.modulus_margin:g}, "
+                  f"with all loops closed: {low}.")
+        return (*self.notes, missed) if low else self.notes
 
 
 def free_axes(rig: Rig, keep: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
@@ -146,7 +148,7 @@ def design_companions(bare: SampledLoop, chain_error: Weight | None = None, band
             others = {name: one for name, one in found.items() if name != axis}
             best = search.best(axis, others)
             found = others if best is None else {**others, axis: best}
-    reason = "no gain and corners tried are stable with the required margins"
+    reason = "none of the gains and corners tried is stable with the required margins"
     missing = tuple((axis, reason) for axis in axes if axis not in found)
     loops = tuple(found[axis] for axis in axes if axis in found)
     return _with_margins(Companions(loops, (*passive, *missing), settings=settings), bare)
@@ -194,8 +196,8 @@ def until_stable(companions: Companions, plants: Sequence[SampledLoop]) -> Compa
     without = [spectral_radius(replace(plant, loops={})) for plant in plants]
     if max(without) < 1:
         lowest = -20 * settings.shrinks * np.log10(settings.shrink)
-        reason = (f"with the other axes' loops, even with gains lowered by {lowest:.0f} dB, a plant of the uncertainty "
-                  "set is unstable")
+        reason = (f"even with the gains of the other axes' loops lowered by {lowest:.0f} dB, a plant of the "
+                  "uncertainty set is unstable")
         return replace(companions, loops=(),
                        passive=(*companions.passive, *((one.axis, reason) for one in companions.loops)))
     return _with_margins(companions, bare)

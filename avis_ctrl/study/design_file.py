@@ -260,9 +260,9 @@ def _require_band_below_crossovers(design: Design) -> None:
     for name in ("actuator_chains", "sensor_chains"):
         chains: ChainUncertainty | None = getattr(design.uncertainty, name)
         if chains is not None and chains.crossover_Hz <= low:
-            raise InputError(f"expected a crossover above {low:g} Hz, the lower end of transmissibility.band_Hz: the "
-                             "chains are 100 % uncertain above it", field=f"uncertainty.{name}.crossover_Hz",
-                             value=chains.crossover_Hz)
+            raise InputError(f"expected a crossover above {low:g} Hz, the lower end of transmissibility.band_Hz: above "
+                             "the crossover the chains are more than 100 % uncertain",
+                             field=f"uncertainty.{name}.crossover_Hz", value=chains.crossover_Hz)
 
 
 def read_study(path: str | Path) -> tuple[Design, Rig]:
@@ -276,8 +276,8 @@ def read_study(path: str | Path) -> tuple[Design, Rig]:
     design = read_design(path)
     beside = path.parent / design.rig
     if design.rig not in SHIPPED and not beside.is_file():
-        raise InputError(f"expected a rig file beside the design or one of {', '.join(SHIPPED)}", file=path,
-                         field="rig", value=design.rig)
+        raise InputError(f"expected one of {', '.join(SHIPPED)}, or the path of a rig file relative to the design file",
+                         file=path, field="rig", value=design.rig)
     named = design.uncertainty.identified
     rig = load_rig(design.rig if design.rig in SHIPPED else beside, design.loaded, check=named is None)
     if isinstance(named, str):

@@ -29,7 +29,7 @@ def open_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence
     except OSError as error:
         if error.errno in FULL:
             raise not_written(path, error) from None
-        raise InputError(f"expected a folder that can be written ({error.strerror or error})", field="--out",
+        raise InputError(f"expected a writable folder ({error.strerror or error})", field="--out",
                          value=str(path)) from None
     for name, is_folder in (*((name, True) for name in folders), *((name, False) for name in files)):
         if (path / name).exists() and (path / name).is_dir() != is_folder:
@@ -57,7 +57,7 @@ def require_other(out: Path, *inputs: Path | str | None) -> None:
     for one in inputs:
         with contextlib.suppress(OSError):
             if one is not None and out.samefile(one):
-                raise InputError("expected another file than the one that is read", field="--out", value=str(out))
+                raise InputError("expected a file other than the input file", field="--out", value=str(out))
 
 
 def write_json(path: Path, value: dict[str, Any]) -> None:

@@ -45,8 +45,8 @@ from avis_ctrl.study.record_checks import check_campaign
 from avis_ctrl.study.rig_channels import in_words_of
 
 Progress = Callable[[str], None]
-CAUTION = ("standard deviations hold the noise of these records alone; what was not free (such as force constants, "
-           "sensitivities, places) counts as exact")
+CAUTION = ("the standard deviations include only the noise of these records; values that were not fitted (such as "
+           "force constants, sensitivities, positions) count as exact")
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
     with threadpool_limits(1):
         model = start_model(measured, rig, options)
         findings = _gates(measured, model, options, progress)
-        progress("which records to fit, which to hold out, and the band")
+        progress("choosing the records to fit, the records to hold out, and the band")
         split, fitted, held_out, band = _divide(measured, options)
         unplayed = excited_space(split.fitted, band).sentence if split else ""
         if unplayed:
@@ -133,10 +133,10 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
         floor = any(block.block.kind == "floor measured" for block in found.fit.residuals)
         report = identifiability_report(found.fit.information, found.fit.model, floor,
                                         {name: sigma for name, (_, sigma) in found.fit.priors.items()})
-        progress(f"{found.fit.information.rank} of {len(model.names)} combinations of parameters are determined")
+        progress(f"the data determine {found.fit.information.rank} of {len(model.names)} combinations of parameters")
         advice = _advice(found, fitted, report, progress)
         kalman, note = _kalman(split.fitted if split else measured, rig, model.names, options, progress)
-        progress("validation on what no fit has seen")
+        progress("validation on held-out data")
         validation = validate(found, fitted, held_out)
     identified = found.fit.model.rig
     seconds = time.monotonic() - began
@@ -147,15 +147,15 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
 def _check(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> None:
     """What can be refused before anything slow begins."""
     if options.band_Hz is not None and not 0 <= options.band_Hz[0] < options.band_Hz[1]:
-        raise InputError("expected the lower end first, the upper one after it", field="band_Hz", value=options.band_Hz)
+        raise InputError("expected the lower limit first, then the upper one", field="band_Hz", value=options.band_Hz)
     if isinstance(measured, Campaign):
         for name in options.hold_out or ():
             measured.named(name)
         if options.band_Hz is not None:
             low, high = excited_band(measured)
             if options.band_Hz[0] >= high or options.band_Hz[1] <= low:
-                raise InputError(f"the records are driven from {low:.3g} to {high:.3g} Hz; expected a band within",
-                                 field="band_Hz", value=options.band_Hz)
+                raise InputError(f"the records are excited from {low:.3g} to {high:.3g} Hz; expected a band that "
+                                 "overlaps this one", field="band_Hz", value=options.band_Hz)
 
 
 def amplifier_corner(rig: Rig, stated_Hz: float | None) -> float | None:
@@ -171,7 +171,7 @@ def amplifier_corner(rig: Rig, stated_Hz: float | None) -> float | None:
 def amplifier_words(corner_Hz: float, stated_Hz: float | None) -> str:
     """The corner, and whether it was stated."""
     return f"amplifiers with a first-order lag of {corner_Hz:g} Hz" + (
-        "" if stated_Hz else ", as rehearsals and designs assume; --amplifier-corner states another")
+        "" if stated_Hz else ", the default for tables with accelerometers; --amplifier-corner sets another corner")
 
 
 def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions) -> ResponseModel:
@@ -231,10 +231,10 @@ def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, report: Id
     model = found.fit.model
     if found.fit.information.rank == len(model.names) or not isinstance(fitted, Campaign):
         return ()
-    progress("which further record would determine the rest")
+    progress("searching for a further record that would determine the rest")
     driven = [record.header for record in fitted.records if record.header.level_V > 0]
     if not driven:
-        return ("No record drives the actuators; such a record is the first thing to add.",)
+        return ("No record drives the actuators; add such a record first.",)
     level = float(np.mean([h.level_V for h in driven]))
     try:
         drive = Drive(level, sum(h.duration_s for h in driven), found.band_Hz)
@@ -247,7 +247,7 @@ def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, report: Id
 def _kalman(fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str], options: IdentifyOptions,
             progress: Progress) -> tuple[EkfResult | None, str]:
     if not options.kalman:
-        return None, "the extended Kalman filter was not asked for"
+        return None, "the extended Kalman filter was not requested"
     if not isinstance(fitted, Campaign):
         return None, "the extended Kalman filter needs records; these are frequency responses"
     # It takes a measured floor for noise; a shaken one would be a disturbance far above what it allows for.
@@ -258,7 +258,7 @@ def _kalman(fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str]
     try:
         return identify_ekf(rig, fitted.only(driven), HONEST_SETTINGS, names, progress), ""
     except AvisError as error:
-        return None, f"the extended Kalman filter gave no answer: {error}"
+        return None, f"the extended Kalman filter failed: {error}"
 
 
 def provenance(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions, seconds: float

@@ -188,14 +188,14 @@ def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float]
 def assumed_weights(rig: Rig) -> str:
     """Comment lines above a `default_design`: for which table its weights were chosen, and how this one compares."""
     shipped = load_rig("avis" if isinstance(rig, AvisTable) else "halcyonics_loaded")
-    lines = ["The weights were not stated for this table. [loop], [uncertainty.actuator_chains], [transmissibility],",
-             "[control_effort] and [[requirement]] come from the shipped design for the first of these tables:"]
+    lines = ["No weights were specified for this table. [loop], [uncertainty.actuator_chains], [transmissibility],",
+             "[control_effort] and [[requirement]] are those of the shipped design for the first of these two tables:"]
     for what, one in (("shipped", shipped), ("this table", rig)):
         eom = one.equations_of_motion()
         modes = eom.natural_frequencies().frequencies_Hz
         lines.append(f"  {what}: {_value(one.name)}, {eom.M[0, 0]:.4g} kg, modes from {modes.min():.3g} to "
                      f"{modes.max():.3g} Hz")
-    lines.append("State here, and in [floor], what this table needs before you design.")
+    lines.append("Before you design, change them, and add [floor] if needed, to suit this table.")
     return "".join(f"# {line}\n" for line in lines)
 
 

@@ -51,8 +51,8 @@ def require_readable(found: Identification) -> None:
     try:
         rig_from(tomllib.loads(identified_toml(found)), getattr(found.rig, "load", None) is not None)
     except InputError as error:
-        raise InputError(f"the identified values make no rig: {error}; something that was taken as known is wrong",
-                         field="rig.toml") from None
+        raise InputError(f"the identified values are not a valid rig: {error}; a value that was taken as known is "
+                         "wrong", field="rig.toml") from None
 
 
 def identified_toml(found: Identification) -> str:
@@ -69,7 +69,7 @@ def identified_toml(found: Identification) -> str:
               f"from {p['measurement'] or 'a measurement'}, SHA-256 {p['measurement_sha256'][:16]}",
               f"{information.rank} of {len(information.names)} combinations of parameters are determined; standard "
               "deviations (1 sigma) beside the values",
-              "what the combinations are stands in the report and in result.json", CAUTION]
+              "the report and result.json list the combinations", CAUTION]
     return rig_toml(identified_rig(found.model), comments, "\n".join(header))
 
 

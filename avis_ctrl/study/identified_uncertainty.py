@@ -47,10 +47,10 @@ class InDesign:
         where = ", ".join(f"{f[first]:.3g} Hz" if last == first + 1 else f"{f[first]:.3g} to {f[last - 1]:.3g} Hz"
                           for first, last in edges.reshape(-1, 2))
         largest = 100 * float(np.max(self.spread.bound(self.confidence)[drowned]))
-        return (f"The noise of the measurement hides the response at {where}: there it alone makes a spread of 100 % "
-                f"or more (bound up to {largest:.0f} %), which says nothing of the model. The uncertainty is assumed "
-                "to be 100 % there, more only where the measurement proves more; record longer or at a higher level to "
-                "measure it.")
+        return (f"Measurement noise hides the response at {where}: there noise alone causes a spread of 100 % or more "
+                f"(bound up to {largest:.0f} %), so that the data contain no information on the model. The uncertainty "
+                "is assumed to be 100 % there, or more only where the measurement proves it. To measure it, record "
+                "longer or at a higher level.")
 
 
 def in_design(content: UncertaintyFile, rig: Rig, keep: Sequence[str], confidence: float = 0.95,
@@ -70,8 +70,8 @@ def in_design(content: UncertaintyFile, rig: Rig, keep: Sequence[str], confidenc
     spread = next((one for one in content.spread if sorted(one.keep) == sorted(keep)), None)
     if spread is None:
         known = "; ".join(", ".join(one.keep) for one in content.spread)
-        raise InputError(f"the uncertainty file holds the spread for {known}; identify again with "
-                         "--design FILE, a design file that keeps these coordinates", field="keep", value=list(keep))
+        raise InputError(f"the uncertainty file is valid for {known}; identify again with --design FILE, a design file "
+                         "that keeps the coordinates wanted here", field="keep", value=list(keep))
     values, own = spread.values(), [name in rig.parameters() for name in content.names]
     names = [name for name, here in zip(content.names, own, strict=True) if here]
     # Sensors and delay are no parameters of the rig's equations: the measured spread covers their errors.

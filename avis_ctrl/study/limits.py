@@ -58,15 +58,16 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
         return ""
     spread = _spread_there(plant, mu.mu.omega)
     if no_better_than_none(mu, others):
-        return (f"The synthesis found no controller better than none: mu of the table is {mu.mu.upper:.3g} with it, at "
-                f"{mu.mu.omega / (2 * np.pi):.3g} Hz, and no smaller than without control. No D-K iteration "
-                f"came nearer to the bounds with this uncertainty. "
-                f"{spread or 'Declare less uncertainty, or wider bounds'}.")
+        return (f"The synthesis found no controller better than none: with the best controller found mu is "
+                f"{mu.mu.upper:.3g}, at {mu.mu.omega / (2 * np.pi):.3g} Hz, which is not smaller than without control. "
+                f"No D-K iteration came closer to the bounds with this uncertainty. "
+                f"{spread or 'Specify less uncertainty or wider bounds'}.")
     worth = (1 - WORTH_NAMING) * mu.mu.upper
     reliefs = [(name, value) for name, value in without_each(plant, mu.K, mu.mu.omega) if value < worth]
     relief = [f"{name} ({value:.2f} without it)" for name, value in reliefs]
     text = (f"The specification is not met for all plants of the set: mu of the mu controller is {mu.mu.upper:.3g}, at "
-            f"{mu.mu.omega / (2 * np.pi):.3g} Hz. What holds it up there: {', '.join(relief[:4]) or 'all together'}. "
+            f"{mu.mu.omega / (2 * np.pi):.3g} Hz. Main contributions there: "
+            f"{', '.join(relief[:4]) or 'no single one'}. "
             f"With uncertainties {mu.mu.upper:.3g} times smaller and bounds {mu.mu.upper:.3g} times wider it is met.")
     if spread and any(RESPONSE in name for name, _ in reliefs):
         text += f" {spread}."
@@ -93,11 +94,11 @@ def _spread_there(plant: DesignPlant, omega: float) -> str:
     nearest = int(np.argmin(np.abs(np.log(weight.omega / omega))))
     drowned = plant.identified.spread.drowned(plant.identified.confidence)
     if not weight.omega[0] <= omega <= weight.omega[-1]:
-        beside = "beyond the measured band, as at its end"
+        beside = "outside the measured band; the value at its end is used"
     elif drowned[nearest]:
-        beside = "assumed, for noise hides the response there"
+        beside = "assumed, because noise hides the response there"
     else:
         beside = f"{100 * weight.data[nearest]:.3g} % in the data there"
     return (f"The uncertainty of the identified response is {100 * size:.3g} % at {omega / (2 * np.pi):.3g} Hz "
-            f"({beside}): to make it smaller, record longer, at a higher level or with more records; or ask for less "
-            "at this frequency")
+            f"({beside}). To reduce it, record longer, at a higher level or with more records; or relax the "
+            "requirements at this frequency")

@@ -209,8 +209,8 @@ def _actuator_side(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, 
     for axis in axes:
         lag = cascade([], [-corner], corner) @ pade_delay(delay_s, design.loop.pade_order)
         diagram.add(f"delay and amplifier {axis}", lag.renamed([f"command_{axis}"], [f"drive_{axis}"]), "actuator")
-        diagram.means(f"command_{axis}", "force asked by the controller", "N")
-        diagram.means(f"drive_{axis}", "force asked, after delay and amplifier", "N")
+        diagram.means(f"command_{axis}", "force commanded by the controller", "N")
+        diagram.means(f"drive_{axis}", "commanded force after delay and amplifier", "N")
     # What the amplifiers hold: the volts that are limited, after delay and lag (both of unit gain).
     diagram.add("allocation", gain(allocation, [f"drive_{a}" for a in axes], [f"{n}_command" for n in actuators]),
                 "allocation")
@@ -238,7 +238,7 @@ def _response_error(diagram: Diagram, identified: InDesign, axes: tuple[str, ...
                                                   [f"{name}_error" for name in actuators]), "allocation")
     for name in actuators:
         diagram.add(f"actuator chain {name}", summing_junction(name, [f"{name}_command", f"{name}_error"]), "actuator")
-        diagram.means(f"{name}_error", "voltage that would make the difference", "V")
+        diagram.means(f"{name}_error", "voltage equivalent to the response error", "V")
     diagram.uncertain(ComplexFull(len(axes), len(axes), RESPONSE), [f"w:{tag}" for tag in tags],
                       [f"z:{tag}" for tag in tags])
 

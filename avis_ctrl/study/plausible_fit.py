@@ -43,7 +43,7 @@ def far_from_file(start: ResponseModel, fit: LikelihoodFit, settings: FitPlausib
     if len(others) > 2 and max(others) / min(others) < settings.alike:
         middle = float(np.median(others))
         return (f"{said}, and all masses, moments of inertia and stiffnesses that are well determined are about "
-                f"{middle:.2g} times the file's: a response to the drives shows only their ratio to the force "
-                f"constants and sensitivities, so check these for a factor of {middle:.2g} or {1 / middle:.2g}",)
-    more = f"; the same holds for {', '.join(one[0] for one in far[1:])}" if len(far) > 1 else ""
-    return (f"{said}{more}: check the rig file, and whether these data determine the value",)
+                f"{middle:.2g} times those of the file. A response to the drives depends only on their ratio to the "
+                f"force constants and sensitivities: check these for a factor of {middle:.2g} or {1 / middle:.2g}",)
+    more = f"; also far from the file: {', '.join(one[0] for one in far[1:])}" if len(far) > 1 else ""
+    return (f"{said}{more}. Check the rig file, and whether these data determine the value",)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.identification.identifiability_words import listed
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates import Finding
@@ -138,10 +139,11 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
     """
     ratio = measured.sample_rate_Hz / model.rig.sample_rate_Hz
     if not 1 / settings.rate < ratio < settings.rate:
-        raise InputError(f"the rig file says {model.rig.sample_rate_Hz:g} Hz, {1 / ratio:g} times that; did you mean "
+        raise InputError(f"the rig file has {model.rig.sample_rate_Hz:g} Hz, {1 / ratio:g} times as much; did you mean "
                          f"{measured.sample_rate_Hz * 1e3:g} (given in kHz)?" if ratio < 1 else
-                         f"the rig file says {model.rig.sample_rate_Hz:g} Hz; is that in kHz, or this in mHz?",
-                         field="sample_rate_Hz of the records", value=measured.sample_rate_Hz)
+                         f"the rig file has {model.rig.sample_rate_Hz:g} Hz; is the rig file's value in kHz, or that "
+                         "of the records in mHz?", field="sample_rate_Hz of the records",
+                         value=measured.sample_rate_Hz)
     seen = look(measured, settings)
     if seen is None:
         return ()
@@ -160,34 +162,41 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
     left = [one for one in found if one[0] <= settings.fits and one[0] <= settings.share * max(before, worst)]
     if left:
         _, field, value, said = left[0]
-        raise InputError(f"the recorded y is {_said(now)} what the rig's model predicts for these voltages; {said}",
-                         field=field, value=value)
+        raise InputError(f"the recorded y is {_said(now)} the y that the rig's model predicts for these voltages; "
+                         f"{said}", field=field, value=value)
     if before > settings.hopeless:
-        raise InputError(f"the recorded y is {_said(now)} what the rig's model predicts for these voltages, and no "
-                         "single wrong unit explains it; check the units of y and u, sensitivities, gains and force "
-                         "constants", field="records")
+        raise InputError(f"the recorded y is {_said(now)} the y that the rig's model predicts for these voltages, and "
+                         "no single wrong unit explains it; check the units of y and u, sensitivities, gains and "
+                         "force constants", field="records")
     return doubts
 
 
 def _doubts(decades: np.ndarray, measured: Campaign, model: ResponseModel, settings: RecordPlausibility
             ) -> tuple[Finding, ...]:
     """Sensors of a kind that read one and the same multiple of what is predicted, in all bands."""
-    off: dict[str, list[tuple[str, float]]] = {}
+    off: list[tuple[str, float, str]] = []
     kinds = {one.name: one.quantity for one in model.rig.sensors()}
     for name, column in zip(measured.y_names, decades.T, strict=True):
         there = column[np.isfinite(column)]
         if there.size >= 3 and abs(middle := float(np.median(there))) > settings.far and (
                 np.median(np.abs(there - middle)) < settings.fits):
-            off.setdefault(kinds.get(name, ""), []).append((name, 10.0 ** middle))
+            off.append((kinds.get(name, ""), middle, name))
+    alike: list[list[tuple[str, float, str]]] = []
+    for one in sorted(off):
+        if alike and alike[-1][0][0] == one[0] and one[1] - alike[-1][0][1] < settings.fits:
+            alike[-1].append(one)
+        else:
+            alike.append([one])
     found = []
-    for kind, sensors in off.items():
-        factor = float(np.median([one[1] for one in sensors]))
-        names = tuple(one[0] for one in sensors)
-        likely = " (9.81 is g: a sensitivity in V/g where V s^2/m is expected, or the reverse)" if (
+    for sensors in alike:
+        kind = sensors[0][0]
+        factor = 10.0 ** float(np.median([one[1] for one in sensors]))
+        names = tuple(name for name in measured.y_names if name in [one[2] for one in sensors])
+        likely = " (9.81 is g: is a sensitivity given in V/g instead of V s^2/m, or the reverse?)" if (
             kind == "acceleration" and settings.like_g > abs(abs(np.log10(factor)) - np.log10(9.80665))) else ""
-        found.append(Finding("units", "warning", f"{', '.join(names)} {'reads' if len(names) == 1 else 'read'} "
-                             f"{factor:.3g} times what the rig's model predicts for these voltages, over all bands"
-                             f"{likely}. Check sensitivity, gain and unit before you trust the fit.", names,
+        found.append(Finding("units", "warning", f"The signal of {listed(names)} is {factor:.3g} times the one that "
+                             f"the rig's model predicts for these voltages, in all frequency bands{likely}. Check "
+                             "sensitivity, gain and unit before you trust the fit.", names,
                              value=factor, limit=10.0 ** settings.far))
     return tuple(found)
 
@@ -342,7 +351,7 @@ def _common_gain(factor: float, seen: Seen, measured: Campaign, model: ResponseM
         _, field, value, meant = options[0]
         return field, value, f"did you mean {meant}{', or ' if records else '?'}{records}"
     others = "; ".join(f"{field} = {value:g} ({meant} would fit)" for _, field, value, meant in options)
-    return "unit of y or u", None, f"all channels are off alike: {records} Otherwise check {others}"
+    return "unit of y or u", None, f"all channels differ by the same factor: {records} Otherwise check {others}"
 
 
 def _gained(within, value: float, factor: float) -> float:
@@ -354,5 +363,5 @@ def _sensor_gain(name: str, factor: float, model: ResponseModel) -> tuple[str, o
     k = model.sensors.names.index(name)
     value = float(model.sensors.sensitivity[k])
     return (f"sensitivity of {name}", value,
-            f"only {name} is off: did you mean {value * factor:g} {model.sensors.sensitivity_units[k]} (with "
-            "preamplifier), or are its records in a different unit from the others?")
+            f"only {name} differs: did you mean {value * factor:g} {model.sensors.sensitivity_units[k]} (with "
+            "preamplifier), or is it recorded in a different unit from the others?")

@@ -60,7 +60,8 @@ def compared(errors: Sequence[PredictionErrors]) -> str:
     if not len(pairs):
         return ""
     if np.array_equal(pairs[:, 0], pairs[:, 1]):
-        return "both models are the same here: nothing that predictions show was named"
+        return "both models give the same predictions: no named effect influences them"
     before, after = np.sqrt(np.mean(pairs ** 2, axis=0))
-    return (f"the updated model is further off than the baseline ({100 * after:.3g} % against {100 * before:.3g} %): "
-            "this campaign is of another table, or of one without the named effects") if after > before else ""
+    return (f"the updated model has a larger error than the baseline ({100 * after:.3g} % instead of "
+            f"{100 * before:.3g} %): this campaign is from a different table, or from one without the named effects"
+            ) if after > before else ""

@@ -41,7 +41,7 @@ def judge_loop(check: SimulationCheck) -> tuple[Requirement, ...]:
         row("voltages stay within the limits of drives and converter", sum(p.within_limits for p in check.plants),
             f"nonlinear simulation of {check.duration_s:g} s"),
         row("motion agrees with the linear prediction", sum(p.agrees for p in check.plants),
-            f"in third octaves; by chance alone at least one plant fails with probability {check.false_alarm:g}"))
+            f"in third octaves; probability {check.false_alarm:g} that noise alone makes at least one plant fail"))
 
 
 def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requirement, ...]:
@@ -68,10 +68,10 @@ def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requ
         "passive_peak_transmissibility_dB": (
             "passive peak transmissibility, nominal", lambda: decibel(passive.peak_transmissibility), ""),
         "advantage_over_skyhook_dB": (
-            f"worst case {band} below the best skyhook's",
+            f"worst case {band}: improvement on the tuned skyhook",
             lambda: _advantage(skyhook, mu) if skyhook else np.nan,
-            f"skyhook reaches {decibel(skyhook.worst_band.lower):+.1f} dB at a worst-case peak of "
-            f"{decibel(skyhook.worst_peak.lower):+.1f} dB" if skyhook else "no skyhook to compare with"),
+            f"worst case of the skyhook: {decibel(skyhook.worst_band.lower):+.1f} dB in this band, "
+            f"{decibel(skyhook.worst_peak.lower):+.1f} dB at its peak" if skyhook else "no skyhook to compare with"),
         "fastest_controller_pole_Hz": ("fastest pole of the mu controller",
                                       lambda: np.nan if idle else mu.fastest_pole_Hz,
                                       "no controller better than none was found" if idle else ""),

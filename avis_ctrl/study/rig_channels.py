@@ -42,8 +42,8 @@ def in_words_of(rig: Rig, measured: Campaign | FrequencyResponse,
             continue
         if len(had[role]) == len(own) and any(had[role] == numbered(stem, len(own)) for stem in stems):
             changes[role] = own
-            notes.append(f"{role}: the file names no channels; taken in the order of the rig {rig.name}: "
-                         f"{', '.join(own)} (otherwise --columns {role}_names=...)")
+            notes.append(f"{role}: the file does not name its channels; assumed to be in the order of the rig "
+                         f"{rig.name}: {', '.join(own)} (otherwise use --columns {role}_names=...)")
         else:
             unknown.append(role)
     if unknown:
@@ -52,7 +52,7 @@ def in_words_of(rig: Rig, measured: Campaign | FrequencyResponse,
         return replace(measured, inputs=changes.get("u", measured.inputs), outputs=changes.get("y", measured.outputs))
     if measured.rig == UNNAMED:
         measured = replace(measured, rig=rig.name)
-        notes.append(f"the file names no rig; taken as {rig.name}")
+        notes.append(f"the file does not name its rig; assumed to be {rig.name}")
     renamed = {f"{role}_names": names for role, names in changes.items()}
     records = tuple(with_header(record, **renamed) for record in measured.records) if renamed else measured.records
     return replace(measured, records=records, notes=(*measured.notes, *notes))
@@ -71,10 +71,9 @@ def _refusal(rig: Rig, had: Mapping[str, Sequence[str]], known: Mapping[str, Seq
     field = " and ".join(f"{role} names" for role in had)
     value = next(iter(strange.values())) if len(had) == 1 else strange
     if stated not in (UNNAMED, rig.name):
-        return InputError(f"the file says it is a campaign of {stated}, not of {rig.name}, of which {said}",
-                          field=field, value=value)
+        return InputError(f"the file is a campaign of {stated}, not of {rig.name}; {said}", field=field, value=value)
     example = ",".join(f"{role}_names={'+'.join(of_rig[role][:2])}+..." for role in had)
     counts = " and ".join(f"{len(names)} of {role}" for role, names in had.items())
-    said += (f"; where the file's channels ({counts}) are some of these, name them in the file's order: "
-             f"--columns {example} (of identify and convert)")
+    said += (f"; if the file's channels ({counts}) are some of these, name them in the order of the file: "
+             f"--columns {example} (option of identify and convert)")
     return InputError(said, field=field, value=value)

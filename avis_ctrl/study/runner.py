@@ -106,7 +106,7 @@ def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesi
         assumed = plant.identified.assumption if plant.identified else ""
         verdict = best_found(plant, mu, controllers) if mu.mu.upper >= 1 else ""
         unlike = [f"{one.title!r} is missing from the comparison: {one.reason}" for one in compared.failed]
-        passive_axes = [f"The axis {axis} stays passive: {why}." for axis, why in compared.loop.companions.passive]
+        passive_axes = [f"The axis {axis} remains passive: {why}." for axis, why in compared.loop.companions.passive]
         notes = tuple(text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.remarks())
                       if text)
     requirements = (*judge_loop(compared.loop.check), *judge(design, controllers))

@@ -14,6 +14,7 @@ from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.robust.mu_realise import realise_delta
+from avis_ctrl.robust.mu_scan import refine_maxima
 from avis_ctrl.simulation.campaign import check_designs
 from avis_ctrl.simulation.culprit import find_culprit
 from avis_ctrl.simulation.discrete import digital_controller
@@ -66,16 +67,34 @@ def nominal_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | N
 
 def six_dof_check(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult,
                   companions: Companions) -> SixDofCheck:
-    """Transmissibility of the sampled loop in six degrees of freedom against the design model's."""
-    T2 = result.transmissibility
-    T = predict_transmissibility_6dof(nominal_loop(design, rig, plant, result.K, companions), T2.omega)
+    """Transmissibility of the sampled loop in six degrees of freedom against the design model's.
+
+    At the design model's frequencies, the ends of the band, and around the peaks, over all frequencies and in the band:
+    a lightly damped mode is narrower than the steps between those.
+    """
+    T2, loop = result.transmissibility, nominal_loop(design, rig, plant, result.K, companions)
     kept = [COORDINATES.index(name) for name in design.keep]
     others = [k for k in range(6) if k not in kept]
-    sigma = np.linalg.norm(T[:, kept][:, :, kept], ord=2, axis=(1, 2))
+    known: dict[float, np.ndarray] = {}
+
+    def kept_rows(omega: np.ndarray) -> np.ndarray:
+        new = np.array([w for w in omega.tolist() if w not in known])
+        if new.size:
+            known.update(zip(new.tolist(), predict_transmissibility_6dof(loop, new)[:, kept], strict=True))
+        return np.array([known[w] for w in omega.tolist()])
+
+    def sigma(omega: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(kept_rows(omega)[:, :, kept], ord=2, axis=(1, 2))
     low, high = (2 * np.pi * f for f in design.transmissibility.band_Hz)
     inside = (T2.omega >= low) & (T2.omega <= high)
-    deviation = 20 * np.max(np.abs(np.log10(sigma[inside] / T2.sigma[inside])))
-    return SixDofCheck(T2.omega, sigma, np.linalg.norm(T[:, kept][:, :, others], ord=2, axis=(1, 2)), float(deviation))
+    whole = np.unique(np.concatenate([T2.omega, [low, high]]))
+    band = whole[(whole >= low) & (whole <= high)]
+    omega = np.unique(np.concatenate([refine_maxima(sigma, part, sigma(part))[0] for part in (whole, band)]))
+    if not np.any(inside):  # a band between two of the design model's frequencies
+        inside = np.arange(T2.omega.size) == np.argmin(np.abs(np.log(T2.omega ** 2 / (low * high))))
+    deviation = 20 * np.max(np.abs(np.log10(sigma(T2.omega[inside]) / T2.sigma[inside])))
+    return SixDofCheck(omega, sigma(omega), np.linalg.norm(kept_rows(omega)[:, :, others], ord=2, axis=(1, 2)),
+                       float(deviation))
 
 
 def sensor_bank(design: Design, rig: Rig) -> SensorBank:

@@ -99,11 +99,12 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
                                next_step="change the corners in [skyhook], or use sensors with a lower corner")
     notes = [in_words(loops), *at_limits(loops, task.search)]
     if loops is classical:
-        notes.append("this is critical damping with the usual corners: no better tuning was found for the whole set")
+        notes.append("this is critical damping with the usual corners: no better tuning was found for the whole "
+                     "uncertainty set")
     if not best.meets:
-        reached = (f"the lowest found is that of this one, {_decibel(best.peak):+.2f} dB" if np.isfinite(best.peak)
-                   else "no tuning found is proved stable for the whole set")
-        notes.append(f"no skyhook found keeps the worst-case peak below {_decibel(peak_limit):+.2f} dB: {reached}")
+        reached = (f"this one has the lowest, {_decibel(best.peak):+.2f} dB" if np.isfinite(best.peak)
+                   else "none is proved stable for the whole uncertainty set")
+        notes.append(f"no skyhook tuning found has a worst-case peak below {_decibel(peak_limit):+.2f} dB: {reached}")
     return Candidate("skyhook", "skyhook, tuned", "skyhook", loops.controller(), tuple(notes))
 
 

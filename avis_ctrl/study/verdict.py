@@ -28,21 +28,24 @@ def all_axes(result: DesignResult) -> str:
     """What the sampled loop of all six degrees of freedom reaches, beside the bounds of the design model.
 
     The bounds are those of the kept coordinates with the others locked. If the nominal loop of all axes exceeds them,
-    the sentence says so.
+    the sentence says so; where there are no bounds it speaks of none.
     """
     mu, six = result.controller("mu"), result.six_dof
     low, high = result.design.transmissibility.band_Hz
     inside = (six.omega >= 2 * np.pi * low) & (six.omega <= 2 * np.pi * high)
     peak, band = (20 * float(np.log10(np.max(sigma))) for sigma in (six.kept, six.kept[inside]))
-    beyond = [f"{value:+.1f} dB {where} exceeds the bound of {20 * np.log10(bound.upper):+.1f} dB"
-              for value, bound, where in ((peak, mu.worst_peak, "at the peak"),
-                                          (band, mu.worst_band, f"from {low:g} to {high:g} Hz"))
+    inside_band = f"from {low:g} to {high:g} Hz"
+    beyond = [f"{value:+.1f} dB {where} (bound {20 * np.log10(bound.upper):+.1f} dB)"
+              for value, bound, where in ((peak, mu.worst_peak, "at the peak"), (band, mu.worst_band, inside_band))
               if np.isfinite(bound.upper) and value > 20 * np.log10(bound.upper)]
+    locked = f"The worst-case bounds hold for {listed(result.design.keep)} with the other coordinates locked"
     if beyond:
-        return (f"These bounds hold for {listed(result.design.keep)} with the other coordinates locked; with all six "
-                f"degrees of freedom the nominal loop does not keep them: {listed(beyond)}.")
-    return (f"These bounds hold for {listed(result.design.keep)} with the other coordinates locked; with all six "
-            f"degrees of freedom the nominal sampled loop reaches {peak:+.1f} dB and {band:+.1f} dB.")
+        return f"{locked}. With all six degrees of freedom the nominal sampled loop exceeds them: {listed(beyond)}."
+    reached = ("With all six degrees of freedom the transmissibility of the nominal sampled loop is at most "
+               f"{peak:+.1f} dB, and at most {band:+.1f} dB {inside_band}")
+    if not (np.isfinite(mu.worst_peak.upper) and np.isfinite(mu.worst_band.upper)):
+        return f"{reached}. For the other plants of the uncertainty set there is no bound."
+    return f"{locked}. {reached}."
 
 
 def refuse_unstable(result: DesignResult) -> None:
@@ -51,8 +54,8 @@ def refuse_unstable(result: DesignResult) -> None:
         return
     kind = result.loop.culprit.kind if result.loop is not None and result.loop.culprit is not None else ""
     steps = {"table": "check the rig file's stiffness, centre of mass and damping",
-             "nonlinear": "look at that plant's drive voltages (at their limit?) and its floor motion",
-             "controller": "add the axes that move to keep in the design file, or ask for less bandwidth"}
+             "nonlinear": "check whether the drive voltages of that plant are at their limits, and its floor motion",
+             "controller": "add the axes that move to keep in the design file, or reduce the bandwidth"}
     step = steps.get(kind, "use sensors with a lower corner frequency, or add these axes to keep in the design file")
     raise ComputationError(text.removesuffix("."), next_step=step)
 

@@ -90,12 +90,12 @@ class IdentifiedSpread(Weight):
     @property
     def meaning(self) -> str:
         low, high = (self.omega[k] / (2 * np.pi) for k in (0, -1))
-        text = (f"relative uncertainty of the response as measured: {100 * np.min(self.data):.2g} to "
-                f"{100 * np.max(self.data):.2g} % from {low:.3g} to {high:.3g} Hz, covered by order {self.shape.order} "
-                f"with at most {self.slack_dB:.2f} dB to spare over an envelope of at most {20 * self.slope:g} dB a "
-                f"decade; beyond the band as at its ends")
-        return text if self.declared is None else f"{text}; the larger of this and of what is declared: " \
-                                                  f"{self.declared.meaning}"
+        text = (f"measured relative uncertainty of the response: {100 * np.min(self.data):.2g} to "
+                f"{100 * np.max(self.data):.2g} % from {low:.3g} to {high:.3g} Hz; the filter of order "
+                f"{self.shape.order} lies at most {self.slack_dB:.2f} dB above an envelope with slopes of at most "
+                f"{20 * self.slope:g} dB per decade, constant outside the band")
+        return text if self.declared is None else f"{text}; or the uncertainty stated for the drives, where it is " \
+                                                  f"larger: {self.declared.meaning}"
 
 
 def covering_spread(omega: np.ndarray, data: np.ndarray, declared: NeglectedDynamics | None = None,

@@ -125,8 +125,8 @@ class TransmissibilityBound(Weight):
     def meaning(self) -> str:
         parts = [f"at most {band.limit_dB:+g} dB from {band.low_Hz:g} to {band.high_Hz:g} Hz" for band in self.bands]
         return (f"transmissibility at most {self.overall_dB:+g} dB" + "".join(f", {part}" for part in parts)
-                + f"; realised with {self.shape.order} states, stricter than asked by up to {self.tolerance_dB:g} dB, "
-                  f"and by more within {self.transition_octaves:g} octave of a stricter band")
+                + f"; realised with {self.shape.order} states, stricter than this bound by up to "
+                  f"{self.tolerance_dB:g} dB, and by more within {self.transition_octaves:g} octave of a stricter band")
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ class ControlEffort(Weight):
         text = f"at most {self.limit_V:g} V when the disturbance has the level {self.disturbance_level:.3g}"
         if self.bandwidth_Hz is None:
             return text
-        return text + (f" up to {self.bandwidth_Hz:g} Hz, falling with order {self.order} to a share "
+        return text + (f" up to {self.bandwidth_Hz:g} Hz, falling with order {self.order} to a fraction "
                        f"{self.reduction ** -self.order:.2g} of it")
 
 

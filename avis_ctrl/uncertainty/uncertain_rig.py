@@ -110,7 +110,7 @@ class UncertainDirection:
         told = [f"{name} {100 * delta * sizes[name]:+.2g} %" if nominal[name] else
                 f"{name} {delta * change:+.2g} {units[name]}" for name, change in most[:WORDS]]
         if len(most) > WORDS:
-            told.append(f"and {len(most) - WORDS} parameters less")
+            told.append(f"and {len(most) - WORDS} parameters by less")
         return f"{self.name} at {delta:+.2g}: {', '.join(told)}"
 
     def stretch(self, nominal: Mapping[str, float], share: float) -> float:

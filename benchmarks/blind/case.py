@@ -44,6 +44,7 @@ class Task:
     truth: str
     finder: str
     cores: tuple[int, ...]
+    clutter: bool = False
 
 
 def work(task: Task, to_parent: Connection) -> None:
@@ -62,7 +63,7 @@ def work(task: Task, to_parent: Connection) -> None:
 def _work(task: Task, to_parent: Connection) -> None:
     truth = importlib.import_module(task.truth)
     case = truth.draw_case(task.seed, kind=task.kind, effect=task.effect, strength=task.strength,
-                           duration_s=task.duration_s)
+                           duration_s=task.duration_s, **({"clutter": True} if task.clutter else {}))
     to_parent.send(("drawn", described(case)))
     began = time.perf_counter()
     campaign = stripped(truth.simulate_case(case))
@@ -72,7 +73,10 @@ def _work(task: Task, to_parent: Connection) -> None:
     finding = _ask(finder, campaign, to_parent)
     if finding is not None and task.unseen:
         try:
-            found = prediction_errors(finder, finding, stripped(truth.simulate_case(case, unseen=True)))
+            unseen = stripped(truth.simulate_case(case, unseen=True))
+            found = prediction_errors(finder, finding, unseen)
+            if hasattr(truth, "best_prediction"):
+                found["best"] = nrmse([record.y for record in unseen.records], truth.best_prediction(case, unseen=True))
             to_parent.send(("unseen", {"unseen": found}))
         except Exception:
             to_parent.send(("unseen", {"unseen_error": traceback.format_exc()[-LONGEST_TEXT:]}))
@@ -98,8 +102,11 @@ def described(case: Any) -> dict:
     """What is hidden, for the scorer."""
     return {"kind": case.kind, "excitation": str(case.excitation), "floor_recorded": bool(case.floor_recorded),
             "hidden": [{"name": one.name, "location": one.location, "strength": one.strength,
-                        "parameters": {key: plain(value) for key, value in one.parameters.items()}}
-                       for one in case.effects]}
+                        "parameters": plain(one.parameters), "variant": getattr(one, "details", {}).get("variant")}
+                       for one in case.effects],
+            "cluttered": bool(getattr(case, "clutter", False)),
+            "traces": [{"name": one.name, "location": one.location, "parameters": plain(one.parameters),
+                        "unexplained": plain(one.details["unexplained"])} for one in getattr(case, "traces", ())]}
 
 
 def plain(value: Any) -> Any:

@@ -75,7 +75,10 @@ def matches(hidden: Sequence[Hidden], named: Sequence[Named]) -> list[Match]:
 
 @dataclass(frozen=True)
 class Judged:
-    """A line with its outcome (one of OUTCOMES[line.kind]) and the pairs of hidden and named effects."""
+    """A line with its outcome (one of OUTCOMES[line.kind]) and the pairs of hidden and named effects.
+
+    An effect that is a trace of a cluttered table is there: naming it is not wrong, though it finds no hidden one.
+    """
 
     line: Line
     outcome: str
@@ -90,8 +93,14 @@ class Judged:
         return self.line.answer.verdict if self.line.answer is not None else "crash"
 
     def right(self, named: Named, *, exact: bool) -> bool:
-        """Whether a named effect is hidden in this case; with `exact` a right group is not enough."""
-        return any(one.named is named and (one.exact or not exact) for one in self.pairs)
+        """Whether a named effect is in this case; with `exact` a right group is not enough."""
+        hidden = any(one.named is named and (one.exact or not exact) for one in self.pairs)
+        return hidden or is_trace(named, self.line)
+
+    @property
+    def false_names(self) -> list[Named]:
+        """Neither hidden nor a trace."""
+        return [one for one in self.named if not self.right(one, exact=False)]
 
     @property
     def answered(self) -> str:
@@ -103,14 +112,21 @@ class Judged:
         return self.pairs[0].hidden.name if self.pairs else self.named[0].name
 
 
+def is_trace(named: Named, line: Line) -> bool:
+    return any(one.name == named.name for one in line.traces)
+
+
 def judge(line: Line) -> Judged:
     if line.answer is None:
         return Judged(line, "crash", ())
-    named = line.answer.effects
-    pairs = tuple(matches(line.hidden, named))
+    pairs = tuple(matches(line.hidden, line.answer.effects))
+    own = [one.named for one in pairs]
+    named = [one for one in line.answer.effects if any(one is pair for pair in own) or not is_trace(one, line)]
     extra, quiet = len(named) - len(pairs), line.answer.verdict == "none"
     if line.kind == "none":
-        return Judged(line, "false name" if named else "quiet" if quiet else "alarm without a name", pairs)
+        only_traces = bool(line.answer.effects) and not named
+        return Judged(line, "false name" if named else "quiet" if quiet or only_traces else "alarm without a name",
+                      pairs)
     if line.kind == "outside":
         outcome = "named as something else" if extra else "missed" if quiet and not named else "refused"
         return Judged(line, outcome, pairs)

@@ -27,12 +27,28 @@ class _Part(BaseModel):
 
 
 class Hidden(_Part):
-    """An effect that the truth contains; its parameters are what the truth was built with."""
+    """An effect that the truth contains; its parameters are what the truth was built with.
+
+    variant : which of the effect's laws a cluttered truth obeys; None where there is only the simplest.
+    """
 
     name: str
     location: str
     parameters: dict[str, Any]
     strength: Strength
+    variant: str | None = None
+
+
+class Trace(_Part):
+    """An effect that a cluttered truth contains besides, at a level that nobody need name.
+
+    unexplained : what it leaves of the response, r.m.s., when the table is re-identified.
+    """
+
+    name: str
+    location: str
+    parameters: dict[str, Any]
+    unexplained: NotNegative
 
 
 class Estimate(_Part):
@@ -87,16 +103,21 @@ class Answer(BaseModel):
 
 
 class Unseen(_Part):
-    """nrmse of the two predictions on a campaign of the same truth that the finder never saw."""
+    """nrmse of the two predictions on a campaign of the same truth that the finder never saw.
+
+    best : of the best prediction possible: the true table with its traces and all that is random switched off.
+    """
 
     baseline: NotNegative
     updated: NotNegative
+    best: NotNegative | None = None
 
 
 class Settings(_Part):
     """What a line was made with: the same for every line of a file, but for the commit.
 
     kind, effect, strength : forced on every case; None where the truth draws them.
+    cluttered : share of the cases with a cluttered table.
     commit : of the code, with "+" where files differed from it.
     """
 
@@ -106,18 +127,20 @@ class Settings(_Part):
     effect: str | None = None
     strength: Strength | None = None
     unseen: bool = False
+    cluttered: Annotated[float, Field(ge=0, le=1)] = 0.0
     commit: str = ""
 
     @property
     def campaign(self) -> tuple:
         """What decides on the cases; lines that differ here do not belong together."""
-        return self.duration_s, self.kind, self.effect, self.strength
+        return self.duration_s, self.kind, self.effect, self.strength, self.cluttered
 
 
 class Line(_Part):
     """A case.
 
     hidden : effects of the truth; empty where kind is "none" (and where the truth itself failed).
+    cluttered : the table is off its rig file in everything a little, and has traces of effects besides.
     relative_change : by how much the effects change the signals, as the truth counts it; None where unknown.
     answer : what the finder said; None after a crash. crash : the text of the exception, None without one.
     seconds, cpu_seconds : the finder's, by the clock and summed over its processes.
@@ -141,6 +164,8 @@ class Line(_Part):
     unseen: Unseen | None
     unseen_error: str | None
     settings: Settings
+    cluttered: bool = False
+    traces: list[Trace] = []
 
     @model_validator(mode="after")
     def _consistent(self) -> Line:

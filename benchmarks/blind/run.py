@@ -1,6 +1,7 @@
 """Run a blind campaign: each case in a fresh process, one JSON line a case, safe to kill and resume.
 
     python -m benchmarks.blind --cases 300 --seed 1 --jobs 2 --duration 60 --out blind.jsonl [--resume] [--unseen]
+                              [--cluttered 0.5]
 
 With several jobs each one is held on a core of its own, so that `seconds` are those of a single core; with --jobs 1
 the finder has all cores.
@@ -57,6 +58,11 @@ class _Running:
         return True
 
 
+def is_cluttered(seed: int, share: float) -> bool:
+    """Multiples of the golden ratio spread evenly, so that any run of seeds holds the share."""
+    return (seed * 0.6180339887498949) % 1 < share
+
+
 class Pool:
     """At most `jobs` cases at once, each in a process of its own, so that nothing stays from case to case.
 
@@ -86,7 +92,7 @@ class Pool:
         slot = next(k for k in range(self.settings.jobs) if k not in taken)
         s, context = self.settings, get_context("spawn")
         task = Task(seed, s.duration_s, s.kind, s.effect, s.strength, s.unseen, self.truth, self.finder,
-                    self._cores[slot])
+                    self._cores[slot], is_cluttered(seed, s.cluttered))
         ours, theirs = context.Pipe(duplex=False)
         process = context.Process(target=work, args=(task, theirs))
         process.start()
@@ -226,6 +232,8 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     options.add_argument("--out", type=Path, required=True, help="file of JSON lines")
     options.add_argument("--resume", action="store_true", help="continue the file")
     options.add_argument("--unseen", action="store_true", help="also predict a campaign that the finder never saw")
+    options.add_argument("--cluttered", type=float, default=0.0, metavar="SHARE",
+                         help="of the cases, by seed: the table is off its rig file in everything a little")
     options.add_argument("--limit", type=float, default=900.0, help="longest that an answer may take [s]")
     options.add_argument("--kind", choices=KINDS, help="of every case; drawn otherwise")
     options.add_argument("--effect", help="of every case; drawn otherwise")
@@ -236,6 +244,8 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     for name, least in (("cases", 1), ("jobs", 1), ("seed", 0)):
         if getattr(given, name) < least:
             options.error(f"--{name} {getattr(given, name)}: expected {least} or more")
+    if not 0 <= given.cluttered <= 1:
+        options.error(f"--cluttered {given.cluttered:g}: expected a share from 0 to 1")
     if not 0 < given.duration <= 3600:
         options.error(f"--duration {given.duration:g}: expected seconds above 0, at most 3600")
     return given
@@ -246,7 +256,7 @@ def main(words: list[str] | None = None) -> None:
     if str(TESTS) not in sys.path:
         sys.path.append(str(TESTS))  # workers get this list too
     settings = Settings(duration_s=given.duration, jobs=given.jobs, kind=given.kind, effect=given.effect,
-                        strength=given.strength, unseen=given.unseen, commit=commit())
+                        strength=given.strength, unseen=given.unseen, cluttered=given.cluttered, commit=commit())
     try:
         check_modules(given.truth, given.finder, given.unseen)
         failed = run(settings, range(given.seed, given.seed + given.cases), given.out, resume=given.resume,

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from avis_ctrl.errors import AvisError, InputError
 from benchmarks.blind import tables
+from benchmarks.blind.clutter import clutter_table
 from benchmarks.blind.figures import Asked, asked_table
 from benchmarks.blind.judge import Judged, contradiction, judge
 from benchmarks.blind.lines import Line, read_lines
@@ -50,8 +51,10 @@ def score(lines: Sequence[Line]) -> Score:
     """Everything that the lines say."""
     cases = [judge(line) for line in lines]
     errors, unknown = parameter_errors(cases)
-    asked = asked_table(cases, errors)
-    found = [tables.asked_rows(asked), tables.verdict_table(cases), *tables.outcome_tables(cases),
+    # The issue asks of clean tables; what the same figures are on cluttered ones stands in a table of its own.
+    clean = [case for case in cases if not case.line.cluttered] or cases
+    asked = asked_table(clean, parameter_errors(clean)[0])
+    found = [tables.asked_rows(asked), clutter_table(cases), tables.verdict_table(cases), *tables.outcome_tables(cases),
              tables.effect_table(cases), tables.group_table(cases), tables.calibration_table(cases, exact=True),
              tables.calibration_table(cases, exact=False), tables.gap_table(cases),
              tables.parameter_table(errors, unknown), tables.excitation_table(cases), tables.cost_table(cases)]
@@ -69,6 +72,11 @@ def remarks(cases: Sequence[Judged]) -> list[str]:
              f"code {', '.join(commits)}" + ("; several versions of the code are mixed" if len(commits) > 1 else "")]
     if forced:
         found.append(f"Not a blind draw: {', '.join(forced)} in every case.")
+    cluttered = sum(line.cluttered for line in lines)
+    if cluttered:
+        found.append(f"{cluttered} cases have a cluttered table: off its rig file in everything a little, with traces "
+                     "of effects besides. Clean and cluttered cases are apart in the table of both, and "
+                     + ("what is asked counts the clean ones." if cluttered < len(lines) else "no case is clean."))
     if len(lines) < 300:
         found.append(f"{len(lines)} cases are fewer than the 300 asked for.")
     crashes = [line for line in lines if line.crash is not None]

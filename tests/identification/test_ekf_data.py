@@ -10,7 +10,7 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.ekf import identify_ekf
 from avis_ctrl.identification.ekf_campaign import flat_floor, logical_drive, sensor_volts, source_campaign
 from avis_ctrl.identification.ekf_model import linear_model, source_parameters
-from avis_ctrl.identification.ekf_result import innovation_statistics, parameter_curves
+from avis_ctrl.identification.ekf_result import Directions, innovation_statistics, parameter_curves
 from avis_ctrl.identification.ekf_settings import (
     HONEST_SETTINGS,
     SOURCE_SETTINGS,
@@ -287,3 +287,12 @@ def test_some_channels_are_enough(rig, campaign):
 def test_density_matrix():
     assert np.array_equal(density_matrix(2.0, 2), 2 * np.eye(2))
     assert np.array_equal(density_matrix([1.0, 3.0], 2), np.diag([1.0, 3.0]))
+
+
+def test_directions_that_kept_their_variance_are_said_in_words():
+    """The threshold itself counts as kept; members that carry a tenth or less are left out."""
+    found = Directions(("a", "b", "c"), np.array([0.01, 0.5, 1.0]),
+                       np.array([[0.0, 1.0, 0.0], [0.8, 0.0, -0.6], [0.6, 0.0, 0.8]]))
+    assert found.words() == ("not determined: a up (variance 0.5 of the prior's)",
+                             "not determined: c up with b down (variance 1 of the prior's)")
+    assert found.words(1.0) == found.words()[1:]

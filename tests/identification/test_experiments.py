@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.experiment_plan import Experiment, compare, needed_experiment, plan
+from avis_ctrl.identification.experiment_plan import Experiment, candidates, compare, needed_experiment, plan
 from avis_ctrl.identification.experiments import (
     AddedSensor,
     Drive,
@@ -137,12 +137,22 @@ def test_sentences_and_the_plan(avis):
     assert ranked[1].alone["isolator1.k_x"] == pytest.approx(0.02, rel=1e-3)
     assert [one.experiment for one in plan(now, model, [longer, bench, raised], NOISE)] == [raised]
     said = needed_experiment(now, model, DRIVE, NOISE, [longer, bench])
-    assert any("Nothing in the list determines" in s and "isolator3.k_x" in s for s in said)
-    assert any("determine nothing new" in s and "record twice as long" in s for s in said)
+    assert any("None of these experiments determines" in s and "isolator3.k_x" in s for s in said)
+    assert any("determine no further combination" in s and "record twice as long" in s for s in said)
+
+
+def test_channels_are_added_at_the_corner_opposite_the_first_mount(avis):
+    """A known mass goes on that mount, the new channels point-symmetric to it: far from all that is there."""
+    rig = avis.with_parameters({f"isolator1.p_{axis}": value for axis, value in zip("xyz", CORNER, strict=True)})
+    said = [one.words for one in candidates(ResponseModel.of(rig, ["mass"]), DRIVE)]
+    assert any("known mass of 50 kg fixed at (0.4, 0.3, 0.1) m" in words for words in said)
+    for axis in "xyz":
+        assert any(f"sensor along {axis} on the payload at (-0.4, -0.3, -0.1) m" in words for words in said)
 
 
 @pytest.mark.parametrize("make", [
-    lambda m: Drive(1.0, 0.0), lambda m: Drive(1.0, 1.0, (5.0, 1.0)), lambda m: Drive(1.0, 1.0, (1.0, 5.0), {"v": 1.0}),
+    lambda m: Drive(1.0, 0.0), lambda m: Drive(1.0, 1.0, (5.0, 1.0)), lambda m: Drive(1.0, 1.0, (0.0, 5.0)),
+    lambda m: Drive(1.0, 1.0, (1.0, 5.0), {"v": 1.0}),
     lambda m: changed(m, {"isolator9.p_x": 0.1}),
     lambda m: predicted_information(m, Drive(1, 1, (900.0, 950.0)), NOISE),
     lambda m: compare(predicted_information(m, DRIVE, NOISE), ResponseModel.of(m.rig, ["J1"]), [], NOISE)])

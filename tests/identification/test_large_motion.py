@@ -1,6 +1,7 @@
 """Second-order terms of large rotations: against the simulator, an independent table, and what a fit finds of them."""
 
 import itertools
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -165,4 +166,13 @@ def test_combinations_of_drives_that_no_record_plays_are_told():
     drives = rng.normal(size=(3000, 8))
     assert space(drives).full and not space(drives).sentence
     drives[:, 2] = 0
-    assert space(drives).full and "no record drives Ax2" in space(drives).sentence
+    assert space(drives).full
+    assert "no record drives Ax2: its own response is unknown, and the rig file's values for it are" in space(
+        drives).sentence
+    drives[:, 3] = 0
+    assert "Ax2, Az2: their own response is unknown, and the rig file's values for them are" in space(drives).sentence
+    drives[:, 2], drives[:, 3] = drives[:, 0], 2 * drives[:, 1]
+    assert "excite 6 of 8" in space(drives).sentence
+    # Either way round, and of any size.
+    assert re.search(r"not excited: (Ay1 - Ax2|-Ay1 \+ Ax2); (-?2 Az1 [-+] Az2|-?Az1 [-+] 0\.5 Az2)\. ",
+                     space(drives).sentence)

@@ -1,11 +1,13 @@
 """The response against the exact discretisation, its derivatives against differences, transients against records."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from exact import discrete_avis, multisine, record
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.response import ResponseModel, positive
 from avis_ctrl.identification.sampling import aliases, hold, sampled_pole
 from avis_ctrl.identification.spectra import record_block, transient_columns
 from avis_ctrl.rigs import load_rig
@@ -30,6 +32,23 @@ def test_against_the_exact_discretisation(avis):
     found = ResponseModel.of(avis, ["mass"]).response(2 * np.pi * f)[:, :, :8]
     error = np.max(np.abs(found - exact), axis=(1, 2)) / np.max(np.abs(exact), axis=(1, 2))
     assert np.all(error[f <= 20] < 1e-7) and np.all(error < 1e-5)
+
+
+@pytest.mark.parametrize(("words", "expected"), [
+    ("mass Ixx actuator.Az2 sensor.Sz1 isolator1.k_x isolator4.c_z k_s1 d1 e3", True),
+    ("Ixy J12 com_x isolator1.p_x L6 dx e load.L8 spring@isolator1.k_3 loop_delay_s", False)])
+def test_what_must_be_positive(words, expected):
+    """Masses, moments of inertia, stiffness, damping and gains; no product of inertia, no place, no effect's own."""
+    assert {name: positive(name) for name in words.split()} == dict.fromkeys(words.split(), expected)
+
+
+def test_an_amplifier_lags_by_its_corner(avis):
+    """In continuous time the response to a voltage is that without amplifier times 1 / (1 + j f / corner)."""
+    plain = replace(ResponseModel.of(avis, ["mass"]), period_s=0.0, delay_s=0.0)
+    f = np.array([0.5, 3.0, 50.0, 400.0])
+    lag = 1 / (1 + 1j * f[:, None, None] / 50.0)
+    slow = replace(plain, amplifier_corner_Hz=50.0).response(2 * np.pi * f)[:, :, :8]
+    np.testing.assert_allclose(slow, lag * plain.response(2 * np.pi * f)[:, :, :8], rtol=1e-12)
 
 
 def test_aliases_matter(avis):

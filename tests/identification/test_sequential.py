@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.sequential import joint_fit, sequential_fit
@@ -43,6 +44,14 @@ BAND = 2 * np.pi * np.arange(2.5, 20.01, 0.5)
 
 def start_of(name):
     return perturbed_start(BARE, UNLOADED_TESTS, 0) if name == "unloaded" else START
+
+
+def test_a_start_is_off_by_20_to_30_per_cent_up_or_down():
+    names = parameters_of(UNLOADED_TESTS)
+    off = np.array([values_of(perturbed_start(BARE, UNLOADED_TESTS, seed), names) for seed in range(20)]) / values_of(
+        BARE, names) - 1
+    assert np.all((np.abs(off) > 0.2 - 1e-12) & (np.abs(off) < 0.3 + 1e-12))
+    assert stats.binomtest(int(np.sum(off > 0)), off.size).pvalue > 1e-4
 
 
 def voltage_transfer(rig, place, direction, pattern, omega):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from scipy import signal
@@ -9,7 +11,7 @@ from scipy import signal
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.single_axis.decay import fit_decay
 from avis_ctrl.identification.single_axis.drive import fit_drive
-from avis_ctrl.identification.single_axis.fit import long_run_covariance, regression
+from avis_ctrl.identification.single_axis.fit import block_bootstrap, long_run_covariance, regression
 from avis_ctrl.identification.single_axis.identify import identify_single_axis
 from avis_ctrl.identification.single_axis.lag import compare_lags, cubic_share
 from avis_ctrl.identification.single_axis.oscillator import damping_ratio, fit_oscillator, resonance_Hz
@@ -27,6 +29,19 @@ def test_long_run_variance_of_an_autoregression_is_its_spectrum_at_zero(rng):
     x = coloured(rng, 200_000, 0.8)[:, None]
     assert long_run_covariance(x, 200)[0, 0] == pytest.approx(25.0, rel=0.15)
     assert long_run_covariance(x, 0)[0, 0] == pytest.approx(1 / 0.36, rel=0.03)
+
+
+@pytest.mark.parametrize("block", [250, 2000])
+def test_a_bootstrap_of_blocks_keeps_the_correlation(rng, block):
+    """The mean of 8000 values of the autoregression has the deviation 5 / sqrt(8000); blocks of up to a quarter."""
+    x = coloured(rng, 8000, 0.8)
+    sigma = block_bootstrap(lambda at: np.array([x[at].mean()]), 8000, block, 400, rng)
+    assert sigma[0] == pytest.approx(5 / np.sqrt(8000), rel=0.2 if block == 250 else 0.6)
+    for wrong in (0, 2001):
+        with pytest.raises(InputError, match="blocks of 1 to 2000 samples"):
+            block_bootstrap(lambda at: x[at], 8000, wrong, 400, rng)
+    with pytest.raises(InputError, match="at least two draws"):
+        block_bootstrap(lambda at: x[at], 8000, block, 1, rng)
 
 
 def test_stated_deviations_are_those_of_repeated_experiments(rng):
@@ -190,6 +205,9 @@ def test_the_ground_response_at_the_corner():
     names, values = ("corner_Hz", "damping", "sensitivity"), np.array([0.5, 0.7, 100.0])
     at_corner = response(np.array([0.5]), names, values)["ground"]
     assert at_corner[0] == pytest.approx(1j * 100.0 / 1.4)
+    # g s / (s^2 + 2 zeta w s + w^2) of the coil: all force against the damping alone.
+    at_corner = response(np.array([0.5]), ("corner_Hz", "damping", "gain"), np.array([0.5, 0.7, 3.0]))["coil"]
+    assert at_corner[0] == pytest.approx(3.0 / (1.4 * 2 * np.pi * 0.5))
 
 
 def test_the_band_of_a_fit_is_the_scatter_of_its_parameters(rng):
@@ -253,6 +271,17 @@ def test_an_oscillator_is_recovered_from_a_piece_of_record(rng):
     assert np.all(np.abs(fit.values - [2.0, 4.0, 5000.0]) < 4 * fit.standard_deviation)
     assert resonance_Hz(fit)[0] == pytest.approx(np.sqrt(2500) / 2 / np.pi, rel=1e-3)
     assert damping_ratio(fit)[0] == pytest.approx(0.02, rel=0.03)
+
+
+@pytest.mark.parametrize(("m", "k"), [(2.0, -5000.0), (-2.0, 5000.0), (-2.0, -5000.0)])
+def test_an_oscillator_of_negative_mass_or_stiffness_is_none(rng, m, k):
+    """Without noise, over whole periods: the fit finds the numbers that were put in, and refuses them."""
+    n, rate = 4096, 100.0
+    s, U = 2j * np.pi * np.fft.rfftfreq(n, 1 / rate), np.fft.rfft(rng.standard_normal(n))
+    U[np.abs(s) > 2 * np.pi * 30] = 0
+    u, y = np.fft.irfft(U), np.fft.irfft(U / (m * s ** 2 + 40.0 * s + k))
+    with pytest.raises(ComputationError, match=re.escape(f"measured: m {m:.3g}, k {k:.3g};")):
+        fit_oscillator(u, y, rate, (0.5, 18.0))
 
 
 def test_deviations_of_an_oscillator_hold_over_repeated_records():

@@ -1,7 +1,9 @@
 """Validation on held-out data against the exact simulation, known laws, finite differences and Monte Carlo."""
 
 import json
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from scipy import stats
 from scipy.signal import dlsim
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.identification.campaign_fit import fit_campaign
+from avis_ctrl.identification.campaign_fit import excited_band, fit_campaign
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.modes import measured_modes, mode_table, model_modes
 from avis_ctrl.identification.noise import residual_noise
@@ -20,7 +22,7 @@ from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block
-from avis_ctrl.identification.validation import _floor_interval, validate
+from avis_ctrl.identification.validation import _floor_interval, _verdict, validate
 from avis_ctrl.identification.whiteness import whiteness
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -81,11 +83,40 @@ def test_an_identified_rig_leaves_what_noise_leaves(checked):
     json.dumps(checked.as_dict(), allow_nan=False)
 
 
+def test_one_record_beyond_its_noise_is_enough(checked):
+    """The record of largest chi-square is predicted as well as noise allows, another one is not: that one is told."""
+    one, other = checked.held_out
+    high = one.nrms_all_interval[1]
+    first = replace(one, chi2_per_dof=9.0 * one.chi2_interval[1], nrms_all=0.9 * high)
+    second = replace(other, chi2_per_dof=5.0 * other.chi2_interval[1], nrms_all=3.0 * other.nrms_all_interval[1])
+    assert "small systematic error" in _verdict([first, one]) and "record 04" in _verdict([first, one])
+    assert "does not agree" in _verdict([first, second]) and "record 05" in _verdict([first, second])
+
+
+def test_a_residual_that_is_not_white_is_in_the_verdict(checked):
+    """The colour of the verdict is that of `passed`, and the words say the same."""
+    one = checked.held_out[0]
+    coloured = replace(one, whiteness=SimpleNamespace(white=False, sentences=()))
+    assert one.whiteness.white and "not white" not in _verdict([one])
+    assert not replace(checked, held_out=(coloured,)).passed and "not white" in _verdict([coloured])
+
+
 def test_errors_in_time_and_by_frequency_agree(checked):
     """Parseval: they differ by the transient of the floor's motion at the ends of the record."""
     for one in checked.held_out:
         assert np.allclose(one.nrms_time, one.nrms, rtol=0.12)
         assert np.allclose(one.nrms_time_start, one.nrms_start, rtol=0.3)
+
+
+def test_the_band_that_is_driven_leaves_out_an_offset(records):
+    """Of a flat spectrum from 0.5 to 30 Hz 0.05 % of the power may lie outside at either end: within a line."""
+    shifted = replace(records[0], u=records[0].u + 0.5)
+    assert excited_band(Campaign("avis", (shifted,))) == pytest.approx(BAND, abs=0.051)
+
+
+def test_the_overlay_reaches_the_lines_at_the_edges_of_the_band(checked):
+    """0.5 and 30 Hz are lines of records of 20 s, whatever 30 / 0.05 rounds to."""
+    assert checked.overlay.frequency_Hz[[0, -1]] == pytest.approx(BAND, rel=1e-12)
 
 
 def test_the_prediction_in_time_is_that_of_scipy(found, records, checked):
@@ -135,6 +166,26 @@ def test_the_interval_is_fishers():
     assert interval(1.0, 300, np.inf) == pytest.approx(tuple(stats.chi2(300).ppf([0.025, 0.975]) / 300))
 
 
+def test_the_interval_of_chi_square_allows_for_the_noise_estimated(found, checked, rng):
+    """Fisher's law; the inverse of a covariance is known as the inverse of a Wishart matrix scatters, drawn."""
+    one = checked.held_out[0]
+    dof = int(re.search(r"(\d+) degrees of freedom per line", one.noise)[1])
+    X = rng.normal(size=(4000, 6, dof)) + 1j * rng.normal(size=(4000, 6, dof))
+    trace = np.trace(np.linalg.inv(X @ np.conj(X.swapaxes(1, 2))), axis1=1, axis2=2).real
+    worth = 2 * np.mean(trace) ** 2 / np.var(trace)
+    law = stats.f(2 * 6 * one.lines, worth * found.fit.dof / (2 * 6 * dof))
+    low, high = one.chi2_interval
+    assert np.log(high / low) == pytest.approx(np.log(law.ppf(0.975) / law.ppf(0.025)), rel=0.01)
+
+
+def test_chi_square_is_consistent_up_to_the_end_of_its_interval(checked):
+    """Below it the record has less noise than the fitted ones, which is no error of the model."""
+    one = checked.held_out[0]
+    low, high = one.chi2_interval
+    for value, inside in ((0.99 * low, True), (low, True), (1.0, True), (high, True), (1.01 * high, False)):
+        assert replace(one, chi2_per_dof=value).consistent == inside
+
+
 def white_error(rng, n=400, n_y=3, n_u=2, white=None):
     omega = 2 * np.pi * np.linspace(1, 41, n)
     U = rng.normal(size=(n, n_u, 1)) + 1j * rng.normal(size=(n, n_u, 1))
@@ -160,7 +211,7 @@ def test_what_is_not_white_is_found(kind):
                "input": lambda U: plain + 0.3 * U[:, 1:2] * np.exp(-0.3j * omega)[:, None, None]}[kind]
     said = whiteness(white_error(rng, white=planted), ("a", "b", "c"), ("u", "v"), np.zeros((1, 1)))
     which = {"lines": said.over_frequency, "time": said.over_time, "input": said.with_inputs}[kind]
-    assert which.beyond and "beyond" in which.sentence
+    assert which.beyond and "values exceed their limit" in which.sentence
     row, lag = np.unravel_index(np.argmax(which.value / which.limit), which.value.shape)
     assert which.lags[lag] == pytest.approx({"lines": 3, "time": 0.5, "input": 0.3}[kind], abs=0.03)
     if kind == "input":
@@ -220,6 +271,9 @@ def test_modes_that_cannot_be_measured_are_answered(true, records):
     heavy = true.at(np.where([".c_" in name for name in true.names], 40 * true.values, true.values))
     with pytest.raises(ComputationError, match="oscillates"):
         mode_table(heavy, np.eye(len(true.names)), heavy, None)
+    free = true.rig.with_parameters({f"isolator{i}.{kind}_x": 0.0 for i in (1, 2, 3, 4) for kind in "kc"})
+    with pytest.raises(ComputationError, match="5 of 6 modes do"):
+        model_modes(ResponseModel.of(free, ["mass"]))
 
 
 @pytest.mark.parametrize("name", ["mass", "isolator1.k_z", "isolator1.c_z"])

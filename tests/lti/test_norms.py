@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, discretise, gain, h2_norm, hinf_norm, tf
 
 
@@ -87,3 +88,9 @@ def test_h2_norm_of_a_low_pass(a, k):
 def test_h2_norm_agrees_with_slicot(rng):
     G = random_stable(rng, 6, 2, 2, 0.0, 0.1)
     assert h2_norm(G) == pytest.approx(control.norm(G.to_control(), 2), rel=1e-9)
+
+
+def test_a_response_beyond_all_numbers_is_said():
+    """1e20 / 1e-300 at rest."""
+    with np.errstate(all="ignore"), pytest.raises(ComputationError, match="overflows"):
+        hinf_norm(StateSpace([[-1e-300]], [[1e10]], [[1e10]], [[0.0]]))

@@ -35,6 +35,15 @@ def spectrum(u: np.ndarray) -> np.ndarray:
     return np.fft.rfft(u, axis=1) / u.shape[1]
 
 
+@pytest.mark.parametrize("samples", [32, 33])
+def test_a_multisine_is_the_sum_of_its_cosines(rng, samples):
+    """Up to the last line below half the sample rate, two sets of phases at once."""
+    lines, n = np.array([1, 4, 7, 14, 15]), np.arange(samples)
+    amplitude, phase = rng.uniform(0.5, 2.0, 5), rng.uniform(0, 6, (2, 5))
+    sums = (amplitude * np.cos(2 * np.pi * lines * n[:, None] / samples + phase[:, None])).sum(axis=2)
+    np.testing.assert_allclose(synthesise(lines, amplitude, phase, samples), sums, atol=1e-12)
+
+
 def test_flat_spectra_of_schroeders_phases_have_a_crest_factor_near_1_7():
     """The independent comparison: Schroeder's closed form, over continuous time, and the iteration beats it."""
     for n in (20, 60, 150):

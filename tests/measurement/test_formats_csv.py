@@ -127,6 +127,13 @@ def test_latin_1_units_and_closing_separators(path):
     assert campaign.y_unit == "m/s^2" and np.ptp(campaign.records[0].load().y) == 0.0  # a constant channel is read
 
 
+@pytest.mark.parametrize("byte", [0x80, 0xFF])
+def test_every_byte_that_is_no_utf_8_is_a_latin_1_letter(path, byte):
+    path.write_bytes(b"t,A1,S" + bytes([byte]) + b"\n0,1,2\n1,0,2\n2,1,3\n")
+    name = "S" + chr(byte)
+    assert read_measurements(path, {"t": "t", "u": "A1", "y": name}).y_names == (name,)
+
+
 GOOD = ["t,A1,S1"] + [f"{i / 4},{i % 2},{i}" for i in range(8)]
 
 

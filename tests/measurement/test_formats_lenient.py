@@ -8,6 +8,7 @@ import scipy.io
 from test_formats_matlab import Matlab73, both, cells, save
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.campaign import in_short
 from avis_ctrl.measurement.formats import parse_columns, read_measurements, write_campaign
 from avis_ctrl.measurement.formats.stored import StoredRecord
 
@@ -155,6 +156,11 @@ def test_frequency_responses_get_names_too(path, rng):
                             "variance": np.ones((7, 3, 2))})
     response = read_measurements(path, NAMES)
     assert response.inputs == ("A", "B") and response.outputs == ("p", "q", "r")
+
+
+def test_notes_that_say_the_same_of_several_records_are_one():
+    notes = ("record 00: no unit", "taken as V", "record 01: no unit", "record 02: late", "y: no unit")
+    assert in_short(notes) == ("records 00, 01: no unit", "taken as V", "record 02: late", "y: no unit")
 
 
 @pytest.mark.parametrize("name", ["a.py", "a.md", "a.M", "a.txt", "a"])

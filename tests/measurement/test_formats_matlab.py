@@ -110,6 +110,20 @@ def test_one_record_and_the_same_content_in_hdf5(path, tmp_path, rng, version):
 
 
 @both
+def test_names_as_the_rows_of_a_char_matrix(path, rng, version):
+    """Padded to one length; stored by columns."""
+    names = ["A1", "A12"]
+    save(path, version, {"records": fields(rng, u_names=np.array(names) if version == "v5" else "x"), "rig": "avis"})
+    if version == "v7.3":
+        with h5py.File(path, "r+") as file:
+            del file["records/u_names"]
+            file["records/u_names"] = np.array([[ord(letter) for letter in name.ljust(3)] for name in names],
+                                               np.uint16).T
+            file["records/u_names"].attrs["MATLAB_class"] = np.bytes_("char")
+    assert list(read_measurements(path).u_names) == names
+
+
+@both
 @pytest.mark.parametrize("shape", ["row", "column"])
 def test_flat_vectors_either_way_round(path, rng, version, shape):
     u, y = rng.normal(size=(2, 50))
@@ -162,6 +176,19 @@ def test_frequency_responses(path, rng, version, lines):
     np.testing.assert_allclose(response.value, 1e-3 * G, rtol=1e-14)
     np.testing.assert_allclose(response.entry_variance, 1e-6 * np.abs(G) ** 2 * (1 - coherence) / (coherence * 24))
     assert response.outputs == ("S1", "S2", "S3") and response.output_unit == "m/s"
+
+
+@pytest.mark.parametrize("named", ["inputs", "outputs"])
+def test_channels_without_names_are_numbered(path, rng, named):
+    """The shape of H tells how many there are, where only the others have names."""
+    names = {"inputs": ["A1", "A2"], "outputs": ["S1", "S2", "S3"]}
+    G = rng.normal(size=(7, 3, 2))
+    scipy.io.savemat(path, {"frequency_Hz": np.arange(1.0, 8.0), "H": G, "variance": np.ones((7, 3, 2)),
+                            named: cells(names[named])})
+    response = read_measurements(path)
+    expected = {"inputs": ["u1", "u2"], "outputs": ["y1", "y2", "y3"]} | {named: names[named]}
+    assert [list(response.inputs), list(response.outputs)] == [expected["inputs"], expected["outputs"]]
+    np.testing.assert_array_equal(response.value, G)
 
 
 def test_as_many_lines_as_channels_are_refused(path, rng):

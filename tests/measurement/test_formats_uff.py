@@ -106,6 +106,15 @@ def test_units_by_data_type_and_data_set_164(path):
     assert read_measurements(path, y_unit="mm/s").records[0].y[0, 0] == pytest.approx(1e-3)
 
 
+def test_what_another_function_refers_to_is_an_input(path, rng):
+    """A reference without node is none: the response beside it may be at node 0, as where nodes were never given."""
+    u, y = rng.normal(size=(2, 20))
+    path.write_bytes(data_set(u, node=7, direction=-3, ordinate=(1, "V"))
+                     + data_set(y, ordinate=(12, "m/s^2"), reference=("NONE", 7, -3)))
+    campaign = read_measurements(path, excitation="noise")
+    assert (campaign.u_names, campaign.y_names) == (("node 7 -Z",), ("node 0",))
+
+
 def test_the_second_function_of_a_channel_is_the_second_record(path, rng):
     u = rng.normal(size=(2, 20))
     path.write_bytes(b"".join(data_set(u[i], name=name, ordinate=(1, "V")) for name in ("A1", "S1") for i in (0, 1)))
@@ -129,6 +138,20 @@ def test_pyuff_writes_ascii_that_is_read_alike(path, rng):
     read = pyuff.UFF(str(path)).read_sets(1)
     np.testing.assert_allclose(response.value[:, 1, 0], read["data"], rtol=1e-12)
     np.testing.assert_allclose(response.value[:, 0, 0], G, rtol=1e-11)
+    for wrong in (0.0, -0.02):
+        with pytest.raises(InputError, match=r"relative_standard_deviation = .*: expected a positive number"):
+            read_measurements(path, relative_standard_deviation=wrong)
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_numbers_that_run_together_are_told_apart_by_their_width(path, double):
+    """-1.0E+100 fills its field."""
+    G = -1e100 * (1 + 1j) * np.arange(1.0, 9.0)
+    path.write_bytes(data_set(G, kind=4, node=1, ordinate=(12, "m/s^2"), denominator=(13, "N"), abscissa=(18, "Hz"),
+                              double=double, start=1.0, step=1.0))
+    assert b"E+100-" in path.read_bytes()
+    response = read_measurements(path, relative_standard_deviation=0.1)
+    np.testing.assert_allclose(response.value[:, 0, 0], G, rtol=1e-5)
 
 
 def test_real_samples(data):

@@ -56,6 +56,19 @@ def test_clipping_below_the_known_range(either, part):
     assert f"{level:.4g}"[:4] in found.sentence and "below the end of the known range" in found.sentence
 
 
+@pytest.mark.parametrize("samples", [1, 2])
+def test_two_samples_at_the_end_of_the_range_are_clipped_and_one_is_not(samples):
+    campaign = everywhere(noise_campaign(1, 8000, (0.2,) * 4), lambda u, y: (u, 0.1 * y))
+    y = campaign.records[0].y.copy()
+    y[:, 1] *= 10
+    k, top = int(np.argmax(y[:, 1])), float(np.max(y[:, 1]))
+    y[k:k + samples, 1] = top
+    found = examine(changed(campaign, 0, y=y), known(y_range_V=(-10.0, top), response=None))
+    (said,) = [f for f in found if f.gate == "clipping"]
+    assert said.severity == ("ok" if samples == 1 else "warning")
+    assert samples == 1 or (said.value, said.channels) == (2, ("Sz1",))
+
+
 def test_clipping_before_the_noise_of_the_converter(either):
     """A flat top that is rounded by noise of one step."""
     (found,) = alarms(limited(either, 0.7, noise=1e-3)[0], "clipping")
@@ -93,6 +106,9 @@ def test_millivolts_are_a_wrong_unit(clean):
     found = alarms(everywhere(clean, lambda u, y: (u, 1000 * y)))
     assert [f.gate for f in found] == ["clipping"] and len(found[0].channels) == 6
     assert "mV" in found[0].sentence and "unit or scale is probably wrong" in found[0].sentence
+    assert "Channels concerned: 'Sy1', 'Sz1'" in found[0].sentence
+    (alone,) = alarms(everywhere(clean, lambda u, y: (u, y * np.where(np.arange(6) == 1, 1000, 1))), "clipping")
+    assert alone.channels == ("Sz1",) and "concerned: 'Sz1'. The unit" in alone.sentence
 
 
 @pytest.mark.parametrize("sample", [4, 12345, -5])
@@ -103,6 +119,24 @@ def test_a_single_spike_is_named(either, sample):
     (found,) = alarms(changed(either, 1, y=y))
     assert (found.gate, found.channels, found.records) == ("spikes", ("Sz2",), ("01",))
     assert f"sample {sample}" in found.sentence and f"{sample / RATE:.6g} s" in found.sentence
+
+
+def test_a_spike_in_a_later_piece_has_its_place_in_the_record():
+    campaign = noise_campaign(1, 24000, (0.2,))
+    y = campaign.records[0].y.copy()
+    y[21000, 3] += 3.0
+    found = examine(changed(campaign, 0, y=y), known(), longest=16000)
+    (said,) = [f for f in found if f.gate == "spikes"]
+    assert "at 21 s (sample 21000)" in said.sentence
+
+
+def test_a_drive_that_never_moves_is_noted(clean):
+    (said,) = [f for f in examine(clean, known()) if f.gate == "dead channel"]
+    assert said.severity == "ok"
+    idle = everywhere(clean, lambda u, y: (u * (np.arange(8) != 2), y))
+    (said,) = [f for f in examine(idle, known(response=None)) if f.gate == "dead channel"]
+    assert (said.severity, said.channels) == ("note", ("Ax2",))
+    assert "'Ax2' is constant in every driven record" in said.sentence
 
 
 def test_false_alarms_of_spikes():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -208,16 +210,42 @@ def test_false_alarms_of_hum(colour):
     assert hits <= 4
 
 
+@pytest.mark.parametrize("off", [0.9975, 1.003])
 @pytest.mark.parametrize("mains", [50.0, 60.0])
-def test_hum_names_mains_and_channel(rng, mains):
+def test_hum_names_mains_channel_and_size(rng, mains, off):
+    """Anywhere in the tolerance; the frequency to half a bin of 1/4 Hz, the size within the noise of its bins."""
     record = rest(rng)
     y = record.y.copy()
-    y[:, 2] += 0.1 * np.sin(2 * np.pi * (mains * 1.001) * np.arange(len(y)) / 1000)
+    y[:, 2] += 0.4 * np.sin(2 * np.pi * (mains * off) * np.arange(len(y)) / 1000)
     record = Record(record.header, record.u, y)
     gate = Hum()
     found = gate.conclude([gate.look(excerpt(record), Expectation())], Campaign("x", (record,)), Expectation())
     assert [(f.channels, f.severity) for f in found] == [(("y2",), "warning")]
     assert f"carries mains hum at {mains:g} Hz:" in found[0].sentence
+    said = re.search(r"Hz: at (\S+) Hz (\S+) V r\.m\.s\.", found[0].sentence)
+    assert float(said[1]) == pytest.approx(mains * off, abs=0.13)
+    assert float(said[2]) == pytest.approx(0.4 / np.sqrt(2), rel=0.1)
+    # Over the louder of 16 bins on either side, three bins away from the tolerance of one bin.
+    P, middle = signal.welch(y[:, 2], 1000, "hann", 4000, 0, detrend="linear")[1], round(4 * mains)
+    floor = max(P[middle - 20:middle - 4].mean(), P[middle + 5:middle + 21].mean())
+    assert found[0].value == pytest.approx(P[middle - 1:middle + 2].max() / floor)
+
+
+@pytest.mark.parametrize("excitation", ["multisine", "noise"])
+def test_signal_to_noise_is_what_was_put_in(rng, excitation):
+    """20 dB and 0 dB on every line, of six periods or of white noise, in each octave within what few lines scatter."""
+    lines, N = np.arange(1, 1024), 2048
+    U = np.zeros(N // 2 + 1, complex)
+    U[lines] = np.sqrt(N) * np.exp(2j * np.pi * rng.random(lines.size))  # the power of white noise of r.m.s. 1
+    u = np.tile(np.fft.irfft(U, N), 6) if excitation == "multisine" else rng.standard_normal(60000)
+    y = u[:, None] * [1.0, 0.1] + 0.1 * rng.standard_normal((len(u), 2))
+    header = RecordHeader("00", 1000.0, len(u), ("u",), ("a", "b"), excitation, 1.0, 0.0,
+                          N / 1000 if excitation == "multisine" else None)
+    campaign = Campaign("x", (Record(header, u[:, None], y),))
+    (said,) = [f for f in examine(campaign) if f.gate == "signal to noise" and f.picture.series]
+    for series, dB in zip(said.picture.series, (20.0, 0.0), strict=True):
+        wide = series.x > 10
+        assert wide.sum() > 3 and np.all(np.abs(series.y[wide] - dB) < 1.5)
 
 
 def test_false_alarms_of_periodicity(rng):
@@ -245,7 +273,7 @@ def test_long_records_are_looked_at_in_pieces_and_that_is_said(rng):
     record = Watched(short.header, short.u, short.y)
     findings = examine(Campaign("x", (record,)), longest=8000)
     assert sum(Watched.sizes) <= 8000
-    assert all("only pieces of 8000 samples" in f.sentence for f in findings)
+    assert all("only pieces with 8000 samples" in f.sentence for f in findings)
 
 
 @pytest.mark.parametrize("field", [{"y_range_V": (1.0, -1.0)}, {"y_lsb_V": 0.0}, {"drive_limits_V": {"Ay1": np.nan}}])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import time
+from itertools import product
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from scipy import stats
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
-from avis_ctrl.measurement.frequency_response.local_fit import LocalFit, local_model
+from avis_ctrl.measurement.frequency_response.local_fit import LocalFit, least_half_width, local_model
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial, local_rational, noise_covariance
 from avis_ctrl.measurement.frequency_response.pooling import pool
 
@@ -92,6 +94,27 @@ def test_the_same_rational_estimate_as_lstsq_with_all_unknowns(rng):
         inverse += np.linalg.inv(K.conj().T @ K)[:2, :2] / 2
     assert found.dof == K.shape[0] - K.shape[1]
     assert np.allclose(np.linalg.inv(found.gram[0]).T, inverse)
+
+
+def test_the_default_window_is_the_smallest_with_equations_to_spare():
+    """Lines less unknowns, counted: of G, of each record's transient and of a denominator; 2 n_y + 4 are left."""
+    for records, n_u, n_y, order, rational in product((1, 2, 5), (0, 1, 8), (1, 6), (2, 3), (False, True)):
+        def spare(w, records=records, n_u=n_u, n_y=n_y, order=order, rational=rational):
+            unknowns = (order + 1) * n_u + (order + 1) * records + (order if rational else 0)
+            return records * (2 * w + 1) - unknowns - (2 * n_y + 4)
+        w = least_half_width(records, n_u, n_y, order, rational)
+        assert spare(w) >= 0 and w > order
+        assert w == order + 1 or spare(w - 1) < 0
+
+
+def test_the_window_of_a_periodic_record_holds_enough_excited_lines():
+    """As many as G has coefficients of an input, in all records as many as it has unknowns; one to spare at most."""
+    for records, n_u, order, spacing in product((1, 2, 5), (1, 2, 8), (2, 3), (2, 5, 6)):
+        w, plain = (least_half_width(records, n_u, 1, order, spacing=each) for each in (spacing, 1))
+        excited, wanted = (2 * w + 1) // spacing, (order + 1) * n_u
+        assert w >= plain and excited > order and excited * records >= wanted
+        enough = max(order, wanted / records) + 2
+        assert w == plain or 2 * w - 1 <= spacing * enough
 
 
 def test_records_taken_in_one_by_one_give_the_same_as_together(rng):
@@ -311,7 +334,7 @@ def test_inputs_that_cannot_be_told_apart_are_named(rng):
     system = Modal(rng, 1, 3, [25.0], 0.3, RATE)
     u = rng.standard_normal((2000, 3))
     u[:, 2] = 2 * u[:, 0]
-    with pytest.raises(ComputationError, match=r"u1, u3 cannot be told apart"):
+    with pytest.raises(ComputationError, match=r"u1, u3 cannot be distinguished"):
         local_polynomial(campaign([(u, system.simulate(u))], RATE))
     u[:, 2] = 0
     got = local_polynomial(campaign([(u, system.simulate(u))], RATE), band_Hz=(5, 80))
@@ -342,6 +365,37 @@ def test_inputs_that_depend_on_each_other_tell_what_they_span(rng):
     of_three, of_two = (noise_covariance(campaign([(one, y)], RATE), at, band_Hz=(5, 80)) for one in (u, two))
     assert np.allclose(of_three.covariance, of_two.covariance, rtol=1e-6)
     assert np.array_equal(of_three.dof, of_two.dof)
+
+
+def test_an_input_90_dB_down_in_part_of_the_band_is_not_silent(rng):
+    """Without noise the response is exact there too, alone and beside an input that follows another."""
+    f = np.arange(1, 61) * 0.5
+    G = sum(rng.standard_normal((2, 2)) * (f[:, None, None] / 30) ** s for s in range(3))
+    U = rng.standard_normal((4, 60, 2)) + 1j * rng.standard_normal((4, 60, 2))
+    U[:, 30:, 1] *= 3e-5
+    Y = (G @ U[..., None])[..., 0]
+    assert np.allclose(local_model(U, Y, f).value, G, atol=1e-9)
+    fit = LocalFit(f, 3, 2, 2, 8, 4.0)
+    fit.add(np.concatenate([U, 2 * U[..., :1]], axis=2), Y, f)
+    value = fit.estimate(partial=True).value
+    assert np.allclose(value[:, :, 0] + 2 * value[:, :, 2], G[:, :, 0], atol=1e-9)
+    assert np.allclose(value[:, :, 1], G[:, :, 1], atol=1e-9)
+
+
+def test_silence_is_measured_against_the_band(rng):
+    """A line with 1e-15 of the band's r.m.s.: its own part over -100 dB of the band's part of a window, by lstsq."""
+    records, order, w = 3, 2, 4
+    U = rng.standard_normal((records, 60, 1)) + 1j * rng.standard_normal((records, 60, 1))
+    U[:, 30:] *= 1e-15
+    with pytest.raises(ComputationError, match="are not excited") as caught:
+        local_model(U, U, np.arange(60.0), np.array([45.0]), order, w)
+    d = np.arange(-w, w + 1.0)
+    powers, here = d[:, None] ** np.arange(order + 1), U[:, 45 - w:45 + w + 1, 0].ravel()
+    others = np.hstack([here[:, None] * np.tile(powers[:, 1:], (records, 1)), np.kron(np.eye(records), powers)])
+    own = np.linalg.norm(here - others @ np.linalg.lstsq(others, here, rcond=1e-25)[0])
+    rms = np.sqrt(np.mean(np.abs(U) ** 2))
+    said = float(re.search(r"own part (\S+?)[;,\s]", f"{caught.value} ")[1])
+    assert said == pytest.approx(own / (1e-5 * rms * np.sqrt(records * (2 * w - order))), rel=0.05)
 
 
 def test_an_input_silent_in_part_of_the_band_is_named_with_the_frequencies(rng):

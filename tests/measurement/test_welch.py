@@ -133,7 +133,7 @@ def test_wrong_requests_are_answered(rng):
         with pytest.raises(InputError, match=words):
             spectral_average(data, **change)
     u = rng.standard_normal((2000, 2)) @ np.array([[1.0, 2.0], [0.0, 0.0]])
-    with pytest.raises(ComputationError, match="u1, u2 cannot be told apart"):
+    with pytest.raises(ComputationError, match="u1, u2 cannot be distinguished"):
         spectral_average(campaign([(u, u)], RATE))
     u[:, 1] = 0
     with pytest.raises(ComputationError, match="u2"):

@@ -139,7 +139,7 @@ def test_warnings_come_first_with_their_pictures(found):
     assert line.x.tolist() == [1.0, 1.0] and line.y.tolist() == [1.0, 2.0]
     assert any(isinstance(p, Fold) for p in part.pieces)
     first = section(replace(found, findings=(extra,)), "result").pieces[0]
-    assert "Gates that warned: dead channel." in first.text
+    assert "Gates (data checks) with warnings: dead channel." in first.text
 
 
 def test_pictures_of_every_style_are_drawn():
@@ -198,8 +198,8 @@ def test_ways_are_compared_in_standard_deviations(found):
 
 
 def test_a_filter_that_did_not_run_is_said_to_have_not(found):
-    part = section(replace(found, kalman=None, kalman_note="the extended Kalman filter was not asked for"), "ways")
-    assert part.pieces[0].text == "The extended Kalman filter was not asked for." and not figures(part)
+    part = section(replace(found, kalman=None, kalman_note="the extended Kalman filter was not requested"), "ways")
+    assert part.pieces[0].text == "The extended Kalman filter was not requested." and not figures(part)
 
 
 def test_text_from_files_is_never_markup(found, html, tmp_path):
@@ -241,7 +241,7 @@ def test_frequency_responses_alone(found):
     alone = replace(found, measured=response, findings=(), split=None, kalman_note="needs records")
     content = document(alone)
     text = " ".join(p.text for s in content.sections for p in s.flat() if isinstance(p, Paragraph))
-    assert "there were none" in text and "Every third line" in text
+    assert "there were none" in text and "Every fourth group of neighbouring lines" in text
     assert identification_pdf(alone).startswith(b"%PDF-")
 
 
@@ -251,7 +251,7 @@ def test_little_was_found(found):
     poor = replace(found, advice=(), validation=replace(v, overlay=None, modes=(), held_out=tuple(
         replace(h, whiteness=None, nrms_time=None, nrms_time_start=None, nrms_time_whole=None) for h in v.held_out)))
     text = " ".join(Reader(identification_html(poor)).text.split())
-    assert "No frequency response could be measured" in text and "not tested" in text
+    assert "No measured frequency response can be shown" in text and "not tested" in text
 
 
 @given(st.floats(1e-9, 1e9), st.floats(1e-9, 1e5), st.booleans())

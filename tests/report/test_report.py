@@ -168,7 +168,7 @@ def test_an_unstable_loop_has_no_steady_motion(fabricated: DesignResult) -> None
     shown |= {curve.label for p in section.pieces if isinstance(p, Figure) for curve in p.panels[0].curves}
     assert "skyhook, tuned" in shown and "skyhook, critical damping" not in shown
     captions = [p.caption for p in section.pieces if isinstance(p, Figure)]
-    assert all("Left out, its nominal loop being unstable: skyhook, critical damping." in c for c in captions)
+    assert all("Not shown, because the nominal loop is unstable: skyhook, critical damping." in c for c in captions)
 
 
 def test_comparison_says_who_is_unstable(fabricated: DesignResult) -> None:
@@ -187,6 +187,6 @@ def test_a_study_that_found_little_is_still_reported(fabricated: DesignResult) -
         replace(c, gamma=np.inf, mu=empty, stability=empty, worst_peak=empty, worst_band=empty, stable=False,
                 peak_transmissibility=np.inf) for c in fabricated.controllers))
     text = " ".join(Reader(render_html(poor)).text.split())
-    assert "not shown to be stable for every plant" in text and "No iteration was made." in text
+    assert "not proved to be stable for every plant" in text and "No iteration was run." in text
     assert not re.search(r"\b(inf|nan) (dB|Hz|V)\b", text)
     assert render_pdf(poor).startswith(b"%PDF-")

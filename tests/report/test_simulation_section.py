@@ -30,7 +30,7 @@ def simulated(fabricated: DesignResult) -> DesignResult:
 
 def test_a_loop_that_misses_the_modulus_margin_is_marked(simulated: DesignResult) -> None:
     table = next(p for p in simulation(simulated).pieces if isinstance(p, Table) and "modulus margin" in p.caption)
-    assert "at least 0.5 was asked" in table.caption
+    assert "at least 0.5 is required" in table.caption
     assert [row[-1] for row in table.rows] == [Mark("0.62", True), Mark("0.43", False), "a reason"]
 
 
@@ -56,13 +56,13 @@ def test_the_peak_voltage_is_that_of_the_drive_nearest_to_its_limit(limited: Des
     assert 0.4 * peaks.max() < peaks[-1] < peaks.max()
     assert (check.plants[0].peak_V, check.plants[0].limit_V) == (peaks[-1], 4.0)
     table = next(p for p in simulation(limited).pieces if isinstance(p, Table) and "Every" in p.caption)
-    assert f"of the drive that comes nearest to its limit {LIMITS};" in table.caption
+    assert f"of the drive that comes closest to its limit; {LIMITS};" in table.caption
     assert table.rows[0][4].endswith(" of 4.00 V")
 
 
 def test_one_limit_is_said_once(simulated: DesignResult) -> None:
     table = next(p for p in simulation(simulated).pieces if isinstance(p, Table) and "Every" in p.caption)
-    assert "Voltages as demanded, limit 10.0 V;" in table.caption and table.rows[0][4] == "0 V"
+    assert "Commanded voltages, limit 10.0 V;" in table.caption and table.rows[0][4] == "0 V"
 
 
 def test_each_axis_is_weighed_against_the_drive_that_reaches_its_limit_first(limited: DesignResult) -> None:
@@ -85,4 +85,4 @@ def test_result_json_says_which_loops_miss_it(simulated: DesignResult) -> None:
     told = result_dict(simulated)["all_axes"]
     assert told["modulus_margin_asked"] == 0.5
     assert [one["modulus_margin"] for one in told["companions"]] == [0.62, 0.43]
-    assert any("below the 0.5 that was asked" in note and note.endswith(": y 0.43.") for note in told["notes"])
+    assert any("below the required 0.5" in note and note.endswith(": y 0.43.") for note in told["notes"])

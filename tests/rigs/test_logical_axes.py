@@ -63,7 +63,7 @@ def test_axes_out_of_reach_are_named():
         actuator_axes(rig, ("x", "z"), ["Az1", "Az2", "Az3", "Az4"], quiet=[])
     with pytest.raises(InputError, match="cannot be pushed independently"):
         actuator_axes(rig, ("z", "phi_x", "phi_y"), ["Az1", "Az2"], quiet=[])
-    with pytest.raises(InputError, match="cannot be told apart by the sensors"):
+    with pytest.raises(InputError, match="cannot be distinguished by the sensors"):
         sensor_axes(rig, COORDINATES, ["Sz1", "Sz2", "Sz3", "Sx2", "Sy1"])
     with pytest.raises(InputError, match="out of"):
         sensor_axes(rig, ("z",), ["Sz9"])
@@ -73,6 +73,16 @@ def test_two_motors_on_a_line_cannot_tell_z_from_the_roll():
     """Az1 and Az2 both stand at y = -0.375: z and phi_x only in the fixed ratio of the arm."""
     with pytest.raises(InputError, match="z and phi_x cannot be pushed independently"):
         actuator_axes(load_rig("avis"), ("z", "phi_x"), ["Az1", "Az2"], quiet=[])
+
+
+def test_two_sensors_on_a_line_read_z_unless_the_roll_is_to_be_told_apart():
+    """Sz1 and Sz2 both stand at y = -0.375: the mean of the two is z - 0.375 phi_x."""
+    rig = load_rig("avis")
+    found = sensor_axes(rig, ("z",), ["Sz1", "Sz2"])
+    assert np.allclose(found.decoding, [[0.5, 0.5]], atol=1e-12)
+    assert np.allclose(found.leftover[0], [0, 0, -0.375 / rig.edge_m, 0, 0], atol=1e-12)
+    with pytest.raises(InputError, match="z and phi_x cannot be told apart"):
+        sensor_axes(rig, ("z",), ["Sz1", "Sz2"], resolved=["phi_x"])
 
 
 def test_five_drives_push_what_is_asked_and_as_little_else_as_they_can():

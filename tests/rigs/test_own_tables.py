@@ -10,8 +10,10 @@ import pytest
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import load_rig
+from avis_ctrl.rigs.logical_axes import drivable
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
+from avis_ctrl.rigs.sensing import conditioning
 
 RIGS = Path(__file__).parents[2] / "designs" / "rigs"
 NAMES = ("tripod", "four_vertical", "twelve_sensors", "skewed", "granite")
@@ -128,3 +130,30 @@ def changed(change):
 def test_what_is_wrong_is_named(change, message):
     with pytest.raises(InputError, match=message):
         rig_from(changed(change))
+
+
+@pytest.mark.parametrize(("tilt_rad", "driven"), [(0.0, ("z",)), (0.01, ("z",)), (0.04, ()), (0.1, ())])
+def test_a_drive_that_stands_askew_drives_no_coordinate_by_itself(tilt_rad, driven):
+    """One drive at the centre of mass: drawings give directions to 0.005 rad, beyond 0.02 rad it is meant."""
+    content = content_of("four_vertical")
+    content["drive"] = [{**content["drive"][0], "position_m": [0.0, 0.0, 0.0],
+                         "direction": [float(np.sin(tilt_rad)), 0.0, float(np.cos(tilt_rad))]}]
+    assert drivable(rig_from(content)) == driven
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_conditioned_channel_shows_velocity_alike(name):
+    """Motion in space above one common corner of second order, motion against the chassis below the differentiator's.
+    """
+    rig, f = load_rig(RIGS / f"{name}.toml"), np.array([1e-3, 1e-2, 0.05, 1.0, 10.0, 50.0])
+    shown = {True: [], False: []}
+    for sensor, own in zip(rig.sensors(), conditioning(rig, 0.1), strict=True):
+        s = 2j * np.pi * f
+        digital = own.leading * np.prod([s - zero for zero in own.zeros], axis=0) / np.prod(
+            [s - pole for pole in own.poles], axis=0)
+        shown[sensor.inertial].append(sensor.as_velocity(2 * np.pi * f) * digital)
+    for inertial, alike in shown.items():
+        if alike:
+            assert np.allclose(alike, alike[0], rtol=1e-9)
+            assert alike[0][-1 if inertial else 2] == pytest.approx(1.0, abs=0.05)
+            assert abs(alike[0][1] / alike[0][0]) == pytest.approx(100.0 if inertial else 1.0, rel=0.02)

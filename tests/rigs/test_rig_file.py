@@ -109,7 +109,7 @@ def test_wrong_entries_are_answered_in_one_line(tmp_path, name, change, field, e
 def test_a_table_that_nothing_holds_is_refused(tmp_path):
     corners = [("-0.475, -0.375, -0.175", "0, 0, 0"), ("0.475, -0.375, -0.175", "0, 0, 0"),
                ("0.475, 0.375, -0.175", "0, 0, 0"), ("-0.475, 0.375, -0.175", "0, 0, 0")]
-    with pytest.raises(InputError, match="nothing resists one that is mostly phi_"):
+    with pytest.raises(InputError, match="no spring resists motion mainly along phi_"):
         load_rig(written(tmp_path, "avis", *corners))
 
 

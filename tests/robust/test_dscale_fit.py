@@ -9,11 +9,13 @@ import pytest
 import scipy.optimize as so
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import find_peaks
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti import StateSpace
+from avis_ctrl.lti import StateSpace, append, gain
 from avis_ctrl.robust.dscale_fit import fit_magnitude, stable_roots
 from avis_ctrl.robust.dscale_matrix import fit_hermitian
+from avis_ctrl.robust.dstep import CHECKED_POINTS, PointwiseScalings, d_step, tightened
 from avis_ctrl.robust.scalings import MatrixScaling, ScalarScaling, Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar
 
@@ -174,6 +176,20 @@ def test_scaled_plant_is_the_product_of_its_parts(rng):
     assert np.allclose(again.scale(P).frequency_response(omega), expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_roots_beyond_the_band_move_to_its_edge_and_leave_the_magnitude(order):
+    """Zeros fast and poles slow, and the other way round: d is known far inside, where each is a constant or a slope.
+    """
+    fast, slow = -(10.0 ** np.arange(5.0, 5.0 + order)), -(10.0 ** -np.arange(5.0, 5.0 + order))
+    inside = np.geomspace(0.1, 10.0, 7)
+    for zeros, poles in ((fast, slow), (slow, fast), (fast, -np.ones(order)), (-np.ones(order), fast)):
+        d = ScalarScaling.from_roots(2.0, zeros, poles)
+        moved = d.within((1e-4, 1e4))
+        sizes = np.abs(np.concatenate([moved.zeros, moved.poles]))
+        assert np.all((sizes > 0.999e-4 / 100) & (sizes < 1.001e4 * 100))
+        assert np.allclose(poly_magnitude(moved, inside) / poly_magnitude(d, inside), 1.0, rtol=0.1)
+
+
 def test_slopes_of_the_magnitude_are_its_derivatives(rng):
     d = rational(rng, 5)
     h = 1e-6
@@ -193,6 +209,91 @@ def test_bad_input_is_named(change, field):
         fit_magnitude(**(good | change))
 
 
-def test_matrix_that_is_not_positive_is_refused():
-    with pytest.raises(InputError, match="positive definite"):
-        fit_hermitian(np.array([1.0]), np.diag([1.0, -1.0])[None].astype(complex), 0)
+@pytest.mark.parametrize(("X", "degree", "message"), [
+    ([[1.0, 0.0], [0.0, -1.0]], 0, "positive definite"), ([[1.0, 0.2], [0.1, 1.0]], 0, "finite Hermitian"),
+    ([[1.0, 0.1j], [0.1j, 1.0]], 0, "finite Hermitian"), ([[1.0, 0.0], [0.0, np.inf]], 0, "finite Hermitian"),
+    ([[1.0, 0.0]], 0, "do not fit"), ([[1.0]], -1, "whole number"), ([[1.0]], 0.5, "whole number")])
+def test_matrix_that_cannot_be_fitted_is_refused(X, degree, message):
+    with pytest.raises(InputError, match=message):
+        fit_hermitian(np.array([1.0]), np.array([X], complex), degree)
+
+
+@pytest.fixture
+def added(monkeypatch) -> list[np.ndarray]:
+    """Frequencies that the check between the grid's points sends back into the grid, one array a round."""
+    rounds, extended = [], PointwiseScalings.extended
+
+    def watched(points, omega, M):
+        rounds.append(np.sort(omega))
+        return extended(points, omega, M)
+    monkeypatch.setattr(PointwiseScalings, "extended", watched)
+    return rounds
+
+
+def test_the_four_highest_peaks_between_the_points_become_points(added):
+    """All entries of N are alike, so that d = 1 is best everywhere and sigma is the modes' own."""
+    omega, zeta = np.array([0.2, 0.7, 2.0, 6.0, 20.0, 70.0]), 0.01
+    A = np.kron(np.diag(omega), [[0.0, 1.0], [-1.0, -2 * zeta]])
+    B = np.kron(omega[:, None], [[0.0, 0.0], [1.0, 1.0]])
+    C = np.kron(2 * zeta * np.array([[1.5, 1.4, 1.3, 1.2, 1.1, 0.5]]), [[1.0, 0.0], [1.0, 0.0]])
+    N = StateSpace(A, B, C, np.full((2, 2), 0.1))
+    structure = BlockStructure.of([ComplexFull(1, 1)]).with_performance(1, 1)
+    coarse, dense = np.geomspace(0.01, 1000, 16), np.geomspace(0.01, 1000, CHECKED_POINTS)
+    step = d_step(PointwiseScalings.of(coarse, N.frequency_response(coarse), structure), N,
+                  Scalings.identity(structure))
+    sigma = np.linalg.norm(N.frequency_response(dense), ord=2, axis=(1, 2))
+    peaks = find_peaks(sigma)[0]
+    highest = peaks[np.argsort(sigma[peaks])[-4:]]
+    assert np.allclose(added[0], dense[np.sort(highest)])
+    assert step.peak == pytest.approx(np.max(sigma))
+
+
+def test_a_resonance_of_the_scaling_itself_becomes_one_point(added):
+    """A constant N and d(s) with a resonance that the grid does not see; its two conjugate roots are one frequency."""
+    structure, omega = BlockStructure.of([ComplexFull(1, 1)]).with_performance(1, 1), np.array([1e-3, 1e-2, 1e3, 1e4])
+    roots = [3.0 * np.exp(1j * sign * np.arccos(-zeta)) for zeta in (1.0, 0.05) for sign in (1, -1)]
+    N, d = gain(np.full((2, 2), 0.5)), ScalarScaling.from_roots(1.0, roots[:2], roots[2:])
+    start = Scalings(structure, (d, ScalarScaling.constant(1.0)))
+    step = tightened(PointwiseScalings.of(omega, N.frequency_response(omega), structure), N, start, 0.01, 10)
+    assert added[0] == pytest.approx([3.0])
+    assert step.peak == pytest.approx(1.0)
+
+
+def test_a_repeated_block_is_fitted_where_its_misfit_costs_most():
+    """Two loops of products 1, of which the first needs D = diag(1, d) over two decades and the second d over one.
+
+    At constant scalings the output and input directions of the first lie wholly within its block.
+    """
+    def loop(ratio):
+        """[0 t; 1/t 0] with |t| from `ratio` at low frequency to 1/ratio at high."""
+        direct, step = np.array([[0.0, 1 / ratio], [ratio, 0.0]]), ratio - 1 / ratio
+        return StateSpace(-np.diag([1 / ratio, ratio]), np.array([[0.0, 1.0], [1.0, 0.0]]),
+                          np.diag([step / ratio, -step * ratio]), direct)
+    pair = append(loop(10.0).renamed(["a", "b"], ["c", "d"]), loop(3.0).renamed(["e", "f"], ["g", "h"]))
+    N = StateSpace(pair.A, pair.B, pair.C, pair.D + 0.05)
+    structure = BlockStructure.of([ComplexScalar(2), ComplexFull(1, 1)]).with_performance(1, 1)
+    omega = np.geomspace(1e-3, 1e3, 40)
+    step = d_step(PointwiseScalings.of(omega, N.frequency_response(omega), structure), N,
+                  Scalings.identity(structure), allowed_cost=0.05)
+    assert step.cost < 0.05 and min(step.scalings.orders[:2]) > 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_constants_are_refined_to_the_best_there_are(seed):
+    """Two blocks, from 0.3 off in log d, against Nelder and Mead; steps that promise 0.1 % or less are not taken."""
+    rng = np.random.default_rng(seed)
+    N = StateSpace(-np.diag(10.0 ** rng.uniform(-1, 1, 4)), rng.normal(size=(4, 3)), rng.normal(size=(3, 4)),
+                   0.1 * rng.normal(size=(3, 3)))
+    structure = BlockStructure.of([ComplexFull(1, 1), ComplexFull(1, 1)]).with_performance(1, 1)
+    omega = np.geomspace(1e-2, 1e2, 30)
+    M = N.frequency_response(omega)
+
+    def peak(log_d):
+        d = np.exp([*log_d, 0.0])
+        return np.max(np.linalg.norm(d[:, None] * M / d, ord=2, axis=(1, 2)))
+
+    best = min((so.minimize(peak, rng.normal(size=2), method="Nelder-Mead") for _ in range(3)), key=lambda x: x.fun)
+    start = Scalings(structure, tuple(map(ScalarScaling.constant, np.exp([*(best.x + 0.3), 0.0]))))
+    step = tightened(PointwiseScalings.of(omega, M, structure), N, start, np.inf, 0)
+    found = peak([part.theta[0] for part in step.scalings.parts[:2]])
+    assert found < 1.003 * best.fun < 0.99 * peak(best.x + 0.3)

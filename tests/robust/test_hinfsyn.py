@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import scipy.linalg as la
@@ -21,6 +23,8 @@ from avis_ctrl.lti import (
 from avis_ctrl.lti.realisation import hankel_singular_values
 from avis_ctrl.robust.hinf_bounds import hinf_lower_bound, limiting_weights
 from avis_ctrl.robust.hinf_lmi import lmi_gamma
+from avis_ctrl.robust.hinf_plant import Plant
+from avis_ctrl.robust.hinf_riccati import gamma_test
 from avis_ctrl.robust.hinfsyn import Status, hinf_suboptimal, hinfsyn
 
 DISTURBANCE_PROCESS = ([200], np.polymul([10, 1], np.polymul([0.05, 1], [0.05, 1])))
@@ -163,6 +167,33 @@ class TestAgainstMatrixInequalities:
         bound = hinf_lower_bound(P, 1, 1)
         assert bound.gamma <= lmi_gamma(P, 1, 1).upper * (1 + 1e-6)
 
+    def test_the_lower_bound_does_not_depend_on_the_units_of_u_and_y(self, rng):
+        """A control in units 1e10 times larger acts all the same: its column is small, not zero."""
+        D = np.zeros((5, 5))
+        D[1:3, 3:] = D[3:, 1:3] = np.eye(2)
+        for _ in range(4):
+            P = StateSpace(rng.standard_normal((4, 4)) - 3 * np.eye(4), rng.standard_normal((4, 5)),
+                           rng.standard_normal((5, 4)), D)
+            other = P.scaled(left=[1, 1, 1, 1, 1e-10], right=[1, 1, 1, 1, 1e-10])
+            assert hinf_lower_bound(other, 2, 2).gamma == pytest.approx(hinf_lower_bound(P, 2, 2).gamma, rel=1e-6)
+
+    @pytest.mark.parametrize("order, corner", [(3, 1e4), (5, 1e3)])
+    def test_a_control_that_has_rolled_off_still_counts(self, order, corner):
+        """z1 = u1 + w2 / 10, z2 = h w1 + g u2, y = w, with g = 1/(s + 1)^order and h a lag beyond its roll-off.
+
+        u1 = -y2 / 10 and u2 = -(h/g) (s/a + 1)^-order y1 leave z2 = h (1 - (s/a + 1)^-order) w1, small for a large a.
+        """
+        g, h, a = tf([1], np.poly(-np.ones(order))), tf([corner], [1, corner]), 1e6
+        B, C = np.zeros((order + 1, 4)), np.zeros((4, order + 1))
+        B[:order, 3], C[1, :order], B[order, 0], C[1, order] = g.B[:, 0], g.C[0], h.B[0, 0], h.C[0, 0]
+        P = StateSpace(la.block_diag(g.A, h.A), B, C, np.array([[0, 0.1, 1, 0], [0, 0, 0, 0], [1, 0, 0, 0],
+                                                                [0, 1, 0, 0]]))
+        s = 1j * np.geomspace(1e-2, 1e9, 5000)
+        reached = np.max(np.abs(corner / (s + corner) * (1 - (s / a + 1) ** -order)))
+        assert reached < 0.1
+        assert hinf_lower_bound(P, 2, 2).gamma <= reached
+        assert hinfsyn(P, 2, 2).gamma_optimal_bounds[0] <= reached
+
 
 class TestWhichWeightForbids:
     def test_elasticities_add_up_to_one(self):
@@ -302,7 +333,32 @@ class TestUse:
         P = mixed_sensitivity(([1 / 1.5, 10.0], [1, 1e-3]))
         result = hinfsyn(P, 1, 1, sample_rate_Hz=10.0)
         assert result.fastest_pole == pytest.approx(np.max(np.abs(result.K.poles())))
-        assert "too fast" in result.notes[-1]
+        share = float(re.search(r"is (\S+) of half the sample rate: too fast", result.notes[-1])[1])
+        assert share == pytest.approx(result.fastest_pole / (2 * np.pi * 10.0 / 2), rel=0.05)
+        assert "slow enough" in hinfsyn(P, 1, 1, sample_rate_Hz=20 * result.fastest_pole).notes[-1]
+
+    @pytest.mark.parametrize("a", [-1.0, 1.0, 3.0])
+    def test_matrix_inequalities_that_hold_are_confirmed(self, a):
+        """The plant below: no gamma under its optimum is called an upper bound, and eigenvalues confirm that one."""
+        found, exact = lmi_gamma(StateSpace(*self.self_dual(a)), 1, 1), a + np.sqrt(a * a + 2)
+        assert found.lower <= exact * (1 + 1e-9) and exact <= found.upper < exact * (1 + 1e-5)
+        assert found.violation <= 0
+
+    @staticmethod
+    def self_dual(a):
+        return ([[a]], [[1.0, 0.0, 1.0]], [[1.0], [0.0], [1.0]], [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+
+    @pytest.mark.parametrize("a", [-1.0, 1.0, 3.0])
+    def test_only_what_rounding_cannot_undo_is_forbidden(self, a):
+        """x' = a x + w1 + u, y = x + w2, z = (x, u): its own dual, so that X = Y = gamma at a + sqrt(a^2 + 2)."""
+        plant = Plant.of(StateSpace(*self.self_dual(a)), 1, 1)
+        low, high = 0.1, 100.0
+        while low < (middle := (low + high) / 2) < high:
+            low, high = (low, middle) if gamma_test(plant, middle).feasible else (middle, high)
+        assert high == pytest.approx(a + np.sqrt(a * a + 2), rel=1e-14)
+        assert gamma_test(plant, low).forbidden == 0.0
+        clear = low * (1 - 1e-12)
+        assert gamma_test(plant, clear).forbidden == clear
 
     @pytest.mark.parametrize("hidden", ["unreached", "unseen"])
     def test_hidden_stable_states_do_not_matter(self, rng, hidden):

@@ -297,6 +297,18 @@ def test_round_off_makes_no_matrix_singular():
     assert found == [False, True]
 
 
+@pytest.mark.parametrize("block", [R, C])
+@pytest.mark.parametrize("n", [3, 4, 5])
+def test_no_perturbation_makes_a_nilpotent_matrix_singular(n, block):
+    """det(I - d J) = 1 for every d, although the smallest singular value falls as |d|^(1 - n)."""
+    J = np.diag(np.ones(n - 1), 1)
+    Q = np.linalg.qr(np.random.default_rng(n).standard_normal((n, n)))[0]
+    for M in (J, Q @ J @ Q.T):
+        assert mu(M, [block(n)]).lower == 0
+    d = 10.0 ** (10 / (n - 1))
+    assert not is_singular(J[None], d * np.eye(n, dtype=complex)[None], BlockStructure.of([block(n)]))[0]
+
+
 # -- input --------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("M, blocks", [

@@ -11,9 +11,12 @@ import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, connect, gain, hinf_norm, lft_lower, summing_junction, tf
+from avis_ctrl.robust.frequency_grid import MAX_POINTS, frequency_grid, merged, refined_grid
 from avis_ctrl.robust.gamma_descent import (
     ScaledProblem,
+    descend,
     gamma_and_gradient,
+    grown,
     parameters,
     with_parameters,
 )
@@ -248,6 +251,72 @@ def test_slope_of_gamma_is_its_derivative():
 
     numeric = [np.log(optimum(theta + h * e) / optimum(theta - h * e)) / (2 * h) for e in np.eye(theta.size)]
     assert np.allclose(slope, numeric, rtol=1e-3, atol=1e-4)
+
+
+def test_descent_learns_the_curvature():
+    """After as many evaluations it is below steepest descent, which creeps along the valley from the same start."""
+    P, structure = distillation(), BlockStructure.of(DISTILLATION_BLOCKS).with_performance(2, 2)
+    d = ScalarScaling.from_roots(1.0, [-0.5, -1.0], [-0.6, -0.9])
+    start = Scalings(structure, (d, d, ScalarScaling.constant(1.0)))
+    problem, theta = ScaledProblem.of(P, 2, 2), parameters(start)
+    gamma, slope = gamma_and_gradient(problem, start)
+    step = -slope
+    for _ in range(40):
+        trial = gamma_and_gradient(problem, with_parameters(start, theta + step))
+        if trial[0] < gamma:
+            theta, (gamma, slope) = theta + step, trial
+            step = -slope
+        else:
+            step = step / 3
+    found = descend(P, 2, 2, start, (1e-3, 1e3), evaluations=40)
+    assert found.evaluations <= 40 and found.gamma < 0.98 * gamma < 0.95 * found.gamma_before
+
+
+@pytest.mark.parametrize(("d", "orders"), [((1.0, 1.0), (1, 1, 0)), ((0.3, 3.0), (1, 0, 0))])
+def test_a_root_pair_is_added_where_gamma_falls_most(d, orders):
+    """The optimum of every pair that could be tried, bisected; both blocks where the two inputs count alike."""
+    P, structure = distillation(), BlockStructure.of(DISTILLATION_BLOCKS).with_performance(2, 2)
+    problem = ScaledProblem.of(P, 2, 2)
+    start = Scalings(structure, tuple(map(ScalarScaling.constant, (*d, 1.0))))
+
+    def optimum(scalings):
+        return find_gamma(problem.normal(scalings).plant, 1e-9).upper.gamma
+
+    larger = grown(P, 2, 2, start, (1e-2, 1e2), 60)
+    assert larger.orders == orders
+    tried = []
+    for place in np.geomspace(1e-2, 1e2, 8)[1:-1]:
+        for split in (-0.02, 0.02):
+            tried += [start.replace(k, start.parts[k].with_neutral_pair(place, split)) for k in (0, 1)]
+            if orders[1]:
+                tried.append(tried[-2].replace(1, tried[-1].parts[1]))
+    assert optimum(larger) == pytest.approx(min(map(optimum, tried)), rel=1e-7)
+    assert optimum(larger) < 0.995 * optimum(start)
+
+
+def test_a_grid_has_the_points_of_both_but_none_twice():
+    one = np.geomspace(1.0, 100.0, 30)
+    assert np.array_equal(merged(one, np.concatenate([1.05 * one, 1.0005 * one[::2]])), np.sort([*one, *(1.05 * one)]))
+    many = merged(np.geomspace(1.0, 100.0, 300), one)
+    assert many.size == MAX_POINTS and many[0] == 1.0 and many[-1] == pytest.approx(100.0)
+
+
+def test_the_grid_of_a_loop_sees_its_resonance_and_halves_around_peaks():
+    """1/(s^2 + 2 zeta s + 1) peaks at sqrt(1 - 2 zeta^2); half a bandwidth to either side it is 3 dB lower."""
+    zeta = 0.01
+    omega = frequency_grid(StateSpace([[0.0, 1.0], [-1.0, -2 * zeta]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]]))
+    size = 1 / np.abs(1 - omega ** 2 + 2j * zeta * omega)
+    assert np.max(size) == pytest.approx(1 / (2 * zeta * np.sqrt(1 - zeta ** 2)), rel=1e-6)
+    assert np.sum((size > 0.69 * np.max(size)) & (size < 0.73 * np.max(size))) == 2
+    assert size[0] == pytest.approx(1.0, rel=0.01) and size[-1] < 1e-2 * np.max(size)
+    coarse, mu = np.geomspace(2.0, 200.0, 9), np.array([9.0, 2.0, 3.0, 3.0, 1.0, 4.0, 1.0, 2.0, 0.5])
+    finer = refined_grid(coarse, mu, peaks=3)
+    # The end is none, of a plateau both ends are, and the lowest of the four stays.
+    between = coarse[[1, 2, 3, 4, 5]] * 10 ** 0.125
+    assert np.allclose(np.setdiff1d(finer, coarse), between)
+    for points, room in ((MAX_POINTS - 2, True), (MAX_POINTS - 1, False)):
+        many = np.geomspace(1.0, 1e4, points)
+        assert refined_grid(many, np.exp(-np.log(many / many[40]) ** 2)).size == points + 2 * room
 
 
 def test_gamma_reported_is_measured(distilled):

@@ -69,3 +69,20 @@ def test_a_small_optimum_that_is_proved_is_not_called_zero():
 def test_no_perturbation_where_round_off_is_all_that_is_singular():
     """A repeated real scalar on a sampled system whose mu is zero: a perturbation of 1e13 proves nothing."""
     assert solve(2026, 7933)["wrong"] == []
+
+
+@pytest.mark.parametrize("seed", [50, 293])
+def test_round_off_in_gamma_is_said_whatever_the_status(seed):
+    """A large D11 and nearly singular D12, D21: the responses of P and K make a loop of another norm, 20 % and more."""
+    rng = np.random.default_rng(seed)
+    A, B, C = rng.standard_normal((2, 2)), rng.standard_normal((2, 3)), rng.standard_normal((3, 2))
+    D = np.zeros((3, 3))
+    D[:2, :2] = 10 ** rng.uniform(2, 4) * rng.standard_normal((2, 2))
+    D[1, 2], D[2, 1] = 10 ** rng.uniform(-6, -4), 10 ** rng.uniform(-6, -4)
+    P = StateSpace(A, B, C, D)
+    found = hinfsyn(P, 1, 1)
+    omega = np.abs(found.closed_loop.poles())
+    p, k = P.frequency_response(omega), found.K.frequency_response(omega)
+    loop = p[:, :2, :2] + p[:, :2, 2:] @ np.linalg.solve(1 - k @ p[:, 2:, 2:], k @ p[:, 2:, :2])
+    assert np.max(np.linalg.norm(loop, 2, axis=(1, 2))) > 1.2 * found.gamma
+    assert any("round-off shows in gamma" in note for note in found.notes)

@@ -54,6 +54,36 @@ def test_refined_solution_holds_the_exact_one_between_its_bounds(error):
     assert 0 < E[0, 0] < 1e-14 + exact * error ** 2
 
 
+def test_the_bounds_hold_what_wrong_entries_do(rng):
+    """Scalar: dx = (2 x da + x^2 dr + dq) / (-2 (a + r x)) for the worst signs. Matrices: 200 drawn ones inside."""
+    a, r, q, noise = -2.0, 1.5 ** -2 - 1, 1.0, (3e-6, 2e-6, 1e-6)
+    x = 1 / (np.sqrt(a * a - r * q) - a)
+    one = [np.full((1, 1), value) for value in (a, r, q, x)]
+    for only in range(3):
+        size = [value * (k == only) for k, value in enumerate(noise)]
+        E = refined(*one, [np.full((1, 1), value) for value in size])[1]
+        assert E[0, 0] == pytest.approx((2 * x * size[0] + x ** 2 * size[1] + size[2]) / (-2 * (a + r * x)), rel=1e-6)
+    A, B, C = rng.standard_normal((3, 3)), rng.standard_normal((3, 1)), rng.standard_normal((2, 3))
+    data = A, -B @ B.T, C.T @ C
+    width = [1e-6 * np.abs(part) for part in data]
+    X, E = refined(*data, solve_riccati(*data).X, width)
+    for _ in range(200):
+        signs = [rng.choice([-1.0, 1.0], (3, 3)) for _ in range(3)]
+        signs = [signs[0], *(np.tril(sign) + np.tril(sign, -1).T for sign in signs[1:])]
+        moved = solve_riccati(*(part + sign * size for part, sign, size in zip(data, signs, width, strict=True))).X
+        assert min(la.eigvalsh(E - (moved - X))[0], la.eigvalsh(E + (moved - X))[0]) > 0
+
+
+@pytest.mark.parametrize("power", [-30, 30])
+def test_the_unit_of_time_does_not_matter(rng, power):
+    """All three matrices times a power of two: the same X to the last bits."""
+    A, B, C = rng.standard_normal((4, 4)), rng.standard_normal((4, 1)), rng.standard_normal((2, 4))
+    data = A, -B @ B.T, C.T @ C
+    plain, scaled = solve_riccati(*data), solve_riccati(*(2.0 ** power * part for part in data))
+    assert plain.semidefinite and scaled.semidefinite
+    np.testing.assert_allclose(scaled.X, plain.X, rtol=1e-9)
+
+
 def test_singular_solution_is_not_called_indefinite():
     """X vanishes on stable modes that the cost does not see, however they are mixed with the others: the block
     that is left is the scalar equation above, positive for gamma = 1.5 and negative for R = 1/2."""

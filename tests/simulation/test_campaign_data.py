@@ -234,7 +234,7 @@ def test_plans_that_a_rig_cannot_follow(name, records, changes, expected):
 
 
 def test_a_table_that_leaves_its_stops_is_reported():
-    with pytest.raises(ComputationError, match="record 00: the table left its stops"):
+    with pytest.raises(ComputationError, match="record 00: the table moved beyond its stops"):
         simulate_campaign(load_rig("avis"), plan({"excitation": "floor", "floor_rms_m_per_s": 1.0}))
 
 

@@ -1,5 +1,6 @@
 """The simulation against other integrators, conservation laws and what its parts are asked to do exactly."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.nonlinear import NonlinearRig
 from avis_ctrl.simulation import SampledLoop, simulate, spectral_radius
+from avis_ctrl.simulation.culprit import find_culprit
 from avis_ctrl.simulation.sampled_loop import SensorBank
 
 SKEW = {"com_x": 0.05, "com_y": -0.03, "com_z": 0.12, "J12": 3.0, "J13": -2.0, "J23": 4.0}
@@ -160,8 +162,12 @@ def test_spectral_radius_is_the_growth_of_an_unstable_loop(make_loop, name, dela
     assert record.diverged
     # In the end the fastest pair is alone: v[k+1] = a v[k] - b v[k-1] throughout, roots of modulus sqrt(b).
     v = record.q_dot[-20:]
-    (_, b), *_ = np.linalg.lstsq(np.column_stack([v[1:-1].ravel(), -v[:-2].ravel()]), v[2:].ravel(), rcond=None)
+    (a, b), *_ = np.linalg.lstsq(np.column_stack([v[1:-1].ravel(), -v[:-2].ravel()]), v[2:].ravel(), rcond=None)
     assert spectral_radius(loop) == pytest.approx(np.sqrt(b), rel=1e-6) and np.sqrt(b) > 1.02
+    said = re.search(r"grows at (\S+) Hz with a time constant of (\S+) s", find_culprit(loop).words())
+    frequency_Hz = np.arccos(a / (2 * np.sqrt(b))) / (2 * np.pi) * loop.sample_rate_Hz
+    assert float(said[1]) == pytest.approx(frequency_Hz, rel=0.01)
+    assert float(said[2]) == pytest.approx(2 / np.log(b) / loop.sample_rate_Hz, rel=0.01)
 
 
 def test_nonlinear_and_linear_tables_agree_in_closed_loop_at_micrometres(make_loop):

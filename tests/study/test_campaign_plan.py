@@ -62,7 +62,7 @@ WRONG = [
     ("floor_rms_m_per_s = 1e-4", "floor_rms_m_per_s = 1e-4\nlevel_V = 1.0", "record[2].level_V", "silent"),
     ("level_V = 0.2", "floor_rms_m_per_s = 1.0", "record[1].floor_rms_m_per_s", 'excitation = "floor"'),
     ('"multisine"\nlevel', '"multisin"\nlevel', "record[1].excitation = 'multisin'", "'multisine'"),
-    ("[1.0, 80.0]", "[80.0, 1.0]", "band_Hz", "lower end first"),
+    ("[1.0, 80.0]", "[80.0, 1.0]", "band_Hz", "lower limit first"),
     ("[1.0, 80.0]", "[80.0]", "band_Hz", "at least 2"),
     ("ligo_livingston", "ligo", "ambient.spectrum = 'ligo'", "expected one of"),
     ("records = 2", "records = 0", "record[1].records = 0", "greater than or equal to 1"),
@@ -83,7 +83,7 @@ def test_wrong_entries_are_answered_in_one_line(tmp_path, old, new, field, expec
 
 
 def test_files_that_are_no_plans(tmp_path):
-    for name, content, expected in (("broken.toml", b"x = = 1", "TOML"), ("empty.toml", b"", "record: this key is"),
+    for name, content, expected in (("broken.toml", b"x = = 1", "TOML"), ("empty.toml", b"", "record: this section is"),
                                     ("latin.toml", b"title = \"\xe9\"", "UTF-8"), ("deep.toml", b"x=" + b"[" * 5000,
                                                                                    "TOML")):
         (tmp_path / name).write_bytes(content)

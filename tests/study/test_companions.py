@@ -101,7 +101,7 @@ def test_a_modulus_margin_below_the_one_asked_is_told(bare, companions):
     low = strong.below_margin()
     assert [one.axis for one in low] == ["y", "phi_y", "phi_z"] and strong.loops[0].modulus_margin > 0.5
     said, = strong.remarks()
-    assert "below the 0.5 that was asked" in said
+    assert "below the required 0.5" in said
     assert said.endswith(": " + ", ".join(f"{one.axis} {one.modulus_margin:.2f}" for one in low) + ".")
     # Were the margins those before the gains were doubled, a loop could not be made unstable within them.
     worst = min(low, key=lambda one: one.modulus_margin)

@@ -53,7 +53,7 @@ def test_the_truth_lies_within_the_standard_deviations(rehearsal, found):
 
 def test_a_design_whose_weights_nobody_stated_says_for_which_table_they_are(found):
     text = design_files(found)[DESIGN_FILE]
-    assert text.startswith("# The weights were not stated for this table.")
+    assert text.startswith("# No weights were specified for this table.")
     assert '\n#   shipped: "avis", 500 kg, modes from 1.94 to 5.24 Hz\n#   this table: "avis", ' in text
     stated = design_from_table(tomllib.loads(text))
     assert stated.rig == RIG_FILE
@@ -134,7 +134,7 @@ def test_hold_out_and_parameters_as_asked(rehearsal):
     ({"hold_out": ("09",)}, "09"), ({"hold_out": ("00", "01", "02", "03", "04", "05", "06")}, "not all"),
     ({"parameters": ("weight*",)}, "weight"), ({"priors": {"weight": (1.0, 1.0)}}, "weight"),
     ({"band_Hz": (300.0, 300.001)}, "band"),
-    ({"band_Hz": (200.0, 400.0)}, r"driven from [\d.]+ to \d+(\.\d)? Hz; expected a band within")])
+    ({"band_Hz": (200.0, 400.0)}, r"excited from [\d.]+ to \d+(\.\d)? Hz; expected a band that overlaps")])
 def test_options_that_do_not_fit_are_answered(rehearsal, change, said):
     with pytest.raises(InputError, match=said) as error:
         identify(rehearsal.campaign, load_rig("avis"), IdentifyOptions(**({"starts": 1} | change)))

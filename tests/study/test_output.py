@@ -232,7 +232,7 @@ def test_what_is_read_is_never_written(tmp_path):
     campaign.write_bytes(b"precious")
     (tmp_path / "link.h5").symlink_to(campaign)
     for out in (campaign, tmp_path / "link.h5", tmp_path / "." / "campaign.h5"):
-        with pytest.raises(InputError, match="another file"):
+        with pytest.raises(InputError, match="other than the input file"):
             folders.require_other(out, "avis", None, campaign)
     folders.require_other(tmp_path / "new.h5", campaign, None, "avis")
 
@@ -253,9 +253,9 @@ def test_a_folder_below_a_file_is_refused(tmp_path):
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a file system that nobody can write")
 def test_a_file_system_that_nobody_can_write_is_refused():
-    with pytest.raises(InputError, match="folder that can be written"):
+    with pytest.raises(InputError, match="a writable folder"):
         open_folder("/proc/avis")
-    with pytest.raises(InputError, match="folder that can be written"):
+    with pytest.raises(InputError, match="a writable folder"):
         open_folder("/proc")
 
 

@@ -33,7 +33,7 @@ def test_common_factor_is_blamed_on_the_gains():
 
 def test_one_mass_alone_is_named():
     sentence, = far_from_file(start(), fitted(start(), [2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]))
-    assert sentence.startswith("mass is identified as") and "check the rig file" in sentence
+    assert sentence.startswith("mass is identified as") and "Check the rig file" in sentence
 
 
 @pytest.mark.parametrize(("factors", "sigma"), [([1.2, 0.9, 1.1, 1.0, 2.0, 0.6, 1.0, 5.0], 1e-3), ([5.0] * 8, 0.5)])

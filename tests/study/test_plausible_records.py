@@ -102,14 +102,24 @@ def test_volts_per_g_are_doubted(sound):
     assert ("V/g" in doubt.sentence) == (rig.accelerometers is not None)
     one = changed(measured, y=only(len(measured.y_names), 2, 0.2))
     doubt, = check_records(one, model_of(rig, one))
-    assert doubt.channels == (measured.y_names[2],) and "reads 0.2" in doubt.sentence
+    assert doubt.channels == (measured.y_names[2],) and "is 0.2" in doubt.sentence
+
+
+def test_sensors_that_are_off_by_different_factors_are_told_apart(sound):
+    """One reads three times too much, one a third: no factor between the two is told of both."""
+    rig, measured = sound
+    n = len(measured.y_names)
+    wrong = changed(measured, y=only(n, 1, 3.0) * only(n, 2, 1 / 3.0))
+    said = {one.channels: one.value for one in check_records(wrong, model_of(rig, wrong))}
+    assert said == {(measured.y_names[1],): pytest.approx(3.0, rel=0.1),
+                    (measured.y_names[2],): pytest.approx(1 / 3.0, rel=0.1)}
 
 
 @pytest.mark.parametrize("change, said", [
     (lambda m: changed(m, u=1e3), r"^u of the records = .*limit of drive A\w+ is 10 V: did you mean .*\(given in mV\)"),
-    (lambda m: changed(m, u=1e-3), "all channels are off alike: are the records' y in mV or u in kV"),
-    (lambda m: changed(m, y=1e-3), "all channels are off alike: are the records' y in kV or u in mV"),
-    (lambda m: changed(m, y=only(len(m.y_names), 2, 1e3)), "sensitivity of (Sx2|acc_A3) = .*only (Sx2|acc_A3) is off"),
+    (lambda m: changed(m, u=1e-3), "all channels differ by the same factor: are the records' y in mV or u in kV"),
+    (lambda m: changed(m, y=1e-3), "all channels differ by the same factor: are the records' y in kV or u in mV"),
+    (lambda m: changed(m, y=only(len(m.y_names), 2, 1e3)), "sensitivity of (Sx2|acc_A3) = .*only (Sx2|acc_A3) differs"),
     (lambda m: changed(m, u=only(len(m.u_names), 3, 1e3)), "force constant of A(z2|4): .* did you mean 0.001 times"),
     (lambda m: changed(m, y_unit="m/s"), r"^unit of y = 'm/s': .*did you mean V\?"),
     (lambda m: changed(m, sample_rate_Hz=1.0),

@@ -38,7 +38,7 @@ def test_a_worse_model_and_the_same_model_are_called_so(predicted):
     with h5py.File(path, "r+") as file:
         for group in file["records"].values():
             group["y_updated"][...] = 3 * group["y_baseline"][()]
-    assert "further off" in compared(list(prediction_errors(path, campaign)))
+    assert "larger error than the baseline" in compared(list(prediction_errors(path, campaign)))
     with h5py.File(path, "r+") as file:
         for group in file["records"].values():
             group["y_updated"][...] = group["y_baseline"][()]

@@ -54,7 +54,7 @@ def test_other_channels_are_refused_with_what_to_do(rig, y_names):
 
 def test_a_campaign_of_another_rig_says_so_and_both_roles_at_once(rig):
     own = campaign(rig.equations_of_motion().actuators, rig.sensor_rows()[0], "avis")
-    with pytest.raises(InputError, match="the file says it is a campaign of avis") as caught:
+    with pytest.raises(InputError, match="the file is a campaign of avis") as caught:
         in_words_of(load_rig("halcyonics"), own)
     for said in ("the actuators of the rig halcyonics are A1", "the sensors of the rig halcyonics are acc_A1",
                  "not of halcyonics"):

@@ -145,7 +145,7 @@ def test_another_rig_is_refused_in_one_line(folder, rig, change, words):
 
 
 def test_other_coordinates_and_confidences_are_refused(rig, content):
-    with pytest.raises(InputError, match="holds the spread for z, phi_x"):
+    with pytest.raises(InputError, match="is valid for z, phi_x"):
         in_design(content, rig, ("z",))
     with pytest.raises(InputError, match="at most 99 %"):
         in_design(content, rig, ("z", "phi_x"), 0.999)

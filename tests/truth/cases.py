@@ -3,6 +3,7 @@
     case = draw_case(7)                        # the usual mixture; kind=, effect=, strength= pin it
     campaign = simulate_case(case)             # what `avis gap` sees
     fresh = simulate_case(case, unseen=True)   # the same table under other signals, noise and floor
+    case = draw_case(7, clutter=True)          # a table that differs from its rig file in everything a little
     relative_change(case)                      # how far the effects stand out of noise and ambient motion
 
 Import as `truth.cases` with the folder tests/ on the path. Only the numbers of the rig file and the containers of a
@@ -22,6 +23,7 @@ import numpy as np
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordHeader
 from avis_ctrl.rigs import AvisTable, load_rig
 
+from .clutter import Pilot, add_trace, disturb, draw_traces, tolerances
 from .effect import STRENGTHS, Draw, Effect, Hidden
 from .kernel import integrate, state_size
 from .library_mechanics import MECHANICS
@@ -29,6 +31,7 @@ from .library_signals import SIGNALS
 from .outside import OUTSIDE
 from .signals import floor_motion, multisine, noise
 from .table import Plant, draw_plant, pilot
+from .variants import vary
 
 LIBRARY: dict[str, Effect] = {effect.name: effect for effect in (*SIGNALS, *MECHANICS)}
 OUTSIDE_LIBRARY: dict[str, Effect] = {effect.name: effect for effect in OUTSIDE}
@@ -36,7 +39,7 @@ KINDS = {"none": 0.20, "one": 0.45, "two": 0.15, "outside": 0.20}
 STRENGTH_SHARES = {"faint": 0.25, "clear": 0.45, "gross": 0.30}
 UNSIZED = {"tilt_coupling"}     # given by gravity: always called clear
 SETTLE_S = 12.0         # ambient motion before a record; the table's slowest mode decays by e^-3.8 within it
-_PARAMETERS, _PLAN, _EFFECTS, _SIGNAL, _FLOOR, _NOISE, _HOOKS, _PAUSES = range(8)
+(_PARAMETERS, _PLAN, _EFFECTS, _SIGNAL, _FLOOR, _NOISE, _HOOKS, _PAUSES, _CLUTTER, _TRACES, _PILOT) = range(11)
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ class Case:
     duration_s: float
     floor_recorded: bool
     floor_slope: float
+    clutter: bool = False
+    traces: tuple[Hidden, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -111,40 +116,60 @@ def _pick(rng: np.random.Generator, kind: str) -> list[str]:
 
 
 def draw_case(seed: int, kind: str | None = None, effect: str | None = None, strength: str | None = None,
-              duration_s: float = 60.0) -> Case:
+              duration_s: float = 60.0, clutter: bool = False, variant: str | None = None) -> Case:
     """A case; the same arguments give the same case.
 
     kind : "none", "one", "two", "outside"; drawn 20/45/15/20 by default. effect : a name of LIBRARY or
     OUTSIDE_LIBRARY (kind "one" or "outside" then). strength : "faint", "clear", "gross"; drawn 25/45/30, for each
     effect. Two effects are of different families, so that a person could in principle tell them apart.
+    clutter : a table off its rig file by tolerances, with traces of effects besides, and one of the richer laws of
+    VARIANTS (or `variant`) for each hidden effect of the library. Kind and names are those of the clean case.
     """
-    case = _bare_case(seed, duration_s)
+    case = replace(_bare_case(seed, duration_s), clutter=clutter)
     rng = _rng(seed, _EFFECTS)
     drawn_kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
     kind = ("outside" if effect in OUTSIDE_LIBRARY else "one") if effect is not None else kind or drawn_kind
     names = [effect] if effect is not None else _pick(rng, kind)
-    plant = draw_plant(rig(), _rng(seed, _PARAMETERS))
+    plant = build_plant(case)
     levels = sorted(set(case.levels_V))
+    middle, high = (pilot(plant, case.band_Hz, level) for level in (levels[len(levels) // 2], levels[-1]))
+    span, limits = case.starts_s[-1] + duration_s, tolerances(rig()) if clutter else {}
     hidden = []
     for name in names:
         chosen = str(rng.choice(list(STRENGTH_SHARES), p=list(STRENGTH_SHARES.values())))
         chosen = strength or chosen
         if chosen not in STRENGTHS:
             raise ValueError(f"strength = {chosen!r}: expected one of {', '.join(STRENGTHS)}")
-        draw = Draw(rng, plant, pilot(plant, case.band_Hz, levels[len(levels) // 2]),
-                    pilot(plant, case.band_Hz, levels[-1]), chosen, case.starts_s[-1] + duration_s, case.band_Hz)
+        draw = Draw(rng, plant, middle, high, chosen, span, case.band_Hz, limits)
         location, parameters, details = (LIBRARY | OUTSIDE_LIBRARY)[name].draw(draw)
+        if clutter:
+            vary(name, draw, parameters, details, variant)
         hidden.append(Hidden(name, location, parameters, "clear" if name in UNSIZED else chosen, details))
+    if clutter:
+        quiet = Draw(_rng(seed, _TRACES), plant, middle, high, "faint", span, case.band_Hz, limits)
+        case = replace(case, traces=draw_traces(quiet, _pilot_of(case), LIBRARY, tuple(names)))
     unmeasured = "ground_motion" in names
     return replace(case, kind=kind, effects=tuple(hidden), floor_recorded=case.floor_recorded and not unmeasured)
 
 
 def build_plant(case: Case) -> Plant:
-    """The case's table with its effects."""
+    """The case's table with its tolerances, traces and effects."""
     plant = draw_plant(rig(), _rng(case.seed, _PARAMETERS))
+    if case.clutter:
+        disturb(plant, tolerances(rig()), _rng(case.seed, _CLUTTER))
+    for trace in case.traces:
+        add_trace(plant, trace, LIBRARY)
     for hidden in case.effects:
         (LIBRARY | OUTSIDE_LIBRARY)[hidden.name].apply(plant, hidden)
     return plant
+
+
+def _pilot_of(case: Case) -> Pilot:
+    """A short record of the case's table alone, on a still floor."""
+    def respond(plant: Plant, u: np.ndarray) -> np.ndarray:
+        return run(plant, u, np.zeros((len(u) + 1, 9)), 0, 0.0, _rng(case.seed, _HOOKS))[0]
+    return Pilot(lambda: build_plant(replace(case, traces=(), effects=())), respond, case.band_Hz, case.levels_V,
+                 _rng(case.seed, _PILOT))
 
 
 def held_voltage(samples: int, before: int, dt: float, delay_s: float,
@@ -177,6 +202,8 @@ def run(plant: Plant, u: np.ndarray, floor: np.ndarray, before: int, start_s: fl
     x[3] = 1.0
     x[0:3], x[7:10] = floor[0, 0:3], floor[0, 3:6]
     first, switch = held_voltage(len(u), before, dt, plant.delay_s, plant.clock_error)
+    if plant.jitter_s > 0:
+        switch = np.clip(switch + plant.jitter_s / dt * rng.uniform(-1, 1, len(switch)), 0.0, 1.0)
     clock = start_s + np.arange(-before, len(u)) * dt
     y = np.empty((before + len(u), 6))
     trace = np.empty((len(y) if states else 0, len(x)))
@@ -193,7 +220,8 @@ def run(plant: Plant, u: np.ndarray, floor: np.ndarray, before: int, start_s: fl
 def convert(plant: Plant, y: np.ndarray, start_s: float, rng: np.random.Generator) -> np.ndarray:
     """Noise, converter, and what happens behind it."""
     y = y + plant.noise_V * rng.standard_normal(y.shape)
-    y = np.clip(plant.step_V * np.floor(y / plant.step_V + 0.5), -plant.range_V, plant.range_V - plant.step_V)
+    y = plant.step_V * (np.floor(y / plant.step_V + 0.5 - plant.offset_steps) + plant.offset_steps)
+    y = np.clip(y, -plant.range_V * plant.rails[:, 1], plant.range_V * plant.rails[:, 0] - plant.step_V)
     t = start_s + np.arange(len(y)) / plant.rig.sample_rate_Hz
     for change in plant.digital:
         y = change(y, t, rng)
@@ -217,7 +245,7 @@ def _signals(case: Case, number: int, unseen: bool) -> tuple[np.ndarray, np.ndar
 
 def _record(case: Case, plant: Plant, number: int, start_s: float, unseen: bool, driven: bool = True) -> Record:
     u, floor, before = _signals(case, number, unseen)
-    u, floor = u * driven, floor * plant.floor_factor
+    u, floor = u * driven, floor * np.tile(np.broadcast_to(plant.floor_factor, 3), 3)
     key = (number, int(unseen))
     y, _ = run(plant, u, floor, before, start_s, _rng(case.seed, _HOOKS, *key))
     y = convert(plant, y, start_s, _rng(case.seed, _NOISE, *key))
@@ -225,6 +253,19 @@ def _record(case: Case, plant: Plant, number: int, start_s: float, unseen: bool,
     header = RecordHeader(f"{number:02d}", plant.rig.sample_rate_Hz, len(u), plant.motors, plant.sensors,
                           case.excitation, case.levels_V[number], start_s, case.period_s, floor_names=names)
     return Record(header, u, y, floor[before:-1, 3:6] if names else None)
+
+
+def best_prediction(case: Case, unseen: bool = False) -> list[np.ndarray]:
+    """Of each record: what the true table would show with its traces and all that is random switched off.
+
+    Its tolerances and hidden effects are in; traces, sensor noise, jitter, lost samples and a floor that nobody
+    measured are not. No prediction from u and the measured floor can do better, but by modelling the traces.
+    """
+    plant = build_plant(replace(case, traces=()))
+    plant.noise_V, plant.jitter_s, plant.digital = np.zeros(6), 0.0, []
+    plant.floor_factor = plant.floor_factor if case.floor_recorded else 0.0
+    return [np.asarray(_record(case, plant, number, start, unseen).y)
+            for number, start in enumerate(_starts_of(case, unseen))]
 
 
 def _starts_of(case: Case, unseen: bool) -> tuple[float, ...]:

@@ -39,11 +39,19 @@ class Draw:
     strength: str
     span_s: float            # campaign clock at the end of the last record
     band_Hz: tuple[float, float]
+    tolerances: dict[str, float] = field(default_factory=dict)      # of a cluttered table, SI; empty: none
 
-    def size(self, faint: float, gross: float) -> float:
-        """A size between the faintest and the grossest, log-uniform within the third that the strength names."""
-        third = STRENGTHS.index(self.strength)
+    def size(self, faint: float, gross: float, least: float = 0.0) -> float:
+        """A size between the faintest and the grossest, log-uniform within the third that the strength names.
+
+        least : where the faintest begins if that is more.
+        """
+        third, faint = STRENGTHS.index(self.strength), max(faint, least)
         return float(faint * (gross / faint) ** ((third + self.rng.random()) / 3))
+
+    def beyond(self, tolerance: str) -> float:
+        """Three tolerances: a departure that is less is none in a cluttered table; 0 in a clean one."""
+        return 3 * self.tolerances.get(tolerance, 0.0)
 
     def sign(self) -> float:
         return float(self.rng.choice([-1.0, 1.0]))

@@ -29,12 +29,15 @@ class Physics(NamedTuple):
     c: np.ndarray            # (4, 3) N s/m
     k2: np.ndarray           # (4,) N/m^2, vertical
     k3: np.ndarray           # (4,) N/m^3, vertical
-    motor_at: np.ndarray     # (8,) mount of each motor
-    motor_axis: np.ndarray   # (8,)
+    k5: np.ndarray           # (4,) N/m^5, vertical
+    motor_r: np.ndarray      # (8, 3)
+    motor_d: np.ndarray      # (8, 3) direction of the force, earth axes
+    motor_at: np.ndarray     # (8,) mount of each motor, with which it moves where the payload bends
     motor: np.ndarray        # (8,) N/V
     motor_b1: np.ndarray     # (8,) 1/m, change of the force constant with displacement
     motor_b2: np.ndarray     # (8,) 1/m^2
-    sensor_at: np.ndarray    # (6,)
+    sensor_r: np.ndarray     # (6, 3)
+    sensor_at: np.ndarray    # (6,) mount of each sensor
     sensor_n: np.ndarray     # (6, 3) axis in the body
     S: np.ndarray            # (6,) V s/m, preamplifier included
     wn: np.ndarray           # (6,) rad/s suspension
@@ -45,6 +48,7 @@ class Physics(NamedTuple):
     zc: float
     g: float                 # m/s^2 that a tilted sensor feels
     lag: np.ndarray          # (8,) rad/s of the amplifiers, 0: none; or (0,)
+    lag2: np.ndarray         # (8,) rad/s of a second pole, not that of lag; or (0,)
     mode_shape: np.ndarray   # (modes, 4, 3) 1/sqrt(kg), at the mounts
     mode_w: np.ndarray
     mode_z: np.ndarray
@@ -53,36 +57,39 @@ class Physics(NamedTuple):
     osc_m: np.ndarray
     osc_k: np.ndarray
     osc_c: np.ndarray
-    base_dof: int            # 0, 3 or 6
+    base_free: np.ndarray    # (6,) 1 for a coordinate of the chassis that moves on its own, 0: with the floor; or (0,)
     base_r: np.ndarray       # (4, 3) mounts on the chassis, from its centre of mass
+    base_motor_r: np.ndarray  # (8, 3) motors on the chassis
     base_Mi: np.ndarray      # (6,) 1/kg, 1/(kg m^2)
     base_K: np.ndarray       # (6, 6)
     base_C: np.ndarray       # (6, 6)
-    max_k: np.ndarray        # (4,) Maxwell branch, vertical, N/m, or (0,)
-    max_c: np.ndarray        # (4,) N s/m
-    max_q: np.ndarray        # (4,) N s^2/m^2, orifice
-    ladder_k: np.ndarray     # (rungs,) stiffness of each rung over that of the mount
+    max_k: np.ndarray        # (branches, 4) Maxwell branches, vertical, N/m
+    max_c: np.ndarray        # (branches, 4) N s/m
+    max_q: np.ndarray        # (branches, 4) N s^2/m^2, orifice
+    ladder_k: np.ndarray     # (rungs, 4) stiffness of each rung over that of the mount
     ladder_w: np.ndarray     # (rungs,) rad/s
     surge_m: np.ndarray      # (4,) kg or (0,)
     surge_c: np.ndarray      # (4,) N s/m
+    surge_share: np.ndarray  # (4,) compliance above the mass over that of the mount
     level_w: np.ndarray      # (3,) rad/s or (0,)
     level_tau: float         # s
     cable_r: np.ndarray      # (cables, 3)
     cable_d: np.ndarray      # (cables, 3)
     cable_k: np.ndarray
     cable_c: np.ndarray
-    fric_s0: np.ndarray      # (8,) N/m or (0,)
+    fric_jenkins: int        # 1: elastic until it slips (Jenkins), 0: Dahl and LuGre
+    fric_s0: np.ndarray      # (elements, 8) N/m
     fric_s1: float           # N s/m
     fric_s2: float           # N s/m
-    fric_Fc: np.ndarray      # (8,) N
-    fric_Fs: np.ndarray      # (8,) N
+    fric_Fc: np.ndarray      # (elements, 8) N
+    fric_Fs: np.ndarray      # (elements, 8) N
     fric_vs: float           # m/s
 
 
 def state_size(P: Physics) -> int:
     """Number of states that the effects present in P need."""
-    return (FIRST_EFFECT_STATE + 2 * len(P.mode_w) + 2 * len(P.osc_m) + 12 * (P.base_dof > 0)
-            + len(P.max_k) + 12 * len(P.ladder_k) + 2 * len(P.surge_m) + 2 * len(P.level_w) + len(P.fric_s0))
+    return (FIRST_EFFECT_STATE + 2 * len(P.mode_w) + 2 * len(P.osc_m) + 12 * (len(P.base_free) > 0)
+            + 4 * len(P.max_k) + 12 * len(P.ladder_k) + 2 * len(P.surge_m) + 2 * len(P.level_w) + 8 * len(P.fric_s0))
 
 
 @njit(cache=True, fastmath=False, inline="never")
@@ -93,7 +100,7 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
     """
     R, F, G = W[0:3], W[3:7], W[7:11]       # rotation; forces on payload and chassis at the mounts, earth axes
     E, Ed = W[11:15], W[15:19]              # relative displacement and velocity over the mounts, earth axes
-    B, A = W[19:23], W[23:27]               # forces at the mounts, and accelerations there, body axes
+    B = W[19:23]                            # forces at the mounts, body axes
     q0, q1, q2, q3 = x[3], x[4], x[5], x[6]
     s = 1.0 / (q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     R[0, 0] = 1 - 2 * s * (q2 * q2 + q3 * q3)
@@ -112,15 +119,24 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
     dx[6] = 0.5 * (q0 * w2 + q1 * w1 - q2 * w0)
 
     # places of the effects' states
-    n_mode, n_osc, rungs = P.mode_w.size, P.osc_m.size, P.ladder_k.size
+    n_mode, n_osc, rungs = P.mode_w.size, P.osc_m.size, P.ladder_w.size
+    chassis = P.base_free.size > 0
     o_mode = FIRST_EFFECT_STATE
     o_osc = o_mode + 2 * n_mode
     o_base = o_osc + 2 * n_osc
-    o_max = o_base + (12 if P.base_dof > 0 else 0)
+    o_max = o_base + (12 if chassis else 0)
     o_lad = o_max + P.max_k.size
     o_sur = o_lad + 12 * rungs
     o_lev = o_sur + 2 * P.surge_m.size
     o_fri = o_lev + 2 * P.level_w.size
+
+    b, bd = W[33:35], W[35:37]      # chassis: displacement and rotation of its centre of mass, and their rates
+    for a in range(3):
+        b[0, a], bd[0, a], b[1, a], bd[1, a] = fd[a], fv[a], 0.0, 0.0
+    if chassis:
+        for a in range(6):
+            if P.base_free[a] > 0:
+                b[a // 3, a % 3], bd[a // 3, a % 3] = x[o_base + a], x[o_base + 6 + a]
 
     for i in range(4):
         ra, rb, rc = P.r[i, 0], P.r[i, 1], P.r[i, 2]
@@ -136,19 +152,18 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
             vc += P.mode_shape[j, i, 2] * yd
         for a in range(3):
             e = R[a, 0] * (ra + da) + R[a, 1] * (rb + db) + R[a, 2] * (rc + dc) - P.r[i, a]
-            E[i, a] = x[a] + e - fd[a]
-            Ed[i, a] = x[7 + a] + R[a, 0] * va + R[a, 1] * vb + R[a, 2] * vc - fv[a]
-        W[29 + i, 0], W[29 + i, 1] = fd[2], fv[2]       # vertical motion of the chassis point
-        if P.base_dof > 0:      # here the chassis moves by its own coordinates instead of with the floor
+            E[i, a] = x[a] + e - b[0, a]
+            Ed[i, a] = x[7 + a] + R[a, 0] * va + R[a, 1] * vb + R[a, 2] * vc - bd[0, a]
+        W[29 + i, 0], W[29 + i, 1] = b[0, 2], bd[0, 2]  # vertical motion of the chassis point
+        if chassis:
             pa, pb, pc = P.base_r[i, 0], P.base_r[i, 1], P.base_r[i, 2]
             for h in range(2):
-                o = o_base + 6 * h
                 T = E if h == 0 else Ed
-                f = fd if h == 0 else fv
-                T[i, 0] += f[0] - (x[o] + x[o + 4] * pc - x[o + 5] * pb)
-                T[i, 1] += f[1] - (x[o + 1] + x[o + 5] * pa - x[o + 3] * pc)
-                W[29 + i, h] = x[o + 2] + x[o + 3] * pb - x[o + 4] * pa
-                T[i, 2] += f[2] - W[29 + i, h]
+                t = b[1] if h == 0 else bd[1]
+                T[i, 0] -= t[1] * pc - t[2] * pb
+                T[i, 1] -= t[2] * pa - t[0] * pc
+                T[i, 2] -= t[0] * pb - t[1] * pa
+                W[29 + i, h] += t[0] * pb - t[1] * pa
 
     for i in range(4):
         for a in range(3):
@@ -159,20 +174,21 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
             for j in range(rungs):
                 o = o_lad + (3 * i + a) * rungs + j
                 stretch = e - x[o]
-                force -= P.ladder_k[j] * k * stretch
+                force -= P.ladder_k[j, i] * k * stretch
                 dx[o] = P.ladder_w[j] * stretch
             F[i, a] = force
             G[i, a] = -force
         z, zd = E[i, 2], Ed[i, 2]
-        force = -P.k2[i] * z * z - P.k3[i] * z * z * z
-        if P.max_k.size > 0:
-            branch = ks * P.max_k[i] * (z - x[o_max + i])
+        force = -P.k2[i] * z * z - P.k3[i] * z * z * z - P.k5[i] * z * z * z * z * z
+        for j in range(P.max_k.shape[0]):
+            o, c, q = o_max + 4 * j + i, P.max_c[j, i], P.max_q[j, i]
+            branch = ks * P.max_k[j, i] * (z - x[o])
             force -= branch
-            if P.max_q[i] > 0:
-                flow = (np.sqrt(P.max_c[i] ** 2 + 4 * P.max_q[i] * abs(branch)) - P.max_c[i]) / (2 * P.max_q[i])
-                dx[o_max + i] = flow if branch > 0 else -flow
+            if q > 0:
+                flow = (np.sqrt(c * c + 4 * q * abs(branch)) - c) / (2 * q)
+                dx[o] = flow if branch > 0 else -flow
             else:
-                dx[o_max + i] = branch / P.max_c[i]
+                dx[o] = branch / c
         if P.level_w.size > 0 and i < 3:
             o = o_lev + 2 * i
             force -= P.level_w[i] * P.k[i, 2] * x[o]
@@ -184,31 +200,19 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
                 dx[o + 1] = 0.0
         F[i, 2] += force
         G[i, 2] -= force
-        if P.surge_m.size > 0:  # the mass sits between two springs of twice the stiffness; its motion is absolute
+        if P.surge_m.size > 0:  # the mass sits between two springs, together the mount's; its motion is absolute
             o = o_sur + 2 * i
-            k = 2 * ks * P.k[i, 2]
+            k, share = ks * P.k[i, 2], P.surge_share[i]
             below, below_d = x[o] - W[29 + i, 0], x[o + 1] - W[29 + i, 1]
-            upper = k * (z - below) + P.surge_c[i] * (zd - below_d)
-            lower = k * below + P.surge_c[i] * below_d
+            upper = k / share * (z - below) + P.surge_c[i] * (zd - below_d)
+            lower = k / (1 - share) * below + P.surge_c[i] * below_d
             F[i, 2] -= upper
             G[i, 2] += lower
             dx[o] = x[o + 1]
             dx[o + 1] = (upper - lower) / P.surge_m[i]
 
-    for j in range(8):
-        i, a = P.motor_at[j], P.motor_axis[j]
-        e = E[i, a]
-        force = P.motor[j] * (1 + P.motor_b1[j] * e + P.motor_b2[j] * e * e) * u[j]
-        if P.fric_s0.size > 0:
-            v, z = Ed[i, a], x[o_fri + j]
-            level = P.fric_Fc[j] + (P.fric_Fs[j] - P.fric_Fc[j]) * np.exp(-(v / P.fric_vs) ** 2)
-            zd = v - P.fric_s0[j] * abs(v) * z / level
-            dx[o_fri + j] = zd
-            force -= P.fric_s0[j] * z + P.fric_s1 * zd + P.fric_s2 * v
-        F[i, a] += force
-        G[i, a] -= force
-
     fx, fy, fz, tx, ty, tz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0     # earth force, body torque
+    bx, by, bz, b3, b4, b5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0     # reaction on the chassis
     for i in range(4):
         fx += F[i, 0]
         fy += F[i, 1]
@@ -218,17 +222,87 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
         tx += P.r[i, 1] * B[i, 2] - P.r[i, 2] * B[i, 1]
         ty += P.r[i, 2] * B[i, 0] - P.r[i, 0] * B[i, 2]
         tz += P.r[i, 0] * B[i, 1] - P.r[i, 1] * B[i, 0]
+        if chassis:
+            p = P.base_r[i]
+            bx += G[i, 0]
+            by += G[i, 1]
+            bz += G[i, 2]
+            b3 += p[1] * G[i, 2] - p[2] * G[i, 1]
+            b4 += p[2] * G[i, 0] - p[0] * G[i, 2]
+            b5 += p[0] * G[i, 1] - p[1] * G[i, 0]
 
-    bx, by, bz, b3, b4, b5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0     # reaction on the chassis
+    elements = P.fric_s0.shape[0]
+    for j in range(8):
+        force = P.motor[j] * u[j]
+        if elements > 0 or P.motor_b1[j] != 0 or P.motor_b2[j] != 0:    # motion across the gap, along the motor
+            i, p0, p1, p2 = P.motor_at[j], P.motor_r[j, 0], P.motor_r[j, 1], P.motor_r[j, 2]
+            d0, d1, d2 = P.motor_d[j, 0], P.motor_d[j, 1], P.motor_d[j, 2]
+            va, vb, vc = w1 * p2 - w2 * p1, w2 * p0 - w0 * p2, w0 * p1 - w1 * p0
+            da, db, dc = 0.0, 0.0, 0.0
+            for h in range(n_mode):
+                y, yd = x[o_mode + 2 * h], x[o_mode + 2 * h + 1]
+                da += P.mode_shape[h, i, 0] * y
+                db += P.mode_shape[h, i, 1] * y
+                dc += P.mode_shape[h, i, 2] * y
+                va += P.mode_shape[h, i, 0] * yd
+                vb += P.mode_shape[h, i, 1] * yd
+                vc += P.mode_shape[h, i, 2] * yd
+            e, v = 0.0, 0.0
+            for a in range(3):
+                e += P.motor_d[j, a] * (x[a] - b[0, a] + R[a, 0] * (p0 + da) + R[a, 1] * (p1 + db)
+                                        + R[a, 2] * (p2 + dc))
+                v += P.motor_d[j, a] * (x[7 + a] + R[a, 0] * va + R[a, 1] * vb + R[a, 2] * vc - bd[0, a])
+            e -= d0 * p0 + d1 * p1 + d2 * p2
+            if chassis:
+                p = P.base_motor_r[j]
+                n0, n1, n2 = p[1] * d2 - p[2] * d1, p[2] * d0 - p[0] * d2, p[0] * d1 - p[1] * d0
+                e -= n0 * b[1, 0] + n1 * b[1, 1] + n2 * b[1, 2]
+                v -= n0 * bd[1, 0] + n1 * bd[1, 1] + n2 * bd[1, 2]
+            force *= 1 + P.motor_b1[j] * e + P.motor_b2[j] * e * e
+            for h in range(elements):
+                o = o_fri + 8 * h + j
+                z, s0, level = x[o], P.fric_s0[h, j], P.fric_Fc[h, j]
+                if P.fric_jenkins > 0:
+                    # Slipping, it stays at its force; what a step carried it beyond is taken back within a millisecond.
+                    zd = 1e3 * (np.sign(z) * level / s0 - z) if abs(s0 * z) >= level and z * v > 0 else v
+                    force -= min(max(s0 * z, -level), level)
+                else:
+                    level += (P.fric_Fs[h, j] - level) * np.exp(-(v / P.fric_vs) ** 2)
+                    zd = v - s0 * abs(v) * z / level
+                    force -= s0 * z + P.fric_s1 * zd + P.fric_s2 * v
+                dx[o] = zd
+        f0, f1, f2 = force * P.motor_d[j, 0], force * P.motor_d[j, 1], force * P.motor_d[j, 2]
+        fx += f0
+        fy += f1
+        fz += f2
+        n0 = R[0, 0] * f0 + R[1, 0] * f1 + R[2, 0] * f2
+        n1 = R[0, 1] * f0 + R[1, 1] * f1 + R[2, 1] * f2
+        n2 = R[0, 2] * f0 + R[1, 2] * f1 + R[2, 2] * f2
+        tx += P.motor_r[j, 1] * n2 - P.motor_r[j, 2] * n1
+        ty += P.motor_r[j, 2] * n0 - P.motor_r[j, 0] * n2
+        tz += P.motor_r[j, 0] * n1 - P.motor_r[j, 1] * n0
+        if n_mode > 0:
+            i = P.motor_at[j]
+            B[i, 0] += n0
+            B[i, 1] += n1
+            B[i, 2] += n2
+        if chassis:
+            p = P.base_motor_r[j]
+            bx -= f0
+            by -= f1
+            bz -= f2
+            b3 -= p[1] * f2 - p[2] * f1
+            b4 -= p[2] * f0 - p[0] * f2
+            b5 -= p[0] * f1 - p[1] * f0
+
     for j in range(P.cable_k.size):
         p, d = P.cable_r[j], P.cable_d[j]
         va, vb, vc = w1 * p[2] - w2 * p[1], w2 * p[0] - w0 * p[2], w0 * p[1] - w1 * p[0]
         e, v = 0.0, 0.0
         for a in range(3):
             e += d[a] * (x[a] + R[a, 0] * p[0] + R[a, 1] * p[1] + R[a, 2] * p[2] - p[a]
-                         - (x[o_base + a] if P.base_dof > 0 else fd[a]))
-            v += d[a] * (x[7 + a] + R[a, 0] * va + R[a, 1] * vb + R[a, 2] * vc
-                         - (x[o_base + 6 + a] if P.base_dof > 0 else fv[a]))
+                         - b[0, a])
+            v += d[a] * (x[7 + a] + R[a, 0] * va + R[a, 1] * vb + R[a, 2] * vc - bd[0, a])
         force = -P.cable_k[j] * e - P.cable_c[j] * v
         fx += force * d[0]
         fy += force * d[1]
@@ -285,15 +359,6 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
     a0 = R[0, 0] * ax + R[1, 0] * ay + R[2, 0] * az
     a1 = R[0, 1] * ax + R[1, 1] * ay + R[2, 1] * az
     a2 = R[0, 2] * ax + R[1, 2] * ay + R[2, 2] * az
-    for i in range(4):
-        p = P.r[i]
-        v0, v1, v2 = w1 * p[2] - w2 * p[1], w2 * p[0] - w0 * p[2], w0 * p[1] - w1 * p[0]
-        A[i, 0] = a0 + g1 * p[2] - g2 * p[1] + w1 * v2 - w2 * v1
-        A[i, 1] = a1 + g2 * p[0] - g0 * p[2] + w2 * v0 - w0 * v2
-        A[i, 2] = a2 + g0 * p[1] - g1 * p[0] + w0 * v1 - w1 * v0
-        for j in range(n_mode):
-            for a in range(3):
-                A[i, a] += P.mode_shape[j, i, a] * dx[o_mode + 2 * j + 1]
     for j in range(n_osc):
         p, d = P.osc_r[j], P.osc_d[j]
         o = o_osc + 2 * j
@@ -302,33 +367,32 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
         dx[o] = x[o + 1]
         dx[o + 1] = -(P.osc_k[j] * x[o] + P.osc_c[j] * x[o + 1]) / P.osc_m[j] - along
 
-    if P.base_dof > 0:
-        for i in range(4):
-            p = P.base_r[i]
-            bx += G[i, 0]
-            by += G[i, 1]
-            bz += G[i, 2]
-            b3 += p[1] * G[i, 2] - p[2] * G[i, 1]
-            b4 += p[2] * G[i, 0] - p[0] * G[i, 2]
-            b5 += p[0] * G[i, 1] - p[1] * G[i, 0]
+    if chassis:
         W[27, 0], W[27, 1], W[27, 2] = bx, by, bz
         W[28, 0], W[28, 1], W[28, 2] = b3, b4, b5
         for a in range(6):
             force = W[27 + a // 3, a % 3]
-            for b in range(6):
-                e, v = x[o_base + b], x[o_base + 6 + b]
-                if b < 3:
-                    e -= fd[b]
-                    v -= fv[b]
-                force -= P.base_K[a, b] * e + P.base_C[a, b] * v
+            for h in range(6):
+                e, v = b[h // 3, h % 3], bd[h // 3, h % 3]
+                if h < 3:
+                    e -= fd[h]
+                    v -= fv[h]
+                force -= P.base_K[a, h] * e + P.base_C[a, h] * v
             dx[o_base + a] = x[o_base + 6 + a]
-            dx[o_base + 6 + a] = force * P.base_Mi[a] if a < P.base_dof else 0.0
+            dx[o_base + 6 + a] = force * P.base_Mi[a] if P.base_free[a] > 0 else 0.0
 
     for j in range(6):
-        i, n = P.sensor_at[j], P.sensor_n[j]
-        a = n[0] * A[i, 0] + n[1] * A[i, 1] + n[2] * A[i, 2]
+        p0, p1, p2 = P.sensor_r[j, 0], P.sensor_r[j, 1], P.sensor_r[j, 2]
+        n0, n1, n2 = P.sensor_n[j, 0], P.sensor_n[j, 1], P.sensor_n[j, 2]
+        v0, v1, v2 = w1 * p2 - w2 * p1, w2 * p0 - w0 * p2, w0 * p1 - w1 * p0
+        a = (n0 * (a0 + g1 * p2 - g2 * p1 + w1 * v2 - w2 * v1) + n1 * (a1 + g2 * p0 - g0 * p2 + w2 * v0 - w0 * v2)
+             + n2 * (a2 + g0 * p1 - g1 * p0 + w0 * v1 - w1 * v0))
+        for h in range(n_mode):
+            i = P.sensor_at[j]
+            a += dx[o_mode + 2 * h + 1] * (n0 * P.mode_shape[h, i, 0] + n1 * P.mode_shape[h, i, 1]
+                                           + n2 * P.mode_shape[h, i, 2])
         if P.g > 0:             # specific force; the part at rest hangs in the suspension spring
-            a += P.g * (n[0] * R[2, 0] + n[1] * R[2, 1] + n[2] * (R[2, 2] - 1.0))
+            a += P.g * (n0 * R[2, 0] + n1 * R[2, 1] + n2 * (R[2, 2] - 1.0))
         o = SENSOR_STATES + 4 * j
         dx[o] = x[o + 1]
         dx[o + 1] = a - 2 * P.zn[j] * P.wn[j] * x[o + 1] - P.wn[j] ** 2 * x[o]
@@ -347,7 +411,7 @@ def integrate(P, x, u, first, switch, floor, ks, dt, y, trace):
     """
     n, N = x.size, y.shape[0]
     k1, k2, k3, k4, xs = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    W, drive, lagged = np.zeros((40, 3)), np.zeros((3, 8)), np.zeros(8)
+    W, drive, lagged = np.zeros((40, 3)), np.zeros((3, 8)), np.zeros((2, 8))
     f = np.zeros((3, 2, 3))
     edge = np.zeros(4)
     for k in range(N):
@@ -368,14 +432,20 @@ def integrate(P, x, u, first, switch, floor, ks, dt, y, trace):
             row = first[k] + (1 if t0 >= sw - 1e-9 else 0)
             for j in range(8):
                 held = u[row, j] if 0 <= row < u.shape[0] else 0.0
-                decay = np.exp(-0.5 * h * P.lag[j]) if P.lag.size > 0 and P.lag[j] > 0 else 0.0
-                if decay > 0:               # first-order lag under a held voltage, exactly
-                    drive[0, j] = lagged[j]
-                    drive[2, j] = held + (lagged[j] - held) * decay * decay
+                if P.lag.size > 0 and P.lag[j] > 0:     # first- or second-order lag under a held voltage, exactly
+                    w, v = P.lag[j], (P.lag2[j] if P.lag2.size > 0 else 0.0)
+                    first_off = lagged[0, j] - held
+                    through = first_off * v / (v - w) if v > 0 else first_off
+                    own = lagged[1, j] - held - through if v > 0 else 0.0
+                    lagged[0, j] = held + first_off * np.exp(-h * w)
+                    drive[0, j] = held + through + own
+                    drive[2, j] = held + through * np.exp(-h * w) + own * np.exp(-h * v)
                     # Simpson's rule of the stages then has the exact mean, however short the lag is in steps.
-                    mean = held + (lagged[j] - held) * (1 - decay * decay) / (h * P.lag[j])
+                    mean = held - through * np.expm1(-h * w) / (h * w)
+                    if v > 0:
+                        mean -= own * np.expm1(-h * v) / (h * v)
                     drive[1, j] = (6 * mean - drive[0, j] - drive[2, j]) / 4
-                    lagged[j] = drive[2, j]
+                    lagged[1, j] = drive[2, j]
                 else:
                     drive[0, j] = drive[1, j] = drive[2, j] = held
             for stage in range(3):      # cubic Hermite interpolation of the floor: 60 Hz at 1 kHz to 5e-5

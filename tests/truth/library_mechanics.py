@@ -13,7 +13,7 @@ Drawn = tuple[str, dict[str, float], dict[str, Any]]
 LADDER_HZ = np.geomspace(0.04, 400.0, 7)     # corners of the Maxwell rungs
 
 
-def _about_one(uneven: np.ndarray) -> np.ndarray:
+def about_one(uneven: np.ndarray) -> np.ndarray:
     """Factors of single mounts with mean one, so that the hidden parameter is the mean that one number can report."""
     return uneven / uneven.mean()
 
@@ -23,7 +23,7 @@ def _contact_friction(d: Draw) -> Drawn:
     sliding = stretch * d.between(0.1, 1.0)              # displacement after which a contact slips
     stuck = 3.3e4 * d.size(0.001, 0.5)                   # N/m, against 2e4-5e4 of a mount
     coulomb = stuck * sliding
-    uneven = _about_one(d.rng.uniform(0.8, 1.2, 8))
+    uneven = about_one(d.rng.uniform(0.8, 1.2, 8))
     lugre = d.rng.random() < 0.35
     return "actuators", {"coulomb_N": coulomb, "stiffness_N_per_m": stuck}, {
         "coulomb_each_N": (coulomb * uneven).tolist(), "stiffness_each": (stuck * uneven).tolist(),
@@ -32,23 +32,28 @@ def _contact_friction(d: Draw) -> Drawn:
 
 
 def _apply_contact_friction(plant: Plant, h: Hidden) -> None:
-    Fc = np.array(h.details["coulomb_each_N"])
-    plant.extra.update(fric_s0=np.array(h.details["stiffness_each"]), fric_Fc=Fc, fric_Fs=Fc * h.details["stiction"],
-                       fric_s1=h.details["bristle_damping"], fric_vs=h.details["stribeck_m_per_s"])
+    # Elements in parallel at each contact, each with its share of the stiffness and of the force.
+    stiff, slip = np.array(h.details.get("elements", [[1.0, 1.0]])).T
+    Fc = np.outer(slip, h.details["coulomb_each_N"])
+    plant.extra.update(fric_s0=np.outer(stiff, h.details["stiffness_each"]), fric_Fc=Fc,
+                       fric_Fs=Fc * h.details["stiction"], fric_s1=h.details["bristle_damping"],
+                       fric_vs=h.details["stribeck_m_per_s"], fric_jenkins=int(h.details.get("jenkins", False)))
 
 
 def _com_offset(d: Draw) -> Drawn:
     direction = np.eye(3)[d.rng.integers(3)] * d.sign() if d.rng.random() < 0.5 else d.direction()
-    x, y, z = direction * d.size(2e-4, 0.03)
+    size = d.size(2e-4, 0.03, d.beyond("centre_of_mass_m"))
+    x, y, z = d.plant.com + direction * (size - direction @ d.plant.com)     # in all, along the direction drawn
     return "payload", {"x_m": float(x), "y_m": float(y), "z_m": float(z)}, {}
 
 
 def _apply_com_offset(plant: Plant, h: Hidden) -> None:
-    plant.com = plant.com + [h.parameters[name] for name in ("x_m", "y_m", "z_m")]
+    plant.com = np.array([h.parameters[name] for name in ("x_m", "y_m", "z_m")])
 
 
 def _product_of_inertia(d: Draw) -> Drawn:
-    return d.one(("Jxy", "Jxz", "Jyz")), {"product_kgm2": d.sign() * d.size(0.04, 6.0)}, {}
+    return d.one(("Jxy", "Jxz", "Jyz")), {
+        "product_kgm2": d.sign() * d.size(0.04, 6.0, d.beyond("product_of_inertia_kgm2"))}, {}
 
 
 def _apply_product_of_inertia(plant: Plant, h: Hidden) -> None:
@@ -112,11 +117,13 @@ def _apply_base_compliance(plant: Plant, h: Hidden) -> None:
     M = mass * np.array([1, 1, 1, *np.square(p["radii_m"])])
     w = 2 * np.pi * np.array(p["frequencies_Hz"])
     K, C = np.diag(M * w**2), np.diag(2 * h.parameters["damping_ratio"] * M * w)
+    free = p.get("free", [1] * p["dof"] + [0] * (6 - p["dof"]))
     if p["dof"] == 6:       # the soft base lies below the centre of mass: rocking couples with sliding
         L = np.eye(6)
         L[0, 4], L[1, 3] = -p["height_m"], p["height_m"]
         K, C = L.T @ K @ L, L.T @ C @ L
-    plant.extra.update(base_dof=p["dof"], base_Mi=1 / M, base_K=K, base_C=C, base_r=plant.points - p["centre_m"])
+    plant.extra.update(base_free=np.array(free), base_Mi=1 / M, base_K=K, base_C=C,
+                       base_r=plant.chassis_points - p["centre_m"], base_motor_r=plant.motor_p - p["centre_m"])
 
 
 def _mount_relaxation(d: Draw) -> Drawn:
@@ -127,8 +134,10 @@ def _mount_relaxation(d: Draw) -> Drawn:
 
 
 def _apply_mount_relaxation(plant: Plant, h: Hidden) -> None:
-    branch = h.parameters["stiffness_ratio"] * plant.k[:, 2]
-    damper = branch / (2 * np.pi * h.parameters["corner_Hz"])
+    # Branches by mounts: share of the stiffness, and corner over the effective one.
+    share, corner = (np.array(h.details.get(name, np.ones((1, 4)))) for name in ("shares", "corners"))
+    branch = h.parameters["stiffness_ratio"] * plant.k[:, 2] * share
+    damper = branch / (2 * np.pi * h.parameters["corner_Hz"] * corner)
     plant.extra.update(max_k=branch, max_c=damper,
                        max_q=h.details["orifice"] * damper**2 / (branch * h.details["stretch_m"]))
 
@@ -144,33 +153,39 @@ def _apply_structural_damping(plant: Plant, h: Hidden) -> None:
     spacing = np.log(LADDER_HZ[1] / LADDER_HZ[0])
     rung = 2 * spacing * h.parameters["loss_factor"] / np.pi     # loss modulus eta k in the middle of a long ladder
     ratio = 3.0 / LADDER_HZ
-    softer = 1 + np.sum(rung * ratio**2 / (1 + ratio**2))        # so that the stiffness at 3 Hz stays
-    plant.k = plant.k / softer
+    rungs = rung * np.outer(ratio ** -h.details.get("exponent", 0.0), h.details.get("uneven", np.ones(4)))
+    softer = 1 + (ratio**2 / (1 + ratio**2)) @ rungs             # so that the stiffness at 3 Hz stays
+    plant.k = plant.k / softer[:, None]
     plant.c = plant.c * h.details["viscous_left"]
-    plant.extra.update(ladder_k=np.full(len(LADDER_HZ), rung * softer), ladder_w=2 * np.pi * LADDER_HZ)
+    plant.extra.update(ladder_k=rungs * softer, ladder_w=2 * np.pi * LADDER_HZ)
 
 
 def _mount_surge(d: Draw) -> Drawn:
     f, zeta = d.size(150.0, 15.0), d.between(0.01, 0.1)
     mass = 4 * float(np.mean(d.plant.k[:, 2])) / (2 * np.pi * f) ** 2
     return "isolators z", {"frequency_Hz": f, "mass_kg": mass, "damping_ratio": zeta}, {
-        "uneven": _about_one(d.rng.uniform(0.97, 1.03, 4)).tolist()}
+        "uneven": about_one(d.rng.uniform(0.97, 1.03, 4)).tolist()}
 
 
 def _apply_mount_surge(plant: Plant, h: Hidden) -> None:
     mass = h.parameters["mass_kg"] * np.array(h.details["uneven"])
-    plant.extra.update(surge_m=mass, surge_c=h.parameters["damping_ratio"] * np.sqrt(4 * plant.k[:, 2] * mass))
+    plant.extra.update(surge_share=np.array(h.details.get("share_above", np.full(4, 0.5))), surge_m=mass,
+                       surge_c=h.parameters["damping_ratio"] * np.sqrt(4 * plant.k[:, 2] * mass))
 
 
 def _cubic_stiffness(d: Draw) -> Drawn:
     relative = d.size(0.0005, 0.3)              # stiffening by statistical linearisation at the highest level
     cubic = relative * float(np.mean(d.plant.k[:, 2])) / (3 * float(np.mean(d.high.stretch[:, 2])) ** 2)
     return "isolators z", {"cubic_N_per_m3": cubic}, {
-        "uneven": _about_one(d.rng.uniform(0.9, 1.1, 4)).tolist()}
+        "uneven": about_one(d.rng.uniform(0.9, 1.1, 4)).tolist()}
 
 
 def _apply_cubic_stiffness(plant: Plant, h: Hidden) -> None:
-    plant.extra["k3"] = h.parameters["cubic_N_per_m3"] * np.array(h.details["uneven"])
+    uneven = np.array(h.details["uneven"])
+    cubic = h.details.get("cubic_left", 1.0) * h.parameters["cubic_N_per_m3"]
+    plant.extra.update(k3=cubic * uneven, k5=h.details.get("quintic_N_per_m5", 0.0) * uneven)
+    if "quadratic_N_per_m2" in h.details:
+        plant.extra["k2"] = h.details["quadratic_N_per_m2"] * uneven
 
 
 def _leveling_loop(d: Draw) -> Drawn:
@@ -180,7 +195,8 @@ def _leveling_loop(d: Draw) -> Drawn:
 
 
 def _apply_leveling_loop(plant: Plant, h: Hidden) -> None:
-    plant.extra.update(level_w=np.full(3, 2 * np.pi * h.parameters["rate_Hz"]), level_tau=float(h.details["lag_s"]))
+    uneven = np.array(h.details.get("uneven", np.ones(3)))
+    plant.extra.update(level_w=2 * np.pi * h.parameters["rate_Hz"] * uneven, level_tau=float(h.details["lag_s"]))
 
 
 def _cable_stiffness(d: Draw) -> Drawn:
@@ -194,8 +210,9 @@ def _cable_stiffness(d: Draw) -> Drawn:
 
 def _apply_cable_stiffness(plant: Plant, h: Hidden) -> None:
     k = np.array(h.details["each"])
-    plant.extra.update(cable_r=np.tile(h.details["point_m"], (len(k), 1)), cable_d=np.array(h.details["axes"]),
-                       cable_k=k, cable_c=k * h.details["damping_s"])
+    points = h.details.get("points_m", [h.details["point_m"]] * len(k))
+    plant.extra.update(cable_r=np.array(points), cable_d=np.array(h.details["axes"]), cable_k=k,
+                       cable_c=k * h.details["damping_s"])
 
 
 def _stiffness_drift(d: Draw) -> Drawn:
@@ -206,10 +223,12 @@ def _stiffness_drift(d: Draw) -> Drawn:
 
 def _apply_stiffness_drift(plant: Plant, h: Hidden) -> None:
     change, span, tau = h.parameters["change"], h.details["span_s"], h.details["time_constant_s"]
-    if tau > 0:
-        plant.stiffness = lambda t: 1 + change * (1 - np.exp(-t / tau)) / (1 - np.exp(-span / tau))
-    else:
-        plant.stiffness = lambda t: 1 + change * t / span
+    swing, cycle = h.details.get("swing", 0.0), h.details.get("cycle_s", 1.0)
+
+    def factor(t: np.ndarray) -> np.ndarray:
+        rise = (1 - np.exp(-t / tau)) / (1 - np.exp(-span / tau)) if tau > 0 else t / span
+        return 1 + change * (rise + swing * np.sin(2 * np.pi * t / cycle))
+    plant.stiffness = factor
 
 
 MECHANICS = tuple(Effect(name, family, draw, apply) for name, family, draw, apply in (

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from .effect import Draw, Effect, Hidden
-from .table import Plant
+from .table import AXES, Plant
 
 Drawn = tuple[str, dict[str, float], dict[str, Any]]
 
 
 def _geophone_corner(d: Draw) -> Drawn:
     nominal = d.plant.rig.geophones
-    corner = nominal.suspension_Hz * (1 + d.sign() * d.size(0.001, 0.25))
+    corner = nominal.suspension_Hz * (1 + d.sign() * d.size(0.001, 0.25, d.beyond("sensor_corner_percent")))
     constant_damper = d.rng.random() < 0.5      # otherwise the damping ratio stays
     zeta = nominal.suspension_damping * (nominal.suspension_Hz / corner if constant_damper else 1.0)
     return d.one(d.plant.sensors), {"corner_Hz": corner}, {"damping_ratio": zeta}
@@ -26,23 +26,41 @@ def _apply_geophone_corner(plant: Plant, h: Hidden) -> None:
 
 
 def _sensor_gain(d: Draw) -> Drawn:
-    return d.one(d.plant.sensors), {"gain": 1 + d.sign() * d.size(0.0007, 0.10)}, {}
+    return d.one(d.plant.sensors), {
+        "gain": 1 + d.sign() * d.size(0.0007, 0.10, d.beyond("sensor_gain_percent"))}, {}
 
 
 def _apply_sensor_gain(plant: Plant, h: Hidden) -> None:
-    plant.S[plant.sensors.index(h.location)] *= h.parameters["gain"]
+    g, j, gain = plant.rig.geophones, plant.sensors.index(h.location), h.parameters["gain"]
+    plant.S[j] = g.sensitivity_Vs_per_m[j] * g.preamplifier_gain * gain
+    if h.details.get("electric_damping"):       # the shunted coil damps with the square of its sensitivity
+        plant.zn[j] *= 1 + h.details["electric_damping"] * (gain**2 - 1)
+    if h.details.get("drift"):
+        def drifting(y: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+            out = y.copy()
+            out[:, j] *= 1 + h.details["drift"] * (t / h.details["span_s"] - 0.5)
+            return out
+        plant.analogue.append(drifting)
+
+
+def nominal_axis(plant: Plant, j: int) -> np.ndarray:
+    """(3,) of a sensor, as the rig file says."""
+    return np.eye(3)[AXES.index(plant.rig.geophones.axis[j])]
 
 
 def _sensor_misalignment(d: Draw) -> Drawn:
     name = d.one(d.plant.sensors)
-    axis = d.plant.sensor_n[d.plant.sensors.index(name)]
+    axis = nominal_axis(d.plant, d.plant.sensors.index(name))
     away = np.cross(axis, d.direction())
-    return name, {"angle_rad": d.size(0.002, 0.15)}, {"towards": (away / np.linalg.norm(away)).tolist()}
+    return name, {"angle_rad": d.size(0.002, 0.15, d.beyond("direction_rad"))}, {
+        "towards": (away / np.linalg.norm(away)).tolist()}
 
 
 def _apply_sensor_misalignment(plant: Plant, h: Hidden) -> None:
     j, angle = plant.sensors.index(h.location), h.parameters["angle_rad"]
-    plant.sensor_n[j] = np.cos(angle) * plant.sensor_n[j] + np.sin(angle) * np.array(h.details["towards"])
+    away = np.array(h.details["towards"])
+    plant.sensor_n[j] = np.cos(angle) * nominal_axis(plant, j) + np.sin(angle) * away
+    plant.sensor_p[j] += h.details.get("foot_m", 0.0) * np.sin(angle) * away
 
 
 def _tilt_coupling(d: Draw) -> Drawn:
@@ -69,9 +87,12 @@ def _apply_mains_hum(plant: Plant, h: Hidden) -> None:
     def hum(y: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         out = y.copy()
         for n, number in enumerate(h.details["harmonics"]):
-            angle = 2 * np.pi * number * h.parameters["frequency_Hz"] * t
+            # The mains wander about their frequency; rectified loads swing with what they feed.
+            wander = h.details.get("wander_rad", 0.0) * np.sin(2 * np.pi * h.details.get("wander_Hz", 0.0) * t)
+            swing = 1 + h.details.get("swing", 0.0) * np.sin(2 * np.pi * h.details.get("swing_Hz", 0.0) * t)
+            angle = number * (2 * np.pi * h.parameters["frequency_Hz"] * t + wander)
             for j in range(6):
-                out[:, j] += h.details["amplitudes_V"][j][n] * np.sin(angle + h.details["phases"][j][n])
+                out[:, j] += swing * h.details["amplitudes_V"][j][n] * np.sin(angle + h.details["phases"][j][n])
         return out
     plant.analogue.append(hum)
 
@@ -87,14 +108,24 @@ def _apply_sensor_quantisation(plant: Plant, h: Hidden) -> None:
     j = plant.sensors.index(h.location)
     plant.step_V[j] = h.parameters.get("step_V", plant.step_V[j])
     plant.range_V[j] = h.parameters.get("range_V", plant.range_V[j])
+    plant.offset_steps[j] = 0.5 * h.details.get("mid_riser", False)
+    plant.rails[j] = 1 + h.details.get("uneven_rails", 0.0), 1 - h.details.get("uneven_rails", 0.0)
 
 
 def _actuator_gain(d: Draw) -> Drawn:
-    return d.one(d.plant.motors), {"gain": 1 + d.sign() * d.size(0.001, 0.15)}, {}
+    return d.one(d.plant.motors), {
+        "gain": 1 + d.sign() * d.size(0.001, 0.15, d.beyond("actuator_gain_percent"))}, {}
 
 
 def _apply_actuator_gain(plant: Plant, h: Hidden) -> None:
-    plant.motor[plant.motors.index(h.location)] *= h.parameters["gain"]
+    j = plant.motors.index(h.location)
+    plant.motor[j] = plant.rig.motors[j].constant_N_per_V * h.parameters["gain"]
+    if h.details.get("drift"):
+        def drifting(u: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+            out = u.copy()
+            out[:, j] *= 1 + h.details["drift"] * (t / h.details["span_s"] - 0.5)
+            return out
+        plant.drive.append(drifting)
 
 
 def _actuator_lag(d: Draw) -> Drawn:
@@ -102,7 +133,10 @@ def _actuator_lag(d: Draw) -> Drawn:
 
 
 def _apply_actuator_lag(plant: Plant, h: Hidden) -> None:
-    plant.extra["lag"] = np.full(8, 2 * np.pi * h.parameters["corner_Hz"])
+    corners = 2 * np.pi * h.parameters["corner_Hz"] * np.array(h.details.get("uneven", np.ones(8)))
+    plant.extra["lag"] = corners
+    if "poles" in h.details:                    # over the corner, with the same delay at low frequency
+        plant.extra["lag"], plant.extra["lag2"] = (corners * pole for pole in h.details["poles"])
 
 
 def _actuator_saturation(d: Draw) -> Drawn:
@@ -110,8 +144,16 @@ def _actuator_saturation(d: Draw) -> Drawn:
 
 
 def _apply_actuator_saturation(plant: Plant, h: Hidden) -> None:
-    limit = h.parameters["limit_V"]
-    plant.drive.append(lambda u, t, rng: np.clip(u, -limit, limit))
+    limit = h.parameters["limit_V"] * np.array(h.details.get("uneven", np.ones(8)))
+    if "knee" in h.details:
+        plant.drive.append(lambda u, t, rng: soft_limit(u, h.details["asymptote_V"], h.details["knee"]))
+    else:
+        plant.drive.append(lambda u, t, rng: np.clip(u, -limit, limit))
+
+
+def soft_limit(u: np.ndarray, limit: float, knee: float) -> np.ndarray:
+    """Linear at first, then bending towards the limit, the more sharply the larger the knee's exponent."""
+    return u / (1 + np.abs(u / limit) ** knee) ** (1 / knee)
 
 
 def _loop_delay(d: Draw) -> Drawn:
@@ -120,6 +162,7 @@ def _loop_delay(d: Draw) -> Drawn:
 
 def _apply_loop_delay(plant: Plant, h: Hidden) -> None:
     plant.delay_s += h.parameters["delay_s"]
+    plant.jitter_s = h.details.get("jitter_s", 0.0)
 
 
 def _ground_motion(d: Draw) -> Drawn:
@@ -129,7 +172,7 @@ def _ground_motion(d: Draw) -> Drawn:
 
 
 def _apply_ground_motion(plant: Plant, h: Hidden) -> None:
-    plant.floor_factor *= h.details["factor"]
+    plant.floor_factor = h.details["factor"] * np.array(h.details.get("uneven", np.ones(3)))
 
 
 SIGNALS = tuple(Effect(name, family, draw, apply) for name, family, draw, apply in (

@@ -198,7 +198,7 @@ def test_hardening_spring_under_a_held_weight(effect, field):
     plant.extra[field] = np.full(4, float(plant.extra[field][0]))
     plant.extra[field] *= 1 if field == "k3" else np.sign(plant.extra[field])
     u = np.zeros((6000, 8))
-    u[:, plant.motor_axis == 2] = 1.0
+    u[:, plant.motor_d[:, 2] == 1] = 1.0
     _, trace = response_to(plant, u, states=True)
     k = plant.extra[field][0]
     roots = np.roots([k, 0, 4.5e4, -2.0] if field == "k3" else [k, 4.5e4, -2.0])
@@ -215,7 +215,7 @@ def test_friction_sticks_as_a_spring_and_slips_at_its_force():
     sigma, Fc = np.array(case.effects[0].details["stiffness_each"]), plant.extra["fric_Fc"]
     P = plant.physics()
     _, _, K, T = matrices(plant)
-    D = np.array([carry(P.r[i])[a] for i, a in zip(P.motor_at, P.motor_axis, strict=True)])
+    D = np.array([d @ carry(p) for p, d in zip(P.motor_r, P.motor_d, strict=True)])
     stuck = K + D.T @ np.diag(sigma) @ D
     small = 2e-4 * float(Fc.min()) * np.sign(np.random.default_rng(0).standard_normal(8))
     _, trace = response_to(plant, np.tile(small, (6000, 1)), states=True)

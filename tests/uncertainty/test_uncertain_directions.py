@@ -104,7 +104,7 @@ def test_words():
     assert told == "identified direction 1 at +0.8: com_y +8e-05 m, isolator1.k_z +0.8 %, mass +0.16 %"
     many = UncertainDirection("d", tuple((f"p{k}", 1.0 + k) for k in range(7)))
     told = many.words(-1.0, {f"p{k}": 100.0 for k in range(7)}, {})
-    assert told == "d at -1: p6 -7 %, p5 -6 %, p4 -5 %, p3 -4 %, and 3 parameters less"
+    assert told == "d at -1: p6 -7 %, p5 -6 %, p4 -5 %, p3 -4 %, and 3 parameters by less"
 
 
 @pytest.mark.parametrize("changes", [(), (("mass", 0.0),), (("mass", float("nan")),), (("mass", 1.0), ("mass", 2.0))])

@@ -112,11 +112,11 @@ def cubic_share(frequency_Hz: np.ndarray, ratio: np.ndarray) -> tuple[float, flo
     """
     if len(frequency_Hz) < 4:
         raise InputError("expected at least four frequencies", field="frequency_Hz", value=len(frequency_Hz))
-    omega = 2 * np.pi * np.asarray(frequency_Hz, float)
-    D = ratio * 1j * omega
+    # In units of the highest frequency: the share has none.
+    x = np.asarray(frequency_Hz, float) / np.max(frequency_Hz)
+    D = ratio * 1j * x
     phase = np.angle(D * np.sign(np.sum(D.real)))
-    size = omega.max()
-    X = np.column_stack([-omega / size, (omega / size) ** 3 / 3])
+    X = np.column_stack([-x, x ** 3 / 3])
     (tau, cubic), *_ = np.linalg.lstsq(X, phase, rcond=None)
     e = phase - X @ (tau, cubic)
     sigma = np.sqrt(np.linalg.inv(X.T @ X)[1, 1] * float(e @ e) / (len(e) - 2))

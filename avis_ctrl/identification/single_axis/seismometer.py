@@ -169,15 +169,9 @@ def _with_misfit(misses: Callable[[np.ndarray, float], np.ndarray], solved: Call
                  start: np.ndarray) -> tuple[np.ndarray, float]:
     """Estimate and relative misfit r with chi2/dof = 1; r = 0 where the noise alone explains the data."""
     theta = solved(0.03, start)
+    dof = misses(theta, 0.0).size - len(theta)
     for _ in range(20):
-        e = misses(theta, 0.0)
-        dof = e.size - len(theta)
-        if np.sum(e ** 2) <= dof:
-            found = solved(0.0, theta)
-            if np.sum(misses(found, 0.0) ** 2) <= dof * 1.0001:
-                return found, 0.0
-
-        def excess(log_r: float, at: np.ndarray = theta, dof: int = dof) -> float:
+        def excess(log_r: float, at: np.ndarray = theta) -> float:
             return float(np.log(np.sum(misses(at, np.exp(log_r)) ** 2) / dof))
         if excess(np.log(1e-9)) <= 0:
             return solved(0.0, theta), 0.0

@@ -78,7 +78,7 @@ def sample_count(matrices: Mapping[str, Sequence[Matrix]], where: str, channels:
     square = any(rows == columns and rows > 1 for some in shapes.values() for rows, columns in some)
     if square or (len(possible) > 1 and samples < MUCH_LONGER * min(possible)):
         raise InputError(f"rows and columns could both be the samples: {shown}; expected names of the channels or a "
-                         "time vector that tells them apart", field=where)
+                         "time vector that distinguishes them", field=where)
     return samples
 
 

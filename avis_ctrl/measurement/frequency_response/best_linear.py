@@ -214,7 +214,7 @@ def _check_rank(gram: np.ndarray, names: tuple[str, ...], experiments: int, freq
     if bad.size:
         which = [n for n, part in zip(names, np.abs(vectors[bad[0], :, 0]), strict=True) if part > 0.03]
         raise ComputationError(
-            f"the responses to {', '.join(which)} cannot be told apart",
+            f"the responses to {', '.join(which)} cannot be distinguished",
             measured=f"{experiments} different experiments on {bad.size} of {frequency_Hz.size} lines from "
                      f"{frequency_Hz[bad[0]]:.6g} Hz",
             cause=f"{len(names)} inputs need as many experiments with independent phases on each line",

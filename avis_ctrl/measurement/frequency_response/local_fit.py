@@ -184,7 +184,7 @@ class LocalFit:
         Raises
         ------
         InputError : no degrees of freedom left.
-        ComputationError : inputs that cannot be told apart, by name, unless `partial`.
+        ComputationError : inputs that cannot be distinguished, by name, unless `partial`.
         """
         if self.dof < 1 or self._unit is None:
             raise InputError(f"expected a wider window or more records: {self.dof} degrees of freedom are left on "
@@ -288,7 +288,7 @@ class LocalFit:
         which = ", ".join(name for name, part in zip(names, np.abs(null), strict=True) if part > 0.03)
         f = self.frequency_Hz[bad]
         raise ComputationError(
-            f"the responses to {which} cannot be told apart or are not excited",
+            f"the responses to {which} cannot be distinguished or are not excited",
             measured=f"{bad.size} of {self.frequency_Hz.size} lines from {f[0]:.6g} to {f[-1]:.6g} Hz, relative size "
                      f"of their own part {weakest[bad].min():.1e}",
             cause="inputs that are silent there, or driven by the same signal, or too few excited lines in a window "
@@ -338,7 +338,7 @@ def local_model(U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray, frequency_Hz:
     Raises
     ------
     InputError : too few lines or degrees of freedom.
-    ComputationError : inputs that cannot be told apart.
+    ComputationError : inputs that cannot be distinguished.
     """
     n_u, n_y = U.shape[2], Y.shape[2]
     if half_width is None:

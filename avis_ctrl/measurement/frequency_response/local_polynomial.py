@@ -86,7 +86,7 @@ def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequen
     Raises
     ------
     InputError : bands, names, windows or records that do not allow an estimate, `apart` beside frequency_Hz.
-    ComputationError : inputs that cannot be told apart, unless `partial`.
+    ComputationError : inputs that cannot be distinguished, unless `partial`.
     """
     if apart and frequency_Hz is not None:
         raise InputError("expected frequencies, or windows that do not overlap, not both", field="apart", value=apart)

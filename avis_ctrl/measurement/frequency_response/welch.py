@@ -168,7 +168,7 @@ def _check_rank(S_uu: np.ndarray, names: tuple[str, ...], frequency_Hz: np.ndarr
         which = [n for n, part, off in zip(names, np.abs(vectors[k, :, 0]), silent[k], strict=True)
                  if off or (values[k, 0] < SETTINGS.dependent and part > 0.03)]
         raise ComputationError(
-            f"the responses to {', '.join(which)} cannot be told apart or are not excited",
+            f"the responses to {', '.join(which)} cannot be distinguished or are not excited",
             measured=f"{bad.size} of {frequency_Hz.size} lines from {frequency_Hz[k]:.6g} Hz",
             cause="inputs that are silent there or driven by the same signal",
             next_step="keep to the excited band, choose other inputs, or take in records that drive them differently")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -12,8 +13,20 @@ from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Response, Series, quoted
 from avis_ctrl.measurement.gates.h1 import Spectra, directions, segment_length, spectra, usable
 
-# Two channels are one where their difference is below this part of either, after scaling.
-COPY = 1e-3
+
+@dataclass(frozen=True)
+class CopySettings:
+    """different : largest r.m.s. of the difference of two channels, after scaling, relative to either's, at which one
+        is a copy of the other: independent noise of sensors is larger.
+    alike : the same of the model's channels, up to which a motion explains that two sensors read alike: parameters that
+        are off by a few per cent make symmetric sensors differ by as much.
+    """
+
+    different: float = 1e-3
+    alike: float = 0.05
+
+
+COPIES = CopySettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +82,9 @@ class ChannelMap(Gate):
 class ChannelOrder:
     """Exchanged or mislabelled channels, and copies of one channel under two names.
 
-    Without a model, copies only: a channel that equals another one times a constant within 0.1 % of its r.m.s.;
-    independent sensor noise of more than that keeps true channels apart.
+    Without a model, copies only: a channel that equals another one times one constant within 0.1 % of its r.m.s. in
+    every record. A motion along one axis makes sensors of a symmetric table read alike, in the records of that motion;
+    where the model expects that of every record, it is a note.
     """
 
     name = "channel order"
@@ -106,8 +120,8 @@ class ChannelOrder:
                 self.name,
                 "warning",
                 f"Sensor {quoted(alone)} agrees with no response of the model (correlation as low as"
-                f" {faults.other[worst]:.2f}), while the others do: its signal is more than {1000 * high:g} ms late or"
-                f" {-1000 * low:g} ms early, is not what the channel list says, or the model lacks an effect there.",
+                f" {faults.other[worst]:.2f}), while the others do. Its signal is more than {1000 * high:g} ms late or"
+                f" {-1000 * low:g} ms early, or the channel list is wrong, or the model lacks an effect there.",
                 alone,
                 value=float(faults.other[worst]),
                 limit=enough,
@@ -117,9 +131,9 @@ class ChannelOrder:
         if faults.doubtful:
             names = [(campaign.y_names if what == "row" else campaign.u_names)[k] for what, k in faults.doubtful]
             sentence = (
-                f"Model and records agree too little to check the order of the channels ({least}; another order or sign"
-                f" of {quoted(names)} would agree better, but an inaccurate model can do that by chance). Check the"
-                " channel list by hand."
+                "The agreement of model and records is too poor to check the order of the channels"
+                f" ({least}; another order or sign of {quoted(names)} would agree better, but an inaccurate model can"
+                " cause that, too). Check the channel list by hand."
             )
         else:
             sentence = f"No other order of the channels agrees better with the model ({least})."
@@ -160,8 +174,8 @@ class ChannelOrder:
                 Finding(
                     self.name,
                     "stop",
-                    f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay do not"
-                    f" count; probability by chance at most {chance:.1g}). Exchange their names or their cables.",
+                    f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay are"
+                    f" fitted; p-value at most {chance:.1g}). Exchange their names or their cables.",
                     pair,
                     value=float(gain),
                     limit=comparison.settings.least_agreement,
@@ -175,18 +189,24 @@ class ChannelOrder:
         pairs = {(i, k) for of in kept for i, k, _, _ in of.copies}
         for i, k in sorted(pairs):
             hits = [(of.record, scale, rest) for of in kept for a, b, scale, rest in of.copies if (a, b) == (i, k)]
-            record, scale, rest = hits[0]
+            _, scale, rest = hits[0]
+            if len(hits) < len(kept) or any(abs(s - scale) > 2 * COPIES.different * abs(scale) for _, s, _ in hits):
+                continue
+            alike = all(of.model is not None and _difference(of.model[:, i], of.model[:, k]) < COPIES.alike
+                        for of in kept)
+            cause = ("the model expects that of these records, so they do not show whether one signal was recorded"
+                     " twice. Excite other axes, too." if alike else
+                     "one signal was recorded twice. Check the wiring and the channel list; leave one of them out.")
             found.append(
                 Finding(
                     self.name,
-                    "stop",
+                    "note" if alike else "stop",
                     f"Channel {names[k]!r} is {names[i]!r} times {scale:.6g} within {100 * rest:.2g} % of its r.m.s. in"
-                    f" record {record}: one signal recorded twice. Check the wiring and the channel list; leave one of"
-                    " them out.",
+                    f" every record: {cause}",
                     (names[i], names[k]),
                     tuple(h[0] for h in hits),
                     float(rest),
-                    COPY,
+                    COPIES.different,
                     _copy_picture(kept),
                 )
             )
@@ -231,14 +251,14 @@ class Polarity:
         )
         both = np.count_nonzero(r < 0) + np.count_nonzero(c < 0)
         total = len(r) + np.count_nonzero(comparison.moving)
-        doubt = " It could as well be that all the other channels are flipped." if 2 * both == total else ""
+        doubt = " It is equally possible that all other channels are reversed." if 2 * both == total else ""
         said = [
             (campaign.y_names[k], "Sensor", -float(faults.other[k]),
              f"correlation {-faults.other[k]:.2f} where +1 is expected", faults.chance["row", int(k)])
             for k in np.flatnonzero(r < 0)
         ] + [
             (campaign.u_names[k], "Drive", faults.columns[k][1] - faults.columns[k][2],
-             f"flipping it raises the correlation of sensor {campaign.y_names[faults.columns[k][0]]!r} from"
+             f"reversing it raises the correlation of sensor {campaign.y_names[faults.columns[k][0]]!r} from"
              f" {faults.columns[k][1]:.2f} to {faults.columns[k][2]:.2f}", faults.chance["column", k])
             for k in map(int, np.flatnonzero(c < 0))
         ]
@@ -246,9 +266,9 @@ class Polarity:
             Finding(
                 self.name,
                 "stop",
-                f"{what} {name!r} has the opposite sign of the model ({how}; probability by chance at most"
-                f" {chance:.1g}). Its leads are exchanged, or the model's axis points the other way; exchange them or"
-                f" flip the channel's sign.{doubt}",
+                f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {chance:.1g}). Its leads"
+                f" are exchanged, or the model's axis has the opposite direction. Exchange the leads or reverse the"
+                f" sign of the channel.{doubt}",
                 (name,),
                 value=value,
                 limit=-comparison.settings.least_agreement,
@@ -261,7 +281,8 @@ class Polarity:
                 Finding(
                     self.name,
                     "note" if faults.doubtful else "ok",
-                    "The signs could not be checked: model and records agree too little." if faults.doubtful else
+                    "The signs could not be checked: the agreement of model and records is too poor."
+                    if faults.doubtful else
                     f"All signs agree with the model (lowest correlation of a sensor {faults.other.min():.2f}).",
                     value=float(faults.other.min()),
                     limit=comparison.settings.least_agreement,
@@ -318,19 +339,19 @@ FEWEST_ALIKE = 8
 
 
 def _copies(seen: Excerpt) -> list[tuple[int, int, float, float]]:
-    """(i, k, scale, rest): channels with y_k = scale y_i up to a constant, within COPY of its r.m.s."""
+    """(i, k, scale, rest): channels with y_k = scale y_i up to a constant, within `CopySettings.different`."""
     y = seen.first.y - seen.first.y.mean(axis=0)
-    S = y.T @ y
-    found: list[tuple[int, int, float, float]] = []
     if len(y) < FEWEST_ALIKE:
-        return found
-    for i in range(len(S)):
-        for k in range(i + 1, len(S)):
-            if S[i, i] > 0 and S[k, k] > 0:
-                rest = max(0.0, 1 - S[i, k] ** 2 / (S[i, i] * S[k, k])) ** 0.5
-                if rest < COPY:
-                    found.append((i, k, float(S[i, k] / S[i, i]), rest))
-    return found
+        return []
+    power = np.sum(y**2, axis=0)
+    return [(i, k, float(y[:, i] @ y[:, k] / power[i]), rest) for i, k in combinations(range(y.shape[1]), 2)
+            if (rest := _difference(y[:, i], y[:, k])) < COPIES.different]
+
+
+def _difference(a: np.ndarray, b: np.ndarray) -> float:
+    """R.m.s. of b less the best multiple of a, relative to b's; infinite where either is zero."""
+    aa, bb = float(a @ a), float(b @ b)
+    return max(0.0, 1 - float(a @ b) ** 2 / (aa * bb)) ** 0.5 if aa > 0 and bb > 0 else np.inf
 
 
 def _copy_picture(kept: list[_Kept]) -> Picture:

@@ -133,9 +133,9 @@ class Clipping(Gate):
             "stop",
             f"{100 * row.count / row.samples:.0f} % of the samples of channel {row.channel!r} of record {row.record}"
             f" are at or beyond the converter's range, which ends at {expectation.y_range_V[1]:.6g} {campaign.y_unit};"
-            f" the largest is {row.peak:.6g}. {quoted(names)} {'are' if len(names) > 1 else 'is'} so. The unit or scale"
-            f" is probably wrong (mV given as {campaign.y_unit}?), or the range in the rig file. Correct it; clipping"
-            " is judged only then.",
+            f" the largest is {row.peak:.6g}. Channels concerned: {quoted(names)}. The unit or scale is probably wrong"
+            f" (mV given as {campaign.y_unit}?), or the range in the rig file. Correct it first; only then can clipping"
+            " be checked.",
             names,
             tuple(dict.fromkeys(r.record for r in rows)),
             row.count / row.samples,
@@ -153,7 +153,7 @@ class Clipping(Gate):
         """Of the records in which one channel is clipped."""
         row = max(of, key=lambda r: r.count)
         part = row.count / row.samples
-        severity: Severity = "note" if row.count < 2 else "stop" if part > 1e-3 else "warning"
+        severity: Severity = "stop" if part > 1e-3 else "warning"
         assert row.t is not None and row.x is not None
         t, x = thinned(row.t, row.x)
         picture = Picture(
@@ -165,11 +165,11 @@ class Clipping(Gate):
         )
         bursts = f" in {row.bursts} bursts" if row.bursts > 1 else ""
         others = [f"{r.record} ({r.count} samples at {r.value:.4g})" for r in of if r is not row]
-        also = f" So it is in record {', '.join(others)}." if others else ""
+        also = f" Also in record {', '.join(others)}." if others else ""
         sentence = (
             f"Channel {row.channel!r} of record {row.record} has {row.count} samples ({100 * part:.2g} %){bursts} at "
-            f"{row.value:.6g}: {row.why}.{also} Lower the level or the gain and repeat the record; until then leave it"
-            " out."
+            f"{row.value:.6g}: {row.why}.{also} Lower the level or the gain and repeat the record; until then leave"
+            " the record out."
         )
         records = tuple(r.record for r in of)
         return Finding(self.name, severity, sentence, (row.channel,), records, float(row.count), 0.0, picture)
@@ -216,8 +216,8 @@ def _ends(
             return made(
                 mask,
                 float(np.median(x[mask])),
-                "a level outside the signal, entered and left by jumps, as an "
-                f"instrument gives when it is out of range (the rest of the record ends at {inside:.6g})",
+                "a constant level outside the range of the signal, with jumps to and from it, as an "
+                f"instrument outputs when it is out of range (the rest of the record reaches {inside:.6g})",
                 0.0,
             )
         top, p, width = repeated_extreme(sign * x, periods)
@@ -231,8 +231,8 @@ def _ends(
                 flat,
                 float(sign * top),
                 ("here and at the opposite value " if both else "")
-                + "the outermost value repeats far more often than the next ones, a flat top as where a converter or a"
-                " preamplifier saturates" + (" below the end of the known range" if bounds is not None else ""),
+                + "the extreme value repeats far more often than the next ones, a flat top as from a saturated"
+                " converter or preamplifier" + (" below the end of the known range" if bounds is not None else ""),
                 p,
             )
     return best

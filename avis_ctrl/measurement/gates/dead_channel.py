@@ -119,11 +119,11 @@ class DeadChannel(Gate):
                     Finding(
                         self.name,
                         "stop",
-                        f"Channel {name!r} holds only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} r.m.s."
+                        f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} r.m.s."
                         f" ({int(np.median([k.codes[j] for k in kept]))} different values) in every driven record while"
-                        f" the other channels respond (its ratio of response to noise is {excess[j]:.2g} of what chance"
-                        f" may give, the median channel's {np.median(excess):.3g}): not connected, or recorded under"
-                        " another name. Check its cable, or leave it out.",
+                        f" the other channels respond (its ratio of response to noise is {excess[j]:.2g} times the"
+                        f" limit for noise alone; the median of all channels is {np.median(excess):.3g} times it): not"
+                        " connected, or recorded under another name. Check its cable, or leave it out.",
                         (name,),
                         tuple(k.record for k in kept if k.response is not None),
                         float(excess[j]),
@@ -158,8 +158,8 @@ class DeadChannel(Gate):
             Finding(
                 self.name,
                 "note",
-                f"Input {quoted(idle)} never moves in any driven record: nothing can be said of "
-                "its effect. Drive it in a further record, or leave it out.",
+                f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. "
+                "Drive it in a further record, or leave it out.",
                 idle,
                 picture=picture,
             )
@@ -181,7 +181,7 @@ class DeadChannel(Gate):
             self.name,
             severity,
             f"Channel {name!r} of record {kept.record} repeats one value for {n} samples "
-            f"({n / rate:.3g} s) from {at / rate:.4g} s on: the converter or the link stuck. "
+            f"({n / rate:.3g} s) from {at / rate:.4g} s on: the converter or the data link was stuck. "
             "Leave that part out or repeat the record.",
             (name,),
             (kept.record,),

@@ -68,8 +68,8 @@ def examine(campaign: Campaign, expectation: Expectation | None = None, longest:
     findings = after_clipping(after_missing_samples(findings, {record.header.name for record in campaign.records}))
     if shortened:
         said = (
-            f" (Of record {', '.join(shortened[:4])}{' and others' if len(shortened) > 4 else ''} only pieces of"
-            f" {longest} samples together were examined.)"
+            f" (Of record {', '.join(shortened[:4])}{' and others' if len(shortened) > 4 else ''} only pieces with"
+            f" {longest} samples in all were examined.)"
         )
         findings = [replace(f, sentence=f.sentence + said) for f in findings]
     return tuple(findings)
@@ -84,7 +84,7 @@ def after_missing_samples(findings: list[Finding], names: Set[str]) -> list[Find
     records = {r for f in findings if f.gate == MissingSamples.name and f.severity == "stop" for r in f.records}
     said = (
         f" This is likely a consequence of the missing or doubled samples of record {', '.join(sorted(records))}:"
-        " judge it again without them."
+        " check again without them."
     )
 
     def follows(f: Finding) -> bool:
@@ -106,7 +106,7 @@ def after_clipping(findings: list[Finding]) -> list[Finding]:
                for r in f.records}
     scaled = {name for f in findings if f.gate == Clipping.name and f.severity == "stop" and f.limit for name in
               f.channels}
-    spikes = " The channel is clipped in this record: these are likely corners of its flat tops."
+    spikes = " The channel is clipped in this record: these are probably the corners of its flat tops."
     noise = " This is likely a consequence of the wrong unit or scale."
     made = []
     for f in findings:

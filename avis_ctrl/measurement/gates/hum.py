@@ -101,8 +101,8 @@ class Hum(Gate):
                     found.append(self._finding(name, mains, hits, campaign.y_unit))
         passed = sum(k.passed_over for k in kept)
         if not found:
-            note = f"; {passed} lines lie where u drives and were not tested" if passed else ""
-            what = "No line of the mains stands out" if tested else "No line of the mains could be tested"
+            note = f"; {passed} lines are excited by u and were not tested" if passed else ""
+            what = "No mains hum was found" if tested else "No line of the mains could be tested"
             last = kept[-1]
             found.append(
                 Finding(

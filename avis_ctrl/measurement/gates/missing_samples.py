@@ -23,13 +23,19 @@ class MissingSamplesSettings:
     longest_samples : largest delay in the search, either way, and largest step: segments without a clear delay scatter
         over the whole range of the search.
     explains : least decrease of the residual's mean logarithm when the step is undone: a tenth of its power. Steps that
-        come from a swept sine, or from a delay of the model that varies with frequency, increase it when undone.
+        come from a delay of the model that varies with frequency increase it when undone.
+    both_sides : least ratio of a line's mean drive powers before and after the step, the smaller to the larger, for the
+        line to show the step: on one side alone it cannot be distinguished from the phase of the response.
+    showing : least fraction of all lines that must show a step. A swept sine drives each line once: only the few around
+        the instant lie on both sides, and each of them only for a moment.
     """
 
     block_rows: int = 16
     jump_samples: float = 0.5
     longest_samples: int = 64
     explains: float = 0.1
+    both_sides: float = 0.1
+    showing: float = 0.5
 
 
 SETTINGS = MissingSamplesSettings()
@@ -50,12 +56,11 @@ class MissingSamples(Gate):
 
     Lost samples shift y against the commanded u. In each segment the delay of y behind H1 u is fitted to the phase of
     the driven lines, weighted by the residual; the largest step between means of the segments before and after any
-    instant is
-    tested (Student's t with the segments' own scatter, 1 % shared over instants, records and the three estimates of H1;
-    few segments), must exceed half a sample, and must explain the record: with the step undone the residual of H1 falls
-    by a tenth. (In a swept sine the delay changes with the frequency, and so with time.) A delay that runs away
-    is no step. Where rows were lost from u and y together, a periodic u shows it: each period is compared with the
-    first by circular correlation, exactly, for u is commanded.
+    instant is tested (Student's t with the segments' own scatter, 1 % shared over instants, records and the three
+    estimates of H1; few segments), must exceed half a sample, and must explain the record: with the step undone the
+    residual of H1 falls by a tenth. A delay that runs away is no step. In a swept sine the delay changes with the
+    frequency, and so with time: steps are not looked for there. Where rows were lost from u and y together, a periodic
+    u shows it: each period is compared with the first by circular correlation, exactly, for u is commanded.
     A repeated block is 16 or more rows equal in every channel of y to earlier ones, not a whole number of periods away
     where the record is periodic; noise in one channel alone makes that impossible by chance.
     """
@@ -114,9 +119,9 @@ class MissingSamples(Gate):
                     Finding(
                         self.name,
                         "stop",
-                        f"In record {name} the measured channels come {abs(size):.1f} samples"
-                        f" {'earlier' if size < 0 else 'later'} behind the commanded voltage from about"
-                        f" {k.t[at] - k.header.start_s:.4g} s on: about {max(1, round(abs(size)))} samples were"
+                        f"In record {name} the delay of the measured channels after the commanded voltage becomes"
+                        f" {abs(size):.1f} samples {'shorter' if size < 0 else 'longer'} at about"
+                        f" {k.t[at] - k.header.start_s:.4g} s: about {max(1, round(abs(size)))} samples were"
                         f" {'lost' if size < 0 else 'doubled'}. Repeat the record, or use only the part before.",
                         (),
                         (name,),
@@ -131,7 +136,7 @@ class MissingSamples(Gate):
             vague = sum(len(k.t) > 3 for k in kept) - len(told)
             scatter = float(max((np.std(k.delay[0]) for k in told), default=np.nan))
             said = f"; the delay scatters by at most {scatter:.2g} samples r.m.s." if told else ""
-            said += f"; in {vague} y follows u too loosely to tell" if vague else ""
+            said += f"; in {vague} the correlation of y with u is too low for this check" if vague else ""
             found.append(
                 Finding(
                     self.name,
@@ -211,13 +216,17 @@ def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
 def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
     """By how much the residual of H1 falls where a step of the delay is undone; mean logarithm over lines and channels.
 
-    The step is of `size` samples, at t[where] or half a segment before or after: rows are put in, or taken out. Below
-    zero where a sine sweeps: each frequency comes once, and any delay is as good as any other.
+    The step is of `size` samples, at t[where] or half a segment before or after: rows are put in, or taken out. Only
+    lines that are driven before and after it count (`both_sides` of the settings); if these are too few (`showing`),
+    nothing is explained.
     """
     rate, n_u = seen.header.sample_rate_Hz, int(np.count_nonzero(np.ptp(seen.first.u, axis=0)))
     u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
     count, length = max(1, round(abs(size))), segment_length(len(u), n_u)
-    before = h1([spectra(u, y, rate, length, wrap=False)])
+    of = spectra(u, y, rate, length, wrap=False)
+    before, power = h1([of]), np.sum(np.abs(of.U) ** 2, axis=2)
+    first, second = power[:where].mean(axis=0), power[where:].mean(axis=0)
+    showing = of.f[np.minimum(first, second) > SETTINGS.both_sides * np.maximum(first, second)]
     most = -np.inf
     for instant in t[max(0, where - 1) : where + 2] - seen.first.header.start_s:
         at = min(max(round(instant * rate), 0), len(y) - count - 1)
@@ -227,8 +236,10 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
             whole = np.concatenate([y[:at], y[at + count :], np.repeat(y[-1:], count, axis=0)])
         after = h1([spectra(u, whole, rate, length, wrap=False)])
         if before is not None and after is not None:
-            noise, left = np.maximum(before.noise, 1e-300), np.maximum(after.noise, 1e-300)
-            most = max(most, float(np.mean(np.log(noise / left))))
+            f = np.intersect1d(showing, np.intersect1d(before.f, after.f))
+            if f.size > SETTINGS.showing * before.f.size:
+                noise, left = (np.maximum(one.noise[..., np.isin(one.f, f), :], 1e-300) for one in (before, after))
+                most = max(most, float(np.mean(np.log(noise / left))))
     return most
 
 

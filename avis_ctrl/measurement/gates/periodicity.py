@@ -95,7 +95,7 @@ class Periodicity(Gate):
                 "period",
                 "difference by noise, power [-]",
                 tuple(Series(n, np.arange(1, P + 1), k.T[:, j], "points") for j, n in enumerate(campaign.y_names)),
-                (Limit("1 % by chance", limit),),
+                (Limit("1 % limit for noise", limit),),
                 y_scale="log",
             )
             if (drifting := self._drifting(k, tests, campaign, picture)) is not None:
@@ -130,7 +130,7 @@ class Periodicity(Gate):
                 Finding(
                     self.name,
                     "note",
-                    f"The transient of the start fills {periods} of {k.period_s:g} s"
+                    f"The initial transient lasts {periods} of {k.period_s:g} s"
                     f" (record {k.record}: the first differs from the last ones by {100 * k.relative[0].max():.2g} % of"
                     f" the signal). A fit that includes the transient, as in avis identify, needs no change;"
                     f" otherwise drop the first {periods} of each record.",
@@ -148,7 +148,7 @@ class Periodicity(Gate):
                 Finding(
                     self.name,
                     "ok",
-                    f"All periods repeat within the noise (largest ratio {k.T.max():.2f}, by chance up to"
+                    f"All periods repeat within the noise (largest ratio {k.T.max():.2f}, limit for noise alone"
                     f" {limit:.2f}).",
                     value=float(k.T.max()),
                     limit=limit,
@@ -170,9 +170,9 @@ class Periodicity(Gate):
             self.name,
             "warning",
             f"Record {k.record} drifts: over its last {len(k.T) // 2} periods of {k.period_s:g} s {quoted(names)}"
-            f" change by {percent(drift[bad].max())} of the signal, steadily ({times(float(T[bad].max()))} the noise"
-            f" power, by chance up to {limit:.2f}). The rig drifts, or the transient is longer than the record. Wait"
-            " longer before recording, or look for what changes.",
+            f" change steadily by {percent(drift[bad].max())} of the signal ({times(float(T[bad].max()))} the noise"
+            f" power; limit for noise alone {limit:.2f}). The rig drifts, or the transient is longer than the record."
+            " Wait longer before recording, or find the cause of the drift.",
             names,
             (k.record,),
             float(T[bad].max()),

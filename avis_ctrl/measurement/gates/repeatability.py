@@ -31,7 +31,7 @@ class ComparisonSettings:
         1.4 mrad, more than rounding the voltages to four digits turns them.
     excited : power of u at a line relative to the median of the driven lines, below which the line counts as the edge
         of the band: u and y are small there, and leakage into them differs from record to record.
-    told : ratio of T to its limit above which the message says "far beyond chance" instead of the number.
+    told : ratio of T to its limit above which the message says "far more than noise explains" instead of the number.
     notable, large : difference relative to the response that is worth a note, because gains are known to 1 % at best,
         and one that is worth a warning.
     blind : noise of the comparison relative to the response, above which it hides changes that matter.
@@ -114,7 +114,8 @@ class _Records(Gate):
         d = max(differences, key=lambda d: d.noise)
         severity: Severity = "note" if d.noise > SETTINGS.blind else "ok"
         hint = (
-            " Smaller changes would not show; records that repeat the same periodic voltage compare more sharply."
+            " Smaller changes would not be detected; records with the same periodic voltage allow a more sensitive"
+            " comparison."
             if severity == "note"
             else ""
         )
@@ -172,7 +173,7 @@ class Repeatability(_Records):
                         f"{d.b.capitalize()} does not repeat {d.a}: {quoted(names)} differ by up to"
                         f" {percent(d.relative[bad].max())} of the response, {beyond_chance(d.T[bad].max())}. The rig"
                         " drifted or was changed in between; treat its"
-                        " parameters as uncertain by as much, or use one of the two.",
+                        " parameters as uncertain by this amount, or use only one of the two.",
                         names,
                         (d.a, d.b),
                         float(d.T[bad].max()),
@@ -232,7 +233,7 @@ class LevelDependence(_Records):
                         f"The response depends on the level: from {d.a} to {d.b} {quoted(names)} change by up to"
                         f" {percent(d.relative[bad].max())} (most from {low:.3g} to {high:.3g} Hz),"
                         f" {beyond_chance(d.T[bad].max())}: nonlinearity. Identify at the level of use, and"
-                        " carry the difference as uncertainty.",
+                        " include the difference in the uncertainty.",
                         names,
                         (),
                         float(d.T[bad].max()),
@@ -374,4 +375,4 @@ def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def beyond_chance(T: float) -> str:
     """How far a statistic is beyond its 1 % limit, in words."""
-    return "far beyond chance" if SETTINGS.told < T else f"{T:.1f} times what chance gives at 1 %"
+    return "far more than noise explains" if SETTINGS.told < T else f"{T:.1f} times the 1 % limit of noise alone"

@@ -67,14 +67,15 @@ class SignalToNoise(Gate):
         if not measured:
             picture = Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ())
             return found or [
-                Finding(self.name, "ok", "No driven record is long enough to part signal from noise.", picture=picture)
+                Finding(self.name, "ok", "No driven record is long enough to separate signal and noise.",
+                        picture=picture)
             ]
         f, snr, segment_s = max(measured, key=lambda m: float(np.median(m[1])))
         advice = (
             f": noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. A periodic"
-            " excitation would show which; more drive helps only against noise."
+            " excitation would distinguish them; a higher level helps only against noise."
             if segment_s
-            else ". Those bands weigh little in a fit; drive them more if they matter."
+            else ". Such bands have little weight in a fit; excite them more if they are important."
         )
         bands = octaves(f)
         dB = np.array([10 * np.log10(np.maximum(snr[band].mean(axis=0), 1e-6)) for band in bands])
@@ -277,9 +278,9 @@ class Coherence(Gate):
             severity,
             f"Multiple coherence is below {LOW_COHERENCE:g} in {'all' if surely else 'some'} of the"
             f" {len(middle)} thirds of octaves: {'; '.join(said)}{more}. Causes are noise, an input that is not"
-            f" recorded, nonlinearity, or leakage of a mode that decays longer than the segments of {seconds:.3g} s,"
-            " where the signal to noise is high. Longer records tell leakage from the others; raise the level against"
-            f" noise.{below}",
+            f" recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that decays more slowly"
+            f" than the segments of {seconds:.3g} s. Longer records distinguish leakage from the other causes; a higher"
+            f" level reduces the influence of noise.{below}",
             tuple(names[j] for j in ordered),
             value=float(mean[:, group].min()),
             limit=LOW_COHERENCE,

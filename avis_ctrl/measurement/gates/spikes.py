@@ -91,8 +91,8 @@ class Spikes(Gate):
             Finding(
                 self.name,
                 "ok",
-                "No single sample stands out of its neighbours; a spike of more than"
-                f" {least.max():.2g} {campaign.y_unit} would in every record.",
+                "No single sample differs from its neighbours; a spike of more than"
+                f" {least.max():.2g} {campaign.y_unit} would be found in every record.",
                 value=float(least.max()),
                 picture=Picture(
                     "Least spike that is found",
@@ -109,11 +109,10 @@ class Spikes(Gate):
         return Finding(
             self.name,
             "warning",
-            f"Channel {k.channel!r} of record {k.record} has {many} far outside the neighbours, at {k.at_s:.6g} s"
-            f" (sample {k.sample}): {k.value:.4g} {unit} where the neighbours lead to {k.expected:.4g},"
-            f" {times(k.ratio)} the usual deviation (limit {FACTOR:g}): an electrical disturbance or a faulty"
-            " conversion. Look at cables and grounding; repeat the record, or replace the sample by what its neighbours"
-            " lead to.",
+            f"Channel {k.channel!r} of record {k.record} has {many} far from the neighbours, at {k.at_s:.6g} s"
+            f" (sample {k.sample}): {k.value:.4g} {unit}, while interpolation gives {k.expected:.4g}. The deviation is"
+            f" {times(k.ratio)} the usual one (limit {FACTOR:g}): an electrical disturbance or a faulty conversion."
+            " Check cables and grounding; repeat the record, or replace the sample by the interpolated value.",
             (k.channel,),
             (k.record,),
             k.ratio,

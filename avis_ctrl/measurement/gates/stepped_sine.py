@@ -106,7 +106,7 @@ class SteppedSine(Gate):
                 continue
             lost = [names[k] for k in silent if k >= n_u]
             likely = (
-                f"; the channel {lost[0]!r}, which should hold a sensor, is silent: their names or cables are probably"
+                f"; the sensor channel {lost[0]!r} is silent: their names or cables are probably"
                 " exchanged"
                 if lost
                 else ""
@@ -119,8 +119,8 @@ class SteppedSine(Gate):
                     f" {names[drive]!r} is not constant (it varies from {np.abs(H).min():.3g} to {np.abs(H).max():.3g}"
                     f" and turns by {turned:.0f} degrees from {f[0]:.3g} to {f[-1]:.3g} Hz) but follows a second-order"
                     f" {KINDS[model.k]} response with corner {model.corner_Hz:.3f} Hz and damping {model.damping:.3f}"
-                    f" within {100 * model.misfit:.1f} %{likely}. Record it as an output, and find out what measures"
-                    " the drive.",
+                    f" within {100 * model.misfit:.1f} %{likely}. Record it as an output, and find the channel that"
+                    " measures the drive.",
                     (names[j], *lost),
                     value=spread,
                     limit=CONSTANT,
@@ -155,7 +155,7 @@ class SteppedSine(Gate):
                 if not noisy and not (astray and rest[k, j] > 2 * near):
                     continue
                 ratio = (
-                    f"its ratio to {names[drive]!r} is {H[k]:.3g} where its neighbours lead to"
+                    f"its ratio to {names[drive]!r} is {H[k]:.3g}, while its neighbours suggest"
                     f" {H[k] * np.exp(-off[k]):.3g}"
                     if off[k]
                     else ""
@@ -164,10 +164,10 @@ class SteppedSine(Gate):
                     Finding(
                         self.name,
                         "stop",
-                        f"Record {fit.record} is bad in channel {names[j]!r}: after the sine of {f[k]:.4g} Hz"
-                        f" {100 * rest[k, j]:.3g} % of it remain, where neighbouring records leave {100 * near:.2g}"
-                        f" %{'; ' + ratio if ratio else ''}. The signal is distorted, clipped or out of range there"
-                        " (see its picture); leave the record out.",
+                        f"Record {fit.record} is bad in channel {names[j]!r}: the residual after removing the sine of"
+                        f" {f[k]:.4g} Hz is {100 * rest[k, j]:.3g} % of the sine, in neighbouring records"
+                        f" {100 * near:.2g} %{'; ' + ratio if ratio else ''}. The signal is distorted, clipped or out"
+                        " of range there (see its figure); leave the record out.",
                         (names[j],),
                         (fit.record,),
                         float(rest[k, j]),

@@ -22,8 +22,8 @@ def document(found: Identification, in_design: InDesign | None = None) -> Docume
     made = str(found.provenance.get("date", ""))[:10]
     sections = [make(found) for make in (opening, measurements, gates, responses, identifiability, ways, validation)]
     sections += [uncertainty(found, in_design), method(found),
-                 provenance_table(found.provenance, "With the same measurement, rig, options, seed, library versions "
-                                  "and processor the same figures come out.")]
+                 provenance_table(found.provenance, "The same measurement, rig, options, seed, library versions and "
+                                  "processor give the same figures.")]
     return Document(f"Identification of the rig {found.rig.name}",
                     "From measurements to a rig with known uncertainty" + (f", {made}" if made else ""),
                     stamp_of(found.provenance), tuple(sections))

@@ -22,24 +22,26 @@ def gates(found: Identification) -> Section:
 def gates_of(findings: Sequence[Finding]) -> Section:
     """The same of findings by themselves."""
     if not findings:
-        return Section("Gates", "gates", (Paragraph("The gates look at records in time; there were none."),))
+        return Section("Gates", "gates", (Paragraph("The gates (automatic checks of the data) need records in the time "
+                                                    "domain; there were none."),))
     ordered = sorted(findings, key=lambda f: -SEVERITIES.index(f.severity))
     together = _together(ordered)
     rows = [(gate, MARKS[severity], text) for gate, severity, text in together]
     listed = [severity for _, severity, _ in together]
     counts = ", ".join(f"{listed.count(s)} {s}" for s in reversed(SEVERITIES) if s in listed)
     pieces: list[Piece] = [
-        table(f"What was tested before any fit, gravest first: {counts}. A note is to be known, a warning makes "
-              "results worse, a stop makes them wrong.", ("gate", "severity", "finding"), rows, "lcl")]
+        table(f"The gates: automatic checks of the data before any fit, the most serious findings first ({counts}). A "
+              "note is for information, a warning means less accurate results, a stop means wrong results.",
+              ("gate", "severity", "finding"), rows, "lcl")]
     grave = [f for f in ordered if f.severity in ("warning", "stop")]
     for k, (picture, sentences) in enumerate(_pictures(grave)):
         pieces.append(figure_of(f"gate_{k}", " ".join(sentences), [picture]))
     notes = [p for p, _ in _pictures([f for f in ordered if f.severity == "note"])]
-    pieces += _small("gate_notes", "Pictures of the gates that have a note, dashed their limits.", notes)
+    pieces += _small("gate_notes", "Gates with a note; limits dashed.", notes)
     well = [p for p, _ in _pictures([f for f in ordered if f.severity == "ok"])]
-    small = _small("gate_ok", "Pictures of the gates that found nothing, dashed their limits.", well)
+    small = _small("gate_ok", "Gates without findings; limits dashed.", well)
     if small:
-        pieces.append(Fold(f"The {len(well)} pictures of gates that found nothing", tuple(small)))
+        pieces.append(Fold(f"The {len(well)} figures of gates without findings", tuple(small)))
     return Section("Gates", "gates", tuple(pieces))
 
 

@@ -16,7 +16,7 @@ def measurements(found: Identification) -> Section:
         return Section("Measurements", "measurements", _response(measured))
     pieces: list[Piece] = [_records(found, measured), _channels(found, measured)]
     if in_short(measured.notes):
-        pieces += [Heading("What the reader says of the file"), Bullets(tuple(in_short(measured.notes)))]
+        pieces += [Heading("Notes on the measurement file"), Bullets(tuple(in_short(measured.notes)))]
     return Section("Measurements", "measurements", tuple(pieces))
 
 
@@ -34,8 +34,8 @@ def _records(found: Identification, campaign: Campaign) -> Table:
                      f"{words.number(h.duration_s)} s", periods, words.yes(bool(h.floor_names)), use))
     how = f" {found.split.how[:1].upper()}{found.split.how[1:]}." if found.split else ""
     return table(f"The records{f' ({campaign.source})' if campaign.source else ''}, sampled at "
-                 f"{words.number(campaign.sample_rate_Hz)} Hz. Levels are r.m.s. of the drives; records at rest and "
-                 f"with a shaken floor have silent drives.{how}",
+                 f"{words.number(campaign.sample_rate_Hz)} Hz. Levels are r.m.s. values of the drive voltages; in "
+                 f"records at rest or with a shaken floor the drives are silent.{how}",
                  ("record", "excitation", "level", "duration", "periods", "floor measured", "used as"), rows,
                  "llrrrcl")
 
@@ -60,6 +60,6 @@ def _response(measured: FrequencyResponse) -> tuple[Piece, ...]:
             ("inputs", f"{', '.join(measured.inputs)} [{words.unit(measured.input_unit)}]"),
             ("outputs", f"{', '.join(measured.outputs)} [{words.unit(measured.output_unit)}]"),
             ("uncertainty", uncertain), ("method", measured.method or "not stated in the file")]
-    return (table("The measured frequency responses; there are no records behind them in the file.",
+    return (table("The measured frequency responses; the file contains no time records.",
                   ("what", "value"), rows, "ll"),
-            Paragraph("Every third line was held out of the fit for validation."))
+            Paragraph("Every fourth group of neighbouring lines was held out of the fit for validation."))

@@ -31,15 +31,15 @@ def _sentence(found: Identification) -> Paragraph:
     consistent = all(one.consistent for one in found.validation.held_out)
     count = len(information.names)
     said = [_upper(found.validation.verdict),
-            f"{information.rank} combinations of the {count} parameters are determined, {alone} parameters by "
-            "themselves."]
+            f"The data determine {information.rank} combinations of the {count} parameters, and {alone} parameters "
+            "individually."]
     if not found.campaign_fit.fit.converged:
         said.append("The fit did not converge.")
     if warned:
         names = list(dict.fromkeys(f.gate for f in warned))
-        said.append(f"Gates that warned: {words.joined(names)}.")
+        said.append(f"Gates (data checks) with warnings: {words.joined(names)}.")
     elif found.findings:
-        said.append("No gate warned.")
+        said.append("No gate (data check) gave a warning.")
     return Paragraph(" ".join(said), "verdict", consistent and not stops and found.campaign_fit.fit.converged)
 
 
@@ -55,10 +55,10 @@ def _parameters(found: Identification) -> Table:
         else:
             shown, spread, share = words.number(value, 5), TOGETHER, ""
         rows.append((name, words.number(before, 5), shown, spread, share, change, words.unit(unit)))
-    prior = " Prior knowledge is part of the standard deviations." if found.campaign_fit.fit.priors else ""
-    return table("Every free parameter at its start and as identified by maximum likelihood, with one standard "
-                 "deviation (Cramér-Rao bound). Where a parameter is known only in combination with others, its own "
-                 f"value is the one nearest to the start and says nothing by itself; section 5 has the combinations."
+    prior = " The standard deviations include the priors." if found.campaign_fit.fit.priors else ""
+    return table("Every fitted parameter: starting value and maximum likelihood estimate with one standard deviation "
+                 "(Cramér-Rao bound). If a parameter is known only in combination with others, its own value is the "
+                 "one nearest to the start and has no meaning by itself; section 5 lists the combinations."
                  f"{prior}", ("parameter", "start", "identified", "± 1 σ", "relative", "change", "unit"), rows,
                  "lrrrrrl")
 
@@ -70,7 +70,7 @@ def _changes(found: Identification) -> Figure:
     bars = 200 * information.standard_deviation / size
     known, n = information.known, len(start)
     place = np.arange(n, 0, -1.0)
-    curves = [Curve(change[known], place[known], "determined by itself, ± 2 σ", Style("#0072b2"), points=True,
+    curves = [Curve(change[known], place[known], "determined individually, ± 2 σ", Style("#0072b2"), points=True,
                     line=False, error=bars[known], along="x")]
     if not known.all():
         curves.append(Curve(change[~known], place[~known], f"{TOGETHER}: the nearest to the start",
@@ -78,9 +78,9 @@ def _changes(found: Identification) -> Figure:
     curves.append(Curve(np.zeros(2), np.array([0.3, n + 0.7]), "", STYLES["faint"]))
     ticks = tuple((float(p), name) for p, name in zip(place, information.names, strict=True))
     longest = float(np.max(bars[known])) if known.any() else np.nan
-    caption = (f"Change of each parameter from its start. The longest bar (2 σ) is {words.number(longest, 2)} % of its "
-               "start; bars shorter than a marker are hidden by it." if known.any()
-               else "Change of each parameter from its start; none is determined by itself.")
+    caption = (f"Change of each parameter from its starting value. The longest bar (2 σ) is "
+               f"{words.number(longest, 2)} % of its starting value; bars shorter than a marker are hidden by it."
+               if known.any() else "Change of each parameter from its starting value; none is determined individually.")
     return Figure("changes", caption, (Panel(Axis("change from the start [%]"),
                                              Axis("", "linear", (0.3, n + 0.7), ticks), tuple(curves)),),
                   height=max(0.5, 0.085 * n))

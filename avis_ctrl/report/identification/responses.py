@@ -21,19 +21,18 @@ def responses(found: Identification) -> Section:
     seen = found.validation.overlay
     if seen is None:
         return Section("Frequency responses", "responses", (Paragraph(
-            "No frequency response could be measured for figures; the notes of section 7 say why."),))
+            "No measured frequency response can be shown; the notes of section 7 state the reason."),))
     pairs = strongest(seen)
     named = words.joined([f"{seen.outputs[i]} from {seen.inputs[j]}" for i, j in pairs])
     pieces: list[Piece] = [Paragraph(
-        f"Measured: {seen.method}. {words.number(100 * seen.inside)} % of the measured entries lie "
-        f"within two standard deviations of the identified model, 95 % if nothing but noise separates them and the "
-        f"estimate has no bias. In full: the strongest input of each output, {named}.")]
+        f"Measured: {seen.method}. {words.number(100 * seen.inside)} % of the measured values lie within their 95 % "
+        f"confidence region about the identified model; 95 % are expected if they differ from the model by noise only "
+        f"and the estimate has no bias. Shown in full: the strongest input of each output, {named}.")]
     if seen.method.startswith("response of the model"):
-        pieces.append(Paragraph("The records do not allow a response that is measured without a model and not rounded "
-                                "off at the resonances. The points are therefore the identified model's response plus "
-                                "what it leaves in the records, regressed on the inputs: an error of the model that is "
-                                "narrower than a window of lines does not show here, but in the tests of section 7.",
-                                "note"))
+        pieces.append(Paragraph("From these records, no response can be estimated without a model that is not smoothed "
+                                "at the resonances. The points are therefore the identified model's response plus the "
+                                "residual of the records, regressed on the inputs. A model error that is narrower than "
+                                "a window of lines is not visible here, but in the tests of section 7.", "note"))
     groups = [pairs[k:k + OUTPUTS_TOGETHER] for k in range(0, len(pairs), OUTPUTS_TOGETHER)]
     pieces += [_bode(seen, group, k) for k, group in enumerate(groups)]
     pieces += [_residual(seen, pairs), _overview(seen)]
@@ -65,9 +64,9 @@ def _thin(count: int, most: int) -> np.ndarray:
 
 def _bode(seen: ResponseOverlay, pairs: list[tuple[int, int]], number: int) -> Figure:
     panels = [panel for i, j in pairs for panel in (_magnitude(seen, i, j), _phase(seen, i, j))]
-    return Figure(f"response_{number}", "Magnitude (left) and phase (right): measured (points) with a band of two "
-                  "standard deviations to each side, the start model (dashed) and the identified one (line). Where the "
-                  "band is narrower than a point it is not seen.", tuple(panels), 2, 0.85)
+    return Figure(f"response_{number}", "Magnitude (left) and phase (right): measured (points) with a band of ± 2 "
+                  "standard deviations, start model (dashed) and identified model (line). A band narrower than a point "
+                  "is not visible.", tuple(panels), 2, 0.85)
 
 
 def _magnitude(seen: ResponseOverlay, i: int, j: int) -> Panel:
@@ -111,8 +110,8 @@ def _residual(seen: ResponseOverlay, pairs: list[tuple[int, int]]) -> Figure:
                   Curve(f, two, "two standard deviations of the measured", Style("#222222", "dot", 1.4)))
         panels.append(Panel(_frequencies(seen), Axis(f"residual [{_unit(seen, j)}]", "log", limits), curves, (),
                             f"{seen.outputs[i]} from {seen.inputs[j]}"))
-    return Figure("residuals", "What is left between measured and model, magnitude of the complex difference. With "
-                  "noise alone 86 % of the points lie below the dotted line.", tuple(panels), 2, 0.75)
+    return Figure("residuals", "Residual: magnitude of the complex difference between measured response and model. "
+                  "With noise alone, 86 % of the points are expected below the dotted line.", tuple(panels), 2, 0.75)
 
 
 def _overview(seen: ResponseOverlay) -> Figure:

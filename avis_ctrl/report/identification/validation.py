@@ -26,8 +26,8 @@ def validation(found: Identification) -> Section:
         if one.whiteness is not None:
             pieces += [_whiteness(one.name, one.whiteness)]
     if len(v.held_out) > len(drawn):
-        pieces.append(Paragraph(f"Figures are shown of the first {len(drawn)} of {len(v.held_out)} held-out records "
-                                "and pieces; the table has all.", "note"))
+        pieces.append(Paragraph(f"Figures are shown for the first {len(drawn)} of {len(v.held_out)} held-out records "
+                                "and pieces; the table lists all.", "note"))
     if v.modes:
         pieces.append(_modes(found))
     said = [f"{s[:1].upper()}{s[1:].rstrip('.')}." for s in (*v.sentences[1:], *v.notes)]
@@ -47,10 +47,10 @@ def _records(found: Identification) -> Table:
                      "not tested" if white is None else Mark("yes", True) if white.white else Mark("no", False)))
     noise = "; ".join(dict.fromkeys(one.noise for one in found.validation.held_out))
     return table(f"Chi-square per degree of freedom of the held-out data, with its 95 % interval if only noise and the "
-                 f"parameters' uncertainty are left. Noise: {noise}. \"Local noise\" is the same against the noise of "
-                 "a local polynomial model.",
-                 ("record", "lines", "chi-square", "expected", "start model", "local noise", "inside", "white"), rows,
-                 "lrrrrrcc")
+                 f"parameters' uncertainty are left. Noise: {noise}. \"Local noise\" is the same chi-square with the "
+                 "noise covariance of a local polynomial model.",
+                 ("record", "lines", "chi-square", "expected", "start model", "local noise", "consistent", "white"),
+                 rows, "lrrrrrcc")
 
 
 def _places(outputs: tuple[str, ...]) -> tuple[np.ndarray, Axis]:
@@ -78,7 +78,7 @@ def _errors(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
     positive = positive[positive > 0]
     limits = (float(positive.min()) / 3, float(positive.max()) * 2) if positive.size else (0.01, 100.0)
     return Figure(f"nrms_{one.name}", f"Normalised r.m.s. error of each output in the band, record {one.name}: error "
-                  "over output, transient of the ends taken out. Logarithmic.",
+                  "divided by output, with the transient of the record removed. Logarithmic.",
                   (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), curves),), height=0.9)
 
 
@@ -97,7 +97,7 @@ def _nrms(one: HeldOut, outputs: tuple[str, ...]) -> Table:
 def _whiteness(name: str, white: Whiteness) -> Figure:
     panels = tuple(_correlation(one) for one in white.correlations)
     return Figure(f"whiteness_{name}", f"Correlations of the residual, record {name}, of each output: the largest over "
-                  "the inputs where there are several. Noise alone exceeds a limit (dashed) anywhere in 1 % of "
+                  "the inputs if there are several. Noise alone exceeds any limit (dashed) in 1 % of all "
                   "validations.", panels, height=0.85)
 
 
@@ -122,9 +122,9 @@ def _modes(found: Identification) -> Table:
         rows.append((row.shape, words.number(row.start_frequency_Hz, 4), f, measured_f, _sigma(row.frequency_sigma),
                      words.number(100 * row.start_damping, 3), z, measured_z, _sigma(row.damping_sigma)))
     return table("Modes of the start and of the identified model beside those measured in the held-out data without "
-                 "the rig's equations. Brackets hold one standard deviation in units of the last "
-                 "digits. Shapes by shares of kinetic energy; the difference is model less measured over "
-                 "its standard deviation.",
+                 "the rig's equations. Brackets give one standard deviation in units of the last "
+                 "digits. Shapes are given by the distribution of the kinetic energy; the difference is model minus "
+                 "measured, divided by its standard deviation.",
                  ("shape", "start [Hz]", "identified [Hz]", "measured [Hz]", "diff. [σ]", "damping, start [%]",
                   "identified [%]", "measured [%]", "diff. [σ]"), rows)
 

@@ -12,7 +12,7 @@ from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.study.identification import Identification
 
 ESTIMATE, RECORDS, LIKELY = Style("#0072b2"), Style("#9a9a9a", "dot", 1.2), Style("#d55e00", "dash", 1.4)
-TITLE = "Ways of identification"
+TITLE = "Comparison of identification methods"
 
 
 def ways(found: Identification) -> Section:
@@ -23,17 +23,17 @@ def ways(found: Identification) -> Section:
         return Section(TITLE, "ways", (Paragraph(f"{note[:1].upper()}{note[1:]}.", "note"), _sequential(found)))
     pieces: list[Piece] = [_agreement(found, result), _table(found, result)]
     pieces += [_figure(found, curves, k) for k, curves in enumerate(parameter_curves(result))]
-    pieces += [_consistency(found, result), Heading("What the filter's tuning hides"), Bullets(_hidden(result)),
+    pieces += [_consistency(found, result), Heading("Influence of the filter's tuning"), Bullets(_hidden(result)),
                _sequential(found)]
     return Section(TITLE, "ways", tuple(pieces))
 
 
 def _sequential(found: Identification) -> Paragraph:
     if isinstance(found.start, Halcyonics):
-        return Paragraph("The sequential fit of the rig's source, test by test, was not run here: it takes "
-                         "displacement per volt of single tests.", "note")
-    return Paragraph("The sequential fit, test by test, belongs to the spring-suspended table; it does not apply to "
-                     "this rig.", "note")
+        return Paragraph("The sequential fit of Beadle et al. was not run here: it needs the displacement per volt "
+                         "from single tests.", "note")
+    return Paragraph("The sequential fit of Beadle et al. is for the spring-suspended table; it does not apply to this "
+                     "rig.", "note")
 
 
 def _differences(found: Identification, result: EkfResult) -> np.ndarray:
@@ -56,19 +56,19 @@ def _agreement(found: Identification, result: EkfResult) -> Paragraph:
     d = _differences(found, result)
     known = np.isfinite(d[:, 4])
     if not known.any():
-        return Paragraph("No combination is determined by both.", "verdict")
+        return Paragraph("No combination of parameters is determined by both methods.", "verdict")
     far = int(np.count_nonzero(np.abs(d[known, 4]) > 3))
     k = int(np.argmax(np.abs(np.where(known, d[:, 4], 0))))
     share = 100 * np.abs(d[:, 2] / np.where(d[:, 0] == 0, np.nan, d[:, 0]) - 1)[known]
     text = (f"Maximum likelihood and the extended Kalman filter differ by "
             f"{words.number(float(np.nanmedian(share)), 2)} % in the median over {np.count_nonzero(known)} determined "
-            f"combinations, at most by {words.number(float(np.nanmax(share)), 2)} %. Measured in their standard "
-            f"deviations {far} differ by more than 3, the farthest is {found.identifiability.combinations[k].words} "
-            f"with {words.number(float(abs(d[k, 4])), 2)}.")
+            f"combinations, and by at most {words.number(float(np.nanmax(share)), 2)} %. {far} of them differ by more "
+            f"than 3 standard deviations; the largest difference is {words.number(float(abs(d[k, 4])), 2)} standard "
+            f"deviations, in {found.identifiability.combinations[k].words}.")
     broken = [name for name, one in zip(_names(found, result), result.innovations, strict=True) if not one.consistent]
     if broken:
         text += (f" The filter's innovations do not agree with its covariance in record{'s' * (len(broken) > 1)} "
-                 f"{words.joined(broken)}: its standard deviations are too small to be believed.")
+                 f"{words.joined(broken)}: its standard deviations are too small.")
     return Paragraph(text, "verdict", far == 0 and not broken)
 
 
@@ -81,7 +81,7 @@ def _table(found: Identification, result: EkfResult) -> Table:
                      f"{apart:+.1f}".replace("-", "−") if np.isfinite(apart) else "",
                      words.unit(one.unit) if one.unit != "1" else ""))
     return table("Estimates of each combination by both methods. The difference is divided by the root of the sum of "
-                 "both variances; the data are the same, so that it should be smaller than for independent data.",
+                 "both variances. Because both use the same data, it should be smaller than for independent data.",
                  ("combination", "likelihood", "± 1 σ", "Kalman", "± 1 σ", "difference [σ]", "unit"), rows, "lrrrrrl")
 
 
@@ -109,8 +109,8 @@ def _figure(found: Identification, curves: ParameterCurves, number: int) -> Figu
                             Axis(f"[{words.unit(curves.units[k])}]", "linear", ends), tuple(drawn), (band,),
                             f"{name}{known}"))
     return Figure(f"kalman_{number}", f"{curves.title}: the extended Kalman filter's estimate against time, as in "
-                  "figs. 3.1 to 3.3 of its source; the first second, when the prior's band is far wider, is cut off. A "
-                  "parameter with * is known only in combination and stays where the prior and its partners leave it.",
+                  "figs. 3.1 to 3.3 of Rademakers; the first second, with the far wider band of the prior, is not "
+                  "shown. A parameter marked * is known only in combination; its own value depends on the prior.",
                   tuple(panels), min(3, len(panels)), 0.62)
 
 
@@ -130,25 +130,24 @@ def _consistency(found: Identification, result: EkfResult) -> Table:
                      f"{words.number(100 * one.outside, 2)} %",
                      Mark("yes", True) if one.consistent else Mark("no", False)))
     return table("Innovations of the filter: mean normalised square per output, where 99.9 % of such means lie, and "
-                 "the share of autocorrelations beyond what white noise keeps in 95 % of the cases. A filter whose "
-                 "innovations are larger than it believes states standard deviations that are too small.",
+                 "the fraction of autocorrelations outside the 95 % limits of white noise. If the innovations are "
+                 "larger than the filter's covariance predicts, its standard deviations are too small.",
                  ("record", "mean square", "expected", "beyond the bound", "consistent"), rows, "lrrrc")
 
 
 def _hidden(result: EkfResult) -> tuple[str, ...]:
     s = result.settings
-    said = ["Noise of the measurements: " + ("the rig's own sensor noise and converter." if s.R is None else
-                                             f"set by hand, R = {s.R}; more than the sensors have widens every band."),
-            "Noise of the process: " + ("the rig's ambient floor motion, through the isolators. A record in which the "
-                                        "floor is shaken harder than that contradicts it." if s.Q is None else
-                                        f"set by hand, Q = {s.Q}."),
-            f"Prior: {100 * s.prior_share:g} % of each starting value. A parameter that the data do not determine "
-            "keeps this band, which tells of the prior and nothing of the rig."]
-    said.append("Each record begins again from the prior covariance: the last record alone sets the bands." if s.reset
-                else "The covariance is kept from record to record"
-                + (f", after {s.warm_up} record{'s' * (s.warm_up > 1)} of warm-up that set the linearisation."
+    said = ["Measurement noise: " + ("the sensor noise and converter of the rig file." if s.R is None else
+                                     f"set by hand, R = {s.R}; a value above the real sensor noise widens every band."),
+            "Process noise: " + ("the rig file's ambient floor motion, through the isolators. It does not hold for a "
+                                 "record with stronger floor motion." if s.Q is None else f"set by hand, Q = {s.Q}."),
+            f"Prior: standard deviation {100 * s.prior_share:g} % of each starting value. A parameter that the data do "
+            "not determine keeps this band; the band then depends on the prior only, not on the rig."]
+    said.append("Each record starts again from the prior covariance: the last record alone determines the bands."
+                if s.reset else "The covariance is kept from record to record"
+                + (f", after {s.warm_up} record{'s' * (s.warm_up > 1)} of warm-up for the linearisation."
                    if s.warm_up else "."))
     held = [name for name, count in zip(result.names, result.guarded, strict=True) if count]
     if held:
-        said.append(f"The guard against values near zero held {words.joined(held)}.")
+        said.append(f"The lower limit of the parameters was reached by {words.joined(held)}.")
     return (*said, *(f"{line[:1].upper()}{line[1:]}." for line in result.directions.words()))

@@ -18,11 +18,11 @@ def bounds(result: DesignResult) -> Section:
     """mu of the weighted performance and of stability alone, and what reaches them."""
     pieces: list[Piece] = [_guarantee(result)]
     pieces += [_figure("mu_performance", result, lambda c: c.mu, "mu, performance", "mu of the weighted performance",
-                       "Below 1 (dashed line) every requirement put into the weights holds for every plant of the "
+                       "Below 1 (dashed line) every weighted requirement holds for every plant of the uncertainty "
                        "set."),
                _figure("mu_stability", result, lambda c: c.stability, "mu, stability", "mu of the uncertainty alone",
-                       "Below 1 the loop is stable for every plant of the set; its inverse is the factor by which the "
-                       "whole set could grow.")]
+                       "Below 1 the loop is stable for every plant of the set; the inverse of its peak is the factor "
+                       "by which the whole set may grow.")]
     pieces += [_stability(result), _worst(result)]
     return Section("Bounds of mu", "bounds", tuple(pieces))
 
@@ -30,11 +30,11 @@ def bounds(result: DesignResult) -> Section:
 def _guarantee(result: DesignResult) -> Paragraph:
     mu = result.controller("mu").mu
     gap = 100 * (1 - mu.lower / mu.upper) if np.isfinite(mu.upper) and mu.upper > 0 else np.nan
-    between = ("The upper bound is guaranteed at every frequency, between the computed points too."
+    between = ("The upper bound is guaranteed at every frequency, also between the computed points."
                if mu.guaranteed else "The upper bound holds at the computed frequencies; between them it is not "
-               "guaranteed, though the grid was refined about every local peak.")
-    return Paragraph(f"The mu controller has a peak between {words.bound(mu.lower, 4)} and {words.bound(mu.upper, 4)} "
-                     f"at {words.hertz(mu.omega)}"
+               "guaranteed, although the grid was refined near every local peak.")
+    return Paragraph(f"With the mu controller the peak of mu is between {words.bound(mu.lower, 4)} and "
+                     f"{words.bound(mu.upper, 4)}, at {words.hertz(mu.omega)}"
                      + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
                      + f". The lower bound is a perturbation that makes the loop singular. {between}")
 
@@ -83,7 +83,7 @@ def _worst(result: DesignResult) -> Table:
                               ("peak transmissibility", c.worst_peak, True)):
             value = words.decibel(b.lower) if gain else words.bound(b.lower, 4)
             rows.append((f"{c.title}: {what}", value, words.hertz(b.omega), "; ".join(b.words) or "none was found"))
-    return table("The worst plants that were found, in physical words. Each reaches the lower bound named beside it. "
-                 "Those of mu are scaled until they reach the limit, to 1/mu of the set: where mu is below 1 they lie "
-                 "outside it. Those of transmissibility lie inside.",
-                 ("what it makes worst", "reaches", "at", "perturbation"), rows, "lrrl")
+    return table("The worst perturbations found, in physical terms. Each reaches the lower bound stated beside it. The "
+                 "perturbations of mu have the size 1/mu, which makes the loop singular: if mu is below 1 they lie "
+                 "outside the uncertainty set. Those of the transmissibility lie inside the set.",
+                 ("worst case of", "reaches", "at", "perturbation"), rows, "lrrl")

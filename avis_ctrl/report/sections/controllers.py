@@ -41,9 +41,10 @@ def _files(result: DesignResult, made: list[ControllerResult]) -> Table:
     rate = result.rig.sample_rate_Hz
     rows = [(c.title, f"controllers/{c.name}.json", str(c.order), f"{words.number(c.fastest_pole_Hz)} Hz",
              words.number(2 * c.fastest_pole_Hz / rate), words.yes(_system(c).is_stable())) for c in made]
-    return table(f"The controllers and their state-space files. The fastest pole is set against half the sample "
+    return table(f"The controllers and their state-space files. The fastest pole is compared with half the sample "
                  f"rate of {words.number(rate, 4)} Hz.",
-                 ("controller", "file", "order", "fastest pole", "over half the rate", "stable itself"), rows, "llrrrc")
+                 ("controller", "file", "order", "fastest pole", "relative to half the rate", "stable itself"), rows,
+                 "llrrrc")
 
 
 def _gains(made: list[ControllerResult]) -> Figure:
@@ -106,6 +107,6 @@ def _poles(mu: ControllerResult) -> Table:
         kind = "pair" if p.imag > 0 else "real"
         damping = -p.real / abs(p) if abs(p) > 0 else 1.0
         rows.append((f"{words.number(abs(p) / (2 * np.pi), 4)} Hz", words.number(damping), kind))
-    left = f" The fastest {len(shown) - MOST_POLES} are in the file." if len(shown) > MOST_POLES else ""
+    left = f" The fastest {len(shown) - MOST_POLES} are listed only in the file." if len(shown) > MOST_POLES else ""
     return table(f"Poles of the mu controller, slowest first; a pair counts once.{left}",
                  ("frequency", "damping ratio", "kind"), rows, "rrl")

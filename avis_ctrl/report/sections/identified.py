@@ -32,20 +32,21 @@ def _origin(result: DesignResult, found: InDesign) -> Paragraph:
     source = content.provenance.get("measurement")
     determined, kept = len(content.direction), len(found.directions)
     text = (f"The identification{f' ({source})' if source else ''} determined {determined} combinations of "
-            f"{len(content.parameter)} parameters; {content.undetermined} change nothing that was measured and stay "
-            f"where they were. ")
+            f"{len(content.parameter)} parameters; {content.undetermined} have no influence on the measurements and "
+            f"keep their starting values. ")
     if kept:
         text += (f"{kept} of them are bounded directions here, within {words.number(d.box)} standard deviations; the "
-                 f"rest together changes the response by at most {_percent(d.rest)} and the transmissibility by at "
+                 f"others together change the response by at most {_percent(d.rest)} and the transmissibility by at "
                  f"most {_percent(d.rest_floor)}. ")
     else:
         text += (f"All of them together, within {words.number(d.ball)} standard deviations, change the response by at "
-                 f"most {_percent(d.rest)} and the transmissibility by at most {_percent(d.rest_floor)}: none is worth "
-                 "a block of its own. ")
-    text += (f"What is not a direction is added to the spread of the response, which acts on the actuators' side; the "
-             f"floor's side of it is not covered. Directions and rest hold together with a probability of "
-             f"{words.number(100 * d.coverage)} %, if the errors are normal; the spread holds with "
-             f"{words.number(100 * found.confidence)} % at each frequency.")
+                 f"most {_percent(d.rest)} and the transmissibility by at most {_percent(d.rest_floor)}: no block of "
+                 "their own is needed. ")
+    text += (f"The combinations without a direction of their own are added to the spread of the response. The spread "
+             f"acts at the actuators; their influence on the response to floor motion is not covered. Directions and "
+             f"the other combinations together hold with a probability of {words.number(100 * d.coverage)} % if the "
+             f"errors are normally distributed; the spread holds with {words.number(100 * found.confidence)} % at each "
+             "frequency.")
     return Paragraph(text)
 
 
@@ -58,14 +59,14 @@ def _directions(result: DesignResult, found: InDesign) -> Table:
     rows = []
     for direction, effect in zip(found.directions, found.found.effect, strict=True):
         sizes = sorted(direction.changes, key=lambda one: -abs(one[1] / (nominal[one[0]] or 1.0)))
-        told = [f"{name} {100 * change / abs(nominal[name]):+.2g} %" if nominal[name] else
-                f"{name} {change:+.2g} {words.unit(units[name])}" for name, change in sizes[:SHOWN]]
-        more = f" and {len(sizes) - SHOWN} parameters less" if len(sizes) > SHOWN else ""
+        shown = [f"{name} {100 * change / abs(nominal[name]):+.2g} %" if nominal[name] else
+                 f"{name} {change:+.2g} {words.unit(units[name])}" for name, change in sizes[:SHOWN]]
+        more = f" and {len(sizes) - SHOWN} parameters by less" if len(sizes) > SHOWN else ""
         rows.append((direction.name, f"{words.number(100 * float(effect), 2)} %",
-                     (", ".join(told) + more).replace("-", "−")))
-    return table("Directions of the identified parameters: each is one real number between −1 and 1 that moves all of "
-                 "them together. The effect is the largest relative change of the response at 1.",
-                 ("direction", "effect", "what +1 does"), rows, "lrl")
+                     (", ".join(shown) + more).replace("-", "−")))
+    return table("Directions of the identified parameters: each is one real number between −1 and 1 that changes all "
+                 "of them together. The effect is the largest relative change of the response at 1.",
+                 ("direction", "effect", "change at +1"), rows, "lrl")
 
 
 def _spread(found: InDesign) -> Figure:
@@ -80,8 +81,8 @@ def _spread(found: InDesign) -> Figure:
               Curve(f, 100 * weight.magnitude(omega), f"|W|, order {weight.shape.order}", STYLES["filter"])]
     low = 10 ** np.floor(np.log10(100 * np.min(weight.data) / 3))
     high = 10 ** np.ceil(np.log10(100 * np.max(weight.magnitude(omega))))
-    declared = (" Where the design declares more of its drives, the envelope follows that." if weight.declared else
-                " Beyond the measured band it keeps the value of the band's end.")
+    declared = (" Where the design file states a larger uncertainty of the drives, the envelope follows it."
+                if weight.declared else " Outside the measured band it keeps the value at the end of the band.")
     assumed = f" {found.assumption}" if found.assumption else ""
     return Figure("identified_spread", "Relative difference between the measured response and the identified model in "
                   "the kept coordinates (largest singular value), its bound with the measurement's noise, the envelope "

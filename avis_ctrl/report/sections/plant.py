@@ -17,7 +17,7 @@ from avis_ctrl.study.plant import EFFORT, DesignPlant
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
-ROLES = {"w": "disturbance", "z": "judged", "u": "command", "y": "measurement", "internal": "internal",
+ROLES = {"w": "disturbance", "z": "performance", "u": "command", "y": "measurement", "internal": "internal",
          "w_delta": "from Delta", "z_delta": "to Delta"}
 KINDS = {"real": "real", "complex": "complex scalar", "full": "complex"}
 HZ = np.geomspace(0.1, 500.0, 400)
@@ -27,11 +27,11 @@ def generalized_plant(result: DesignResult) -> Section:
     """The section on the generalized plant."""
     plant = result.plant
     P = plant.synthesis
-    drawing = Drawing("blocks", "Connection of the generalized plant, drawn from its parts and signals. A star stands "
-                      "for the axes or channels; ×n is the number of alike parts. Red: disturbances; blue: judged "
-                      "outputs; Δ: what the model does not know.", block_diagram(plant),
+    drawing = Drawing("blocks", "Block diagram of the generalized plant, drawn from its parts and signals. A star "
+                      "stands for the axes or channels; ×n is the number of equal parts. Red: disturbances; blue: "
+                      "performance outputs; Δ: uncertainty.", block_diagram(plant),
                       "Block diagram of the loop: controller, actuators, rig, sensors, weights and uncertainty")
-    summary = Paragraph(f"The plant that synthesis works on has {P.P.nstates} states, {P.ncon} commands, {P.nmeas} "
+    summary = Paragraph(f"The plant of the synthesis has {P.P.nstates} states, {P.ncon} commands, {P.nmeas} "
                         f"measurements, {len(P.w)} disturbances, {len(P.z)} weighted outputs and "
                         f"{len(P.blocks.blocks)} blocks of uncertainty. The axes are "
                         f"{words.joined([words.axis(a) for a in plant.axes])}.")
@@ -51,11 +51,11 @@ def _signals(plant: DesignPlant) -> Table:
         source = {"u": "controller", "w_delta": "Delta"}.get(s.role, "outside" if s.source == EXTERNAL else s.source)
         rows.append((s.name, inside, s.meaning or _delta_words(s.role), s.unit or "1", source, readers, ROLES[s.role]))
     return table("Signals of the connection; a star stands for an axis or a channel.",
-                 ("signal", "number", "meaning", "unit", "made by", "read by", "role"), rows, "lclllll")
+                 ("signal", "number", "meaning", "unit", "output of", "input of", "role"), rows, "lclllll")
 
 
 def _delta_words(role: str) -> str:
-    return {"w_delta": "what the unknown adds", "z_delta": "what the unknown acts on"}.get(role, "")
+    return {"w_delta": "output of the perturbation", "z_delta": "input of the perturbation"}.get(role, "")
 
 
 def _blocks(result: DesignResult) -> Table:
@@ -70,7 +70,7 @@ def _blocks(result: DesignResult) -> Table:
             spread = f"{len(one.changes)} parameters together, see the table"
             meaning = "direction in which the identified parameters are uncertain"
         elif block.name == RESPONSE:
-            spread, meaning = "|W| of the weight", "what the identified model leaves of the response, of any phase"
+            spread, meaning = "|W| of the weight", "error of the identified model's response, of any phase"
         elif one is not None:
             half = one.half_range(plant.rig.nominal[block.name])
             nominal, unit = plant.rig.nominal[block.name], words.unit(plant.rig.units[block.name])
@@ -80,8 +80,8 @@ def _blocks(result: DesignResult) -> Table:
             spread = "see the weight" if chain is None else "|W| of the weight"
             meaning = "neglected dynamics of this channel, of any phase"
         rows.append((block.name, KINDS[block.kind], size, spread, meaning))
-    return table("Blocks of the uncertainty, in the order of Delta. A real block repeats a parameter as often as the "
-                 "equations need it; each block is at most 1 in size.",
+    return table("Blocks of the uncertainty, in the order of Delta. The size of a real block is the number of times "
+                 "that its parameter is repeated; each block has norm at most 1.",
                  ("block", "kind", "size", "range", "what it stands for"), rows, "llcll")
 
 
@@ -94,13 +94,13 @@ def _transmissibility_weight(result: DesignResult) -> Figure:
     omega = mu.transmissibility.omega
     f = omega / (2 * np.pi)
     limit = result.plant.weights["transmissibility"].bound(omega)
-    curves = (Curve(f, asked_dB(result, omega), "asked", STYLES["limit"]),
+    curves = (Curve(f, asked_dB(result, omega), "required", STYLES["limit"]),
               Curve(f, decibels(limit), "1/|W_T|, the filter", STYLES["filter"]),
               Curve(f, decibels(mu.transmissibility.sigma), "mu synthesis, nominal", STYLES["mu"]),
               upper_bound(mu, "mu synthesis, upper bound over the set"))
-    return Figure("weight_transmissibility", "The transmissibility bound as asked, as the rational filter realises it, "
-                  "and what the loop achieves. The loop meets the bound where its curves lie below the filter's; the "
-                  "bound over the set was computed at the marked frequencies.",
+    return Figure("weight_transmissibility", "The required transmissibility bound, its realisation by a rational "
+                  "filter, and the transmissibility achieved. The loop meets the bound where its curves lie below that "
+                  "of the filter; the upper bound over the set was computed at the marked frequencies.",
                   (Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", (-60.0, 20.0)), curves),))
 
 
@@ -117,8 +117,8 @@ def _effort(result: DesignResult) -> Figure:
         closed = plant.full.closed(_mu(result).K).select([f"effort_{axis}"], plant.floor_velocities)
         gain = np.linalg.norm(closed.frequency_response(omega), ord=2, axis=(1, 2)) / weight.magnitude(omega)
         curves.append(Curve(HZ, gain, f"mu synthesis, {words.axis(axis)}", numbered(k)))
-    return Figure("weight_effort", "Control effort: volts per m/s of floor velocity on the drive that the axis brings "
-                  "to its limit first, against what the weight allows; nominal plant.",
+    return Figure("weight_effort", "Control effort: volts per m/s of floor velocity on the drive that saturates first "
+                  "when a force acts along the axis, compared with the limit of the weight; nominal plant.",
                   (Panel(hertz(0.1, 500.0), Axis("V per m/s", "log"), tuple(curves)),))
 
 
@@ -130,8 +130,8 @@ def _chains(plant: DesignPlant) -> list[Piece]:
     curves = [Curve(HZ, 100 * w.magnitude(omega), f"{n.removesuffix(' *')}s", numbered(k))
               for k, (n, w) in enumerate(chains.items())]
     curves.append(level(0.1, 500.0, 100.0, "100 %"))
-    return [Figure("weight_chains", "Neglected dynamics of each channel: relative uncertainty over frequency. Above "
-                   "the frequency of 100 % not even the sign of the channel is known.",
+    return [Figure("weight_chains", "Neglected dynamics of each channel: relative uncertainty over frequency. Where it "
+                   "exceeds 100 %, not even the sign of the channel is known.",
                    (Panel(hertz(0.1, 500.0), Axis("uncertainty [%]", "log", (1.0, 1000.0)), tuple(curves)),))]
 
 
@@ -144,9 +144,9 @@ def _noise(result: DesignResult) -> Figure:
     curves = (Curve(HZ, floor, f"floor ({plant.floor.name})", STYLES["plain"]),
               Curve(HZ, noise, "noise of one sensor", STYLES["hinf"]),
               level(0.1, 500.0, plant.floor_density, "mean floor density, unit of the noise inputs"))
-    return Figure("weight_noise", "Density of the floor's velocity at the site, where its model holds, and of the "
-                  "noise of one sensor with its converter. Where the noise lies above the floor, the sensor sees "
-                  "itself.",
+    return Figure("weight_noise", "Spectral density of the floor velocity at the site, in the band of its model, and "
+                  "of the noise of one sensor with its converter. Where the noise exceeds the floor motion, sensor "
+                  "noise dominates the signal.",
                   (Panel(hertz(0.1, 500.0), Axis("velocity [m/s/√Hz]", "log"), curves),))
 
 
@@ -157,5 +157,5 @@ def _compliance(result: DesignResult) -> list[Piece]:
     f = omega / (2 * np.pi)
     curves = (Curve(f, result.plant.weights["compliance"].bound(omega), "1/|W_c|, allowed", STYLES["limit"]),
               Curve(f, _mu(result).compliance, "mu synthesis", STYLES["mu"]))
-    return [Figure("weight_compliance", "Compliance against what the weight allows; nominal plant.",
+    return [Figure("weight_compliance", "Compliance, compared with the limit of the weight; nominal plant.",
                    (Panel(hertz(0.1, 200.0), Axis("compliance [m/N]", "log"), curves),))]

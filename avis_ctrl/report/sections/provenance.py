@@ -15,8 +15,8 @@ NAMES = {"avis_ctrl": "avis_ctrl version", "design_file": "design file", "inputs
 
 def provenance(result: DesignResult) -> Section:
     """The provenance of a design."""
-    return provenance_table(result.provenance, "With the same inputs, seed, library versions and processor the same "
-                            "figures come out; elsewhere round-off may lead the D-K iteration another way.")
+    return provenance_table(result.provenance, "The same inputs, seed, library versions and processor give the same "
+                            "figures; otherwise round-off may change the course of the D-K iteration.")
 
 
 def provenance_table(made: Mapping[str, Any], caption: str) -> Section:

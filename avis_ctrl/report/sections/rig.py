@@ -46,9 +46,9 @@ def _parameters(one: Rig) -> list[Piece]:
         numbers = sorted({n for row in rows.values() for n in row})
         body = [(rest, words.unit(next(iter(row.values())).unit),
                  *(_value(row[n].value) if n in row else "" for n in numbers)) for rest, row in rows.items()]
-        found.append(table(f"Parameters by {group}: stiffness k, damping c and place p along each axis, the place from "
-                           f"the geometric centre.", ("name", "unit", *(f"{group} {n}" for n in numbers)), body,
-                           "ll" + "r" * len(numbers)))
+        found.append(table(f"Parameters by {group}: stiffness k, damping c and position p along each axis, the "
+                           f"position relative to the geometric centre.",
+                           ("name", "unit", *(f"{group} {n}" for n in numbers)), body, "ll" + "r" * len(numbers)))
     return found
 
 
@@ -69,8 +69,8 @@ def _modes(one: Rig) -> Table:
                       reverse=True)
         rows.append((f"{words.number(frequency)} Hz", words.number(damping, 2),
                      ", ".join(f"{name} {share:.2f}" for share, name in main)))
-    return table("Natural frequencies of the six degrees of freedom without control, modal damping, and how the "
-                 "coordinates take part (largest = 1, rotations as displacement at the edge lever).",
+    return table("Natural frequencies of the six degrees of freedom without control, modal damping, and mode shapes "
+                 "(largest coordinate = 1, rotations as displacement at the edge lever).",
                  ("frequency", "damping ratio", "moves mainly"), rows, "rrl")
 
 
@@ -79,9 +79,9 @@ def _drives(one: Rig) -> Table:
     rows = [(a.name, *_placed(a.position, a.direction), f"{words.number(a.constant_N_per_V)} N/V",
              f"±{words.number(limit)} V", f"±{words.number(a.constant_N_per_V * limit)} N")
             for a, limit in zip(actuators, one.limits_of([a.name for a in actuators]).tolist(), strict=True)]
-    return table("Drives: place from the geometric centre, direction of the force on the payload for a positive "
-                 "voltage.", ("name", "x, y, z [m]", "direction", "force constant", "limit", "largest force"), rows,
-                 "lllrrr")
+    return table("Drives: position relative to the geometric centre, direction of the force on the payload for a "
+                 "positive voltage.",
+                 ("name", "x, y, z [m]", "direction", "force constant", "limit", "largest force"), rows, "lllrrr")
 
 
 def _sensors(one: Rig) -> Table:
@@ -94,9 +94,9 @@ def _sensors(one: Rig) -> Table:
         rows.append((*row, *full))
     header = ("name", "kind", "x, y, z [m]", "direction", "gain", "corner", "noise", *(
         ("limit",) if one.converter else ()))
-    return table("Sensors on the payload: place from the geometric centre, direction of the motion that gives a "
-                 "positive voltage, gain in the passband with preamplifier, corner with the damping ratio in brackets, "
-                 "r.m.s. of the white noise of one sample"
+    return table("Sensors on the payload: position relative to the geometric centre, direction of the motion that "
+                 "gives a positive voltage, gain in the passband with preamplifier, corner with the damping ratio in "
+                 "brackets, r.m.s. of white noise per sample"
                  + (", motion at the converter's limit" if one.converter else "") + ". Position sensors, if any, "
                  "measure relative to the chassis.", header, rows, "llllrlrr")
 
@@ -142,12 +142,12 @@ def _reduction(result: DesignResult) -> list[Piece]:
     rows = [(words.axis(out), name, words.quantity(error.max_dB[out, name], "dB"),
              words.quantity(error.rms_dB[out, name], "dB")) for out, name in error.max_dB]
     kept = words.joined(list(error.keep))
-    text = (f"The controller is designed on {kept} alone, with the other coordinates locked. Against all six degrees "
-            "of freedom this misses what the table and the figure show: the difference, as a share of the largest gain "
-            "at the same frequency. The floor's motion along the other axes, which the small model does not have, "
-            f"reaches {kept} with at most {words.decibel(float(np.max(np.abs(error.left_out), initial=0.0)))}. "
-            + _largest(error))
-    return [Heading("What the small model leaves out"), Paragraph(text),
+    text = (f"The controller is designed on a model of {kept} alone, with the other coordinates locked. The table and "
+            "the figure show the difference from the model with six degrees of freedom, relative to the largest gain "
+            "at the same frequency. Floor motion along the other axes, which the small model does not contain, is "
+            f"transmitted to {kept} with at most "
+            f"{words.decibel(float(np.max(np.abs(error.left_out), initial=0.0)))}. " + _largest(error))
+    return [Heading("Error of the small model"), Paragraph(text),
             table("Difference between the small model and six degrees of freedom, relative to the largest gain, over "
                   "0.1 to 100 Hz.", ("output", "input", "largest", "r.m.s."), rows, "llrr"), _compared(result, n)]
 
@@ -157,7 +157,7 @@ def _largest(error: ReductionError) -> str:
     out, name = max(error.max_dB, key=lambda channel: error.max_dB[channel])
     k, j = error.keep.index(out), error.inputs.index(name)
     place = int(np.argmax(error.relative[:, k, j]))
-    return (f"It is worst at {words.hertz(float(error.omega[place]))}, from {name} to {out}: "
+    return (f"The difference is largest at {words.hertz(float(error.omega[place]))}, from {name} to {out}: "
             f"{words.number(100 * float(error.relative[place, k, j]))} % of the largest gain there.")
 
 
@@ -179,5 +179,5 @@ def _compared(result: DesignResult, n: int) -> Figure:
     lower = Panel(hertz(), Axis("difference [dB]", "linear", (-140.0, 20.0)), tuple(apart),
                   title="difference, relative to the largest gain")
     return Figure("reduction", "Transmissibility without control, floor to payload along each kept axis: six degrees "
-                  "of freedom (coloured) and the small model on top of it (black, dotted), with what the floor's other "
-                  "axes contribute. Below, their difference.", (panel, lower))
+                  "of freedom (coloured) and the small model on top of it (black, dotted), with the contribution of "
+                  "the floor's other axes. Below, their difference.", (panel, lower))

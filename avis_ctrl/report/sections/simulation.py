@@ -19,12 +19,12 @@ def simulation(result: DesignResult) -> Section:
     if not isinstance(check, SimulationCheck):
         return Section("Simulation of the nonlinear rig", "simulation", (Paragraph("No simulation was run."),))
     passed = sum(p.passed for p in check.plants)
-    text = (f"{passed} of {len(check.plants)} plants pass. Each is the nonlinear rig with six degrees of freedom under "
-            f"the sampled mu controller, the other axes under loops of their own, for "
+    text = (f"{passed} of {len(check.plants)} plants pass. Each is the nonlinear rig with six degrees of freedom, with "
+            f"the sampled mu controller and the skyhook loops of the other axes, simulated for "
             f"{words.number(check.duration_s)} s with hold, delay, converter, limits, sensors, floor motion and "
             "noise. A plant passes if it is stable, no voltage reaches its limit, and its "
-            "spectrum agrees with the linear prediction within what chance allows "
-            f"(false alarm over the whole campaign: {words.number(100 * check.false_alarm, 2)} %).")
+            "spectrum agrees with the linear prediction within the limits of random scatter "
+            f"(probability of a false alarm in any plant: {words.number(100 * check.false_alarm, 2)} %).")
     pieces: list[Piece] = [Paragraph(text, "verdict", passed == len(check.plants)), _plants(check)]
     if result.loop is not None and (result.loop.companions.loops or result.loop.companions.passive):
         pieces.append(_companions(result.loop.companions))
@@ -45,8 +45,8 @@ def _plants(check: SimulationCheck) -> Table:
              str(p.clipped_dac + p.clipped_adc),
              ", ".join(f"{words.axis(a)} {words.number(1e6 * v)}" for a, v in p.payload_rms.items()))
             for p in check.plants]
-    nearest = "of the drive that comes nearest to its limit" if differ else "limit"
-    return table(f"Every simulated plant. Voltages as demanded, {nearest} {words.limits(limits)}; clipped samples at "
+    nearest = "of the drive that comes closest to its limit;" if differ else "limit"
+    return table(f"Every simulated plant. Commanded voltages, {nearest} {words.limits(limits)}; clipped samples of "
                  "drives and converter together.",
                  ("plant", "verdict", "stable", "bands that agree", "peak voltage", "clipped",
                   "velocity r.m.s. [µm/s]"), rows, "lcccrrl")
@@ -59,10 +59,10 @@ def _companions(companions: Companions) -> Table:
          f"{words.number(one.roll_off_Hz)} Hz", Mark(words.number(one.modulus_margin, 2), one not in low))
         for one in companions.loops]
     rows += [(words.axis(axis), "passive", "", "", why) for axis, why in companions.passive]
-    return table("Axes outside the mu controller. Each has a skyhook loop that was designed for this rig's sensors "
-                 "with all other loops closed, or stays passive. The modulus margin is the least distance of the "
-                 f"Nyquist curve from the critical point, for the nominal plant; at least {asked:g} was asked. "
-                 "sampled_controller.json holds these loops and the mu controller.",
+    return table("Axes that the mu controller does not control. Each has a skyhook loop, designed for this rig's "
+                 "sensors with all other loops closed, or remains passive. The modulus margin is the smallest distance "
+                 "of the Nyquist curve from the critical point, for the nominal plant; at least "
+                 f"{asked:g} is required. sampled_controller.json contains these loops and the mu controller.",
                  ("axis", "gain", "tilt corner", "roll-off", "modulus margin"), rows, "lrrrr")
 
 
@@ -80,8 +80,8 @@ def _spectrum(name: str, s: SpectrumAgreement) -> Figure:
                   Curve(s.frequency_Hz, np.sqrt(s.predicted_psd[k]), "predicted", STYLES["mu"]))
         panels.append(Panel(hertz(float(s.frequency_Hz[0]), 100.0), Axis("velocity [m/s/√Hz]", "log"), curves, (),
                             words.axis(axis)))
-    return Figure("spectrum", f"Payload velocity density of the plant \"{name}\": simulated, by Welch's method, and as "
-                  "the linear model of the sampled loop predicts it.", tuple(panels))
+    return Figure("spectrum", f"Spectral density of the payload velocity for the plant \"{name}\": simulated (Welch's "
+                  "method), and predicted by the linear model of the sampled loop.", tuple(panels))
 
 
 def _ratios(check: SimulationCheck) -> Figure:
@@ -95,11 +95,11 @@ def _ratios(check: SimulationCheck) -> Figure:
                                     Style("#0072b2", "solid", 0.7), points=True, line=False))
         s = next(p.spectrum for p in check.plants if p.spectrum is not None)
         for edge in (s.lower, s.upper):
-            curves.append(Curve(s.midband_Hz, 10 * np.log10(edge[k]), "what chance allows", STYLES["limit"]))
+            curves.append(Curve(s.midband_Hz, 10 * np.log10(edge[k]), "limits of random scatter", STYLES["limit"]))
         panels.append(Panel(hertz(0.8, 100.0), Axis("simulated over predicted [dB]", "linear"), tuple(curves), (),
                             words.axis(axis)))
     return Figure("spectrum_ratio", "Power in third octaves, simulated over predicted, for every plant. The dashed "
-                  "lines are the bounds of the first plant; each plant is judged against its own.", tuple(panels))
+                  "lines are the limits of the first plant; each plant is tested against its own.", tuple(panels))
 
 
 def _record(check: SimulationCheck) -> Figure:
@@ -109,6 +109,6 @@ def _record(check: SimulationCheck) -> Figure:
                     Style(("#0072b2", "#d55e00", "#009e73")[k % 3], "solid", 0.9))
               for k, axis in enumerate(first.loop.axes)]
     span = (float(first.time[part][0]), float(first.time[part][-1]))
-    return Figure("record", f"The first seconds of the plant \"{check.plants[0].name}\" against time: payload "
+    return Figure("record", f"The first seconds of the simulation of the plant \"{check.plants[0].name}\": payload "
                   "velocity, rotations at the edge.",
                   (Panel(Axis("time [s]", "linear", span), Axis("velocity [µm/s]"), tuple(motion)),))

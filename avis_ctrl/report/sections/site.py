@@ -15,8 +15,8 @@ from avis_ctrl.study.model import ControllerResult, DesignResult
 def site(result: DesignResult) -> Section:
     """The section on the site."""
     floor = result.plant.floor
-    text = Paragraph(f"The floor moves like {floor.name} ({floor.source}), along each kept axis alike and "
-                     "independently; sensor noise is added. Nominal plant, by the linear model.")
+    text = Paragraph(f"The floor motion has the spectrum {floor.name} ({floor.source}), the same and independent along "
+                     "each kept axis; sensor noise is added. Nominal plant, linear model.")
     return Section("On the site", "site", (text, _third_octaves(result), _motion(result), _volts(result),
                                            _compliance(result)))
 
@@ -40,8 +40,9 @@ def _third_octaves(result: DesignResult) -> Figure:
                             controller_style(one.name)))
     ratings = "; ".join(f"{c.title} {c.site.rating or 'none'}" for c in _settled(result))
     panel = Panel(hertz(1.0, 100.0), Axis("velocity [µm/s r.m.s.]", "log"), tuple(curves))
-    return Figure("third_octaves", "Velocity in third octaves on the site's floor, payload by its worst axis, against "
-                  f"the generic vibration criteria. Criterion met: floor {first.floor_rating or 'none'}; {ratings}."
+    return Figure("third_octaves", "Velocity in third octaves: the site's floor, and the worst axis of the payload, "
+                  "compared with the generic vibration criteria. Criterion met: floor "
+                  f"{first.floor_rating or 'none'}; {ratings}."
                   + left_out(result),
                   (panel,))
 
@@ -64,8 +65,8 @@ def _volts(result: DesignResult) -> Table:
             for c in _settled(result) if c.K is not None]
     names = result.plant.actuators
     limits = dict(zip(names, result.rig.limits_of(names).tolist(), strict=True))
-    return table("Voltages on the site by channel, r.m.s. / peak [V]. The peak is what a Gaussian signal passes once "
-                 f"in ten minutes; the limit is {words.limits(limits)}.",
+    return table("Voltages on the site by channel, r.m.s. / peak [V]. The peak is the level that a Gaussian signal "
+                 f"exceeds once in ten minutes; the limit is {words.limits(limits)}.",
                  ("controller", *names), rows)
 
 
@@ -74,6 +75,6 @@ def _compliance(result: DesignResult) -> Figure:
     for c in _settled(result):
         style: Style = controller_style(c.name)
         curves.append(Curve(c.transmissibility.omega / (2 * np.pi), 1e6 * c.compliance, c.title, style))
-    return Figure("compliance", "Compliance: displacement of the payload against the floor per force on it, largest "
-                  "singular value, floor at rest; nominal plant. Low is stiff." + left_out(result),
+    return Figure("compliance", "Compliance: displacement of the payload relative to the floor per force on the "
+                  "payload, largest singular value, floor at rest; nominal plant." + left_out(result),
                   (Panel(hertz(0.1, 200.0), Axis("compliance [µm/N]", "log"), tuple(curves)),))

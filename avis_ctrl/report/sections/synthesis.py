@@ -14,7 +14,7 @@ def synthesis(result: DesignResult) -> Section:
     """Each iteration of the mu synthesis."""
     history = result.dk_history
     if not history:
-        return Section("D-K iteration", "synthesis", (Paragraph("No iteration was made."),))
+        return Section("D-K iteration", "synthesis", (Paragraph("No iteration was run."),))
     rows = [(str(h.iteration), h.kind, words.bound(h.gamma, 4), words.bound(h.mu_upper, 4), str(h.order),
              str(h.d_order), f"{words.number(100 * h.d_fit_error, 2)} %", f"{words.number(h.seconds, 2)} s")
             for h in history]
@@ -37,10 +37,11 @@ def synthesis(result: DesignResult) -> Section:
         Curve(steps, np.array([h.d_order for h in history], float), "states of the scalings", numbered(3),
               points=True)))
     total = sum(h.seconds for h in history)
-    caption = (f"Course of the mu synthesis: {len(history)} iterations in {words.number(total)} s. gamma is measured "
-               "on the scaled loop and bounds mu with every block taken as complex.")
+    caption = (f"Course of the mu synthesis: {len(history)} iterations in {words.number(total)} s. gamma is the norm "
+               "of the scaled loop, an upper bound of mu with every block taken as complex.")
     return Section("D-K iteration", "synthesis", (
-        table("The iterations. \"fit\" is what the realised scalings cost against the best ones at each frequency; the "
-              "best controller of all is kept.",
+        table("The iterations. \"fit\" is the increase of the bound caused by realising the scalings as rational "
+              "functions, compared with the best scalings at each frequency. The best controller of all iterations is "
+              "used.",
               ("step", "kind", "gamma", "mu upper", "order", "order of D", "fit", "time"), rows, "rlrrrrrr"),
         Figure("dk_history", caption, (values, orders))))

@@ -29,12 +29,12 @@ def asked_dB(result: DesignResult, omega: np.ndarray) -> np.ndarray:
 def left_out(result: DesignResult) -> str:
     """Which controllers a figure of the nominal loop cannot show."""
     unstable = [c.title for c in result.controllers if not c.stable]
-    return f" Left out, its nominal loop being unstable: {words.joined(unstable)}." if unstable else ""
+    return f" Not shown, because the nominal loop is unstable: {words.joined(unstable)}." if unstable else ""
 
 
 def _limit(result: DesignResult) -> Curve:
     omega = 2 * np.pi * np.geomspace(0.1, 200.0, 2000)
-    return Curve(omega / (2 * np.pi), asked_dB(result, omega), "asked of the synthesis", STYLES["limit"])
+    return Curve(omega / (2 * np.pi), asked_dB(result, omega), "required bound", STYLES["limit"])
 
 
 def _sigma(c: ControllerResult) -> Curve:
@@ -85,8 +85,8 @@ def _spread_words(result: DesignResult) -> str:
         parts.append(f"{c.title}: sampled plants peak at {words.decibel(float(np.max(c.transmissibility.high)))}, the "
                      f"bound at {words.decibel(c.worst_peak.upper)}")
     return ("Largest singular value over the uncertainty set: nominal (line), range over the sampled plants (area), "
-            f"and the upper bound that no plant of the set exceeds at the marked frequencies; the lines between them "
-            f"guide the eye, only the peak is proved there too. {'; '.join(parts)}.")
+            f"and the upper bound that no plant of the set exceeds at the marked frequencies. The lines between the "
+            f"marks only guide the eye; the bound of the peak is also proved between them. {'; '.join(parts)}.")
 
 
 def _by_axis(result: DesignResult) -> Figure:
@@ -105,8 +105,8 @@ def _six_dof(result: DesignResult) -> Figure:
     f = check.omega / (2 * np.pi)
     curves = [_sigma(mu), Curve(f, decibels(check.kept), "six degrees of freedom, sampled", STYLES["plain"]),
               Curve(f, decibels(check.others), "from the floor's other coordinates", STYLES["limit"])]
-    caption = (f"What the design model leaves out: the mu controller at its sample rate on all six degrees of freedom, "
-               f"the other axes under their own loops. In the band the largest gain differs by at most "
-               f"{check.deviation_dB:.2g} dB from the design model's; floor motion along the other coordinates "
-               "reaches the kept axes as the third line shows.")
+    caption = (f"Check of the design model: the sampled mu controller on all six degrees of freedom, with the skyhook "
+               f"loops of the other axes. In the band the largest gain differs by at most {check.deviation_dB:.2g} dB "
+               "from that of the design model. The third line shows how floor motion along the other coordinates "
+               "reaches the kept axes.")
     return Figure("transmissibility_six_dof", caption, (_panel(curves, [], ""),))

@@ -16,9 +16,9 @@ def verdict(result: DesignResult) -> Section:
     """The verdict table, with one sentence above it that says what was achieved."""
     rows = [(r.name, Mark("met" if r.met else "NOT MET", r.met), words.quantity(r.value, r.unit),
              f"{r.comparison} {words.quantity(r.limit, r.unit)}", r.note) for r in result.requirements]
-    asked = [table("What the design asks and what was measured on the mu controller. Decibels count the largest "
+    asked = [table("Requirements of the design and the results of the mu controller. Values in dB are the largest "
                    "singular value from floor to payload, rotations as displacement of the edge.",
-                   ("requirement", "verdict", "measured", "asked", "note"), rows, "lcrrl")] if rows else []
+                   ("requirement", "verdict", "result", "limit", "note"), rows, "lcrrl")] if rows else []
     notes = [Paragraph(note, "note") for note in result.notes]
     return Section("Verdict", "verdict", (_sentence(result), *asked, *notes))
 
@@ -34,7 +34,7 @@ def _achieved(result: DesignResult) -> str:
     mu = result.controller("mu")
     low, high = result.design.transmissibility.band_Hz
     if not np.isfinite(mu.worst_peak.upper):
-        return ("The mu controller is not shown to be stable for every plant of the uncertainty set, so no worst-case "
+        return ("The mu controller is not proved to be stable for every plant of the uncertainty set, so no worst-case "
                 "transmissibility can be stated.")
     sure = "" if mu.worst_peak.guaranteed and mu.worst_band.guaranteed else " at the computed frequencies"
     return (f"For every plant of the uncertainty set the mu controller keeps the transmissibility at or below "
@@ -72,9 +72,9 @@ def comparison(result: DesignResult) -> Section:
     notes += [Paragraph(f"The controller {c.title!r} is not in the table: {c.reason}", "note") for c in result.failed]
     floor = controllers[0].site.floor_rating
     return Section("Controllers compared", "comparison", (
-        table("Every controller measured in the same way on the same plants. Worst cases are upper bounds over the "
-              "whole uncertainty set; \"unstable\" means that the set holds a plant that the controller does not "
-              f"stabilise, or is not shown to. The floor itself meets {floor or 'no criterion'}.",
+        table("All controllers, evaluated in the same way on the same plants. Worst cases are upper bounds over the "
+              "whole uncertainty set; \"unstable\" means that the controller is not proved to stabilise every plant of "
+              f"the set. The floor itself meets {floor or 'no criterion'}.",
               ("", *(c.title for c in controllers)), body), *notes))
 
 
