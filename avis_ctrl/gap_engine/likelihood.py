@@ -7,15 +7,15 @@ z are standardised parameters; the whitened residual e is free of the transients
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from avis_ctrl.gap_engine.settings import GapSettings
+from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.gap_engine.tolerances import Priors
-from avis_ctrl.gap_engine.weights import Variances, Weights, bands, estimated, path_contributions, weigh
+from avis_ctrl.gap_engine.weights import Group, Variances, Weights, bands, estimated, path_contributions, weigh
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened
 from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns, transient_parts
 
@@ -49,7 +49,9 @@ class Fitted:
 
 def first_variances(data: Data, settings: GapSettings) -> Variances:
     """Where nothing is known yet: a relative error of every path, distortion as large as a tenth of it."""
-    path, distortion, count = {}, {}, {}
+    path: dict[Group, np.ndarray] = {}
+    distortion: dict[Group, np.ndarray] = {}
+    count: dict[Group, int] = {}
     for block, level in zip(data.blocks, data.levels, strict=True):
         own = bands(block.omega, settings.bands_per_octave)
         for band in np.unique(own):
@@ -61,7 +63,8 @@ def first_variances(data: Data, settings: GapSettings) -> Variances:
     return Variances(path, {group: value / count[group] for group, value in distortion.items()})
 
 
-def residual(model: Any, block: SpectralBlock, L: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def residual(model: Any, block: SpectralBlock, L: np.ndarray, derivative: bool
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whitened residual (N,), negative Jacobian (n_p, N), both free of the transient, and the residual (n, n_y)."""
     L = L[:, None]
     columns, norms = transient_columns(block, model)
@@ -78,13 +81,14 @@ def residual(model: Any, block: SpectralBlock, L: np.ndarray, derivative: bool) 
     return e, J, error[:, :, 0]
 
 
-def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: GapSettings = GapSettings(),
+def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: GapSettings = SETTINGS,
         progress: Callable[[str], None] = lambda text: None) -> Fitted:
     """Alternate Gauss-Newton steps in z with estimates of the variances."""
     steps = 0
     model = model.at(priors.values(z))
     for k in range(settings.rounds + 1):
-        weights = weigh(data.blocks, data.levels, [path_contributions(model, b) for b in data.blocks], variances, settings)
+        paths = [path_contributions(model, block) for block in data.blocks]
+        weights = weigh(data.blocks, data.levels, paths, variances, settings)
         found = _evaluate(model, priors, z, data, weights)
         for _ in range(settings.iterations):
             e, J, _ = found

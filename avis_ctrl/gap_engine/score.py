@@ -9,20 +9,20 @@ import numpy as np
 
 from avis_ctrl.gap.score import Part, Score
 from avis_ctrl.gap_engine.likelihood import Data, Fitted
-from avis_ctrl.gap_engine.settings import GapSettings
+from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.gap_engine.weights import Weights, path_contributions, weigh, with_distortion
 
 
 class EvidenceScore(Score):
     """`gap.score.Score` with path errors integrated out and normal priors on all parameters."""
 
-    def __init__(self, fitted: Fitted, data: Data, settings: GapSettings = GapSettings()):
+    def __init__(self, fitted: Fitted, data: Data, settings: GapSettings = SETTINGS):
         self.model, self.kept = fitted.model, {}
         blocks = [with_distortion(block, level, fitted.variances, settings)
                   for block, level in zip(data.blocks, data.levels, strict=True)]
         self.parts = [Part(self.model, block) for block in blocks]
-        self.weights: Weights = weigh(data.blocks, data.levels, [path_contributions(self.model, b) for b in data.blocks],
-                                      fitted.variances, settings)
+        paths = [path_contributions(self.model, block) for block in data.blocks]
+        self.weights: Weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
         n = len(fitted.z)
         e = np.concatenate([part.real((part.block.Y - part.answer.Y)[None])[0] for part in self.parts])
         J = np.concatenate([part.real(self.model.answer(part.block, part.body, inner=part.inner).dY)

@@ -13,7 +13,7 @@ from avis_ctrl.gap.effects.base import Effect, Seed
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
 from avis_ctrl.gap_engine.likelihood import Data, Fitted, fit
 from avis_ctrl.gap_engine.score import EvidenceScore
-from avis_ctrl.gap_engine.settings import GapSettings
+from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.gap_engine.tolerances import Priors
 
 
@@ -35,7 +35,7 @@ class Step:
 
 
 def priors_of(effect: ActiveEffect, settings: GapSettings) -> Priors:
-    """Normal priors of an effect's parameters: broad, about none where the effect vanishes, about its start elsewhere."""
+    """Broad normal priors of an effect's parameters: about none for its strength, about the start for its shape."""
     mean = np.array([p.none if p.linear else v for p, v in zip(effect.parameters, effect.values, strict=True)])
     sigma = np.array([settings.effect_sizes * p.size if p.linear else max(settings.shape_spread * abs(v), p.size)
                       for p, v in zip(effect.parameters, effect.values, strict=True)])
@@ -85,7 +85,7 @@ def with_effect(fitted: Fitted, candidate: Candidate, data: Data, settings: GapS
         return None
 
 
-def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = GapSettings(),
+def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
            progress: Callable[[str], None] = lambda text: None) -> list[Step]:
     """Effects in the order in which they are found."""
     steps: list[Step] = []
@@ -96,7 +96,8 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
         progress("score: " + ", ".join(f"{one.effect.label} {one.fall:.4g}" for one in found[:6]))
         made = {one.effect.label: with_effect(now, one, data, quick) for one in chosen}
         gains = {label: one.log_evidence - now.log_evidence for label, one in made.items() if one is not None}
-        progress("evidence: " + ", ".join(f"{label} {gain:+.4g}" for label, gain in sorted(gains.items(), key=lambda p: -p[1])))
+        ranked = sorted(gains.items(), key=lambda pair: -pair[1])
+        progress("evidence: " + ", ".join(f"{label} {gain:+.4g}" for label, gain in ranked))
         if not gains:
             break
         best = max(gains, key=lambda label: gains[label])

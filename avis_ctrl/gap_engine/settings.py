@@ -47,3 +47,6 @@ class GapSettings:
     longest: int = 3
     certain: float = 4.6
     converged: float = 1e-4
+
+
+SETTINGS = GapSettings()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avis_ctrl.gap_engine.settings import GapSettings
+from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs.instruments import Tolerances
@@ -44,30 +44,31 @@ class Priors:
         """Both, one after the other."""
         def both(name: str) -> np.ndarray:
             return np.concatenate([np.broadcast_to(getattr(one, name), len(one.names)) for one in (self, other)])
-        return Priors((*self.names, *other.names), *(both(name) for name in ("mean", "sigma", "positive", "low", "high")))
+        fields = ("mean", "sigma", "positive", "low", "high")
+        return Priors((*self.names, *other.names), *(both(name) for name in fields))
 
     def slopes(self, z: np.ndarray) -> np.ndarray:
         """(n,) derivative of the values by z."""
         return np.where(self.positive, self.sigma * self.values(z), self.sigma)
 
 
-def re_identified(rig: Rig, settings: GapSettings = GapSettings()) -> Priors:
+def re_identified(rig: Rig, settings: GapSettings = SETTINGS) -> Priors:
     """Mass, moments of inertia, stiffness and damping: what every identification leaves free."""
     known, names = rig.parameters(), default_parameters(rig)
     mean = np.array([known[name].value for name in names])
     damping = np.array([known[name].unit.startswith("N s") or known[name].unit.startswith("N m s") for name in names])
-    sigma = np.where(damping, settings.damping_percent, settings.stiffness_percent) / 100
+    sigma = np.asarray(np.where(damping, settings.damping_percent, settings.stiffness_percent)) / 100
     return Priors(names, mean, sigma, np.ones(len(names), bool))
 
 
-def with_tolerances(model: ResponseModel, tolerances: Tolerances, settings: GapSettings = GapSettings()) -> Priors:
+def with_tolerances(model: ResponseModel, tolerances: Tolerances, settings: GapSettings = SETTINGS) -> Priors:
     """The same and every value of the rig file that has a tolerance; the model has its channels apart."""
     first, known = re_identified(model.rig, settings), model.all_parameters()
     rest = {name: sigma for name in known if name not in first.names and (sigma := _sigma(name, tolerances))}
     mean = np.array([known[name].value for name in rest])
     relative = np.array([name.partition(".")[0] in _RELATIVE for name in rest])
-    sigma = np.array(list(rest.values()))
-    return Priors((*first.names, *rest), np.concatenate([first.mean, mean]), np.concatenate([first.sigma, sigma]),
+    own = np.array(list(rest.values()))
+    return Priors((*first.names, *rest), np.concatenate([first.mean, mean]), np.concatenate([first.sigma, own]),
                   np.concatenate([first.positive, relative]))
 
 

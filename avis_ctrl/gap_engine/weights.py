@@ -57,7 +57,7 @@ class PathError:
 class Weights:
     """Whitening of stacked residuals.
 
-    L : (n, n_y, n_y) a block. paths : of every level and band. log_determinant : of the whole covariance (real numbers).
+    L : (n, n_y, n_y) a block. paths : of every level and band. log_determinant : of the covariance of all real numbers.
     """
 
     L: tuple[np.ndarray, ...]

@@ -56,20 +56,24 @@ class SensorModel:
     sensitivity_units: tuple[str, ...]
     poles: tuple[tuple[float, ...], ...]
     relative: np.ndarray
+    # Corner [Hz] and damping ratio of each geophone's suspension, as it is and as its filter assumes; None without one.
     suspensions: tuple[tuple[float, float] | None, ...] = ()
     assumed: tuple[tuple[float, float] | None, ...] = ()
 
     def _detuned(self, s: np.ndarray, k: int) -> np.ndarray | float:
         """Factor on a geophone's response whose suspension is not the one that its filter assumes."""
-        if not self.suspensions or self.suspensions[k] == self.assumed[k] or self.suspensions[k] is None:
+        known, own = (one[k] if one else None for one in (self.assumed, self.suspensions))
+        if known is None or own is None or known == own:
             return 1.0
-        (f0, z0), (f, z) = self.assumed[k], self.suspensions[k]
+        (f0, z0), (f, z) = known, own
         w0, w = 2 * np.pi * f0, 2 * np.pi * f
         return (s ** 2 + 2 * z0 * w0 * s + w0 ** 2) / (s ** 2 + 2 * z * w * s + w ** 2)
 
     def suspension_slopes(self, s: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
         """(n,) each: relative change of the response per Hz of the corner, and per unit of the damping ratio."""
-        f, z = self.suspensions[k]
+        own = self.suspensions[k]
+        assert own is not None
+        f, z = own
         w = 2 * np.pi * f
         den = s ** 2 + 2 * z * w * s + w ** 2
         return -2 * np.pi * (2 * z * s + 2 * w) / den, -2 * w * s / den
@@ -279,7 +283,7 @@ class ResponseModel:
             raise InputError("expected a delay from 0 to 1 s", field="loop_delay_s", value=delay)
         of_rig = {name: value for name, value in values.items()
                   if not name.startswith(("sensor.", "corner.", "damping.")) and name != "loop_delay_s"}
-        own = tuple(None if old is None else (values.get(f"corner.{name}", old[0]), values.get(f"damping.{name}", old[1]))
+        own = tuple(old and (values.get(f"corner.{name}", old[0]), values.get(f"damping.{name}", old[1]))
                     for name, old in zip(self.sensors.names, self.sensors.suspensions, strict=False))
         return replace(self, rig=self.rig.with_parameters(of_rig), delay_s=delay,
                        sensors=replace(self.sensors, sensitivity=sensitivity, suspensions=own))

@@ -150,8 +150,6 @@ class AvisTable(Rig):
         return found
 
     def channel_slope(self, name: str) -> tuple[str, str, np.ndarray] | None:
-        """Of a parameter that moves one channel only: "T" or "R", the channel, and the derivative (6,) of its column of
-        T or row of R; None for any other parameter."""
         kind, _, rest = name.partition(".")
         if kind == "actuator":
             one = self._by_name[rest]
@@ -258,8 +256,8 @@ class AvisTable(Rig):
 
 def _across(direction: Triple) -> tuple[int, int]:
     """The two smallest components of a unit vector, which the third one follows."""
-    first, second, _ = np.argsort(np.abs(direction), kind="stable")
-    return tuple(sorted((int(first), int(second))))
+    first, second, _ = (int(k) for k in np.argsort(np.abs(direction), kind="stable"))
+    return min(first, second), max(first, second)
 
 
 def _moved(one: Any, values: Mapping[str, float]) -> Any:

@@ -129,6 +129,8 @@ class Rig(ABC):
                          value=[f"sensor.{name}" for name in gains])
 
     def channel_slope(self, name: str) -> tuple[str, str, np.ndarray] | None:
+        """Of a parameter that moves one channel only: "T" or "R", the channel, and the derivative (6,) of its column of
+        T or row of R; None for any other parameter."""
         return None
 
     def sensor_rows(self) -> tuple[tuple[str, ...], np.ndarray]:
