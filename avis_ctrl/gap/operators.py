@@ -193,7 +193,7 @@ def _sensors_of(base: ResponseModel) -> tuple:
     known = {id(chain): b"" if chain is None else b"".join(part.tobytes() for part in (chain.A, chain.B, chain.C,
                                                                                        chain.D))
              for chain in base.sensors.chains}
-    return base.sensors.motions, tuple(known[id(chain)] for chain in base.sensors.chains)
+    return base.sensors.motions, base.sensors.suspensions, tuple(known[id(chain)] for chain in base.sensors.chains)
 
 
 def chain_response(base: ResponseModel, omega: np.ndarray) -> np.ndarray:

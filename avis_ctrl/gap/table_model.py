@@ -435,6 +435,13 @@ class _Answer:
                 else:
                     push = s[:, :, 0] * ops.damping_factor[:, k, None] * (chassis[:, k] - own[:, k])
                 dY[j] = through[:, :, k, None] * push[:, None, :]
+            elif name.startswith(("corner.", "damping.")):
+                others += 1
+                kind, _, sensor = name.partition(".")
+                k = model.sensors.names.index(sensor)
+                slope = model.sensors.suspension_slopes(s[:, 0, 0], k)[kind == "damping"]
+                alias = self.gain * self.alias * (mat.R @ self.Minv @ mat.T @ self.folded)
+                dY[j, :, k] = slope[:, None] * (self.Y - alias)[:, k]
             elif name == "loop_delay_s":
                 raise InputError("expected the effect loop_delay in the place of this parameter", field="parameters",
                                  value=name)

@@ -56,6 +56,27 @@ class SensorModel:
     sensitivity_units: tuple[str, ...]
     poles: tuple[tuple[float, ...], ...]
     relative: np.ndarray
+    # Corner [Hz] and damping ratio of each geophone's suspension, as it is and as its filter assumes; None without one.
+    suspensions: tuple[tuple[float, float] | None, ...] = ()
+    assumed: tuple[tuple[float, float] | None, ...] = ()
+
+    def _detuned(self, s: np.ndarray, k: int) -> np.ndarray | float:
+        """Factor on a geophone's response whose suspension is not the one that its filter assumes."""
+        known, own = (one[k] if one else None for one in (self.assumed, self.suspensions))
+        if known is None or own is None or known == own:
+            return 1.0
+        (f0, z0), (f, z) = known, own
+        w0, w = 2 * np.pi * f0, 2 * np.pi * f
+        return (s ** 2 + 2 * z0 * w0 * s + w0 ** 2) / (s ** 2 + 2 * z * w * s + w ** 2)
+
+    def suspension_slopes(self, s: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) each: relative change of the response per Hz of the corner, and per unit of the damping ratio."""
+        own = self.suspensions[k]
+        assert own is not None
+        f, z = own
+        w = 2 * np.pi * f
+        den = s ** 2 + 2 * z * w * s + w ** 2
+        return -2 * np.pi * (2 * z * s + 2 * w) / den, -2 * w * s / den
 
     def picked(self, index: Sequence[int]) -> SensorModel:
         """The sensors at `index` (from the first), in that order; an index may come again."""
@@ -96,8 +117,8 @@ class SensorModel:
             if (id(chain), motion) not in known:
                 response = 1.0 if chain is None else chain.frequency_response(omega)[:, 0, 0]
                 known[id(chain), motion] = response * s ** _POWER[motion]
-        return np.stack([known[id(chain), motion] for chain, motion in zip(self.chains, self.motions, strict=True)],
-                        axis=1)
+        return np.stack([known[id(chain), motion] * self._detuned(s, k) for k, (chain, motion) in
+                         enumerate(zip(self.chains, self.motions, strict=True))], axis=1)
 
     def folded(self, omega: np.ndarray, period_s: float, delay_s: float, corner_Hz: float | None) -> np.ndarray:
         """(n, n_y) `aliases` of each sensor's motion, which pass its chain far above its corners."""
@@ -131,7 +152,8 @@ def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) 
                        tuple(systems[one.zeros, one.poles, one.quantity] for one in sensors),
                        np.array([one.gain for one in sensors]), "V", tuple(units[one.quantity] for one in sensors),
                        tuple(tuple(np.atleast_1d(np.real(np.poly(one.poles)))[::-1].tolist()) for one in sensors),
-                       np.array([not one.inertial for one in sensors]))
+                       np.array([not one.inertial for one in sensors]),
+                       tuple(one.suspension for one in sensors), tuple(one.suspension for one in sensors))
 
 
 class Matrices(NamedTuple):
@@ -203,7 +225,7 @@ class ResponseModel:
     @property
     def _known(self) -> frozenset[str]:
         """Names of every parameter that could be free."""
-        return frozenset(self.rig.parameters()) | {f"sensor.{name}" for name in self.sensors.names} | {"loop_delay_s"}
+        return frozenset(self.all_parameters())
 
     def all_parameters(self) -> dict[str, Parameter]:
         """Every parameter that could be free."""
@@ -211,6 +233,10 @@ class ResponseModel:
         for name, value, unit in zip(self.sensors.names, self.sensors.sensitivity, self.sensors.sensitivity_units,
                                      strict=True):
             found[f"sensor.{name}"] = Parameter(float(value), unit, f"sensitivity of {name}")
+        for name, own in zip(self.sensors.names, self.sensors.suspensions or (), strict=False):
+            if own is not None:
+                found[f"corner.{name}"] = Parameter(own[0], "Hz", f"corner of the suspension of {name}")
+                found[f"damping.{name}"] = Parameter(own[1], "", f"damping ratio of the suspension of {name}")
         found["loop_delay_s"] = Parameter(self.delay_s, "s", "delay from the sample to the actuator voltage")
         return found
 
@@ -256,9 +282,11 @@ class ResponseModel:
         if not 0 <= delay < 1:
             raise InputError("expected a delay from 0 to 1 s", field="loop_delay_s", value=delay)
         of_rig = {name: value for name, value in values.items()
-                  if not name.startswith("sensor.") and name != "loop_delay_s"}
+                  if not name.startswith(("sensor.", "corner.", "damping.")) and name != "loop_delay_s"}
+        own = tuple(old and (values.get(f"corner.{name}", old[0]), values.get(f"damping.{name}", old[1]))
+                    for name, old in zip(self.sensors.names, self.sensors.suspensions, strict=False))
         return replace(self, rig=self.rig.with_parameters(of_rig), delay_s=delay,
-                       sensors=replace(self.sensors, sensitivity=sensitivity))
+                       sensors=replace(self.sensors, sensitivity=sensitivity, suspensions=own))
 
     @cached_property
     def matrices(self) -> Matrices:
@@ -280,7 +308,14 @@ class ResponseModel:
         shapes = [(len(self.names), *matrix.shape) for matrix in self.matrices]
         found = Matrices(*(np.zeros(shape) for shape in shapes))
         for j, name in enumerate(self.names):
-            if name in known:
+            slope = self.rig.channel_slope(name) if name in known else None
+            if slope is not None:
+                which, channel, column = slope
+                if which == "T" and channel in self.actuators:
+                    found.T[j][:, self.actuators.index(channel)] = column
+                elif which == "R" and channel in self.sensors.names:
+                    found.R[j][self.sensors.names.index(channel)] = column
+            elif name in known:
                 value = known[name].value
                 # Exact at any step for polynomials of second degree: a tenth loses no digits.
                 step = 0.1 * abs(value) or 1e-3
@@ -359,10 +394,16 @@ class ResponseModel:
         pushed_q = Minv @ mat.T @ volts
         dY = np.zeros((len(self.names), *seen.shape), complex)
         driven = a * volts
+        pushed_alias = mat.R @ pushed_q
         for j, name in enumerate(self.names):
             if name.startswith("sensor."):
                 k = self.sensors.names.index(name.removeprefix("sensor."))
                 dY[j, :, k] = seen[:, k]
+            elif name.startswith(("corner.", "damping.")):
+                kind, _, sensor = name.partition(".")
+                k = self.sensors.names.index(sensor)
+                slope = self.sensors.suspension_slopes(1j * omega, k)[kind == "damping"]
+                dY[j, :, k] = self.sensors.sensitivity[k] * slope[:, None] * (seen - alias * pushed_alias)[:, k]
             elif name == "loop_delay_s":
                 dY[j] = self._delay_derivative(omega, volts, mat, inverse, out, Minv)
             else:

@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geoph
 from avis_ctrl.rigs.instruments import Drive, FloorSensor, GeophoneAt, Instrument, Sensor, Tolerances, Triple, with_gain
 from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
 from avis_ctrl.rigs.rig import Parameter, Place, Rig
-from avis_ctrl.rigs.rigid_body import EquationsOfMotion
+from avis_ctrl.rigs.rigid_body import EquationsOfMotion, point_map
 
 AXES = ("x", "y", "z")
 INERTIA = ("J1", "J2", "J3", "J12", "J13", "J23")
@@ -140,7 +141,39 @@ class AvisTable(Rig):
                         value, _UNITS[kind], f"{_WORDS[kind]} of isolator {number} along {axis}")
         for drive in self.all_drives:
             found[f"actuator.{drive.name}"] = Parameter(drive.constant_N_per_V, "N/V", "force constant")
+        for one in (*self.drives, *self.instruments):
+            for axis, place in zip(AXES, one.position, strict=True):
+                found[f"place.{one.name}.{axis}"] = Parameter(place, "m", f"position of {one.name} along {axis}")
+            for k in _across(one.direction):
+                found[f"direction.{one.name}.{AXES[k]}"] = Parameter(
+                    one.direction[k], "", f"component of the unit direction of {one.name} along {AXES[k]}")
         return found
+
+    def channel_slope(self, name: str) -> tuple[str, str, np.ndarray] | None:
+        kind, _, rest = name.partition(".")
+        if kind == "actuator":
+            one = self._by_name[rest]
+            return "T", rest, point_map(one.position).T @ np.array(one.direction)
+        if kind not in ("place", "direction"):
+            return None
+        rest, _, axis = rest.rpartition(".")
+        one, k = self._by_name[rest], AXES.index(axis)
+        if kind == "place":
+            slope = (point_map(np.eye(3)[k]) - point_map(np.zeros(3))).T @ np.array(one.direction)
+        else:
+            along = ({0, 1, 2} - set(_across(one.direction))).pop()
+            turn = np.eye(3)[k] - np.eye(3)[along] * one.direction[k] / one.direction[along]
+            slope = point_map(one.position).T @ turn
+        return ("T", rest, slope * one.constant_N_per_V) if isinstance(one, Drive) else ("R", rest, slope)
+
+    @cached_property
+    def _by_name(self) -> dict[str, Any]:
+        return {one.name: one for one in (*self.all_drives, *self.instruments)}
+
+    def with_channels_apart(self) -> AvisTable:
+        """The same table with each motor and geophone at a place of its own, which does not move with the isolator."""
+        return replace(self, motors=(), drives=self.all_drives, geophones=None,
+                       instruments=(*self._attached(), *self.instruments))
 
     def _with_values(self, values: dict[str, float]) -> AvisTable:
         get = values.get
@@ -155,10 +188,11 @@ class AvisTable(Rig):
         motors = tuple(replace(m, constant_N_per_V=get(f"actuator.{m.name}", m.constant_N_per_V))
                        for m in self.motors)
         drives = tuple(replace(d, constant_N_per_V=get(f"actuator.{d.name}", d.constant_N_per_V)) for d in self.drives)
+        drives, instruments = (tuple(_moved(one, values) for one in some) for some in (drives, self.instruments))
         inertia = tuple(get(name, old) for name, old in zip(INERTIA, self.inertia, strict=True))
         com = tuple(get(f"com_{axis}", old) for axis, old in zip(AXES, self.centre_of_mass, strict=True))
         return replace(self, mass=get("mass", self.mass), inertia=inertia, centre_of_mass=com,
-                       isolators=isolators, motors=motors, drives=drives)
+                       isolators=isolators, motors=motors, drives=drives, instruments=instruments)
 
     def mounted_body(self) -> MountedBody:
         return self._body
@@ -218,6 +252,28 @@ class AvisTable(Rig):
             raise InputError(f"expected an isolator from 1 to {len(self.isolators)}", field="isolator", value=isolator)
         x, y, z = self.isolators[isolator - 1].position
         return x, y, z
+
+
+def _across(direction: Triple) -> tuple[int, int]:
+    """The two smallest components of a unit vector, which the third one follows."""
+    first, second, _ = (int(k) for k in np.argsort(np.abs(direction), kind="stable"))
+    return min(first, second), max(first, second)
+
+
+def _moved(one: Any, values: Mapping[str, float]) -> Any:
+    """A drive or instrument at another place and in another direction."""
+    place = tuple(values.get(f"place.{one.name}.{axis}", old) for axis, old in zip(AXES, one.position, strict=True))
+    across = _across(one.direction)
+    if not any(f"direction.{one.name}.{AXES[k]}" in values for k in across):
+        return one if place == one.position else replace(one, position=place)
+    n = np.array(one.direction)
+    n[list(across)] = [values.get(f"direction.{one.name}.{AXES[k]}", n[k]) for k in across]
+    along = ({0, 1, 2} - set(across)).pop()
+    rest = 1 - float(np.sum(n[list(across)] ** 2))
+    if rest <= 0:
+        raise InputError("expected components of a unit vector", field=f"direction.{one.name}", value=n.tolist())
+    n[along] = np.copysign(np.sqrt(rest), n[along])
+    return replace(one, position=place, direction=(float(n[0]), float(n[1]), float(n[2])))
 
 
 def _unit(axis: str) -> Triple:

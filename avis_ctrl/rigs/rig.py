@@ -128,6 +128,11 @@ class Rig(ABC):
         raise InputError("a rig file of this kind has one sensitivity for all; leave these out", field="parameters",
                          value=[f"sensor.{name}" for name in gains])
 
+    def channel_slope(self, name: str) -> tuple[str, str, np.ndarray] | None:
+        """Of a parameter that moves one channel only: "T" or "R", the channel, and the derivative (6,) of its column of
+        T or row of R; None for any other parameter."""
+        return None
+
     def sensor_rows(self) -> tuple[tuple[str, ...], np.ndarray]:
         """Sensor names and the (n, 6) matrix from q to the displacement along each sensor's axis."""
         axes = self.sensor_axes()

@@ -1,0 +1,1 @@
+"""Which effect a model of a table lacks: tolerances, unexplained response and selection by evidence."""

@@ -1,0 +1,38 @@
+"""Score test of effects at a fitted model: the fall of the penalised sum of squares that a small effect would bring.
+
+Priors are rows of their own below the residuals: e = (e, -z), J = (J, I). A direction of an effect has zeros there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.gap.score import Part, Score
+from avis_ctrl.gap_engine.likelihood import Data, Fitted
+from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
+from avis_ctrl.gap_engine.weights import Weights, path_contributions, weigh, with_distortion
+
+
+class EvidenceScore(Score):
+    """`gap.score.Score` with path errors integrated out and normal priors on all parameters."""
+
+    def __init__(self, fitted: Fitted, data: Data, settings: GapSettings = SETTINGS):
+        self.model, self.kept = fitted.model, {}
+        blocks = [with_distortion(block, level, fitted.variances, settings)
+                  for block, level in zip(data.blocks, data.levels, strict=True)]
+        self.parts = [Part(self.model, block) for block in blocks]
+        paths = [path_contributions(self.model, block) for block in data.blocks]
+        self.weights: Weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
+        n = len(fitted.z)
+        e = np.concatenate([part.real((part.block.Y - part.answer.Y)[None])[0] for part in self.parts])
+        J = np.concatenate([part.real(self.model.answer(part.block, part.body, inner=part.inner).dY)
+                            for part in self.parts], axis=1) * fitted.priors.slopes(fitted.z)[:, None]
+        self.e = np.concatenate([self.weights.flatten(e[None])[0], -fitted.z])
+        J = np.concatenate([self.weights.flatten(J), np.eye(n)], axis=1)
+        self.basis = np.linalg.qr(J.T)[0].T
+        self.e = self.e - self.basis.T @ (self.basis @ self.e)
+
+    def directions(self, dY):
+        A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
+        A = np.concatenate([self.weights.flatten(A), np.zeros((len(A), len(self.basis)))], axis=1)
+        return A - (A @ self.basis.T) @ self.basis

@@ -1,0 +1,168 @@
+"""What a residual is held against: noise, distortion, and relative errors of the paths that nobody has named.
+
+On a line the residual of a record has the covariance N + diag(s) of noise and distortion. Beside it every path from an
+input to a sensor may have a relative error, constant over a band and alike in all records of a level:
+
+    e_c(k) = sum_j eps_cjb G_cj(k) u_j(k) + noise,     eps circular normal, E|eps|^2 = v_cb
+
+The path errors are integrated out. In real numbers whitened by N + diag(s), with B the columns of the path errors times
+their standard deviation, the covariance is I + B B^T, and its inverse root is
+
+    (I + B B^T)^(-1/2) = I - Q diag(1 - 1/sqrt(1 + lambda)) Q^T,      B B^T = Q diag(lambda) Q^T
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.gap_engine.settings import GapSettings
+from avis_ctrl.identification.spectra import SpectralBlock
+
+Group = tuple[float, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Variances:
+    """By level [V] and band: path (n_y,) relative variances v, distortion (n_y,) variances s [unit of y^2]."""
+
+    path: Mapping[Group, np.ndarray]
+    distortion: Mapping[Group, np.ndarray]
+
+
+def bands(omega: np.ndarray, per_octave: int) -> np.ndarray:
+    """(n,) number of the band of each line, counted from 1 rad/s."""
+    return np.floor(per_octave * np.log2(omega) + 1e-9).astype(int)
+
+
+@dataclass(frozen=True, eq=False)
+class PathError:
+    """Lines of one level and band: rows (m,) of the stacked real residual, and Q (m, r), lambda (r,) of B B^T.
+
+    columns (m, k), sensor (k,), of relative error 1, kept for the estimate of the variances.
+    """
+
+    group: Group
+    rows: np.ndarray
+    columns: np.ndarray
+    sensor: np.ndarray
+    Q: np.ndarray
+    size: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """Whitening of stacked residuals.
+
+    L : (n, n_y, n_y) a block. paths : of every level and band. log_determinant : of the covariance of all real numbers.
+    """
+
+    L: tuple[np.ndarray, ...]
+    paths: tuple[PathError, ...]
+    log_determinant: float
+
+    def flatten(self, x: np.ndarray) -> np.ndarray:
+        """(k, N) whitened rows times the inverse root of I + B B^T."""
+        out = x.copy()
+        for one in self.paths:
+            part = x[:, one.rows]
+            out[:, one.rows] = part - ((part @ one.Q) * (1 - 1 / np.sqrt(1 + one.size))) @ one.Q.T
+        return out
+
+
+def path_contributions(model: Any, block: SpectralBlock) -> np.ndarray:
+    """(n, n_y, n_in): what each input of a record contributes to each sensor."""
+    U = np.zeros((*block.U.shape[:2], block.U.shape[1]), complex)
+    k = np.arange(block.U.shape[1])
+    U[:, k, k] = block.U[:, :, 0]
+    return model.driven(block.omega, U, derivative=False).Y
+
+
+def with_distortion(block: SpectralBlock, level: float, variances: Variances, settings: GapSettings) -> SpectralBlock:
+    """The block with noise and distortion as its covariance."""
+    assert block.noise is not None
+    own = bands(block.omega, settings.bands_per_octave)
+    s = np.array([variances.distortion[level, int(band)] for band in own])
+    return block.with_noise(block.noise[:, 0] + s[:, :, None] * np.eye(s.shape[1]))
+
+
+def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Sequence[np.ndarray], variances: Variances,
+          settings: GapSettings) -> Weights:
+    """Weights of blocks; paths : (n, n_y, n_in) G_cj u_j of each block by the present model."""
+    L, total, start = [], 0.0, 0
+    members: dict[Group, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for block, level, path in zip(blocks, levels, paths, strict=True):
+        n, n_y, n_in = path.shape
+        own = bands(block.omega, settings.bands_per_octave)
+        whole = with_distortion(block, level, variances, settings).noise
+        assert whole is not None
+        factor = np.linalg.cholesky(whole[:, 0])
+        total += 4 * float(np.sum(np.log(np.real(np.einsum("kii->ki", factor)))))
+        white = np.sqrt(2) * np.linalg.inv(factor)
+        L.append(white)
+        # Real parts of all lines and sensors, then imaginary parts, as `as_real` stacks them.
+        place = start + np.arange(n * n_y).reshape(n, n_y)
+        start += 2 * n * n_y
+        for band in np.unique(own):
+            at = own == band
+            # columns (m, n_y, n_y * n_in): sensor c, input j
+            C = (white[at][:, :, :, None] * path[at][:, None, :, :]).reshape(at.sum() * n_y, n_y * n_in)
+            rows = np.concatenate([place[at].ravel(), place[at].ravel() + n * n_y])
+            real = np.block([[C.real, -C.imag], [C.imag, C.real]])
+            members.setdefault((level, int(band)), []).append((rows, real))
+    errors = []
+    for group, parts in members.items():
+        n_y = len(variances.path[group])
+        n_in = parts[0][1].shape[1] // (2 * n_y)
+        columns = np.concatenate([part[1] for part in parts])
+        sensor = np.tile(np.repeat(np.arange(n_y), n_in), 2)
+        used = np.any(columns != 0, axis=0)
+        columns, sensor = columns[:, used], sensor[used]
+        B = columns * np.sqrt(variances.path[group][sensor] / 2)
+        values, vectors = np.linalg.eigh(B.T @ B)
+        kept = values > 1e-8
+        Q = B @ vectors[:, kept] / np.sqrt(values[kept])
+        errors.append(PathError(group, np.concatenate([part[0] for part in parts]), columns, sensor, Q, values[kept]))
+        total += float(np.sum(np.log1p(values[kept])))
+    return Weights(tuple(L), tuple(errors), total)
+
+
+def estimated(weights: Weights, e: np.ndarray, error: Sequence[np.ndarray], blocks: Sequence[SpectralBlock],
+              levels: Sequence[float], old: Variances, settings: GapSettings) -> Variances:
+    """One step of expectation-maximisation from whitened residuals e (N,) (before `flatten`).
+
+    error : (n, n_y) a block, the residual in the unit of y.
+    """
+    path, distortion = {}, {}
+    left = e.copy()
+    for one in weights.paths:
+        v = old.path[one.group][one.sensor] / 2
+        S = np.linalg.inv(np.diag(1 / v) + one.columns.T @ one.columns)
+        mean = S @ (one.columns.T @ e[one.rows])
+        power = mean ** 2 + np.diag(S)
+        nu, v0 = settings.error_weight, settings.least_error ** 2
+        path[one.group] = np.array([(2 * np.sum(power[one.sensor == c]) + nu * v0) / (np.sum(one.sensor == c) + nu)
+                                    if np.any(one.sensor == c) else v0 for c in range(len(old.path[one.group]))])
+        left[one.rows] -= one.columns @ mean
+    start = 0
+    sums: dict[Group, list] = {}
+    for block, level, L in zip(blocks, levels, weights.L, strict=True):
+        assert block.noise is not None
+        n, n_y = len(block.omega), L.shape[-1]
+        flat = left[start:start + 2 * n * n_y].reshape(2, n, n_y)
+        start += 2 * n * n_y
+        back = np.linalg.solve(L, (flat[0] + 1j * flat[1])[:, :, None])[:, :, 0]
+        noise = np.real(np.einsum("kii->ki", block.noise[:, 0]))
+        own = bands(block.omega, settings.bands_per_octave)
+        for band in np.unique(own):
+            at, group = own == band, (level, int(band))
+            entry = sums.setdefault(group, [0.0, 0.0, 0])
+            entry[0] = entry[0] + np.sum(np.abs(back[at]) ** 2, axis=0)
+            entry[1] = entry[1] + np.sum(noise[at], axis=0)
+            entry[2] += int(at.sum())
+    for group, (power, noise, count) in sums.items():
+        distortion[group] = np.maximum(power - noise, 0.02 * noise) / count
+    return Variances(path, distortion)
