@@ -188,6 +188,9 @@ def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: Ident
         unit, sensors, sampled = measured.output_unit, measured.outputs, False
         actuators = tuple(name for name in measured.inputs if name not in ("vx", "vy", "vz"))
     names = named_parameters(rig, options.parameters, unit) if options.parameters else default_parameters(rig)
+    if homeless := [name for name in names if name.startswith(("corner.", "damping."))]:
+        raise InputError("a rig file states one suspension for all geophones, so that these could not be written",
+                         field="parameters", value=homeless)
     corner = amplifier_corner(rig, options.amplifier_corner_Hz)
     return ResponseModel.of(rig, names, unit, sensors, actuators, sampled, corner)
 

@@ -132,7 +132,8 @@ def test_hold_out_and_parameters_as_asked(rehearsal):
 
 @pytest.mark.parametrize(("change", "said"), [
     ({"hold_out": ("09",)}, "09"), ({"hold_out": ("00", "01", "02", "03", "04", "05", "06")}, "not all"),
-    ({"parameters": ("weight*",)}, "weight"), ({"priors": {"weight": (1.0, 1.0)}}, "weight"),
+    ({"parameters": ("weight*",)}, "weight"), ({"parameters": ("mass", "corner.Sz1")}, "one suspension for all"),
+    ({"priors": {"weight": (1.0, 1.0)}}, "weight"),
     ({"band_Hz": (300.0, 300.001)}, "band"),
     ({"band_Hz": (200.0, 400.0)}, r"excited from [\d.]+ to \d+(\.\d)? Hz; expected a band that overlaps")])
 def test_options_that_do_not_fit_are_answered(rehearsal, change, said):
