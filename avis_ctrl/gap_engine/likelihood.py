@@ -7,7 +7,6 @@ z are standardised parameters; the whitened residual e is free of the transients
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,8 +15,8 @@ import numpy as np
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.gap_engine.tolerances import Priors
 from avis_ctrl.gap_engine.weights import Group, Variances, Weights, bands, estimated, path_contributions, weigh
-from avis_ctrl.identification.maximum_likelihood import as_real, whitened
-from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns, transient_parts
+from avis_ctrl.identification.maximum_likelihood import block_residual
+from avis_ctrl.identification.spectra import SpectralBlock
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,26 +62,8 @@ def first_variances(data: Data, settings: GapSettings) -> Variances:
     return Variances(path, {group: value / count[group] for group, value in distortion.items()})
 
 
-def residual(model: Any, block: SpectralBlock, L: np.ndarray, derivative: bool
-             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whitened residual (N,), negative Jacobian (n_p, N), both free of the transient, and the residual (n, n_y)."""
-    L = L[:, None]
-    columns, norms = transient_columns(block, model)
-    plain = block.Y - model.answer(block, None, False).Y
-    T = as_real(np.moveaxis(whitened(L, columns), -1, 0))
-    Q, X = span(T.T)
-    x = X @ (Q.T @ as_real(whitened(L, plain)[None])[0])
-    error = plain - (columns @ x)[:, :, None]
-    e, J = as_real(whitened(L, error)[None])[0], np.empty(0)
-    if derivative:
-        body, inner = transient_parts(x, norms, block, model)
-        J = as_real(whitened(L, model.answer(block, body, inner=inner).dY))
-        J -= (J @ Q) @ Q.T
-    return e, J, error[:, :, 0]
-
-
-def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: GapSettings = SETTINGS,
-        progress: Callable[[str], None] = lambda text: None) -> Fitted:
+def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: GapSettings = SETTINGS
+        ) -> Fitted:
     """Alternate Gauss-Newton steps in z with estimates of the variances."""
     steps = 0
     model = model.at(priors.values(z))
@@ -97,7 +78,7 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
             H = Jf @ Jf.T + np.eye(len(z))
             step = np.linalg.solve(H, Jf @ flat - z)
             promised = step @ (Jf @ flat - z)
-            if promised < settings.converged * len(flat) * 1e-2:
+            if promised < settings.converged * len(flat):
                 break
             size = 1.0
             while size > 1e-3:
@@ -124,7 +105,9 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
 
 
 def _evaluate(model: Any, priors: Priors, z: np.ndarray, data: Data, weights: Weights, derivative: bool = True):
-    parts = [residual(model, block, L, derivative) for block, L in zip(data.blocks, weights.L, strict=True)]
+    """Whitened residual (N,), its negative Jacobian by z (n, N), and the residuals (n, n_y) of the blocks."""
+    parts = [block_residual(model, block, L[:, None], derivative=derivative)
+             for block, L in zip(data.blocks, weights.L, strict=True)]
     e = np.concatenate([one[0] for one in parts])
     J = np.concatenate([one[1] for one in parts], axis=1) * priors.slopes(z)[:, None] if derivative else np.empty(0)
-    return e, J, [one[2] for one in parts]
+    return e, J, [one[2].error[:, :, 0] for one in parts]

@@ -1,4 +1,4 @@
-"""Which effects the data ask for: score tests, refits, evidence; one effect after the other, then pruned."""
+"""Which effects the data ask for: score tests, refits, evidence; one effect after the other."""
 
 from __future__ import annotations
 

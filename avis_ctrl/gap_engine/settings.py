@@ -46,7 +46,7 @@ class GapSettings:
     refits: int = 6
     longest: int = 3
     certain: float = 4.6
-    converged: float = 1e-4
+    converged: float = 1e-6
 
 
 SETTINGS = GapSettings()

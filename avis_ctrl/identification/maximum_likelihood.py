@@ -187,7 +187,7 @@ class _Descent:
         n_p = len(model.names)
         chi2, g, H, F, kept = 0.0, np.zeros(n_p), np.zeros((n_p, n_p)), np.zeros((n_p, n_p)), []
         _ = model.matrices, derivative and model.derivative_matrices  # formed once, before the threads ask for them
-        work = partial(_block_residual, model, derivative=derivative)
+        work = partial(block_residual, model, derivative=derivative)
         # Large arrays in few calls, which leave the interpreter free: threads serve, and keep the order of the sums.
         if sum(len(block.omega) for block in self.blocks) < SETTINGS.few_lines:
             parts = list(map(work, self.blocks, self.whiteners))
@@ -320,7 +320,7 @@ def _physical(model: ResponseModel) -> bool:
     return all(value > 0 for name, value in zip(model.names, model.values, strict=True) if positive(name))
 
 
-def _block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
+def block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
                     ) -> tuple[np.ndarray, np.ndarray, Residual]:
     """Real residual e (N,) of unit variance, its negative Jacobian J (n_p, N), both free of the transient."""
     if not block.transient:
@@ -358,7 +358,7 @@ def added_terms(model: ResponseModel, blocks: Sequence[SpectralBlock], columns: 
     scale = model.scales()
     for block, of in zip(blocks, columns, strict=True):
         L = whitener(block)
-        e, J, _ = _block_residual(model, block, L, derivative=True)
+        e, J, _ = block_residual(model, block, L, derivative=True)
         c = as_real(whitened(L, of))
         if block.transient:
             T = as_real(np.moveaxis(whitened(L, transient_columns(block, model)[0]), -1, 0))

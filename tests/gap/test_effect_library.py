@@ -15,7 +15,7 @@ from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.record_motion import mount_rows
 from avis_ctrl.gap.search import location
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.identification.maximum_likelihood import _block_residual, whitener
+from avis_ctrl.identification.maximum_likelihood import block_residual, whitener
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, record_block
@@ -395,9 +395,9 @@ def test_the_gradient_of_a_fit_knows_what_the_states_inside_start_with(name, pla
     L = whitener(block)
 
     def chi2(theta):
-        e, _, _ = _block_residual(model.at(theta), block, L, derivative=False)
+        e, _, _ = block_residual(model.at(theta), block, L, derivative=False)
         return e @ e
-    e, J, _ = _block_residual(model, block, L, derivative=True)
+    e, J, _ = block_residual(model, block, L, derivative=True)
     for row in [*range(0, len(BARE.names), 2), *range(len(BARE.names), len(model.values))]:
         h = 1e-4 * max(abs(model.values[row]), 1e-3 * model.scales()[row]) * np.eye(len(model.values))[row]
         slope = (chi2(model.values + h) - chi2(model.values - h)) / (2 * np.abs(h).max())

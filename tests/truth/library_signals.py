@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .effect import Draw, Effect, Hidden
-from .table import AXES, Plant
+from .table import AXES, Plant, Signal
 
 Drawn = tuple[str, dict[str, float], dict[str, Any]]
 
@@ -25,6 +25,15 @@ def _apply_geophone_corner(plant: Plant, h: Hidden) -> None:
     plant.wn[j], plant.zn[j] = 2 * np.pi * h.parameters["corner_Hz"], h.details["damping_ratio"]
 
 
+def _drifting(j: int, h: Hidden) -> Signal:
+    """Channel j with a gain that drifts over the campaign, about its mean."""
+    def change(x: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        out = x.copy()
+        out[:, j] *= 1 + h.details["drift"] * (t / h.details["span_s"] - 0.5)
+        return out
+    return change
+
+
 def _sensor_gain(d: Draw) -> Drawn:
     return d.one(d.plant.sensors), {
         "gain": 1 + d.sign() * d.size(0.0007, 0.10, d.beyond("sensor_gain_percent"))}, {}
@@ -36,11 +45,7 @@ def _apply_sensor_gain(plant: Plant, h: Hidden) -> None:
     if h.details.get("electric_damping"):       # the shunted coil damps with the square of its sensitivity
         plant.zn[j] *= 1 + h.details["electric_damping"] * (gain**2 - 1)
     if h.details.get("drift"):
-        def drifting(y: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-            out = y.copy()
-            out[:, j] *= 1 + h.details["drift"] * (t / h.details["span_s"] - 0.5)
-            return out
-        plant.analogue.append(drifting)
+        plant.analogue.append(_drifting(j, h))
 
 
 def nominal_axis(plant: Plant, j: int) -> np.ndarray:
@@ -121,11 +126,7 @@ def _apply_actuator_gain(plant: Plant, h: Hidden) -> None:
     j = plant.motors.index(h.location)
     plant.motor[j] = plant.rig.motors[j].constant_N_per_V * h.parameters["gain"]
     if h.details.get("drift"):
-        def drifting(u: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-            out = u.copy()
-            out[:, j] *= 1 + h.details["drift"] * (t / h.details["span_s"] - 0.5)
-            return out
-        plant.drive.append(drifting)
+        plant.drive.append(_drifting(j, h))
 
 
 def _actuator_lag(d: Draw) -> Drawn:
