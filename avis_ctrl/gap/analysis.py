@@ -19,7 +19,8 @@ from avis_ctrl.gap.judgement import effects_of, judge, undetermined
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
 from avis_ctrl.gap.refit import Refit, anew, judged, likelihood, refit, scattered, try_refit
 from avis_ctrl.gap.result import Detectable, Gap
-from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, Rival, contested, definite, search
+from avis_ctrl.gap.score import Score
+from avis_ctrl.gap.search import CLOSED, LONGEST, NOISE, Found, Rival, contested, definite, known_noise, search
 from avis_ctrl.gap.show import shown
 from avis_ctrl.gap.signal_effects import (
     SignalFaults,
@@ -154,7 +155,8 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     limits: tuple[Detectable, ...] = ()
     if judgement.verdict == "none":
         progress("how large an effect would have had to be to be seen")
-        limits = detectable(base.model, prepared.thin, effects)
+        score = Score(base.model, prepared.thin)
+        limits = detectable(score, effects, max(1.0, score.chi2 / score.dof) * known_noise(prepared.thin))
     gap = shown(prepared, found, base, updated, judgement, seed, time.monotonic() - began, faults.noise)
     return replace(gap, detectable=limits)
 

@@ -16,15 +16,13 @@ from avis_ctrl.gap.covariance import directions
 from avis_ctrl.gap.effects.base import Effect, library
 from avis_ctrl.gap.result import Detectable
 from avis_ctrl.gap.score import LEFT, Score
-from avis_ctrl.gap.search import known_noise, location
-from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.gap.search import location
+from avis_ctrl.gap.table_model import active
 
 DEVIATIONS = 5.0
 
 
-def detectable(model: TableModel, blocks: Sequence[SpectralBlock], effects: Sequence[Effect] | None = None
-               ) -> tuple[Detectable, ...]:
+def detectable(score: Score, effects: Sequence[Effect] | None = None, stretch: float = 1.0) -> tuple[Detectable, ...]:
     """For every effect, place and parameter the departure from none of five standard deviations.
 
     Of effects whose parameters are all linear, each parameter with the others of its effect free; of two laws of one
@@ -32,10 +30,10 @@ def detectable(model: TableModel, blocks: Sequence[SpectralBlock], effects: Sequ
 
     Parameters
     ----------
-    model : fitted to the blocks. effects : the library where None.
+    score : at the fitted model. effects : the library where None. stretch : of variances, by which the noise may be
+        larger than it was taken for.
     """
-    score = Score(model, blocks)
-    deviation = DEVIATIONS * np.sqrt(max(1.0, score.chi2 / score.dof) * known_noise(blocks))
+    model, deviation = score.model, DEVIATIONS * np.sqrt(stretch)
     rows: dict[tuple[str, str, str], Detectable] = {}
     for effect in list(library().values()) if effects is None else effects:
         if effect.nonlinear and not model.motion:

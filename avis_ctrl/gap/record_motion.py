@@ -81,8 +81,8 @@ def origin(record: RecordSource) -> tuple[RecordSource, int, int]:
 def mount_rows(model: TableModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Rows from q (n_g, 6), stiffness (n_g,) N/m, which are vertical (n_g,), row of each motor (n_u,)."""
     mounts = mount_geometry(model.effective.rig)
-    motors = {one.name: f"isolator{one.isolator}.{one.axis}" for one in getattr(model.rig, "motors", ())}
-    rows = [mounts.names.index(motors[name]) for name in model.actuators if motors.get(name) in mounts.names]
+    found = map(getattr(model.rig, "mount_of", lambda name: None), model.actuators)
+    rows = [mounts.names.index(one[0]) for one in found if one and one[0] in mounts.names]
     return mounts.payload, mounts.stiffness, mounts.along("z"), np.array(rows, int)
 
 

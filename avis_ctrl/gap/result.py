@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -23,6 +23,7 @@ class NamedEffect:
     probability : of this effect among the candidates that were refitted in its place, given the data, equal beforehand;
     of one that acts on the signals alone, what its finder states. indistinguishable_from : names that this data cannot
     tell from it. confirmed : by how much the held-out log-likelihood rises with it, beside those named before it.
+    share : by how much the held-out residual power rises without it, over the baseline's in excess of the noise.
     label : of the active effect in the updated model; empty for one that acts on the signals alone (hum, converter,
     ground motion). confirmation : in words, how it was found.
     """
@@ -36,6 +37,40 @@ class NamedEffect:
     confirmed: float = 0.0
     label: str = ""
     confirmation: str = ""
+    share: float = 1.0
+
+    def to_json(self) -> dict[str, Any]:
+        """As the contract has it."""
+        return {"name": self.name, "location": self.location,
+                "parameters": {key: {"value": p.value, "std": p.std, "unit": p.unit}
+                               for key, p in self.parameters.items()},
+                "probability": self.probability, "indistinguishable_from": list(self.indistinguishable_from),
+                "share": self.share}
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """A value of the rig file with a tolerance: its estimate, standard deviation, and by how many tolerances it moved."""
+
+    parameter: str
+    value: float
+    std: float
+    moved: float
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What the updated model leaves of held-out records.
+
+    nrmse : over y, r.m.s. over_noise : over what noise alone leaves. share : of its power beyond noise over that of the
+    baseline. grows_with_level : whether it grows faster than the drives; None where the records do not tell.
+    """
+
+    nrmse: float
+    over_noise: float
+    share: float
+    grows_with_level: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -159,6 +194,8 @@ class Gap:
     detectable : where the verdict is none, sizes of five standard deviations of absent effects; else empty.
     shares : what accounts for the outputs' power, by level, the lowest first. records : what each record leaves.
     raised : sensors whose own noise is all that has no name; `remaining` then holds these.
+    traces : effects that are there, each below 1 % of the gap. left : what remains, in figures. tolerances : of the
+    updated model, the most moved first.
     """
 
     verdict: Verdict
@@ -181,20 +218,28 @@ class Gap:
     shares: tuple[PowerShares, ...] = ()
     records: tuple[RecordGap, ...] = ()
     raised: tuple[str, ...] = ()
+    traces: tuple[NamedEffect, ...] = ()
+    left: Remainder | None = None
+    tolerances: tuple[Tolerance, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """gap.json of the contract, format "avis-gap" version 1."""
         return {
             "format": "avis-gap", "version": 1, "verdict": self.verdict,
-            "effects": [{"name": one.name, "location": one.location,
-                         "parameters": {key: {"value": p.value, "std": p.std, "unit": p.unit}
-                                        for key, p in one.parameters.items()},
-                         "probability": one.probability,
-                         "indistinguishable_from": list(one.indistinguishable_from)} for one in self.effects],
+            "effects": [one.to_json() for one in self.effects],
+            "traces": [one.to_json() for one in self.traces],
             "gap": [{"stage": one.name, "nrmse": one.nrmse, "chi2_per_dof": one.chi2_per_dof} for one in self.stages],
-            "where": [{"from_Hz": one.from_Hz, "to_Hz": one.to_Hz, "input": one.input, "output": one.output,
-                       "share": one.share} for one in (self.where if self.verdict != "partly explained"
-                                                       else self.remaining)],
+            "where": _places(self.where if self.verdict != "partly explained" else self.remaining),
+            "remaining": None if self.left is None else {
+                "nrmse": self.left.nrmse, "over_noise": self.left.over_noise, "share": self.left.share,
+                "where": _places(self.remaining), "grows_with_level": self.left.grows_with_level},
+            "tolerances": [{"parameter": one.parameter, "value": one.value, "std": one.std,
+                            "tolerances_moved": one.moved} for one in self.tolerances],
             "next_experiment": self.next_experiment,
             "seconds": self.seconds,
         }
+
+
+def _places(places: Sequence[Where]) -> list[dict[str, Any]]:
+    return [{"from_Hz": one.from_Hz, "to_Hz": one.to_Hz, "input": one.input, "output": one.output, "share": one.share}
+            for one in places]

@@ -88,7 +88,7 @@ def shown(prepared: Prepared, found: Found, base: Refit, updated: Refit, judgeme
     remaining = places(after)
     sentences = (opening(judgement, ladder, after), *judgement.reasons, *bent(*ladder[:2]), prepared.noise)
     sensors = None if noise is None else {name: one.value for name, one in noise.sensors.items()}
-    records, shares = _every(prepared, base.model, judgement.updated.model, sensors)
+    records, shares = every_record(prepared, base.model, judgement.updated.model, sensors)
     onward = judgement.next_experiment
     if onward is None and judgement.verdict in ("unexplained", "partly explained"):
         onward = of_unexplained(remaining, records)
@@ -247,7 +247,7 @@ def _ratios(left: Left, edges: np.ndarray) -> np.ndarray:
     return found
 
 
-def _every(prepared: Prepared, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
+def every_record(prepared: Prepared, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
            ) -> tuple[tuple[RecordGap, ...], tuple[PowerShares, ...]]:
     """What the models leave of each record, fitted ones too, and what accounts for the outputs' power; on SHOWN_LINES
     lines of each record."""

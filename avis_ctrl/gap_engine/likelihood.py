@@ -7,11 +7,13 @@ z are standardised parameters; the whitened residual e is free of the transients
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.gap_engine.tolerances import Priors
 from avis_ctrl.gap_engine.weights import Group, Variances, Weights, bands, estimated, path_contributions, weigh
@@ -33,6 +35,7 @@ class Fitted:
 
     model : at the estimate. priors, z (n,), covariance (n, n) of z. variances : of what is not explained.
     log_evidence : Laplace. iterations : Gauss-Newton steps. e (N,) and J (n, N) : whitened, path errors integrated out.
+    groups : level and band of each entry of e, as rows by (level, band).
     """
 
     model: Any
@@ -44,6 +47,25 @@ class Fitted:
     iterations: int
     e: np.ndarray
     J: np.ndarray
+    groups: Mapping[Group, np.ndarray]
+
+    @property
+    def by_name(self) -> dict[str, float]:
+        """Standardised values by name."""
+        return dict(zip(self.priors.names, map(float, self.z), strict=True))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Effects of the model but the second-order terms."""
+        return tuple(one.label for one in self.model.effects if not isinstance(one.effect, LargeMotion))
+
+    def covariance_of(self, names: Sequence[str]) -> np.ndarray:
+        """(k, k) of some parameters in their units; zero for those that are not free."""
+        slopes = self.priors.slopes(self.z)
+        rows = [self.priors.names.index(name) if name in self.priors.names else -1 for name in names]
+        C = (self.covariance * slopes) * slopes[:, None]
+        C = np.pad(C, (0, 1))[np.ix_(rows, rows)]
+        return C
 
 
 def first_variances(data: Data, settings: GapSettings) -> Variances:
@@ -57,7 +79,7 @@ def first_variances(data: Data, settings: GapSettings) -> Variances:
             at, group = own == band, (level, int(band))
             path[group] = np.full(block.Y.shape[1], settings.first_error ** 2)
             power = np.sum(np.abs(block.Y[at, :, 0]) ** 2, axis=0)
-            distortion[group] = distortion.get(group, 0.0) + 0.01 * settings.first_error ** 2 * power
+            distortion[group] = distortion.get(group, 0.0) + settings.first_distortion * settings.first_error ** 2 * power
             count[group] = count.get(group, 0) + int(at.sum())
     return Variances(path, {group: value / count[group] for group, value in distortion.items()})
 
@@ -101,7 +123,17 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
     nu, v0 = settings.error_weight, settings.least_error ** 2
     hyper = sum(float(np.sum(-(nu / 2 + 1) * np.log(v) - nu * v0 / (2 * v))) for v in variances.path.values())
     log_evidence = -0.5 * (flat @ flat + z @ z + weights.log_determinant + np.linalg.slogdet(H)[1]) + hyper
-    return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), steps, flat, Jf)
+    return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), steps, flat, Jf,
+                  {one.group: one.rows for one in weights.paths})
+
+
+def log_likelihood(fitted: Fitted, data: Data, settings: GapSettings = SETTINGS) -> float:
+    """Of records that no fit has seen, by the fitted parameters and variances; what does not depend on them left out."""
+    paths = [path_contributions(fitted.model, block) for block in data.blocks]
+    weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
+    e, _, _ = _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, derivative=False)
+    flat = weights.flatten(e[None])[0]
+    return -0.5 * float(flat @ flat + weights.log_determinant)
 
 
 def _evaluate(model: Any, priors: Priors, z: np.ndarray, data: Data, weights: Weights, derivative: bool = True):

@@ -5,19 +5,26 @@ Priors are rows of their own below the residuals: e = (e, -z), J = (J, I). A dir
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from avis_ctrl.gap.score import Part, Score
 from avis_ctrl.gap_engine.likelihood import Data, Fitted
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.gap_engine.weights import Weights, path_contributions, weigh, with_distortion
+from avis_ctrl.identification.parameter_sets import default_parameters
 
 
 class EvidenceScore(Score):
     """`gap.score.Score` with path errors integrated out and normal priors on all parameters."""
 
     def __init__(self, fitted: Fitted, data: Data, settings: GapSettings = SETTINGS):
-        self.model, self.kept = fitted.model, {}
+        full = fitted.model
+        # What an effect fits by itself, to find where to begin, leaves the tolerances where they are.
+        rig = tuple(name for name in full.base.names if name in default_parameters(full.rig))
+        nominal = full.nominal and replace(full.nominal, names=rig)
+        self.model, self.kept = replace(full, base=replace(full.base, names=rig), nominal=nominal), {}
         blocks = [with_distortion(block, level, fitted.variances, settings)
                   for block, level in zip(data.blocks, data.levels, strict=True)]
         self.parts = [Part(self.model, block) for block in blocks]
@@ -25,7 +32,7 @@ class EvidenceScore(Score):
         self.weights: Weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
         n = len(fitted.z)
         e = np.concatenate([part.real((part.block.Y - part.answer.Y)[None])[0] for part in self.parts])
-        J = np.concatenate([part.real(self.model.answer(part.block, part.body, inner=part.inner).dY)
+        J = np.concatenate([part.real(full.answer(part.block, part.body, inner=part.inner).dY)
                             for part in self.parts], axis=1) * fitted.priors.slopes(fitted.z)[:, None]
         self.e = np.concatenate([self.weights.flatten(e[None])[0], -fitted.z])
         J = np.concatenate([self.weights.flatten(J), np.eye(n)], axis=1)

@@ -1,4 +1,12 @@
-"""Which effects the data ask for: score tests, refits, evidence; one effect after the other."""
+"""Which effects the data ask for: score tests, refits, evidence; one effect after the other.
+
+    evidence of a model = p(records | model), parameters and path errors integrated out (`likelihood`)
+
+At each step the effects that promise most by the score test are fitted, each beside what is there already with all
+parameters of the rig and all tolerances. The one of the largest evidence is taken if it beats the present model by more
+than the number of candidates explains. Then each effect found before is left out in turn: what the others explain as
+well goes.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +17,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.effects.base import Effect, Seed
-from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
+from avis_ctrl.gap.each import Each, one_by_one
+from avis_ctrl.gap.effects.base import Effect
+from avis_ctrl.gap.table_model import ActiveEffect, active
 from avis_ctrl.gap_engine.likelihood import Data, Fitted, fit
 from avis_ctrl.gap_engine.score import EvidenceScore
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
-from avis_ctrl.gap_engine.tolerances import Priors
+from avis_ctrl.gap_engine.tolerances import Priors, of_effect
+
+Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,85 +38,139 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One more effect: the fit with it, its gain of log evidence, and the other candidates' by label."""
+    """One more effect: the fit with it, and all fits that were tried in its place, by label.
 
+    before : the fit without it. candidates : how many effects and places were scored.
+    """
+
+    before: Fitted
     fitted: Fitted
-    gain: float
-    others: dict[str, float]
+    tried: dict[str, Fitted]
+    candidates: int
+
+    @property
+    def label(self) -> str:
+        return self.fitted.labels[-1]
 
 
-def priors_of(effect: ActiveEffect, settings: GapSettings) -> Priors:
-    """Broad normal priors of an effect's parameters: about none for its strength, about the start for its shape."""
-    mean = np.array([p.none if p.linear else v for p, v in zip(effect.parameters, effect.values, strict=True)])
-    sigma = np.array([settings.effect_sizes * p.size if p.linear else max(settings.shape_spread * abs(v), p.size)
-                      for p, v in zip(effect.parameters, effect.values, strict=True)])
-    low, high = (np.array([getattr(p, name) for p in effect.parameters]) for name in ("low", "high"))
-    return Priors(effect.names, mean, sigma, np.zeros(len(mean), bool), low, high)
+def name_of(label: str) -> tuple[str, str]:
+    """Name and location of an effect by its label, without the variant of its law."""
+    name, _, place = label.partition("@")
+    return name, place.partition("/")[0]
 
 
-def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings) -> list[Candidate]:
+def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each = one_by_one
+               ) -> list[Candidate]:
     """Every effect at every place at its best seed, the largest fall first."""
-    score, found = EvidenceScore(fitted, data, settings), []
-    model: TableModel = fitted.model
-    taken = {one.label for one in model.effects}
-    for effect in effects:
+    score = EvidenceScore(fitted, data, settings)
+    model, taken = score.model, {name_of(label) for label in fitted.labels}
+
+    def scored(effect: Effect) -> list[Candidate]:
         if effect.nonlinear and not model.motion:
-            continue
+            return []
+        found = []
         for place in effect.places(model):
-            if f"{effect.name}@{place}" in taken:
-                continue
-            seeds: list[Seed] = effect.seeds(score, place)
-            found += [Candidate(active(effect, model, place, seed.values), seed.chi2) for seed in seeds[:1]]
-    return sorted(found, key=lambda one: -one.fall)
+            if (effect.name, place.partition("/")[0]) not in taken:
+                found += [Candidate(active(effect, model, place, seed.values), seed.chi2)
+                          for seed in effect.seeds(score, place)[:1]]
+        return found
+    return sorted((one for own in each(scored, effects) for one in own), key=lambda one: -one.fall)
 
 
 def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candidate]:
-    """The best place of each name, as far as its fall may be worth its parameters."""
+    """The best place of each effect and law, as far as its fall may be worth its parameters."""
     least = 2 * (settings.certain + math.log(max(len(found), 1)))
-    chosen: dict[str, Candidate] = {}
+    chosen: dict[tuple[str, str], Candidate] = {}
     for one in found:
         if one.fall > least:
-            chosen.setdefault(one.effect.effect.name, one)
+            chosen.setdefault((one.effect.effect.name, one.effect.place.partition("/")[2]), one)
     return list(chosen.values())[:settings.refits]
 
 
-def with_effect(fitted: Fitted, candidate: Candidate, data: Data, settings: GapSettings) -> Fitted | None:
+def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSettings) -> Fitted | None:
     """The fit with one effect more; None where it came to no end."""
-    one = candidate.effect
     model = fitted.model.with_effect(one)
-    own = priors_of(one, settings)
-    free = [k for k, name in enumerate(own.names) if name in model.names]
-    own = Priors(tuple(own.names[k] for k in free), *(np.asarray(getattr(own, f))[free] for f in
-                                                      ("mean", "sigma", "positive", "low", "high")))
-    values = np.array(one.values)[free]
+    own = of_effect(one, settings).of([name for name in one.names if name in model.names])
+    own = _with_known(own, model.priors)
+    values = dict(zip(one.names, one.values, strict=True))
+    z = np.concatenate([fitted.z, own.z(np.array([values[name] for name in own.names]))])
+    return _try(fitted, model, fitted.priors.followed_by(own), z, data, settings)
+
+
+def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings) -> Fitted | None:
+    """The fit with one effect less."""
+    model = fitted.model.without(label)
+    rows = [fitted.priors.names.index(name) for name in model.names]
+    return _try(fitted, model, fitted.priors.of(model.names), fitted.z[rows], data, settings)
+
+
+def _with_known(priors: Priors, known) -> Priors:
+    """With what an effect says of parameters that records need not determine (`Effect.priors`)."""
+    rows = [priors.names.index(name) for name in known if name in priors.names]
+    mean, sigma = priors.mean.copy(), priors.sigma.copy()
+    for row in rows:
+        mean[row], sigma[row] = known[priors.names[row]]
+    return replace(priors, mean=mean, sigma=sigma)
+
+
+def _try(fitted: Fitted, model, priors: Priors, z: np.ndarray, data: Data, settings: GapSettings) -> Fitted | None:
     try:
-        return fit(model, fitted.priors.followed_by(own), np.concatenate([fitted.z, own.z(values)]), data,
-                   fitted.variances, settings)
+        return fit(model, priors, z, data, fitted.variances, settings)
     except (AvisError, np.linalg.LinAlgError, FloatingPointError):
         return None
 
 
 def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
-           progress: Callable[[str], None] = lambda text: None) -> list[Step]:
-    """Effects in the order in which they are found."""
+           progress: Progress = lambda text: None, each: Each = one_by_one,
+           enough: Callable[[Step], bool] = lambda step: False) -> list[Step]:
+    """Effects in the order in which they are found.
+
+    enough : whether the search may end with a step, because what it found takes next to nothing.
+    """
     steps: list[Step] = []
-    now, quick = base, replace(settings, rounds=1, iterations=4)
+    now = base
+    quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
     while len(steps) < settings.longest:
-        found = candidates(now, data, effects, settings)
+        progress(f"effects that may be missing, step {len(steps) + 1}")
+        found = candidates(now, data, effects, settings, each)
         chosen = shortlist(found, settings)
-        progress("score: " + ", ".join(f"{one.effect.label} {one.fall:.4g}" for one in found[:6]))
-        made = {one.effect.label: with_effect(now, one, data, quick) for one in chosen}
-        gains = {label: one.log_evidence - now.log_evidence for label, one in made.items() if one is not None}
-        ranked = sorted(gains.items(), key=lambda pair: -pair[1])
-        progress("evidence: " + ", ".join(f"{label} {gain:+.4g}" for label, gain in ranked))
-        if not gains:
+        if not chosen:
             break
-        best = max(gains, key=lambda label: gains[label])
-        if gains[best] < settings.certain + math.log(max(len(found), 1)):
+        made = dict(zip([one.effect.label for one in chosen],
+                        each(lambda one, now=now: with_effect(now, one.effect, data, quick), chosen), strict=True))
+        tried = {label: one for label, one in made.items() if one is not None}
+        tried = {label: one for label, one in tried.items() if not implausible(one)} or tried
+        if not tried:
             break
-        start = made[best]
-        assert start is not None
+        best = max(tried, key=lambda label: tried[label].log_evidence)
+        if tried[best].log_evidence - now.log_evidence < settings.certain + math.log(len(found)):
+            break
+        start = tried[best]
         full = fit(start.model, start.priors, start.z, data, start.variances, settings)
-        steps.append(Step(full, full.log_evidence - now.log_evidence, gains))
+        steps.append(Step(now, full, tried, len(found)))
+        progress(f"step {len(steps)}: {', '.join(full.labels)}")
+        if enough(steps[-1]):
+            break
         now = full
     return steps
+
+
+def implausible(fitted: Fitted) -> str:
+    """Why physics forbids the values of some effect; empty where it does not."""
+    for one in fitted.model.effects:
+        std = np.sqrt(np.maximum(np.diag(fitted.covariance_of(one.names)), 0))
+        values = dict(zip((p.name for p in one.parameters), std, strict=True))
+        if reason := one.effect.implausible(one.by_name, values) or at_the_edge(one):
+            return str(reason)
+    return ""
+
+
+def at_the_edge(effect: ActiveEffect) -> str:
+    """A shape parameter that ran to the end of what physics allows: the effect has turned into something else."""
+    for parameter, value in zip(effect.parameters, effect.values, strict=True):
+        span = parameter.high - parameter.low
+        if not parameter.linear and not parameter.optional and (value > parameter.high - 1e-6 * span
+                                                                or value < parameter.low + 1e-6 * span):
+            return (f"{parameter.name} of {effect.effect.name} runs to {value:.3g} {parameter.unit}, the end of its "
+                    "range")
+    return ""

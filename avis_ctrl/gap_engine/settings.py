@@ -14,6 +14,9 @@ class GapSettings:
     damping_percent : the same of dampings [%], which data sheets hardly state.
     lines : spectral lines of a record that are fitted; with 8 drives and 6 sensors the response needs about 100, and
         three times as many make the estimate of the unexplained part precise.
+    fewest_lines : lines of a record in the band below which a fit with its transient determines nothing.
+    few_clipped : share of a channel's samples beyond its limits from which repaired samples are predicted anew.
+    repairs : how often, each time with the better model that the last repair allowed.
     bands_per_octave : bands over which the relative error of a path counts as constant; a third of an octave is what a
         mode's flank takes to change by a factor of two.
     least_error : relative error of every path that nobody can exclude [1], the scale of its prior: cables, threads and
@@ -22,30 +25,77 @@ class GapSettings:
     first_error : relative error of the paths in the first fit [1], before any residual is known.
     rounds : estimates of the variances, each from the fit before it.
     iterations : Gauss-Newton steps between two estimates of the variances.
+    first_distortion : distortion in the first fit, over the square of `first_error` [1].
+    least_distortion : distortion that nobody can exclude, over the noise [1]; below it an estimate is round-off.
+    least_eigenvalue : of the path errors' covariance over that of the noise, below which a direction is left out [1].
+    second_order_percent : prior standard deviation of the second-order terms of rotations [%]: Newton and Euler have
+        them, and they hang on a geometry known to some per cent.
+    turning_percent : the same of the share of the rotation that turns the axes of motors and sensors [%], which a rig
+        file does not state.
     effect_sizes : prior standard deviation of an effect's strength, in units of its parameter's size; broad, so that it
         costs some nats and bends nothing.
     shape_spread : prior standard deviation of a parameter that shapes an effect (a frequency), relative to its start.
     refits : effects that are refitted at each step of the search, the best by the score test.
+    quick_rounds, quick_iterations : `rounds` and `iterations` of a fit that only compares candidates.
     longest : most effects that are named together.
     certain : gain of log evidence [nats] that a name needs beside the logarithm of the number of candidates: odds of
         a hundred.
+    outside_odds : how many times as probable an effect of the library is beforehand as one that has no name in it [1].
+    rival : probability from which another name cannot be ruled out [1]; one in twenty.
+    headline : probability below which a name is an alternative only [1].
+    most_sure : largest probability that is reported [1]: what nobody thought of leaves so much.
+    trace : share of the gap's power below which an effect is a trace [1].
+    law_p_value, law_change : an effect is refuted where its parameters from half of the data (by band, by level) differ
+        from the whole with a smaller p-value than this [1] and by more than this share [1]; real elements follow their
+        textbook law to some per cent only, which no p-value knows.
+    least_difference : of the variance of a difference between a half and the whole over the whole's, below which it is
+        round-off [1].
+    within_noise : chi-square per degree of freedom up to which what remains counts as noise [1]: a tenth in r.m.s.,
+        which is what the noise's own estimate leaves open.
+    small : r.m.s. of what remains over the response below which nothing is missing [1] (contract).
+    explained : share of the baseline's excess power that must be gone for a gap to count as explained [1] (contract).
+    known_noise : chi-square per degree of freedom up to which what remains tells the level of floor and sensors [1].
+    shown_runners_up : runners-up that are reported.
     converged : change of the penalised sum of squares, relative to the number of data, below which a fit has converged.
     """
 
     stiffness_percent: float = 5.0
     damping_percent: float = 20.0
     lines: int = 300
+    fewest_lines: int = 60
+    few_clipped: float = 1e-5
+    repairs: int = 3
     bands_per_octave: int = 3
     least_error: float = 1e-3
     error_weight: float = 2.0
     first_error: float = 0.05
     rounds: int = 4
     iterations: int = 6
+    first_distortion: float = 0.01
+    least_distortion: float = 0.02
+    least_eigenvalue: float = 1e-8
+    second_order_percent: float = 20.0
+    turning_percent: float = 50.0
     effect_sizes: float = 100.0
     shape_spread: float = 1.0
     refits: int = 6
-    longest: int = 3
+    quick_rounds: int = 1
+    quick_iterations: int = 4
+    longest: int = 5
     certain: float = 4.6
+    outside_odds: float = 10.0
+    rival: float = 0.05
+    headline: float = 0.5
+    most_sure: float = 0.99
+    trace: float = 0.01
+    law_p_value: float = 1e-4
+    law_change: float = 0.2
+    least_difference: float = 1e-3
+    within_noise: float = 1.21
+    small: float = 0.01
+    explained: float = 0.9
+    known_noise: float = 2.25
+    shown_runners_up: int = 12
     converged: float = 1e-6
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from avis_ctrl.gap.effects.large_motion import LargeMotion
+from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
@@ -44,12 +46,20 @@ class Priors:
         """Both, one after the other."""
         def both(name: str) -> np.ndarray:
             return np.concatenate([np.broadcast_to(getattr(one, name), len(one.names)) for one in (self, other)])
-        fields = ("mean", "sigma", "positive", "low", "high")
-        return Priors((*self.names, *other.names), *(both(name) for name in fields))
+        return Priors((*self.names, *other.names), *map(both, _FIELDS))
+
+    def of(self, names: Sequence[str]) -> Priors:
+        """Those of some parameters, in their order. Raises ValueError for one that is not there."""
+        rows = [self.names.index(name) for name in names]
+        return Priors(tuple(names), *(np.broadcast_to(getattr(self, field), len(self.names))[rows]
+                                      for field in _FIELDS))
 
     def slopes(self, z: np.ndarray) -> np.ndarray:
         """(n,) derivative of the values by z."""
         return np.where(self.positive, self.sigma * self.values(z), self.sigma)
+
+
+_FIELDS = ("mean", "sigma", "positive", "low", "high")
 
 
 def re_identified(rig: Rig, settings: GapSettings = SETTINGS) -> Priors:
@@ -70,6 +80,19 @@ def with_tolerances(model: ResponseModel, tolerances: Tolerances, settings: GapS
     own = np.array(list(rest.values()))
     return Priors((*first.names, *rest), np.concatenate([first.mean, mean]), np.concatenate([first.sigma, own]),
                   np.concatenate([first.positive, relative]))
+
+
+def of_effect(effect: ActiveEffect, settings: GapSettings = SETTINGS) -> Priors:
+    """Broad normal priors of an effect's parameters: about none for its strength, about where its fit begins for what
+    shapes it. Those of the second-order terms are narrow: they are known but for what turns with the payload."""
+    if isinstance(effect.effect, LargeMotion):
+        sigma = np.array([settings.second_order_percent, *[settings.turning_percent] * 2]) / 100
+        return Priors(effect.names, np.array(effect.values), sigma, np.zeros(3, bool))
+    mean = np.array([p.none if p.linear else v for p, v in zip(effect.parameters, effect.values, strict=True)])
+    sigma = np.array([settings.effect_sizes * p.size if p.linear else max(settings.shape_spread * abs(v), p.size)
+                      for p, v in zip(effect.parameters, effect.values, strict=True)])
+    low, high = (np.array([getattr(p, name) for p in effect.parameters]) for name in ("low", "high"))
+    return Priors(effect.names, mean, sigma, np.zeros(len(mean), bool), low, high)
 
 
 _RELATIVE: Mapping[str, str] = {"actuator": "actuator_gain_percent", "sensor": "sensor_gain_percent",

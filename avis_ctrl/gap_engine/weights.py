@@ -32,6 +32,13 @@ class Variances:
     path: Mapping[Group, np.ndarray]
     distortion: Mapping[Group, np.ndarray]
 
+    def of(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
+        """v and s (n_y,) of a level and band, or of the nearest that was fitted."""
+        if group not in self.path:
+            level, band = group
+            group = min(self.path, key=lambda g: (abs(np.log(max(g[0], 1e-9) / max(level, 1e-9))), abs(g[1] - band)))
+        return self.path[group], self.distortion[group]
+
 
 def bands(omega: np.ndarray, per_octave: int) -> np.ndarray:
     """(n,) number of the band of each line, counted from 1 rad/s."""
@@ -85,7 +92,7 @@ def with_distortion(block: SpectralBlock, level: float, variances: Variances, se
     """The block with noise and distortion as its covariance."""
     assert block.noise is not None
     own = bands(block.omega, settings.bands_per_octave)
-    s = np.array([variances.distortion[level, int(band)] for band in own])
+    s = np.array([variances.of((level, int(band)))[1] for band in own])
     return block.with_noise(block.noise[:, 0] + s[:, :, None] * np.eye(s.shape[1]))
 
 
@@ -115,15 +122,16 @@ def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Seque
             members.setdefault((level, int(band)), []).append((rows, real))
     errors = []
     for group, parts in members.items():
-        n_y = len(variances.path[group])
+        v, _ = variances.of(group)
+        n_y = len(v)
         n_in = parts[0][1].shape[1] // (2 * n_y)
         columns = np.concatenate([part[1] for part in parts])
         sensor = np.tile(np.repeat(np.arange(n_y), n_in), 2)
         used = np.any(columns != 0, axis=0)
         columns, sensor = columns[:, used], sensor[used]
-        B = columns * np.sqrt(variances.path[group][sensor] / 2)
+        B = columns * np.sqrt(v[sensor] / 2)
         values, vectors = np.linalg.eigh(B.T @ B)
-        kept = values > 1e-8
+        kept = values > settings.least_eigenvalue
         Q = B @ vectors[:, kept] / np.sqrt(values[kept])
         errors.append(PathError(group, np.concatenate([part[0] for part in parts]), columns, sensor, Q, values[kept]))
         total += float(np.sum(np.log1p(values[kept])))
@@ -164,5 +172,5 @@ def estimated(weights: Weights, e: np.ndarray, error: Sequence[np.ndarray], bloc
             entry[1] = entry[1] + np.sum(noise[at], axis=0)
             entry[2] += int(at.sum())
     for group, (power, noise, count) in sums.items():
-        distortion[group] = np.maximum(power - noise, 0.02 * noise) / count
+        distortion[group] = np.maximum(power - noise, settings.least_distortion * noise) / count
     return Variances(path, distortion)

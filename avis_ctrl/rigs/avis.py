@@ -21,6 +21,9 @@ from avis_ctrl.rigs.rig import Parameter, Place, Rig
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, point_map
 
 AXES = ("x", "y", "z")
+# A drive or sensor no further from a mount's attachment than this [m], and no further from an earth axis than this
+# [rad], sits in the mount: many tolerances of its place and direction, and much less than mounts are apart.
+IN_MOUNT_m, IN_MOUNT_rad = 0.03, 0.3
 INERTIA = ("J1", "J2", "J3", "J12", "J13", "J23")
 _ISOLATOR_PARAMETER = re.compile(r"isolator(\d+)\.(k|c|p)_([xyz])")
 _UNITS = {"k": "N/m", "c": "N s/m", "p": "m"}
@@ -169,6 +172,22 @@ class AvisTable(Rig):
     @cached_property
     def _by_name(self) -> dict[str, Any]:
         return {one.name: one for one in (*self.all_drives, *self.instruments)}
+
+    def mount_of(self, channel: str) -> tuple[str, float] | None:
+        """Mount and earth axis ("isolator1.x") that a drive or sensor sits in, and the sign of its direction along that
+        axis; None for one that sits in none."""
+        place, direction = self._channels[channel]
+        away = [float(np.linalg.norm(np.subtract(one.position, place))) for one in self.isolators]
+        nearest, k = int(np.argmin(away)), int(np.argmax(np.abs(direction)))
+        if away[nearest] > IN_MOUNT_m or abs(direction[k]) < np.cos(IN_MOUNT_rad):
+            return None
+        return f"isolator{nearest + 1}.{AXES[k]}", float(np.sign(direction[k]))
+
+    @cached_property
+    def _channels(self) -> dict[str, tuple[Triple, Triple]]:
+        """Place and direction of every drive and sensor by name."""
+        return {one.name: (one.position, one.direction) for one in (*self.all_drives, *self._attached(),
+                                                                    *self.instruments)}
 
     def with_channels_apart(self) -> AvisTable:
         """The same table with each motor and geophone at a place of its own, which does not move with the isolator."""

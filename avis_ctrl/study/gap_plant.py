@@ -199,8 +199,9 @@ def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
                     add(key, change * known[key].value)
         elif name == "contact_friction":
             each = dict(zip(model.actuators, contacts(values), strict=True))
-            for motor in model.rig.motors:  # type: ignore[attr-defined]
-                add(f"isolator{motor.isolator}.k_{motor.axis}", float(each[motor.name]))
+            for name, stiffness in each.items():
+                mount, axis = model.rig.mount_of(name)[0].split(".")  # type: ignore[attr-defined]
+                add(f"{mount}.k_{axis}", float(stiffness))
     return Carried(_with_sensitivity(rig.with_parameters(changes), model, factors), asked, tuple(inside),
                    tuple(outside))
 

@@ -47,7 +47,7 @@ class PayloadFlexibleMode(Effect):
     holds_states = True
 
     def places(self, model: TableModel) -> tuple[str, ...]:
-        return ("payload", "payload/two", "payload/three") if shape_points(model) is not None else ()
+        return ("payload", "payload/two", "payload/three") if shape_points(model) else ()
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
         names = mount_geometry(model.rig).names
@@ -125,23 +125,22 @@ def modes(values: Mapping[str, float]) -> list[tuple[float, float, np.ndarray]]:
     return [(float(own[0]), float(own[1]), own[2:]) for own in np.split(numbers, count)]
 
 
-def shape_points(model: TableModel) -> bool | None:
-    """Whether every motor and sensor sits in a mount, along an earth axis; None where not."""
-    try:
-        shape_rows(model.rig, model.actuators, model.sensors.names)
-    except (KeyError, AttributeError):
-        return None
-    return True
+def shape_points(model: TableModel) -> bool:
+    """Whether every motor and sensor sits in a mount, along an earth axis."""
+    find = getattr(model.rig, "mount_of", None)
+    return find is not None and all(find(name) for name in (*model.actuators, *model.sensors.names))
 
 
 def shape_rows(rig, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """(n_u, n_g) and (n_y, n_g): which mount and axis each motor and each sensor sits in."""
+    """(n_u, n_g) and (n_y, n_g): which mount and axis each motor and each sensor sits in, with its sign."""
     order = {name: k for k, name in enumerate(mount_geometry(rig).names)}
-    motors = {motor.name: f"isolator{motor.isolator}.{motor.axis}" for motor in rig.motors}
-    g = rig.geophones
-    places = {name: f"isolator{i}.{axis}" for name, i, axis in zip(g.names, g.isolator, g.axis, strict=True)}
-    return (np.eye(len(order))[[order[motors[name]] for name in actuators]],
-            np.eye(len(order))[[order[places[name]] for name in sensors]])
+
+    def rows(names: Sequence[str]) -> np.ndarray:
+        found = np.zeros((len(names), len(order)))
+        for k, (mount, sign) in enumerate(rig.mount_of(name) for name in names):
+            found[k, order[mount]] = sign
+        return found
+    return rows(actuators), rows(sensors)
 
 
 def _modes_one_by_one(score: Score, grid: Sequence[float], most: int = len(COUNTS)) -> list[tuple[int, Seed]]:

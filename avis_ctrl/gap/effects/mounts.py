@@ -295,8 +295,8 @@ class ContactFriction(Effect):
     strength = "stiffness_N_per_m"
 
     def places(self, model: TableModel) -> tuple[str, ...]:
-        in_mounts = {motor.name for motor in getattr(model.rig, "motors", ())}
-        return ("actuators",) if has_mounts(model) and in_mounts >= set(model.actuators) else ()
+        find = getattr(model.rig, "mount_of", None)
+        return ("actuators",) if find and has_mounts(model) and all(map(find, model.actuators)) else ()
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
         rms, k = median_rms(model), float(np.mean(mount_geometry(model.rig).stiffness))

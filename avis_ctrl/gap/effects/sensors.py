@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from avis_ctrl.gap.table_model import TableModel
 
 GRAVITY = 9.80665
+# A sensor counts as lying along an earth axis up to this tilt [rad].
+TILTED_rad = 0.3
 
 
 def second_order(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
@@ -34,9 +36,9 @@ def suspensions(rig: Rig) -> dict[str, tuple[float, float]]:
 
 
 def axis_of(model: TableModel, sensor: str) -> str:
-    """x, y or z: the earth axis that a sensor lies along; empty where it lies along none."""
+    """x, y or z: the earth axis that a sensor lies along, within what one is tilted; empty where it lies along none."""
     direction = model.rig.sensor_axes()[sensor][1]
-    along = np.flatnonzero(np.abs(direction) > 1 - 1e-9)
+    along = np.flatnonzero(np.abs(direction) > np.cos(TILTED_rad))
     return "xyz"[along[0]] if len(along) else ""
 
 

@@ -1,0 +1,325 @@
+"""The gap between a rig and a campaign, from signals to verdict.
+
+    prepare -> fit of rig -> with tolerances -> search -> names -> stages, shares and what remains
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.gap.detectable import detectable
+from avis_ctrl.gap.each import Each, one_by_one
+from avis_ctrl.gap.effects.base import Effect, library
+from avis_ctrl.gap.effects.beyond import beyond
+from avis_ctrl.gap.in_words import in_words
+from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplained
+from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
+from avis_ctrl.gap.show import Left, every_record, heat_map, places
+from avis_ctrl.gap.signal_effects import left_by, levels, named
+from avis_ctrl.gap_engine.likelihood import Data, Fitted, first_variances, fit, log_likelihood
+from avis_ctrl.gap_engine.preparation import Prepared, mended_with, prepare, with_second_order
+from avis_ctrl.gap_engine.score import EvidenceScore
+from avis_ctrl.gap_engine.search import Step, implausible, name_of, search, without_effect
+from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
+from avis_ctrl.gap_engine.tolerances import of_effect, re_identified, with_tolerances
+from avis_ctrl.gap_engine.validation import Power, halves, share_of
+from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.rigs.instruments import Tolerances
+from avis_ctrl.rigs.rig import Rig
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """base : the rig re-identified. tolerant : with every tolerance. steps : of the search."""
+
+    base: Fitted
+    tolerant: Fitted
+    steps: tuple[Step, ...]
+
+    @property
+    def best(self) -> Fitted:
+        return self.steps[-1].fitted if self.steps else self.tolerant
+
+
+@dataclass(frozen=True, eq=False)
+class Names:
+    """What is named. updated : the model with it. probability, rivals : by label of its effects. refused : why what was
+    found is not named, in sentences."""
+
+    updated: Fitted
+    probability: dict[str, float]
+    rivals: dict[str, tuple[str, ...]]
+    refused: tuple[str, ...] = ()
+
+
+def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, float] | None = None,
+            amplifier_corner_Hz: float | None = None, effects: Sequence[Effect] | None = None,
+            progress: Progress = lambda text: None, each: Each = one_by_one, settings: GapSettings = SETTINGS) -> Gap:
+    """Find, name and close the gap.
+
+    Parameters
+    ----------
+    campaign : records in the rig's own words, driven ones among them. rig : as its file has it.
+    band_Hz : of the comparison; the excited one where None. effects : candidates; the library where None.
+    each : how independent fits are done; one after the other by default.
+
+    Raises
+    ------
+    InputError : a campaign that drives nothing, or tells no noise.
+    """
+    began = time.monotonic()
+    prepared = prepare(campaign, rig, band_Hz, amplifier_corner_Hz, progress, each, settings)
+    known = list(library().values()) if effects is None else list(effects)
+    fits = _fits(prepared, rig, known, progress, each, settings)
+    if prepared.clipped is not None and fits.steps:
+        progress("clipped samples: what the model with its effects expects behind the limits")
+        prepared = mended_with(prepared, fits.best.model, progress, each, settings)
+        fits = _fits(prepared, rig, known, progress, each, settings)
+    progress("names, and what held-out records say of them")
+    names = _names(fits, prepared, settings)
+    return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
+
+
+def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Progress, each: Each,
+          settings: GapSettings) -> Fits:
+    data = prepared.data(prepared.fitted, settings.lines)
+    progress("fit of mass, inertia, stiffness and damping")
+    start, nominal = prepared.rough, prepared.nominal.base
+    large = of_effect(start.effects[0], settings)
+    priors = re_identified(nominal.rig, settings).followed_by(large)
+    base = fit(start, priors, priors.z(start.values), data, first_variances(data, settings), settings)
+    progress("the same with all tolerances")
+    tolerances = with_tolerances(nominal, rig.tolerances or Tolerances(), settings)
+    apart = replace(base.model, base=replace(base.model.base, names=tolerances.names),
+                    nominal=replace(nominal, names=tolerances.names))
+    priors = tolerances.followed_by(large)
+    tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
+    ground = _excess(base, data)
+
+    def enough(step: Step) -> bool:
+        """What was found takes next to nothing of the gap."""
+        rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
+        return rise < settings.trace * ground
+    steps = search(tolerant, data, [*effects, *beyond().values()], settings, progress, each, enough)
+    return Fits(base, tolerant, tuple(steps))
+
+
+def _left(model, data: Data) -> float:
+    return Left.of(model, data.blocks).nrmse ** 2
+
+
+def _excess(base: Fitted, data: Data) -> float:
+    left = Left.of(base.model, data.blocks)
+    return left.nrmse ** 2 - left.noise_nrmse ** 2
+
+
+def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
+    """What was found and stands: the more probable of its alternatives, of the same size in both halves of band and
+    level, and borne out by held-out records."""
+    data, held = (prepared.data(blocks, settings.lines) for blocks in (prepared.fitted, prepared.held_out))
+    best, probability, rivals, refused = fits.best, {}, {}, []
+    for step in fits.steps:
+        probability[step.label], rivals[step.label] = _probability(step, settings)
+    for step in fits.steps:
+        label = step.label
+        why = _refusal(fits.best, step, label, probability[label], held, settings)
+        if why:
+            one = next(effect for effect in fits.best.model.effects if effect.label == label)
+            refused.append(f"it behaves most like {one.effect.said(one.place, one.by_name)}, for which the library has "
+                           "no name" if one.effect.outside else f"{one.effect.name} comes nearest, but {why}: not named")
+            best = without_effect(best, label, data, settings) or best
+    kept = {label: value for label, value in probability.items() if label in best.labels}
+    return Names(best, kept, {label: rivals[label] for label in kept}, tuple(refused))
+
+
+def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Data, settings: GapSettings) -> str:
+    """Why an effect that was found is not named; empty where it is."""
+    one = next(effect for effect in best.model.effects if effect.label == label)
+    if one.effect.outside:
+        return "the library has no name for it"
+    if probability < settings.headline:
+        return f"another explanation is as probable ({probability:.2f})"
+    if reason := implausible(replace(best, model=replace(best.model, effects=(one,)))):
+        return reason
+    if log_likelihood(step.fitted, held, settings) <= log_likelihood(step.before, held, settings):
+        return "held-out records do not bear it out"
+    strength = [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
+    for half in halves(best, strength, settings):
+        if half.p_value < settings.law_p_value and half.change > settings.law_change:
+            return f"{half.words} ask for another size, by {100 * half.change:.0f} %"
+    return ""
+
+
+def _probability(step: Step, settings: GapSettings) -> tuple[float, tuple[str, ...]]:
+    """Probability of the effect that was taken among all that were fitted in its place, and the names that cannot be
+    ruled out. What has no name in the library is less probable beforehand."""
+    by: dict[tuple[str, str], float] = {("", ""): step.before.log_evidence}
+    for label, one in step.tried.items():
+        outside = one.model.effects[-1].effect.outside
+        value = one.log_evidence - (math.log(settings.outside_odds) if outside else 0.0)
+        key = name_of(label)
+        by[key] = max(by.get(key, -np.inf), value)
+    top = max(by.values())
+    weight = {key: math.exp(value - top) for key, value in by.items()}
+    whole = sum(weight.values())
+    own = name_of(step.label)
+    rivals = [name for (name, place), one in sorted(weight.items(), key=lambda item: -item[1])
+              if (name, place) != own and name and one / whole > settings.rival]
+    return min(weight[own] / whole, settings.most_sure), tuple(dict.fromkeys(one for one in rivals if one != own[0]))
+
+
+def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect], seed: int, began: float,
+         progress: Progress, each: Each, settings: GapSettings) -> Gap:
+    """Figures, maps and sentences, all on held-out records."""
+    blocks, updated = prepared.held_out, names.updated
+    before, after = Left.of(fits.base.model, blocks), Left.of(updated.model, blocks)
+    raw = Left.of(fits.base.model, prepared.unmasked)
+    noise = after.noise_nrmse ** 2
+    power = Power(noise, before.nrmse ** 2)
+    stages = [Stage("nominal", *_figures(Left.of(with_second_order(prepared.nominal), prepared.unmasked))),
+              Stage("re-identified", *_figures(raw)),
+              Stage("tolerances", *_figures(Left.of(fits.tolerant.model, blocks)))]
+    stages += [Stage(name_of(step.label)[0], *_figures(Left.of(step.fitted.model, blocks))) for step in fits.steps
+               if step.label in updated.labels and set(step.fitted.labels) < set(updated.labels)]
+    if updated.labels:
+        stages.append(Stage(name_of(updated.labels[-1])[0], *_figures(after)))
+    found = [_named(one, updated, names, power, after.nrmse ** 2, prepared) for one in updated.model.effects
+             if one.label in updated.labels]
+    faults = prepared.faults
+    if after.chi2_per_dof <= settings.known_noise:
+        progress("noise of floor and sensors")
+        left = left_by(prepared.campaign, updated.model, each)
+        faults = replace(faults, noise=levels(left, updated.model, faults.hum, faults.converter))
+    found += [replace(one, share=_share_of_signal(one.name, raw, before, power)) for one in named(faults)]
+    found.sort(key=lambda one: -one.share)
+    told = tuple(one for one in found if one.share >= settings.trace)
+    traces = tuple(one for one in found if one.share < settings.trace)
+    excess = after.nrmse ** 2 - noise
+    records, shares = every_record(prepared, fits.base.model, updated.model, _sensors(faults))
+    growth = grows(records)
+    remainder = Remainder(after.nrmse, after.nrmse / max(after.noise_nrmse, 1e-300), power.share(excess),
+                          None if growth is None else bool(growth[0] > LINEAR + 2 * growth[1]))
+    closed = after.chi2_per_dof <= settings.within_noise or excess <= 0
+    verdict = _verdict(told, closed, remainder, settings)
+    where, remaining = places(before), places(after)
+    onward = _next(told, fits, names)
+    if onward is None and verdict in ("unexplained", "partly explained"):
+        onward = of_unexplained(remaining, records)
+    limits = ()
+    if verdict == "none":
+        progress("how large an effect would have had to be to be seen")
+        data = prepared.data(prepared.fitted, settings.lines)
+        limits = detectable(EvidenceScore(fits.tolerant, data, settings), effects)
+    sentences = (_opening(verdict, told, traces, stages, remainder, after), *names.refused, _remains(remainder, remaining),
+                 prepared.noise)
+    return Gap(verdict, told, tuple(stages), where if verdict != "none" else (), remaining, after.noise_nrmse, onward,
+               fits.base.model, updated.model, _considered(fits, names, prepared, settings), heat_map(before, after),
+               tuple(one for one in sentences if one), prepared.halves.how, seed, time.monotonic() - began,
+               updated.covariance_of(updated.model.names), limits, shares, records, faults.raised if closed else (),
+               traces, remainder, _moved(updated))
+
+
+def _figures(left: Left) -> tuple[float, float]:
+    return left.nrmse, left.chi2_per_dof
+
+
+def _sensors(faults) -> dict[str, float] | None:
+    return None if faults.noise is None else {name: one.value for name, one in faults.noise.sensors.items()}
+
+
+def _named(one, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared) -> NamedEffect:
+    reported = one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names))
+    return NamedEffect(one.effect.name, name_of(one.label)[1], one.effect.title, reported,
+                       names.probability[one.label], names.rivals[one.label], label=one.label,
+                       share=share_of(updated.model, one.label, prepared.held_out, power, with_it))
+
+
+def _share_of_signal(name: str, raw: Left, masked: Left, power: Power) -> float:
+    """Of what acts on the signals alone, over the baseline's excess with it: hum by the lines that it spoils; what is in
+    the noise (floor, converter) by the noise itself."""
+    own = max(raw.nrmse ** 2 - masked.nrmse ** 2, 0.0) if name == "mains_hum" else power.noise
+    return float(own / max(own + power.excess, 1e-300))
+
+
+def _verdict(told: Sequence[NamedEffect], closed: bool, left: Remainder, settings: GapSettings) -> Verdict:
+    """By the rules of the contract."""
+    if not told:
+        return "none" if closed or left.nrmse < settings.small else "unexplained"
+    return "explained" if closed or left.share <= 1 - settings.explained else "partly explained"
+
+
+def _moved(fitted: Fitted) -> tuple[Tolerance, ...]:
+    """Every value of the rig file with a tolerance, the most moved first."""
+    units = dict(zip(fitted.model.names, fitted.model.units, strict=True))
+    known = re_identified(fitted.model.rig).names
+    values = fitted.priors.values(fitted.z)
+    std = np.sqrt(np.diag(fitted.covariance)) * fitted.priors.slopes(fitted.z)
+    rows = [Tolerance(name, float(values[k]), float(std[k]), float(fitted.z[k]), units[name])
+            for k, name in enumerate(fitted.priors.names) if "@" not in name and name not in known]
+    return tuple(sorted(rows, key=lambda one: -abs(one.moved)))
+
+
+def _next(told: Sequence[NamedEffect], fits: Fits, names: Names) -> str | None:
+    """Which measurement would tell an effect from what it cannot be told from."""
+    for one in told:
+        if one.indistinguishable_from and one.label:
+            step = next(step for step in fits.steps if step.label == one.label)
+            other = one.indistinguishable_from[0]
+            model = next(fit.model for label, fit in step.tried.items() if name_of(label)[0] == other)
+            return between(one.name, other, step.tried[step.label].model, model)
+    return None
+
+
+def _considered(fits: Fits, names: Names, prepared: Prepared, settings: GapSettings) -> tuple[Considered, ...]:
+    """What was fitted and not named, step by step, the most probable first."""
+    rows, thin = [], prepared.data(prepared.held_out, settings.lines).blocks
+    for number, step in enumerate(fits.steps, 1):
+        top = max(one.log_evidence for one in step.tried.values())
+        for label, one in sorted(step.tried.items(), key=lambda item: -item[1].log_evidence):
+            effect = one.model.effects[-1]
+            if effect.effect.outside or label in names.updated.labels:
+                continue
+            reason = implausible(one) or (f"step {number}: log evidence {top - one.log_evidence:.3g} behind")
+            reported = effect.effect.reported(one.model, effect.place, effect.by_name, one.covariance_of(effect.names))
+            rows.append(Considered(effect.effect.name, name_of(label)[1], Left.of(one.model, thin).chi2_per_dof,
+                                   min(math.exp(one.log_evidence - top), settings.most_sure), reason, reported))
+    return tuple(sorted(rows, key=lambda one: -one.probability)[:settings.shown_runners_up])
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
+
+
+def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[NamedEffect], stages: Sequence[Stage],
+             left: Remainder, after: Left) -> str:
+    """The one sentence."""
+    before = next(one.nrmse for one in stages if one.name == "re-identified")
+    rest = f"noise alone {_percent(after.noise_nrmse)}"
+    beside = f", beside traces of {' and '.join(one.name for one in traces)}" if traces else ""
+    if verdict == "none":
+        return (f"No missing effect shows{beside}: with all tolerances the model leaves {_percent(left.nrmse)} of the "
+                f"held-out records, {rest}.")
+    if verdict == "unexplained":
+        return (f"Something is missing that the library has no name for{beside}: with all tolerances the model leaves "
+                f"{_percent(left.nrmse)} of the held-out records, {rest}.")
+    return (f"Missing from the model: {' and '.join(map(in_words, told))}{beside}; with that and all tolerances the gap "
+            f"falls from {_percent(before)} to {_percent(left.nrmse)}, {rest}.")
+
+
+def _remains(left: Remainder, remaining: Sequence[Where]) -> str:
+    """How much remains, where, and at which level."""
+    if left.over_noise <= 1.05:
+        return "what remains is the noise"
+    level = {True: ", and grows faster than the drives", False: ", and does not grow faster than the drives",
+             None: ""}[left.grows_with_level]
+    lies = f", most of it in {remaining[0].output} from {remaining[0].from_Hz:.3g} to {remaining[0].to_Hz:.3g} Hz" \
+        if remaining else ""
+    return (f"{_percent(left.nrmse)} of the held-out records remains, {left.over_noise:.3g} times the noise{lies}{level}: "
+            f"{_percent(left.share)} of the power that the re-identified model leaves beyond noise")

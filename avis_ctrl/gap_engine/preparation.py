@@ -1,0 +1,196 @@
+"""A campaign made ready for the search: signals mended, spectra with measured noise, motion in time, what is held out.
+
+What the signals themselves show (a converter that clips or is coarse, hum) is found and taken out before any fit, since
+no fit of a table can absorb it. A first fit, every line weighted relative to its response, is close enough to tell
+noise and hum from the response.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.data import Halves, blocks_of, divide, of_one_level, thinned, with_noise
+from avis_ctrl.gap.each import Each, one_by_one
+from avis_ctrl.gap.effects.large_motion import LargeMotion
+from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
+from avis_ctrl.gap.signal_effects import SignalFaults, converter_faults, left_by, predicted, without_hum
+from avis_ctrl.gap.signals.converter import ConverterFinding
+from avis_ctrl.gap.signals.hum import HumFinding, find_hum, polluted
+from avis_ctrl.gap.signals.leftover import Leftover
+from avis_ctrl.gap.signals.repair import repair
+from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.gap_engine.likelihood import Data
+from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
+from avis_ctrl.identification.campaign_fit import excited_band
+from avis_ctrl.identification.maximum_likelihood import fit
+from avis_ctrl.identification.noise import relative_noise
+from avis_ctrl.identification.parameter_sets import default_parameters
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.measurement.campaign import Campaign, Record
+from avis_ctrl.rigs.rig import Rig
+
+Progress = Callable[[str], None]
+# Second-order terms as Newton and Euler have them, with sensors fixed to the payload and forces along earth axes.
+BY_PHYSICS = (1.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A campaign made ready.
+
+    campaign : without hum and clipping. fitted, held_out : spectra of all lines, with noise. unmasked : the held-out
+    ones with the lines that hum spoils. noise : in words, where the noise comes from. nominal : the rig as its file has
+    it. rough : the first fit. faults : of the signals. clipped : the campaign before clipped samples were mended, None
+    where there are few. left : what the rough model leaves of each record in time.
+    """
+
+    campaign: Campaign
+    halves: Halves
+    band_Hz: tuple[float, float]
+    fitted: tuple[SpectralBlock, ...]
+    held_out: tuple[SpectralBlock, ...]
+    unmasked: tuple[SpectralBlock, ...]
+    noise: str
+    nominal: TableModel
+    rough: TableModel
+    faults: SignalFaults
+    left: tuple[Leftover, ...]
+    clipped: Campaign | None = None
+
+    def data(self, blocks: Sequence[SpectralBlock], lines: int) -> Data:
+        """Some lines of blocks, each with the level of its group of like records."""
+        levels = self.levels
+        return Data(tuple(thinned(block, lines) for block in blocks), tuple(levels[block.name] for block in blocks))
+
+    @property
+    def levels(self) -> dict[str, float]:
+        """Level [V] by block: of the lowest record of a group that counts as one level."""
+        headers = [record.header for record in (*self.halves.fitted.records, *self.halves.held_out.records)]
+        groups = of_one_level(headers, lambda h: ("", h.level_V))
+        return {h.name: group[0].level_V for group in groups for h in group}
+
+
+def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = None,
+            amplifier_corner_Hz: float | None = None, progress: Progress = lambda text: None,
+            each: Each = one_by_one, settings: GapSettings = SETTINGS) -> Prepared:
+    """From records to spectra with noise.
+
+    Raises
+    ------
+    InputError : a band in which nothing is excited, too few lines, records that drive nothing or tell no noise.
+    """
+    progress("converters, and what is held out")
+    converter = converter_faults(campaign, rig)
+    mended = repair(campaign, rig, None, converter) if campaign.y_unit == "V" and rig.acquisition else None
+    campaign = mended.campaign if mended else campaign
+    halves = divide(campaign)
+    band = _band(halves, band_Hz, settings)
+    if amplifier_corner_Hz is not None and not 0 < amplifier_corner_Hz < np.inf:
+        raise InputError("expected a frequency above zero", field="amplifier corner", value=amplifier_corner_Hz)
+    apart = rig.with_channels_apart() if hasattr(rig, "with_channels_apart") else rig
+    base = ResponseModel.of(apart, default_parameters(apart), campaign.y_unit, campaign.y_names, campaign.u_names, True,
+                            amplifier_corner_Hz)
+    nominal = TableModel(base, nominal=base)
+    progress(f"first fit, {band[0]:.3g} to {band[1]:.3g} Hz; {halves.how}")
+    rough = _rough(nominal, halves, band, settings)
+    clipped = campaign if mended and max(mended.clipped.values()) > settings.few_clipped else None
+    if clipped is not None:
+        progress("clipped samples: what the model expects behind the limits")
+        for _ in range(settings.repairs):
+            campaign = repair(clipped, rig, predicted(clipped, rough, each), converter).campaign
+            halves = divide(campaign)
+            rough = _rough(rough, halves, band, settings)
+    return _ready(campaign, halves, nominal, rough, band, converter, clipped, progress, each, settings)
+
+
+def mended_with(prepared: Prepared, model: TableModel, progress: Progress, each: Each, settings: GapSettings
+                ) -> Prepared:
+    """The same with clipped samples as a better model expects them."""
+    assert prepared.clipped is not None
+    expected = predicted(prepared.clipped, model, each)
+    campaign = repair(prepared.clipped, model.rig, expected, prepared.faults.converter).campaign
+    return _ready(campaign, divide(campaign), prepared.nominal, prepared.rough, prepared.band_Hz,
+                  prepared.faults.converter, prepared.clipped, progress, each, settings)
+
+
+def _band(halves: Halves, band_Hz: tuple[float, float] | None, settings: GapSettings) -> tuple[float, float]:
+    low, high = excited_band(halves.fitted)
+    band = band_Hz or (low, high)
+    if not 0 <= band[0] < band[1]:
+        raise InputError("expected 0 <= LOW < HIGH", field="band_Hz", value=band)
+    if band[1] <= low or band[0] >= high:
+        raise InputError(f"expected a band in which the records are excited, {low:.3g} to {high:.3g} Hz",
+                         field="band_Hz", value=band)
+    for record in halves.fitted.records:
+        lines = int((band[1] - band[0]) * record.header.duration_s)
+        if lines < settings.fewest_lines:
+            raise InputError(f"expected a wider band or longer records: {lines} lines of record {record.header.name} "
+                             f"lie in it, and a fit needs {settings.fewest_lines}", field="band_Hz", value=band)
+    return band
+
+
+def _ready(campaign: Campaign, halves: Halves, nominal: TableModel, rough: TableModel, band: tuple[float, float],
+           converter: tuple[ConverterFinding, ...], clipped: Campaign | None, progress: Progress, each: Each,
+           settings: GapSettings) -> Prepared:
+    """Hum taken out, spectra with noise, and the motion of every record with its second-order terms."""
+    left = left_by(campaign, rough, each)
+    raw_held = blocks_of(halves.held_out, rough, band)
+    hum = find_hum(left)
+    if hum is not None:
+        progress(f"hum of {hum.frequency_Hz.value:.5g} Hz taken out")
+        campaign = without_hum(campaign, hum, left)
+        halves = divide(campaign)
+        rough = _rough(rough, halves, band, settings)
+        left = left_by(campaign, rough, each)
+    fitted = _masked(blocks_of(halves.fitted, rough, band), halves.fitted, hum)
+    held_out = _masked(blocks_of(halves.held_out, rough, band), halves.held_out, hum)
+    progress("noise, and the motion of the table in every record")
+    (fitted, held_out, unmasked), how = _noise((fitted, held_out, raw_held), halves, left, rough, band)
+    parts = replace(halves.fitted, records=(*halves.fitted.records, *halves.held_out.records))
+    motion = with_large_motion(motion_of(parts, rough, campaign, each), rough)
+    return Prepared(campaign, halves, band, tuple(fitted), tuple(held_out), tuple(unmasked), how,
+                    replace(nominal, motion=motion), with_second_order(replace(rough, motion=motion)),
+                    SignalFaults(converter, hum), left, clipped)
+
+
+def with_second_order(model: TableModel) -> TableModel:
+    """The model with the second-order terms of its rotations."""
+    return model.with_effect(active(LargeMotion(), model, "payload", BY_PHYSICS))
+
+
+def _noise(groups: Sequence[list[SpectralBlock]], halves: Halves, left: tuple[Leftover, ...], model: TableModel,
+           band: tuple[float, float]) -> tuple[list[list[SpectralBlock]], str]:
+    """Groups of blocks with the noise of the fitted records, from what a model leaves of them in time; in words."""
+    of, records = {one.header.name: one for one in left}, []
+    for source in halves.fitted.records:
+        whole, start, stop = origin(source)
+        record = source.load()
+        records.append(Record(record.header, record.u, of[whole.header.name].e[start:stop], record.floor))
+    every = [block for group in groups for block in group]
+    made, how = with_noise(every, halves.fitted, replace(halves.fitted, records=tuple(records)), model, band)
+    ends = np.cumsum([len(group) for group in groups])
+    return [made[end - len(group):end] for group, end in zip(groups, ends, strict=True)], how
+
+
+def _rough(model: TableModel, halves: Halves, band: tuple[float, float], settings: GapSettings) -> TableModel:
+    """A first fit, each line weighted by its response."""
+    blocks = [thinned(block, settings.lines) for block in relative_noise(blocks_of(halves.fitted, model, band))]
+    return replace(model, base=fit(model.base, blocks).model)
+
+
+def _masked(blocks: Sequence[SpectralBlock], campaign: Campaign, hum: HumFinding | None) -> list[SpectralBlock]:
+    """Blocks without the lines that hum has spoiled."""
+    if hum is None:
+        return list(blocks)
+    found = []
+    for block in blocks:
+        h = campaign.named(block.name).header
+        spoiled = polluted(hum, h.samples, h.sample_rate_Hz)
+        lines = np.rint(block.omega * h.samples / (2 * np.pi * h.sample_rate_Hz)).astype(int)
+        found.append(block.lines(np.flatnonzero(~spoiled[lines])))
+    return found

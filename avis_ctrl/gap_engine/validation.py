@@ -1,0 +1,96 @@
+"""What records that no fit has seen say: the stages of the gap, each effect's share, and what remains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from avis_ctrl.gap.show import Left
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.gap_engine.likelihood import Fitted
+from avis_ctrl.gap_engine.settings import GapSettings
+from avis_ctrl.gap_engine.weights import Group
+from avis_ctrl.identification.spectra import SpectralBlock
+
+
+@dataclass(frozen=True, eq=False)
+class Power:
+    """What models leave of held-out records, mean over the sensors of power over that of y; of noise alone, and of the
+    baseline."""
+
+    noise: float
+    baseline: float
+
+    @property
+    def excess(self) -> float:
+        """Of the baseline over noise; never quite zero."""
+        return max(self.baseline - self.noise, 1e-3 * self.noise, 1e-12)
+
+    def share(self, power: float) -> float:
+        """A power over the baseline's excess, from 0 to 1."""
+        return float(np.clip(power / self.excess, 0.0, 1.0))
+
+
+def share_of(model: TableModel, label: str, blocks: Sequence[SpectralBlock], power: Power, with_it: float) -> float:
+    """By how much the held-out residual power rises when an effect alone is taken out, nothing refitted, over the
+    baseline's excess. with_it : the power that the whole model leaves."""
+    return power.share(Left.of(model.without(label), blocks).nrmse ** 2 - with_it)
+
+
+@dataclass(frozen=True)
+class Half:
+    """An effect's parameters by half of the data: the half in words, chi-square of the difference from the whole, its
+    p-value, and the largest relative change of a parameter."""
+
+    words: str
+    chi2: float
+    p_value: float
+    change: float
+
+
+def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings) -> list[Half]:
+    """An effect's parameters from halves of the data, one Gauss-Newton step from the whole: below and above the band's
+    middle by information, and at low and high level.
+
+    A parameter that moves with the band or the level refutes its law. Of a true law the difference has the covariance
+    P_half - P (J. A. Hausman, Econometrica 46 (1978) 1251-1271).
+    """
+    rows = [fitted.priors.names.index(name) for name in names if name in fitted.priors.names]
+    whole, slope = fitted.covariance[np.ix_(rows, rows)], fitted.priors.slopes(fitted.z)[rows]
+    values = fitted.priors.values(fitted.z)[rows]
+    found = []
+    for words, groups in _parts(fitted, rows):
+        at = np.concatenate([fitted.groups[group] for group in groups])
+        J, e = fitted.J[:, at], fitted.e[at]
+        P = np.linalg.inv(J @ J.T + np.eye(len(J)))
+        step = (P @ (J @ e - fitted.z))[rows]
+        D = P[np.ix_(rows, rows)] - whole
+        size, V = np.linalg.eigh((D + D.T) / 2)
+        known = size > settings.least_difference * np.diag(whole).max()
+        chi2 = float(np.sum((V.T @ step)[known] ** 2 / size[known]))
+        change = np.abs(step * slope) / np.maximum(np.abs(values), 1e-300)
+        found.append(Half(words, chi2, float(stats.chi2.sf(chi2, max(int(known.sum()), 1))), float(change.max())))
+    return found
+
+
+def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, list[Group]]]:
+    """Halves of the groups: by band, each with half of the information on the parameters, and by level."""
+    information: dict[Group, float] = {group: float(np.sum(fitted.J[np.ix_(rows, at)] ** 2))
+                                       for group, at in fitted.groups.items()}
+    found = []
+    for k, words in ((1, ("the lower part of the band", "the upper part of the band")),
+                     (0, ("low levels", "high levels"))):
+        by: dict[float, float] = {}
+        for group, value in information.items():
+            by[group[k]] = by.get(group[k], 0.0) + value
+        order = sorted(by)
+        total = np.cumsum([by[key] for key in order])
+        below = {key for key, value in zip(order, total, strict=True) if value <= total[-1] / 2}
+        for word, inside in zip(words, (True, False), strict=True):
+            own = [group for group in fitted.groups if (group[k] in below) == inside]
+            if below and own:
+                found.append((word, own))
+    return found
