@@ -41,7 +41,7 @@ class Part:
     def __init__(self, model: TableModel, block: SpectralBlock):
         self.model, self.block = model, block
         self.L = whitener(block)
-        self.made = assemble(model.operators(block.omega))
+        self.made = model.assembled(block.omega)
         self.transient = np.zeros((0, 0))
         self.body: np.ndarray | None = None
         self.inner: np.ndarray | None = None

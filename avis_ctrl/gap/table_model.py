@@ -18,6 +18,8 @@ from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs.rig import Parameter, Rig
 
 _MOUNT = re.compile(r"isolator(\d+)\.([kc])_([xyz])")
+# Sets of lines of which the assembled table is kept.
+MOST_KEPT = 8
 # Relative step of differences by an effect's parameters, in units of their size.
 STEP = 1e-4
 # A sensor's chain is another one where its ratio to the rig's varies over these frequencies by more than this share.
@@ -230,6 +232,20 @@ class TableModel:
             one.effect.change(ops, one.place, one.by_name)
         return ops
 
+    def assembled(self, omega: np.ndarray) -> Assembled:
+        """On lines omega; the last ones are kept, for a fit asks for them several times."""
+        kept = self.__dict__.setdefault("_assembled", {})
+        key = len(omega), float(omega[0]), float(omega[-1]), float(np.sum(omega))
+        if key not in kept:
+            while len(kept) >= MOST_KEPT:
+                kept.pop(next(iter(kept)))
+            kept[key] = assemble(self.operators(omega))
+        return kept[key]
+
+    def __getstate__(self) -> dict:
+        """Without what is kept, which is as quickly made again."""
+        return {name: value for name, value in self.__dict__.items() if name != "_assembled"}
+
     def response(self, omega: np.ndarray) -> np.ndarray:
         """G, (n, n_y, n_u + 3), as `ResponseModel.response`; effects that depend on amplitude left out."""
         n, n_in = len(omega), len(self.inputs)
@@ -260,7 +276,7 @@ class TableModel:
 
     def _chain_ratio(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y) chain of each sensor over that of the rig."""
-        return self.operators(omega).sense / Operators(self.effective, omega).sense
+        return self.assembled(omega).ops.sense / Operators(self.effective, omega).sense
 
     def inner_transients(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y, n_t): y by unit initial states of what effects hold inside: modes, masses in mounts, a chassis.
@@ -270,7 +286,7 @@ class TableModel:
         n_y = len(self.sensors.names)
         if not any(one.effect.holds_states for one in self.effects):
             return np.zeros((len(omega), n_y, 0), complex)
-        made = assemble(self.operators(omega))
+        made = self.assembled(omega)
         seen = (_gain(made) * made.ops.sense[:, :, None]) * (made.rows @ made.inverse)
         return seen @ made.forces_of_states
 
@@ -287,7 +303,7 @@ class TableModel:
 
     def _driven(self, omega: np.ndarray, U: np.ndarray, block: SpectralBlock | None, derivative: bool,
                 inner: np.ndarray | None = None) -> Driven:
-        made = assemble(self.operators(omega))
+        made = self.assembled(omega)
         answer = _Answer(made, self._acting(U, block, inner))
         if not derivative:
             return Driven(answer.Y, np.empty(0))
@@ -304,29 +320,16 @@ class TableModel:
         if record is None:
             raise InputError("expected the record's motion in time for an effect that depends on it",
                              field=f"block {block.name}")
-        total: np.ndarray | None = None
-        seen: np.ndarray | None = None
-        output: np.ndarray | None = None
-        for one in self.effects:
-            volts = one.effect.volts_spectrum(record, one.place, one.by_name, block.omega)
-            if volts is not None:
-                # Several may change the volts: each adds what it changes.
-                U = U.copy()
-                U[:, :len(self.actuators), 0] += volts - record.kept("volts", block.omega, lambda: record.volts)
-            force = one.effect.force_spectrum(record, one.place, one.by_name, block.omega)
-            if force is not None:
-                total = force[:, :, None] if total is None else total + force[:, :, None]
-            reading = one.effect.reading_spectrum(record, one.place, one.by_name, block.omega)
-            if reading is not None:
-                moved = -reading[:, :, None] / (block.omega ** 2)[:, None, None]
-                seen = moved if seen is None else seen + moved
-            added = one.effect.output_spectrum(record, one.place, one.by_name, block.omega)
-            if added is not None:
-                output = added[:, :, None] if output is None else output + added[:, :, None]
-        return Acting(U, total, seen, output, inner)
+        added = [_added(one, record, block.omega) for one in self.effects]
+        volts, *others = (_sum(some) for some in zip(*added, strict=True))
+        if volts is not None:
+            U = U.copy()
+            U[:, :len(self.actuators)] += volts
+        return Acting(U, *others, inner)
 
     def _by_effects(self, omega, U, block, made: Assembled, answer: _Answer, dY: np.ndarray) -> None:
-        """Central differences of the whole response by the effects' parameters."""
+        """Central differences by the effects' parameters: of what an effect adds to a record, which the response is
+        linear in; of the whole response where it changes the table."""
         n, theta, (low, high) = len(self.base.names), self.values, self.bounds()
         scale = self.scales()
         for row in range(n, len(theta)):
@@ -334,17 +337,46 @@ class TableModel:
             # A bound that goes with the payload's mass may have moved past the value.
             lowest, highest = min(low[row], theta[row]), max(high[row], theta[row])
             ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]
-            sides = []
-            for end in ends:
-                other = self._with_effect_parameter(row - n, end)
-                acting = other._acting(U, block, answer.inner)
-                own = made if self.effects[self._free[row - n][0]].effect.nonlinear else assemble(
-                    other.operators(omega), invert=False)
-                sides.append(_Side(own, acting, answer.x))
+            others, k = [self._with_effect_parameter(row - n, end) for end in ends], self._free[row - n][0]
+            width = ends[0] - ends[1]
+            if self.effects[k].effect.nonlinear:
+                assert block is not None
+                record = self.motion[block.name]
+                up, down = (_added(other.effects[k], record, omega) for other in others)
+                volts, *rest = (None if a is None or b is None else (a - b) / width
+                                for a, b in zip(up, down, strict=True))
+                change = np.zeros((len(omega), len(self.inputs), 1), complex)
+                if volts is not None:
+                    change[:, :len(self.actuators)] = volts
+                side = _Side(made, Acting(change, *rest), np.zeros_like(answer.x))
+                dY[row] = side.Y + answer.left @ side.push
+                continue
+            sides = [_Side(assemble(other.operators(omega), invert=False), answer.acting, answer.x)
+                     for other in others]
             # d x = inv(D) (d F - d D x): no second inverse.
-            push, seen = ((sides[0].push - sides[1].push) / (ends[0] - ends[1]),
-                          (sides[0].Y - sides[1].Y) / (ends[0] - ends[1]))
-            dY[row] = seen + answer.left @ push
+            dY[row] = ((sides[0].Y - sides[1].Y) + answer.left @ (sides[0].push - sides[1].push)) / width
+
+
+def _added(one: ActiveEffect, record: RecordMotion, omega: np.ndarray) -> tuple[np.ndarray | None, ...]:
+    """What an effect adds to a record on its lines: volts (n, n_u, 1) beside the commanded ones, force (n, 6, 1),
+    displacement that the sensors read (n, n_y, 1), and outputs (n, n_y, 1); None for nothing."""
+    if not one.effect.nonlinear:
+        return None, None, None, None
+    effect, values = one.effect, one.by_name
+    volts = effect.volts_spectrum(record, one.place, values, omega)
+    if volts is not None:
+        # Several may change the volts: each adds what it changes.
+        volts = volts - record.kept("volts", omega, lambda: record.volts)
+    reading = effect.reading_spectrum(record, one.place, values, omega)
+    found = (volts, effect.force_spectrum(record, one.place, values, omega),
+             None if reading is None else -reading / (omega ** 2)[:, None],
+             effect.output_spectrum(record, one.place, values, omega))
+    return tuple(None if each is None else each[:, :, None] for each in found)
+
+
+def _sum(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    given = [part for part in parts if part is not None]
+    return sum(given[1:], given[0]) if given else None
 
 
 class _Side:
@@ -401,7 +433,7 @@ class _Answer:
 
     def __init__(self, made: Assembled, acting: Acting):
         ops, drive = made.ops, _Drive(made, acting)
-        self.made, self.s, self.inner = made, ops.s[:, None, None], acting.inner
+        self.made, self.acting, self.s, self.inner = made, acting, ops.s[:, None, None], acting.inner
         self.volts, self.w, self.folded, self.alias = drive.volts, drive.w, drive.folded, drive.alias
         self.x = made.inverse @ drive.total
         self.Minv = np.linalg.inv(ops.base.matrices.M)

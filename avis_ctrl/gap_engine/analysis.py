@@ -21,13 +21,13 @@ from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplaine
 from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
 from avis_ctrl.gap.show import Left, every_record, heat_map, places
 from avis_ctrl.gap.signal_effects import left_by, levels, named
-from avis_ctrl.gap_engine.likelihood import Data, Fitted, first_variances, fit, log_likelihood
+from avis_ctrl.gap_engine.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.gap_engine.preparation import Prepared, mended_with, prepare, with_second_order
 from avis_ctrl.gap_engine.score import EvidenceScore
 from avis_ctrl.gap_engine.search import Step, implausible, name_of, search, without_effect
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.gap_engine.tolerances import of_effect, re_identified, with_tolerances
-from avis_ctrl.gap_engine.validation import Power, halves, share_of
+from avis_ctrl.gap_engine.validation import Power, halves, odds_against, share_of
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.instruments import Tolerances
 from avis_ctrl.rigs.rig import Rig
@@ -148,7 +148,8 @@ def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Dat
         return f"another explanation is as probable ({probability:.2f})"
     if reason := implausible(replace(best, model=replace(best.model, effects=(one,)))):
         return reason
-    if log_likelihood(step.fitted, held, settings) <= log_likelihood(step.before, held, settings):
+    after, before = (log_likelihoods(one, held, settings) for one in (step.fitted, step.before))
+    if sum(after.values()) <= sum(before.values()):
         return "held-out records do not bear it out"
     strength = [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
     for half in halves(best, strength, settings):
@@ -160,19 +161,24 @@ def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Dat
 def _probability(step: Step, settings: GapSettings) -> tuple[float, tuple[str, ...]]:
     """Probability of the effect that was taken among all that were fitted in its place, and the names that cannot be
     ruled out. What has no name in the library is less probable beforehand."""
-    by: dict[tuple[str, str], float] = {("", ""): step.before.log_evidence}
+    own, mine = name_of(step.label), step.tried[step.label]
+    odds = {("", ""): odds_against_fit(mine, step.before)}
     for label, one in step.tried.items():
-        outside = one.model.effects[-1].effect.outside
-        value = one.log_evidence - (math.log(settings.outside_odds) if outside else 0.0)
-        key = name_of(label)
-        by[key] = max(by.get(key, -np.inf), value)
-    top = max(by.values())
-    weight = {key: math.exp(value - top) for key, value in by.items()}
-    whole = sum(weight.values())
-    own = name_of(step.label)
-    rivals = [name for (name, place), one in sorted(weight.items(), key=lambda item: -item[1])
-              if (name, place) != own and name and one / whole > settings.rival]
-    return min(weight[own] / whole, settings.most_sure), tuple(dict.fromkeys(one for one in rivals if one != own[0]))
+        if name_of(label) != own:
+            outside = settings.outside_odds if one.model.effects[-1].effect.outside else 1.0
+            odds[name_of(label)] = max(odds.get(name_of(label), 0.0), odds_against_fit(mine, one) / outside)
+    probability = 1 / (1 + sum(odds.values()))
+    rivals = [name for (name, _), one in sorted(odds.items(), key=lambda item: -item[1])
+              if name not in ("", own[0]) and one * probability > settings.rival]
+    return min(probability, settings.most_sure), tuple(dict.fromkeys(rivals))
+
+
+def odds_against_fit(one: Fitted, other: Fitted) -> float:
+    """Of another fit against one: by evidence, or by how evenly that is spread, whichever is larger."""
+    ahead = one.log_evidence - other.log_evidence
+    beside = ahead - sum(one.log_likelihoods.values()) + sum(other.log_likelihoods.values())
+    return max(math.exp(-min(max(ahead, -50.0), 50.0)),
+               odds_against(one.log_likelihoods, other.log_likelihoods, beside))
 
 
 def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect], seed: int, began: float,
@@ -281,7 +287,8 @@ def _considered(fits: Fits, names: Names, prepared: Prepared, settings: GapSetti
     """What was fitted and not named, step by step, the most probable first."""
     rows, thin = [], prepared.data(prepared.held_out, settings.lines).blocks
     for number, step in enumerate(fits.steps, 1):
-        top = max(one.log_evidence for one in step.tried.values())
+        best = max(step.tried.values(), key=lambda one: one.log_evidence)
+        top = best.log_evidence
         for label, one in sorted(step.tried.items(), key=lambda item: -item[1].log_evidence):
             effect = one.model.effects[-1]
             if effect.effect.outside or label in names.updated.labels:
@@ -289,7 +296,7 @@ def _considered(fits: Fits, names: Names, prepared: Prepared, settings: GapSetti
             reason = implausible(one) or (f"step {number}: log evidence {top - one.log_evidence:.3g} behind")
             reported = effect.effect.reported(one.model, effect.place, effect.by_name, one.covariance_of(effect.names))
             rows.append(Considered(effect.effect.name, name_of(label)[1], Left.of(one.model, thin).chi2_per_dof,
-                                   min(math.exp(one.log_evidence - top), settings.most_sure), reason, reported))
+                                   min(odds_against_fit(best, one), settings.most_sure), reason, reported))
     return tuple(sorted(rows, key=lambda one: -one.probability)[:settings.shown_runners_up])
 
 

@@ -35,7 +35,8 @@ class Fitted:
 
     model : at the estimate. priors, z (n,), covariance (n, n) of z. variances : of what is not explained.
     log_evidence : Laplace. iterations : Gauss-Newton steps. e (N,) and J (n, N) : whitened, path errors integrated out.
-    groups : level and band of each entry of e, as rows by (level, band).
+    rows : of e by level and band. log_likelihoods : by level and band; what is in `log_evidence` beside their sum is of
+        the priors.
     """
 
     model: Any
@@ -47,7 +48,8 @@ class Fitted:
     iterations: int
     e: np.ndarray
     J: np.ndarray
-    groups: Mapping[Group, np.ndarray]
+    rows: Mapping[Group, np.ndarray]
+    log_likelihoods: Mapping[Group, float]
 
     @property
     def by_name(self) -> dict[str, float]:
@@ -106,15 +108,14 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
             while size > 1e-3:
                 trial = z + size * step
                 moved = model.at(priors.values(trial))
-                own = _evaluate(moved, priors, trial, data, weights, derivative=False)
+                own = _evaluate(moved, priors, trial, data, weights)
                 new = weights.flatten(own[0][None])[0]
                 if new @ new + trial @ trial < cost:
                     break
                 size /= 3
             else:
                 break
-            model, z, steps = moved, trial, steps + 1
-            found = _evaluate(model, priors, z, data, weights)
+            model, z, found, steps = moved, trial, own, steps + 1
         if k < settings.rounds:
             variances = estimated(weights, found[0], found[2], data.blocks, data.levels, variances, settings)
     e, J, _ = found
@@ -124,16 +125,20 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
     hyper = sum(float(np.sum(-(nu / 2 + 1) * np.log(v) - nu * v0 / (2 * v))) for v in variances.path.values())
     log_evidence = -0.5 * (flat @ flat + z @ z + weights.log_determinant + np.linalg.slogdet(H)[1]) + hyper
     return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), steps, flat, Jf,
-                  {one.group: one.rows for one in weights.paths})
+                  {one.group: one.rows for one in weights.paths}, _by_group(weights, flat))
 
 
-def log_likelihood(fitted: Fitted, data: Data, settings: GapSettings = SETTINGS) -> float:
-    """Of records that no fit has seen, by the fitted parameters and variances; what does not depend on them left out."""
+def log_likelihoods(fitted: Fitted, data: Data, settings: GapSettings = SETTINGS) -> dict[Group, float]:
+    """Of records that no fit has seen, by level and band, by the fitted parameters and variances."""
     paths = [path_contributions(fitted.model, block) for block in data.blocks]
     weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
     e, _, _ = _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, derivative=False)
-    flat = weights.flatten(e[None])[0]
-    return -0.5 * float(flat @ flat + weights.log_determinant)
+    return _by_group(weights, weights.flatten(e[None])[0])
+
+
+def _by_group(weights: Weights, flat: np.ndarray) -> dict[Group, float]:
+    return {one.group: -0.5 * float(flat[one.rows] @ flat[one.rows] + weights.log_determinants[one.group])
+            for one in weights.paths}
 
 
 def _evaluate(model: Any, priors: Priors, z: np.ndarray, data: Data, weights: Weights, derivative: bool = True):

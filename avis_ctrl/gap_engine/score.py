@@ -6,6 +6,7 @@ Priors are rows of their own below the residuals: e = (e, -z), J = (J, I). A dir
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -38,6 +39,12 @@ class EvidenceScore(Score):
         J = np.concatenate([self.weights.flatten(J), np.eye(n)], axis=1)
         self.basis = np.linalg.qr(J.T)[0].T
         self.e = self.e - self.basis.T @ (self.basis @ self.e)
+
+    @cached_property
+    def plain(self) -> Score:
+        """The same against noise and distortion alone, for effects that look for their beginning by fits of their own:
+        there what has no name is not taken out."""
+        return Score(self.model, [part.block for part in self.parts])
 
     def directions(self, dY):
         A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)

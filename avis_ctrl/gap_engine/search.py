@@ -19,6 +19,7 @@ import numpy as np
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Effect
+from avis_ctrl.gap.effects.flexible_mode import resonance
 from avis_ctrl.gap.table_model import ActiveEffect, active
 from avis_ctrl.gap_engine.likelihood import Data, Fitted, fit
 from avis_ctrl.gap_engine.score import EvidenceScore
@@ -30,10 +31,14 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An effect at a place, where its fit begins, and the fall of the sum of squares by the score test."""
+    """An effect at a place, where its fit begins, and the fall of the sum of squares by the score test.
+
+    p_value : of as large a fall by chance, over all frequencies and other values that were tried there.
+    """
 
     effect: ActiveEffect
     fall: float
+    p_value: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +66,11 @@ def name_of(label: str) -> tuple[str, str]:
 
 def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each = one_by_one
                ) -> list[Candidate]:
-    """Every effect at every place at its best seed, the largest fall first."""
+    """Every effect at every place at its best seed, the largest fall first.
+
+    Effects that add a resonance of many parameters take long to begin well. They are looked for only where a resonance
+    with a shape of its own on every path, which each of them is at least as well described by, takes its part.
+    """
     score = EvidenceScore(fitted, data, settings)
     model, taken = score.model, {name_of(label) for label in fitted.labels}
 
@@ -71,20 +80,30 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: 
         found = []
         for place in effect.places(model):
             if (effect.name, place.partition("/")[0]) not in taken:
-                found += [Candidate(active(effect, model, place, seed.values), seed.chi2)
+                found += [Candidate(active(effect, model, place, seed.values), seed.chi2, seed.chance(1.0))
                           for seed in effect.seeds(score, place)[:1]]
         return found
-    return sorted((one for own in each(scored, effects) for one in own), key=lambda one: -one.fall)
+    resonant = [one for one in effects if one.resonant]
+    found = [one for own in each(scored, [one for one in effects if not one.resonant]) for one in own]
+    most = max((one.fall for one in found), default=0.0)
+    if not found or resonance(score) >= settings.resonance_share * most:
+        found += [one for own in each(scored, resonant) for one in own]
+    return sorted(found, key=lambda one: -one.fall)
 
 
 def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candidate]:
-    """The best place of each effect and law, as far as its fall may be worth its parameters."""
-    least = 2 * (settings.certain + math.log(max(len(found), 1)))
-    chosen: dict[tuple[str, str], Candidate] = {}
+    """Each effect at its best place, of those whose fall is no chance among so many."""
+    chosen: dict[str, Candidate] = {}
     for one in found:
-        if one.fall > least:
-            chosen.setdefault((one.effect.effect.name, one.effect.place.partition("/")[2]), one)
+        if one.p_value * len(found) < math.exp(-settings.certain):
+            chosen.setdefault(one.effect.effect.name, one)
     return list(chosen.values())[:settings.refits]
+
+
+def other_laws(found: Sequence[Candidate], best: ActiveEffect) -> list[Candidate]:
+    """The same effect at the same place by its other laws."""
+    return [one for one in found if name_of(one.effect.label) == name_of(best.label)
+            and one.effect.label != best.label]
 
 
 def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSettings) -> Fitted | None:
@@ -129,19 +148,17 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
     """
     steps: list[Step] = []
     now = base
-    quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
     while len(steps) < settings.longest:
         progress(f"effects that may be missing, step {len(steps) + 1}")
         found = candidates(now, data, effects, settings, each)
         chosen = shortlist(found, settings)
         if not chosen:
             break
-        made = dict(zip([one.effect.label for one in chosen],
-                        each(lambda one, now=now: with_effect(now, one.effect, data, quick), chosen), strict=True))
-        tried = {label: one for label, one in made.items() if one is not None}
-        tried = {label: one for label, one in tried.items() if not implausible(one)} or tried
+        tried = _tried(now, chosen, data, settings, each)
         if not tried:
             break
+        best = max(tried, key=lambda label: tried[label].log_evidence)
+        tried |= _tried(now, other_laws(found, tried[best].model.effects[-1]), data, settings, each)
         best = max(tried, key=lambda label: tried[label].log_evidence)
         if tried[best].log_evidence - now.log_evidence < settings.certain + math.log(len(found)):
             break
@@ -153,6 +170,23 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
             break
         now = full
     return steps
+
+
+def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Each
+           ) -> dict[str, Fitted]:
+    """Fits of candidates by label: a few iterations for each, then more for those that are not far behind. Left out are
+    those that come to no end, or to values that physics forbids."""
+    rough = replace(settings, rounds=0, iterations=settings.rough_iterations)
+    quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
+    # Against the variances that a fit starts with: what the fit before it makes of them would be no fair measure.
+    level = now.log_evidence
+    made = [one for one in each(lambda one: with_effect(now, one.effect, data, rough), chosen) if one is not None]
+    if not made:
+        return {}
+    most = max(one.log_evidence for one in made) - level
+    near = [one for one in made if one.log_evidence - level >= settings.not_far_behind * most]
+    further = each(lambda one: _try(one, one.model, one.priors, one.z, data, quick), near)
+    return {one.labels[-1]: one for one in further if one is not None and not implausible(one)}
 
 
 def implausible(fitted: Fitted) -> str:

@@ -13,7 +13,7 @@ class GapSettings:
         from scales and data sheets.
     damping_percent : the same of dampings [%], which data sheets hardly state.
     lines : spectral lines of a record that are fitted; with 8 drives and 6 sensors the response needs about 100, and
-        three times as many make the estimate of the unexplained part precise.
+        twice as many make the estimate of the unexplained part precise.
     fewest_lines : lines of a record in the band below which a fit with its transient determines nothing.
     few_clipped : share of a channel's samples beyond its limits from which repaired samples are predicted anew.
     repairs : how often, each time with the better model that the last repair allowed.
@@ -35,7 +35,11 @@ class GapSettings:
     effect_sizes : prior standard deviation of an effect's strength, in units of its parameter's size; broad, so that it
         costs some nats and bends nothing.
     shape_spread : prior standard deviation of a parameter that shapes an effect (a frequency), relative to its start.
+    resonance_share : of the largest fall of the sum of squares, that a resonance of any shape must bring for effects
+        with a resonance to be looked for [1].
     refits : effects that are refitted at each step of the search, the best by the score test.
+    rough_iterations : of a first fit of every candidate, at the variances as they are.
+    not_far_behind : share of the best candidate's gain of log evidence by that fit with which another one is fitted on.
     quick_rounds, quick_iterations : `rounds` and `iterations` of a fit that only compares candidates.
     longest : most effects that are named together.
     certain : gain of log evidence [nats] that a name needs beside the logarithm of the number of candidates: odds of
@@ -61,7 +65,7 @@ class GapSettings:
 
     stiffness_percent: float = 5.0
     damping_percent: float = 20.0
-    lines: int = 300
+    lines: int = 200
     fewest_lines: int = 60
     few_clipped: float = 1e-5
     repairs: int = 3
@@ -78,7 +82,10 @@ class GapSettings:
     turning_percent: float = 50.0
     effect_sizes: float = 100.0
     shape_spread: float = 1.0
-    refits: int = 6
+    resonance_share: float = 0.1
+    refits: int = 8
+    rough_iterations: int = 3
+    not_far_behind: float = 0.3
     quick_rounds: int = 1
     quick_iterations: int = 4
     longest: int = 5
@@ -96,7 +103,7 @@ class GapSettings:
     explained: float = 0.9
     known_noise: float = 2.25
     shown_runners_up: int = 12
-    converged: float = 1e-6
+    converged: float = 1e-5
 
 
 SETTINGS = GapSettings()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,19 @@ def share_of(model: TableModel, label: str, blocks: Sequence[SpectralBlock], pow
     return power.share(Left.of(model.without(label), blocks).nrmse ** 2 - with_it)
 
 
+def odds_against(one: Mapping[Group, float], other: Mapping[Group, float], beside: float = 0.0) -> float:
+    """Odds of another model against one, by how evenly the difference of their log-likelihoods is spread over bands and
+    levels (Q. H. Vuong, Econometrica 57 (1989) 307-333).
+
+    Textbook laws are not quite those of real elements. A model that is ahead here and behind there is not certain to be
+    the better one, however much it is ahead in sum. beside : difference of what does not belong to any band (priors).
+    """
+    d = np.array([value - other[group] for group, value in one.items() if group in other])
+    spread = float(np.sqrt(np.sum((d - d.mean()) ** 2)))
+    ahead = (float(d.sum()) + beside) / max(spread, 1.0)
+    return float(stats.norm.sf(ahead) / stats.norm.cdf(ahead))
+
+
 @dataclass(frozen=True)
 class Half:
     """An effect's parameters by half of the data: the half in words, chi-square of the difference from the whole, its
@@ -63,7 +76,7 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings) -> list[
     values = fitted.priors.values(fitted.z)[rows]
     found = []
     for words, groups in _parts(fitted, rows):
-        at = np.concatenate([fitted.groups[group] for group in groups])
+        at = np.concatenate([fitted.rows[group] for group in groups])
         J, e = fitted.J[:, at], fitted.e[at]
         P = np.linalg.inv(J @ J.T + np.eye(len(J)))
         step = (P @ (J @ e - fitted.z))[rows]
@@ -79,7 +92,7 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings) -> list[
 def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, list[Group]]]:
     """Halves of the groups: by band, each with half of the information on the parameters, and by level."""
     information: dict[Group, float] = {group: float(np.sum(fitted.J[np.ix_(rows, at)] ** 2))
-                                       for group, at in fitted.groups.items()}
+                                       for group, at in fitted.rows.items()}
     found = []
     for k, words in ((1, ("the lower part of the band", "the upper part of the band")),
                      (0, ("low levels", "high levels"))):
@@ -90,7 +103,7 @@ def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, list[Group]]]
         total = np.cumsum([by[key] for key in order])
         below = {key for key, value in zip(order, total, strict=True) if value <= total[-1] / 2}
         for word, inside in zip(words, (True, False), strict=True):
-            own = [group for group in fitted.groups if (group[k] in below) == inside]
+            own = [group for group in fitted.rows if (group[k] in below) == inside]
             if below and own:
                 found.append((word, own))
     return found

@@ -64,12 +64,17 @@ class PathError:
 class Weights:
     """Whitening of stacked residuals.
 
-    L : (n, n_y, n_y) a block. paths : of every level and band. log_determinant : of the covariance of all real numbers.
+    L : (n, n_y, n_y) a block. paths : of every level and band. log_determinants : of the covariance of the real numbers
+    of each.
     """
 
     L: tuple[np.ndarray, ...]
     paths: tuple[PathError, ...]
-    log_determinant: float
+    log_determinants: Mapping[Group, float]
+
+    @property
+    def log_determinant(self) -> float:
+        return float(sum(self.log_determinants.values()))
 
     def flatten(self, x: np.ndarray) -> np.ndarray:
         """(k, N) whitened rows times the inverse root of I + B B^T."""
@@ -99,7 +104,8 @@ def with_distortion(block: SpectralBlock, level: float, variances: Variances, se
 def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Sequence[np.ndarray], variances: Variances,
           settings: GapSettings) -> Weights:
     """Weights of blocks; paths : (n, n_y, n_in) G_cj u_j of each block by the present model."""
-    L, total, start = [], 0.0, 0
+    L, start = [], 0
+    determinants: dict[Group, float] = {}
     members: dict[Group, list[tuple[np.ndarray, np.ndarray]]] = {}
     for block, level, path in zip(blocks, levels, paths, strict=True):
         n, n_y, n_in = path.shape
@@ -107,7 +113,7 @@ def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Seque
         whole = with_distortion(block, level, variances, settings).noise
         assert whole is not None
         factor = np.linalg.cholesky(whole[:, 0])
-        total += 4 * float(np.sum(np.log(np.real(np.einsum("kii->ki", factor)))))
+        by_line = 4 * np.sum(np.log(np.real(np.einsum("kii->ki", factor))), axis=1)
         white = np.sqrt(2) * np.linalg.inv(factor)
         L.append(white)
         # Real parts of all lines and sensors, then imaginary parts, as `as_real` stacks them.
@@ -115,11 +121,13 @@ def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Seque
         start += 2 * n * n_y
         for band in np.unique(own):
             at = own == band
+            group = level, int(band)
+            determinants[group] = determinants.get(group, 0.0) + float(by_line[at].sum())
             # columns (m, n_y, n_y * n_in): sensor c, input j
             C = (white[at][:, :, :, None] * path[at][:, None, :, :]).reshape(at.sum() * n_y, n_y * n_in)
             rows = np.concatenate([place[at].ravel(), place[at].ravel() + n * n_y])
             real = np.block([[C.real, -C.imag], [C.imag, C.real]])
-            members.setdefault((level, int(band)), []).append((rows, real))
+            members.setdefault(group, []).append((rows, real))
     errors = []
     for group, parts in members.items():
         v, _ = variances.of(group)
@@ -134,8 +142,8 @@ def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Seque
         kept = values > settings.least_eigenvalue
         Q = B @ vectors[:, kept] / np.sqrt(values[kept])
         errors.append(PathError(group, np.concatenate([part[0] for part in parts]), columns, sensor, Q, values[kept]))
-        total += float(np.sum(np.log1p(values[kept])))
-    return Weights(tuple(L), tuple(errors), total)
+        determinants[group] += float(np.sum(np.log1p(values[kept])))
+    return Weights(tuple(L), tuple(errors), determinants)
 
 
 def estimated(weights: Weights, e: np.ndarray, error: Sequence[np.ndarray], blocks: Sequence[SpectralBlock],

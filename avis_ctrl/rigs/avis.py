@@ -176,18 +176,18 @@ class AvisTable(Rig):
     def mount_of(self, channel: str) -> tuple[str, float] | None:
         """Mount and earth axis ("isolator1.x") that a drive or sensor sits in, and the sign of its direction along that
         axis; None for one that sits in none."""
-        place, direction = self._channels[channel]
-        away = [float(np.linalg.norm(np.subtract(one.position, place))) for one in self.isolators]
-        nearest, k = int(np.argmin(away)), int(np.argmax(np.abs(direction)))
-        if away[nearest] > IN_MOUNT_m or abs(direction[k]) < np.cos(IN_MOUNT_rad):
-            return None
-        return f"isolator{nearest + 1}.{AXES[k]}", float(np.sign(direction[k]))
+        return self._in_mounts[channel]
 
     @cached_property
-    def _channels(self) -> dict[str, tuple[Triple, Triple]]:
-        """Place and direction of every drive and sensor by name."""
-        return {one.name: (one.position, one.direction) for one in (*self.all_drives, *self._attached(),
-                                                                    *self.instruments)}
+    def _in_mounts(self) -> dict[str, tuple[str, float] | None]:
+        at = np.array([one.position for one in self.isolators])
+        found: dict[str, tuple[str, float] | None] = {}
+        for one in (*self.all_drives, *self._attached(), *self.instruments):
+            away, k = np.linalg.norm(at - one.position, axis=1), int(np.argmax(np.abs(one.direction)))
+            nearest, along = int(np.argmin(away)), one.direction[k]
+            inside = away[nearest] < IN_MOUNT_m and abs(along) > np.cos(IN_MOUNT_rad)
+            found[one.name] = (f"isolator{nearest + 1}.{AXES[k]}", float(np.sign(along))) if inside else None
+        return found
 
     def with_channels_apart(self) -> AvisTable:
         """The same table with each motor and geophone at a place of its own, which does not move with the isolator."""

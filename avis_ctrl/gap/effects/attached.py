@@ -39,6 +39,7 @@ class AttachedOscillator(AtPoint):
     looks_like = "a pair of peak and dip at its own frequency, in every channel that moves its place"
     confusable = ("payload_flexible_mode", "mount_surge", "base_compliance")
     holds_states = True
+    resonant = True
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return ("payload/oblique", "payload/axes")

@@ -102,6 +102,7 @@ class Effect(ABC):
     nonlinear : depends on amplitude or time; acts through `volts` or `force`.
     strength : the parameter to which `force` is in proportion, empty where to none.
     holds_states : has resonances of its own, whose states at the ends of a record are to be found with its transient.
+    resonant : adds resonances of many parameters, of which a mode of any shape is a first description.
     outside : of `effects.beyond`, refitted beside the library and never named.
     idealised : its law stands for several of real tables (friction, loss, bending): a little that it leaves is more
         likely its own law than a second effect. Not so of geometry, gains and first-order lags.
@@ -114,6 +115,7 @@ class Effect(ABC):
     nonlinear: ClassVar[bool] = False
     strength: ClassVar[str] = ""
     holds_states: ClassVar[bool] = False
+    resonant: ClassVar[bool] = False
     outside: ClassVar[bool] = False
     idealised: ClassVar[bool] = True
 

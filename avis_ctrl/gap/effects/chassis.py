@@ -72,6 +72,7 @@ class BaseCompliance(Effect):
     looks_like = "one more resonance in every channel, and less floor motion above it"
     confusable = ("payload_flexible_mode", "attached_oscillator", "mount_surge")
     holds_states = True
+    resonant = True
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return ("chassis/translation", "chassis/rocking") if has_mounts(model) else ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from avis_ctrl.gap.table_model import ActiveEffect, TableModel
     from avis_ctrl.identification.spectra import SpectralBlock
 
+# Frequencies at which a mode is looked for [Hz].
+FREQUENCIES_Hz = tuple(np.geomspace(7.0, 140.0, 22).tolist())
 # Variants by number of modes.
 COUNTS = {"": 1, "two": 2, "three": 3}
 # A further mode is looked for where it takes this share of what the modes before it leave over the noise, and, of
@@ -52,12 +54,12 @@ class PayloadFlexibleMode(Effect):
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
         names = mount_geometry(model.rig).names
         driven = np.any(shape_rows(model.rig, model.actuators, model.sensors.names)[0], axis=0)
-        grid = tuple(np.geomspace(7.0, 140.0, 22))
         found: list[EffectParameter] = []
         for k in range(COUNTS[place.partition("/")[2]]):
             of, of_mode = ("", "of the mode") if k == 0 else (f"_{k + 1}", f"of mode {k + 1}")
             found += [
-                EffectParameter(f"frequency{of}_Hz", "Hz", f"{of_mode}, free", 0.0, 3.0, 400.0, 20.0, False, grid),
+                EffectParameter(f"frequency{of}_Hz", "Hz", f"{of_mode}, free", 0.0, 3.0, 400.0, 20.0, False,
+                                FREQUENCIES_Hz),
                 EffectParameter(f"damping{of}", "1", f"damping ratio {of_mode}", 0.0, 1e-4, 0.5, 0.02, False, (0.02,),
                                 True),
                 *(EffectParameter(f"shape{of}_{name.replace('.', '_')}", "1/sqrt(kg)",
@@ -90,7 +92,7 @@ class PayloadFlexibleMode(Effect):
         """Residues over all paths at the frequencies that take most, of which the symmetric part of rank one is each
         mode's shape."""
         count = COUNTS[place.partition("/")[2]]
-        return [seed for n, seed in _modes_one_by_one(score, self.parameters(score.model, "payload")[0].grid)
+        return [seed for n, seed in _modes_one_by_one(score)
                 if n == count]
 
     def grown(self, one: ActiveEffect, model: TableModel, blocks: Sequence[SpectralBlock]) -> list[ActiveEffect]:
@@ -102,7 +104,7 @@ class PayloadFlexibleMode(Effect):
             return []
         known = np.log([frequency for frequency, _, _ in modes(one.by_name)])
         score = Score(model, blocks)
-        further = [seed for _, seed in _modes_one_by_one(score, self.parameters(model, "payload")[0].grid, 1)
+        further = [seed for _, seed in _modes_one_by_one(score, 1)
                    if seed.chi2 > FURTHER * (score.chi2 - score.dof)
                    and np.min(np.abs(np.log(seed.values[0]) - known)) > APART]
         larger = next(f"payload/{name}" for name, modes_of in COUNTS.items() if modes_of == count + 1)
@@ -133,26 +135,48 @@ def shape_points(model: TableModel) -> bool:
 
 def shape_rows(rig, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """(n_u, n_g) and (n_y, n_g): which mount and axis each motor and each sensor sits in, with its sign."""
-    order = {name: k for k, name in enumerate(mount_geometry(rig).names)}
-
-    def rows(names: Sequence[str]) -> np.ndarray:
-        found = np.zeros((len(names), len(order)))
-        for k, (mount, sign) in enumerate(rig.mount_of(name) for name in names):
-            found[k, order[mount]] = sign
-        return found
-    return rows(actuators), rows(sensors)
+    return _shape_rows(tuple(rig.mount_of(name) for name in actuators), tuple(rig.mount_of(name) for name in sensors),
+                       mount_geometry(rig).names)
 
 
-def _modes_one_by_one(score: Score, grid: Sequence[float], most: int = len(COUNTS)) -> list[tuple[int, Seed]]:
+@lru_cache(maxsize=16)
+def _shape_rows(actuators: tuple[tuple[str, float], ...], sensors: tuple[tuple[str, float], ...],
+                mounts: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    at_actuators, at_sensors = np.zeros((len(actuators), len(mounts))), np.zeros((len(sensors), len(mounts)))
+    for found, channels in ((at_actuators, actuators), (at_sensors, sensors)):
+        for k, (mount, sign) in enumerate(channels):
+            found[k, mounts.index(mount)] = sign
+    return at_actuators, at_sensors
+
+
+def resonance(score: Score) -> float:
+    """Fall of chi-square by one mode whose residues are free on every path."""
+    return max(reduction(G, b).chi2 for G, b in _looks(score)[2])
+
+
+Looks = tuple[list[tuple[float, float]], list[np.ndarray], list[tuple[np.ndarray, np.ndarray]]]
+
+
+def _looks(score: Score) -> Looks:
+    """Frequency and damping ratio of every mode that is looked for, its paths (n_y n_u, N), and their Gram matrix and
+    product with the residual."""
+    if "looks" not in score.kept:
+        lowest = FREQUENCIES_Hz[0]
+        tried = [(f, 0.02) for f in FREQUENCIES_Hz]
+        tried += [(f, zeta) for f in peaks(score) if f > lowest for zeta in (0.005, 0.02)]
+        kept = [paths(score, partial(receptance, frequency_Hz=f, damping=zeta)).astype(np.float32) for f, zeta in tried]
+        e = score.e.astype(np.float32)
+        score.kept["looks"] = tried, kept, [((A @ A.T).astype(float), (A @ e).astype(float)) for A in kept]
+    return score.kept["looks"]
+
+
+def _modes_one_by_one(score: Score, most: int = len(COUNTS)) -> list[tuple[int, Seed]]:
     """(number of modes, seed), the best first: each further mode beside those before it, up to `most`."""
     key = ("modes", most)
     if key in score.kept:
         return score.kept[key]
-    frequencies = [(f, 0.02) for f in grid] + [(f, zeta) for f in peaks(score) if f > grid[0] for zeta in (0.005, 0.02)]
-    kept = [paths(score, partial(receptance, frequency_Hz=f, damping=zeta)).astype(np.float32)
-            for f, zeta in frequencies]
-    e, found = score.e.astype(np.float32), []
-    own = [((A @ A.T).astype(float), (A @ e).astype(float)) for A in kept]
+    frequencies, kept, own = _looks(score)
+    found: list[tuple[int, Seed]] = []
     chosen: list[int] = []
     before = 0.0
     for count in range(1, most + 1):

@@ -114,6 +114,7 @@ class MountSurge(_OfMounts):
     looks_like = "a resonance far above the suspension's along z, in every vertical channel alike"
     confusable = ("payload_flexible_mode", "attached_oscillator", "base_compliance")
     holds_states = True
+    resonant = True
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
         count = int(np.sum(vertical(model)))
