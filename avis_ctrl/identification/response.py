@@ -308,22 +308,23 @@ class ResponseModel:
         shapes = [(len(self.names), *matrix.shape) for matrix in self.matrices]
         found = Matrices(*(np.zeros(shape) for shape in shapes))
         for j, name in enumerate(self.names):
-            slope = self.rig.channel_slope(name) if name in known else None
-            if slope is not None:
-                which, channel, column = slope
-                if which == "T" and channel in self.actuators:
-                    found.T[j][:, self.actuators.index(channel)] = column
+            if name not in known:
+                continue
+            for which, channel, slope in self.rig.slopes(name) or self._differences(name, known[name].value):
+                if not channel:
+                    getattr(found, which)[j] = slope
+                elif which == "T" and channel in self.actuators:
+                    found.T[j, :, self.actuators.index(channel)] = slope
                 elif which == "R" and channel in self.sensors.names:
-                    found.R[j][self.sensors.names.index(channel)] = column
-            elif name in known:
-                value = known[name].value
-                # Exact at any step for polynomials of second degree: a tenth loses no digits.
-                step = 0.1 * abs(value) or 1e-3
-                up, down = (self.matrices_of(self.rig.with_parameters({name: value + sign * step}))
-                            for sign in (1, -1))
-                for all_of, high, low in zip(found, up, down, strict=True):
-                    all_of[j] = (high - low) / (2 * step)
+                    found.R[j, self.sensors.names.index(channel)] = slope
         return found
+
+    def _differences(self, name: str, value: float) -> list[tuple[str, str, np.ndarray]]:
+        """As `Rig.slopes`, whole matrices: central differences, exact at any step for polynomials of second degree."""
+        step = 0.1 * abs(value) or 1e-3  # a tenth loses no digits
+        up, down = (self.matrices_of(self.rig.with_parameters({name: value + sign * step})) for sign in (1, -1))
+        slopes = (high - low for high, low in zip(up, down, strict=True))
+        return [(which, "", slope / (2 * step)) for which, slope in zip(Matrices._fields, slopes, strict=True)]
 
     def response(self, omega: np.ndarray) -> np.ndarray:
         """G, (n, n_y, n_u + 3): from commanded volts and floor velocity [m/s] to y; omega > 0 [rad/s]."""
