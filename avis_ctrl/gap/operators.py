@@ -155,7 +155,7 @@ class Operators:
             self.extra_floor = F if self.extra_floor is None else self.extra_floor + F
 
     def volts(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n, n_u) commanded volts to acting ones, and (n, n_y) their aliases in each sensor."""
+        """(n,) commanded volts to acting ones, without the factors of the drives, and (n, n_y) aliases by sensor."""
         base, corner = self.base, self.amplifier_corner_Hz
         key = ("volts", base.period_s, self.delay_s, _sensors_of(base), corner, *_of(self.omega))
         known = _kept.get(key)
@@ -168,8 +168,7 @@ class Operators:
             if corner:
                 a = a / (1 + self.s / (2 * np.pi * corner))
             known = _keep(key, (a, folded))
-        a, folded = known
-        return a[:, None] * self.drive, folded
+        return known
 
 
 # What a fit asks for again and again on the same lines; the oldest go first.
@@ -237,12 +236,17 @@ class Assembled:
     slope_pf: np.ndarray
     T: np.ndarray
     rows: np.ndarray
-    volts: np.ndarray
+    hold: np.ndarray
     folded: np.ndarray
 
     @property
     def n_q(self) -> int:
         return self.G.shape[1]
+
+    @property
+    def volts(self) -> np.ndarray:
+        """(n, n_u) commanded volts to acting ones."""
+        return self.hold[:, None] * self.ops.drive
 
     @cached_property
     def forces_of_states(self) -> np.ndarray:
@@ -343,9 +347,9 @@ def assemble(ops: Operators, invert: bool = True) -> Assembled:
         D[:, N_Q + k, N_Q + k] += one.stiffness
     if ops.recoil is not None:
         D[:, :, :N_Q] += (G.T @ (z_pf[:, :, None] * (mounts.chassis @ ops.recoil))) @ ops.borne(M)
-    volts, folded = ops.volts()
+    hold, folded = ops.volts()
     inverse = np.linalg.inv(D) if invert else np.empty(0)
-    return Assembled(ops, D, inverse, M, G, z_pp, z_pf, slope_pp, slope_pf, T, rows, volts, folded)
+    return Assembled(ops, D, inverse, M, G, z_pp, z_pf, slope_pp, slope_pf, T, rows, hold, folded)
 
 
 def _with_internal_mass(s: np.ndarray, ops: Operators) -> tuple[np.ndarray, np.ndarray]:

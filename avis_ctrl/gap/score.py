@@ -21,7 +21,7 @@ import numpy as np
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.score_algebra import SYMMETRIC, Reduction, reduction
 from avis_ctrl.gap.table_model import Acting, ActiveEffect, TableModel, _Answer, _Side
-from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
+from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitened_real, whitener
 from avis_ctrl.identification.response import N_Q, ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns, transient_parts
 
@@ -67,9 +67,9 @@ class Part:
 
     def real(self, dY: np.ndarray) -> np.ndarray:
         """(k, n, n_y, m) of y to (k, N), whitened, free of the transient."""
-        out = as_real(whitened(self.L, dY))
+        out = whitened_real(self.L, dY)
         if self.transient.size:
-            out -= (out @ self.transient) @ self.transient.T
+            out -= (self.transient @ (self.transient.T @ out.T)).T
         return out
 
     def side(self, model: TableModel) -> _Side:

@@ -13,13 +13,11 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import Effect, EffectParameter
 from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.operators import Assembled, Operators, assemble
-from avis_ctrl.identification.response import N_Q, Driven, Matrices, ResponseModel, SensorModel
+from avis_ctrl.identification.response import N_Q, Driven, Matrices, Operands, ResponseModel, SensorModel, kept_lines
 from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs.rig import Parameter, Rig
 
 _MOUNT = re.compile(r"isolator(\d+)\.([kc])_([xyz])")
-# Sets of lines of which the assembled table is kept.
-MOST_KEPT = 8
 # Relative step of differences by an effect's parameters, in units of their size.
 STEP = 1e-4
 # A sensor's chain is another one where its ratio to the rig's varies over these frequencies by more than this share.
@@ -218,9 +216,9 @@ class TableModel:
 
     @cached_property
     def derivative_matrices(self) -> Matrices:
-        """Of the free parameters that are not a mount's stiffness or damping, in their order."""
-        others = tuple(name for name in self.base.names if not _MOUNT.fullmatch(name))
-        return replace(self.effective, names=others).derivative_matrices
+        """Of the rig's free parameters; zero for stiffness and damping of mounts, which effects may change."""
+        others = np.array([not _MOUNT.fullmatch(name) for name in self.base.names], bool)
+        return Matrices(*(slopes * others[:, None, None] for slopes in self.effective.derivative_matrices))
 
     @property
     def nonlinear(self) -> bool:
@@ -232,19 +230,10 @@ class TableModel:
             one.effect.change(ops, one.place, one.by_name)
         return ops
 
+    @kept_lines
     def assembled(self, omega: np.ndarray) -> Assembled:
-        """On lines omega; the last ones are kept, for a fit asks for them several times."""
-        kept = self.__dict__.setdefault("_assembled", {})
-        key = len(omega), float(omega[0]), float(omega[-1]), float(np.sum(omega))
-        if key not in kept:
-            while len(kept) >= MOST_KEPT:
-                kept.pop(next(iter(kept)))
-            kept[key] = assemble(self.operators(omega))
-        return kept[key]
-
-    def __getstate__(self) -> dict:
-        """Without what is kept, which is as quickly made again."""
-        return {name: value for name, value in self.__dict__.items() if name != "_assembled"}
+        """On lines omega."""
+        return assemble(self.operators(omega))
 
     def response(self, omega: np.ndarray) -> np.ndarray:
         """G, (n, n_y, n_u + 3), as `ResponseModel.response`; effects that depend on amplitude left out."""
@@ -307,8 +296,7 @@ class TableModel:
         answer = _Answer(made, self._acting(U, block, inner))
         if not derivative:
             return Driven(answer.Y, np.empty(0))
-        dY = np.zeros((len(self.names), *answer.Y.shape), complex)
-        answer.by_rig(self.effective, self.derivative_matrices, dY)
+        dY = answer.by_rig(self.effective, self.derivative_matrices, len(self._free))
         self._by_effects(omega, U, block, made, answer, dY)
         return Driven(answer.Y, dY)
 
@@ -399,7 +387,8 @@ class _Drive:
         self.volts = made.volts[:, :, None] * commanded
         self.w = U[:, n_u:n_u + 3] / s
         self.folded, self.alias = commanded * ops.drive[:, :, None], made.folded[:, :, None]
-        total = made.T @ self.volts
+        self.driven = bool(np.any(self.folded))
+        total = made.T @ self.volts if self.driven else np.zeros((len(s), made.n_q, U.shape[2]), complex)
         if np.any(self.w):
             total = total + made.floor_force(self.w)
         if U.shape[1] > n_u + 3:
@@ -418,13 +407,15 @@ def _gain(made: Assembled) -> np.ndarray:
 def _read(made: Assembled, x: np.ndarray, drive: _Drive) -> np.ndarray:
     """(n, n_y, m) of a motion x; aliases pass the chain far above its corners."""
     mat = made.ops.base.matrices
-    alias = drive.alias * ((mat.R @ np.linalg.inv(mat.M) @ mat.T) @ drive.folded)
     moved = made.rows @ x
     if np.any(against := made.ops.base.sensors.relative):
         moved = moved - (against[:, None] * mat.R) @ made.chassis(x, drive.w)
     if drive.reading is not None:
         moved = moved + drive.reading
-    Y = _gain(made) * (made.ops.sense[:, :, None] * moved + alias)
+    seen = made.ops.sense[:, :, None] * moved
+    if drive.driven:
+        seen += drive.alias * ((mat.R @ np.linalg.inv(mat.M) @ mat.T) @ drive.folded)
+    Y = _gain(made) * seen
     return Y if drive.output is None else Y + drive.output
 
 
@@ -436,7 +427,6 @@ class _Answer:
         self.made, self.acting, self.s, self.inner = made, acting, ops.s[:, None, None], acting.inner
         self.volts, self.w, self.folded, self.alias = drive.volts, drive.w, drive.folded, drive.alias
         self.x = made.inverse @ drive.total
-        self.Minv = np.linalg.inv(ops.base.matrices.M)
         self.sense, self.gain = ops.sense[:, :, None], _gain(made)
         self.Y = _read(made, self.x, drive)
 
@@ -445,60 +435,33 @@ class _Answer:
         """(n, n_y, n_q) y by a force on the coordinates."""
         return self.gain * self.sense * (self.made.rows @ self.made.inverse)
 
-    def by_rig(self, model: ResponseModel, d: Matrices, dY: np.ndarray) -> None:
-        """Derivatives by the rig's free parameters into the first rows of dY; d of those that are no mount's."""
-        made, ops, s = self.made, self.made.ops, self.s
-        left = self.left
-        mat, others = model.matrices, 0
-        rows = {name: k for k, name in enumerate(ops.mounts.names)}
+    def by_rig(self, model: ResponseModel, d: Matrices, more: int) -> np.ndarray:
+        """(n_p + more, n, n_y, m) by the rig's free parameters, and zeros; d of all of them, zero for stiffness and
+        damping of mounts."""
+        if "loop_delay_s" in model.names:
+            raise InputError("expected the effect loop_delay in the place of this parameter", field="parameters",
+                             value="loop_delay_s")
+        made, ops, s, left = self.made, self.made.ops, self.s, self.left
         own = made.G @ self.x
-        chassis = ops.mounts.chassis @ made.chassis(self.x, self.w, self.inner)
         through = left @ made.G.T
-        folded_q = self.Minv @ mat.T @ self.folded
-        for j, name in enumerate(model.names):
-            if name.startswith("sensor."):
-                others += 1
-                k = model.sensors.names.index(name.removeprefix("sensor."))
-                dY[j, :, k] = self.Y[:, k] / model.sensors.sensitivity[k]
-            elif match := _MOUNT.fullmatch(name):
-                k = rows[f"isolator{match[1]}.{match[3]}"]
-                if match[2] == "k":
-                    push = made.slope_pf[:, k, None] * chassis[:, k] - made.slope_pp[:, k, None] * own[:, k]
-                else:
-                    push = s[:, :, 0] * ops.damping_factor[:, k, None] * (chassis[:, k] - own[:, k])
-                dY[j] = through[:, :, k, None] * push[:, None, :]
-            elif name.startswith(("corner.", "damping.")):
-                others += 1
-                kind, _, sensor = name.partition(".")
-                k = model.sensors.names.index(sensor)
-                slope = model.sensors.suspension_slopes(s[:, 0, 0], k)[kind == "damping"]
-                alias = self.gain * self.alias * (mat.R @ self.Minv @ mat.T @ self.folded)
-                dY[j, :, k] = slope[:, None] * (self.Y - alias)[:, k]
-            elif name == "loop_delay_s":
-                raise InputError("expected the effect loop_delay in the place of this parameter", field="parameters",
-                                 value=name)
+        inertial = left[:, :, :N_Q]
+        if ops.recoil is not None:
+            inertial = inertial + through @ (made.z_pf[:, :, None] * (ops.mounts.chassis @ ops.recoil))
+        operands = Operands(ops.base.sensors, model.matrices, s, left[:, :, :N_Q], inertial, self.gain * self.sense,
+                            self.gain * self.alias, made.hold[:, None, None], self.folded, self.x[:, :N_Q],
+                            made.follow(self.w), made.chassis(self.x, self.w), self.Y)
+        dY = operands.derivative(model.names, d, more)
+        moved = ops.mounts.chassis @ made.chassis(self.x, self.w, self.inner)
+        rows = {name: k for k, name in enumerate(ops.mounts.names)}
+        for kind in "kc":
+            found = [(j, rows[f"isolator{match[1]}.{match[3]}"]) for j, name in enumerate(model.names)
+                     if (match := _MOUNT.fullmatch(name)) and match[2] == kind]
+            if not found:
+                continue
+            j, k = np.array(found).T
+            if kind == "k":
+                push = made.slope_pf[:, k, None] * moved[:, k] - made.slope_pp[:, k, None] * own[:, k]
             else:
-                dY[j] = self._by_matrices(d, others, left, folded_q, mat)
-                others += 1
-
-    def _by_matrices(self, d: Matrices, j: int, left, folded_q, mat: Matrices) -> np.ndarray:
-        """By a parameter of M, T, R, or of stiffness and damping beside the mounts."""
-        made, s, q = self.made, self.s, self.x[:, :N_Q]
-        push = np.zeros_like(self.x)
-        changed = np.zeros_like(self.Y)
-        if np.any(d.T[j]):
-            push[:, :N_Q] += d.T[j] @ self.volts
-            changed += self.gain * self.alias * (mat.R @ self.Minv @ d.T[j] @ self.folded)
-        if np.any(d.M[j]):
-            inertia = s ** 2 * (d.M[j] @ q)
-            push[:, :N_Q] -= inertia
-            if made.ops.recoil is not None:
-                moved = made.ops.mounts.chassis @ (made.ops.recoil @ inertia)
-                push -= made.G.T @ (made.z_pf[:, :, None] * moved)
-            changed -= self.gain * self.alias * (mat.R @ self.Minv @ d.M[j] @ folded_q)
-        if np.any(d.K[j]) or np.any(d.C[j]):
-            floor = made.follow(self.w)
-            push[:, :N_Q] += d.K_floor[j] @ floor + d.C_floor[j] @ (s * floor) - (d.K[j] + s * d.C[j]) @ q
-        if np.any(d.R[j]):
-            changed += self.gain * (self.sense * (d.R[j] @ q) + self.alias * (d.R[j] @ folded_q))
-        return left @ push + changed
+                push = s * ops.damping_factor[:, k, None] * (moved[:, k] - own[:, k])
+            dY.transpose(1, 3, 2, 0)[..., j] = through[:, None, :, k] * push.swapaxes(1, 2)[:, :, None]
+        return dY

@@ -192,10 +192,8 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     stages = [Stage("nominal", *_figures(Left.of(with_second_order(prepared.nominal), prepared.unmasked))),
               Stage("re-identified", *_figures(raw)),
               Stage("tolerances", *_figures(Left.of(fits.tolerant.model, blocks)))]
-    stages += [Stage(name_of(step.label)[0], *_figures(Left.of(step.fitted.model, blocks))) for step in fits.steps
-               if step.label in updated.labels and set(step.fitted.labels) < set(updated.labels)]
-    if updated.labels:
-        stages.append(Stage(name_of(updated.labels[-1])[0], *_figures(after)))
+    stages += [Stage(name_of(label)[0], *_figures(after if one is updated else Left.of(one.model, blocks)))
+               for label, one in _chain(fits, updated, prepared, settings)]
     found = [_named(one, updated, names, power, after.nrmse ** 2, prepared) for one in updated.model.effects
              if one.label in updated.labels]
     faults = prepared.faults
@@ -230,6 +228,20 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
                tuple(one for one in sentences if one), prepared.halves.how, seed, time.monotonic() - began,
                updated.covariance_of(updated.model.names), limits, shares, records, faults.raised if closed else (),
                traces, remainder, _moved(updated))
+
+
+def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSettings) -> list[tuple[str, Fitted]]:
+    """The models between that with tolerances and the updated one, an effect more each, in the order of finding."""
+    found, data = [], prepared.data(prepared.fitted, settings.lines)
+    one: Fitted | None = updated
+    for label in reversed(updated.labels):
+        if one is None:
+            break
+        found.append((label, one))
+        before = {label for label in one.labels if label != found[-1][0]}
+        one = next((step.fitted for step in fits.steps if set(step.fitted.labels) == before),
+                   without_effect(one, label, data, settings) if before else None)
+    return found[::-1]
 
 
 def _figures(left: Left) -> tuple[float, float]:

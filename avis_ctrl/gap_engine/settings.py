@@ -54,6 +54,7 @@ class GapSettings:
         textbook law to some per cent only, which no p-value knows.
     least_difference : of the variance of a difference between a half and the whole over the whole's, below which it is
         round-off [1].
+    most_of_half : variance of a half over the whole's, above which that half says nothing of a direction [1].
     within_noise : chi-square per degree of freedom up to which what remains counts as noise [1]: a tenth in r.m.s.,
         which is what the noise's own estimate leaves open.
     small : r.m.s. of what remains over the response below which nothing is missing [1] (contract).
@@ -98,6 +99,7 @@ class GapSettings:
     law_p_value: float = 1e-4
     law_change: float = 0.2
     least_difference: float = 1e-3
+    most_of_half: float = 20.0
     within_noise: float = 1.21
     small: float = 0.01
     explained: float = 0.9

@@ -72,19 +72,21 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings) -> list[
     P_half - P (J. A. Hausman, Econometrica 46 (1978) 1251-1271).
     """
     rows = [fitted.priors.names.index(name) for name in names if name in fitted.priors.names]
-    whole, slope = fitted.covariance[np.ix_(rows, rows)], fitted.priors.slopes(fitted.z)[rows]
-    values = fitted.priors.values(fitted.z)[rows]
+    slope, values = fitted.priors.slopes(fitted.z)[rows], fitted.priors.values(fitted.z)[rows]
+    root = np.linalg.cholesky(fitted.covariance[np.ix_(rows, rows)])
     found = []
     for words, groups in _parts(fitted, rows):
         at = np.concatenate([fitted.rows[group] for group in groups])
         J, e = fitted.J[:, at], fitted.e[at]
         P = np.linalg.inv(J @ J.T + np.eye(len(J)))
-        step = (P @ (J @ e - fitted.z))[rows]
-        D = P[np.ix_(rows, rows)] - whole
-        size, V = np.linalg.eigh((D + D.T) / 2)
-        known = size > settings.least_difference * np.diag(whole).max()
-        chi2 = float(np.sum((V.T @ step)[known] ** 2 / size[known]))
-        change = np.abs(step * slope) / np.maximum(np.abs(values), 1e-300)
+        step = np.linalg.solve(root, (P @ (J @ e - fitted.z))[rows])
+        # Variances of the half over those of the whole; a half that hardly knows a direction says nothing of it.
+        half = np.linalg.solve(root, np.linalg.solve(root, P[np.ix_(rows, rows)]).T)
+        size, V = np.linalg.eigh((half + half.T) / 2)
+        known = (size > 1 + settings.least_difference) & (size < settings.most_of_half)
+        along = (V.T @ step)[known]
+        chi2 = float(np.sum(along ** 2 / (size[known] - 1)))
+        change = np.abs(root @ V[:, known] @ along * slope) / np.maximum(np.abs(values), 1e-300)
         found.append(Half(words, chi2, float(stats.chi2.sf(chi2, max(int(known.sum()), 1))), float(change.max())))
     return found
 

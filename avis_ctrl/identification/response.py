@@ -15,10 +15,10 @@ polynomials of at most second degree in each parameter, for which a central diff
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from functools import cached_property, lru_cache, wraps
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -35,8 +35,32 @@ FLOOR = ("vx", "vy", "vz")
 MOTION_OF_UNIT: dict[str, Motion] = {"m": "displacement", "m/s": "velocity", "m/s^2": "acceleration"}
 _POWER: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
 N_Q = 6
+Model = TypeVar("Model")
+Value = TypeVar("Value")
 # Share of its size at the start that a positive parameter keeps in a fit.
 LOWEST = 1e-6
+
+
+@lru_cache(maxsize=32)
+def _chain_response(chain: StateSpace | None, motion: Motion, lines: bytes) -> np.ndarray:
+    """(n,) from displacement to y of unit sensitivity; not to be written to. A fit asks for the same lines again."""
+    omega = np.frombuffer(lines)
+    return (1.0 if chain is None else chain.frequency_response(omega)[:, 0, 0]) * (1j * omega) ** _POWER[motion]
+
+
+def kept_lines(compute: Callable[[Model, np.ndarray], Value]) -> Callable[[Model, np.ndarray], Value]:
+    """A method of lines omega that keeps what it found last, not to be written to: a fit asks again and again."""
+    known: list[tuple[Model, np.ndarray, Value]] = []
+
+    @wraps(compute)
+    def found(model: Model, omega: np.ndarray) -> Value:
+        for one, lines, value in known:
+            if one is model and lines is omega:
+                return value
+        known.append((model, omega, value := compute(model, omega)))
+        del known[:-2]
+        return value
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +93,10 @@ class SensorModel:
         w0, w = 2 * np.pi * f0, 2 * np.pi * f
         return (s ** 2 + 2 * z0 * w0 * s + w0 ** 2) / (s ** 2 + 2 * z * w * s + w ** 2)
 
-    def suspension_slopes(self, s: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) each: relative change of the response per Hz of the corner, and per unit of the damping ratio."""
-        own = self.suspensions[k]
-        assert own is not None
-        f, z = own
+    def suspension_slopes(self, s: np.ndarray, k: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """(n, len(k)) each: relative change of the response of some geophones per Hz of the corner, and per unit of the
+        damping ratio; s (n, 1)."""
+        f, z = np.array([self.suspensions[one] for one in k], float).T
         w = 2 * np.pi * f
         den = s ** 2 + 2 * z * w * s + w ** 2
         return -2 * np.pi * (2 * z * s + 2 * w) / den, -2 * w * s / den
@@ -112,12 +135,9 @@ class SensorModel:
 
     def sense(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y) from displacement to y of unit sensitivity."""
-        s, known = 1j * np.asarray(omega, float), {}
-        for chain, motion in zip(self.chains, self.motions, strict=True):
-            if (id(chain), motion) not in known:
-                response = 1.0 if chain is None else chain.frequency_response(omega)[:, 0, 0]
-                known[id(chain), motion] = response * s ** _POWER[motion]
-        return np.stack([known[id(chain), motion] * self._detuned(s, k) for k, (chain, motion) in
+        s = 1j * np.asarray(omega, float)
+        lines = s.imag.tobytes()
+        return np.stack([_chain_response(chain, motion, lines) * self._detuned(s, k) for k, (chain, motion) in
                          enumerate(zip(self.chains, self.motions, strict=True))], axis=1)
 
     def folded(self, omega: np.ndarray, period_s: float, delay_s: float, corner_Hz: float | None) -> np.ndarray:
@@ -173,6 +193,77 @@ class Driven(NamedTuple):
 
     Y: np.ndarray
     dY: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Operands:
+    """What the entries of the matrices multiply on each line, and how y follows.
+
+    s : (n, 1, 1) j omega. left, inertial : (n, n_y, 6) y by forces on q, and by forces of inertia, whose reaction a
+    chassis may bear. sense, alias : (n, n_y, 1) y by the displacement along a sensor, and by what of it folds back.
+    volts : (n, n_u, m) whose aliases are seen; times hold (n, 1, 1) they act. q : (n, 6, m). floor, chassis :
+    (n, 3 or 6, m) displacement of what pushes through the mounts, and of what sensors read against. Y : (n, n_y, m).
+    """
+
+    sensors: SensorModel
+    mat: Matrices
+    s: np.ndarray
+    left: np.ndarray
+    inertial: np.ndarray
+    sense: np.ndarray
+    alias: np.ndarray
+    hold: np.ndarray
+    volts: np.ndarray
+    q: np.ndarray
+    floor: np.ndarray
+    chassis: np.ndarray
+    Y: np.ndarray
+
+    def derivative(self, names: Sequence[str], d: Matrices, more: int = 0) -> np.ndarray:
+        """(n_p + more, n, n_y, m): of Y by parameters of the rig and its sensors, then zeros. d : of the matrices.
+
+        In memory the parameters come last: what is done to all of them is one product a line.
+        """
+        s, q, (n, n_y, m), n_f = self.s, self.q, self.Y.shape, self.floor.shape[1]
+        dY = np.zeros((n, m, n_y, len(names) + more), complex)
+        aliased = np.broadcast_to(self.alias, (n, n_y, 1)) * (self.mat.R @ np.linalg.inv(self.mat.M))
+        folded = np.linalg.solve(self.mat.M, self.mat.T) @ self.volts
+        springs = [(-d.K, q), (-d.C, s * q)]
+        if np.any(self.floor):
+            springs += [(d.K_floor[:, :, :n_f], self.floor), (d.C_floor[:, :, :n_f], s * self.floor)]
+        # y by a vector, and the entries with what they multiply to make it: of rows (p) that they enter at all.
+        for left, entries in ((self.left, springs), (-self.inertial, [(d.M, s ** 2 * q)]), (-aliased, [(d.M, folded)]),
+                              (self.left * self.hold + aliased, [(d.T, self.volts)])):
+            rows = np.flatnonzero(sum(np.any(A, axis=(1, 2)) for A, _ in entries))
+            if rows.size:
+                dY[..., rows] += left[:, None] @ sum(_products(A[rows], x) for A, x in entries)
+        # A row of R touches its own sensor only, as do the sensor's own parameters.
+        alias = np.broadcast_to(self.alias, (n, n_y, 1))
+        rows, k = np.nonzero(np.any(d.R, axis=2))
+        if rows.size:
+            R = d.R[rows, k]
+            against = R[:, :self.chassis.shape[1]] * self.sensors.relative[k, None]
+            change = self.sense[:, k] * (R @ q - against @ self.chassis) + alias[:, k] * (R @ folded)
+            dY[:, :, k, rows] += change.swapaxes(1, 2)
+        for kind in ("sensor", "corner", "damping"):
+            own = [(j, self.sensors.names.index(name.removeprefix(f"{kind}."))) for j, name in enumerate(names)
+                   if name.startswith(f"{kind}.")]
+            if not own:
+                continue
+            rows, k = np.array(own).T
+            if kind == "sensor":
+                change = self.Y[:, k] / self.sensors.sensitivity[k, None]
+            else:
+                slope = self.sensors.suspension_slopes(s[:, :, 0], k)[kind == "damping"]
+                change = slope[:, :, None] * (self.Y[:, k] - alias[:, k] * (self.mat.R[k] @ folded))
+            dY[:, :, k, rows] = change.swapaxes(1, 2)
+        return dY.transpose(3, 0, 2, 1)
+
+
+def _products(slopes: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """(n, m, i, p) of matrices (p, i, j) times x (n, j, m)."""
+    (p, i, j), (n, _, m) = slopes.shape, x.shape
+    return (x.swapaxes(1, 2).reshape(n * m, j) @ slopes.transpose(2, 1, 0).reshape(j, i * p)).reshape(n, m, i, p)
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,22 +399,23 @@ class ResponseModel:
         shapes = [(len(self.names), *matrix.shape) for matrix in self.matrices]
         found = Matrices(*(np.zeros(shape) for shape in shapes))
         for j, name in enumerate(self.names):
-            slope = self.rig.channel_slope(name) if name in known else None
-            if slope is not None:
-                which, channel, column = slope
-                if which == "T" and channel in self.actuators:
-                    found.T[j][:, self.actuators.index(channel)] = column
+            if name not in known:
+                continue
+            for which, channel, slope in self.rig.slopes(name) or self._differences(name, known[name].value):
+                if not channel:
+                    getattr(found, which)[j] = slope
+                elif which == "T" and channel in self.actuators:
+                    found.T[j, :, self.actuators.index(channel)] = slope
                 elif which == "R" and channel in self.sensors.names:
-                    found.R[j][self.sensors.names.index(channel)] = column
-            elif name in known:
-                value = known[name].value
-                # Exact at any step for polynomials of second degree: a tenth loses no digits.
-                step = 0.1 * abs(value) or 1e-3
-                up, down = (self.matrices_of(self.rig.with_parameters({name: value + sign * step}))
-                            for sign in (1, -1))
-                for all_of, high, low in zip(found, up, down, strict=True):
-                    all_of[j] = (high - low) / (2 * step)
+                    found.R[j, self.sensors.names.index(channel)] = slope
         return found
+
+    def _differences(self, name: str, value: float) -> list[tuple[str, str, np.ndarray]]:
+        """As `Rig.slopes`, whole matrices: central differences, exact at any step for polynomials of second degree."""
+        step = 0.1 * abs(value) or 1e-3  # a tenth loses no digits
+        up, down = (self.matrices_of(self.rig.with_parameters({name: value + sign * step})) for sign in (1, -1))
+        slopes = (high - low for high, low in zip(up, down, strict=True))
+        return [(which, "", slope / (2 * step)) for which, slope in zip(Matrices._fields, slopes, strict=True)]
 
     def response(self, omega: np.ndarray) -> np.ndarray:
         """G, (n, n_y, n_u + 3): from commanded volts and floor velocity [m/s] to y; omega > 0 [rad/s]."""
@@ -339,12 +431,12 @@ class ResponseModel:
 
     def sensor_transients(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y, n_t): `chain_transients` of each sensor."""
-        n_y, each = len(self.sensors.names), self.chain_transients(1j * omega)
-        parts = []
+        each, start = self.chain_transients(1j * omega), 0
+        found = np.zeros((len(omega), len(each), sum(own.shape[1] for own in each)), complex)
         for k, own in enumerate(each):
-            parts.append(np.zeros((len(omega), n_y, own.shape[1]), complex))
-            parts[-1][:, k] = own
-        return np.concatenate(parts, axis=2)
+            found[:, k, start:start + own.shape[1]] = own
+            start += own.shape[1]
+        return found
 
     def chain_transients(self, s: np.ndarray) -> list[np.ndarray]:
         """(n, k) of each sensor: what the ends of a record leave in it by itself: the states of its chain, and a
@@ -365,56 +457,35 @@ class ResponseModel:
         U : (n, n_u + 3, m), or (n, n_u + 3 + 12, m) with impulse and step of the transient last.
         """
         omega = np.asarray(omega, float)
-        s, mat = 1j * omega[:, None, None], self.matrices
-        n_u, transient = len(self.actuators), U.shape[1] > len(self.inputs)
-        a, alias = self._drive(omega)
+        s, mat, n_u = 1j * omega[:, None, None], self.matrices, len(self.actuators)
+        a, alias, inverse, out = self._lines(omega)
         volts, floor = U[:, :n_u], U[:, n_u:n_u + 3]
-        D = mat.K + s * mat.C + s ** 2 * mat.M
-        force = mat.T @ (a * volts) + (mat.K_floor[:, :3] / s + mat.C_floor[:, :3]) @ floor
-        if transient:
-            force = force + U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
-        inverse = np.linalg.inv(D)
+        force = np.zeros((len(omega), N_Q, U.shape[2]), complex)
+        driven, moving = np.any(volts), np.any(floor)
+        if driven:
+            force += mat.T @ (a * volts)
+        if moving:
+            force += (mat.K_floor[:, :3] / s + mat.C_floor[:, :3]) @ floor
+        if U.shape[1] > len(self.inputs):
+            force += U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
         q = inverse @ force
-        out = self.sensors.sense(omega)[:, :, None]
+        seen = mat.R @ q
+        if moving and np.any(self.sensors.relative):
+            seen -= (mat.R[:, :3] * self.sensors.relative[:, None]) @ (floor / s)
         S = self.sensors.sensitivity[:, None]
+        Y = S * out * seen
         Minv = np.linalg.inv(mat.M)
-        moved = mat.R @ q
-        if np.any(self.sensors.relative):
-            moved = moved - (mat.R[:, :3] * self.sensors.relative[:, None]) @ (floor / s)
-        # Aliases pass the chain far above its corners.
-        seen = out * moved + alias * (mat.R @ Minv @ mat.T @ volts)
+        if driven:
+            # Aliases pass the chain far above its corners.
+            Y += S * alias * (mat.R @ Minv @ mat.T @ volts)
         if not derivative:
-            return Driven(S * seen, np.empty(0))
-        return Driven(S * seen, self._derivative(omega, volts, floor, q, inverse, out, alias, seen, mat, Minv, a))
-
-    def _derivative(self, omega, volts, floor, q, inverse, out, alias, seen, mat, Minv, a) -> np.ndarray:
-        s, d = 1j * omega[:, None, None], self.derivative_matrices
-        S = self.sensors.sensitivity[:, None]
-        left = S * out * (mat.R @ inverse)
-        pushed_q = Minv @ mat.T @ volts
-        dY = np.zeros((len(self.names), *seen.shape), complex)
-        driven = a * volts
-        pushed_alias = mat.R @ pushed_q
-        for j, name in enumerate(self.names):
-            if name.startswith("sensor."):
-                k = self.sensors.names.index(name.removeprefix("sensor."))
-                dY[j, :, k] = seen[:, k]
-            elif name.startswith(("corner.", "damping.")):
-                kind, _, sensor = name.partition(".")
-                k = self.sensors.names.index(sensor)
-                slope = self.sensors.suspension_slopes(1j * omega, k)[kind == "damping"]
-                dY[j, :, k] = self.sensors.sensitivity[k] * slope[:, None] * (seen - alias * pushed_alias)[:, k]
-            elif name == "loop_delay_s":
-                dY[j] = self._delay_derivative(omega, volts, mat, inverse, out, Minv)
-            else:
-                dY[j] = left @ _force_derivative(d, j, s, q, driven, floor)
-                folding = _nonzero(d.T[j], lambda X: X @ volts) - _nonzero(d.M[j], lambda X: X @ pushed_q)
-                if np.ndim(folding):
-                    dY[j] += S * alias * (mat.R @ Minv @ folding)
-                if np.any(d.R[j]):
-                    moved = d.R[j] @ q - (d.R[j][:, :3] * self.sensors.relative[:, None]) @ (floor / s)
-                    dY[j] += S * (out * moved + alias * (d.R[j] @ pushed_q))
-        return dY
+            return Driven(Y, np.empty(0))
+        left, w = S * out * (mat.R @ inverse), floor / s
+        operands = Operands(self.sensors, mat, s, left, left, S * out, S * alias, a, volts, q, w, w, Y)
+        dY = operands.derivative(self.names, self.derivative_matrices)
+        if "loop_delay_s" in self.names:
+            dY[self.names.index("loop_delay_s")] = self._delay_derivative(omega, volts, mat, inverse, out, Minv)
+        return Driven(Y, dY)
 
     def _delay_derivative(self, omega, volts, mat, inverse, out, Minv) -> np.ndarray:
         """Of the continuous term exactly; aliases by a difference, for they are small, with a kink at whole samples."""
@@ -425,6 +496,13 @@ class ResponseModel:
                  - replace(self, delay_s=earlier)._drive(omega)[1]) / (later - earlier)
         moved = out * (mat.R @ inverse @ mat.T @ (-s * a * volts)) + slope * (mat.R @ Minv @ mat.T @ volts)
         return self.sensors.sensitivity[:, None] * moved
+
+    @kept_lines
+    def _lines(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """`_drive`, inv(D) (n, 6, 6), and the chains of the sensors (n, n_y, 1)."""
+        s, mat = 1j * omega[:, None, None], self.matrices
+        inverse = np.linalg.inv(mat.K + s * mat.C + s ** 2 * mat.M)
+        return *self._drive(omega), inverse, self.sensors.sense(omega)[:, :, None]
 
     def _drive(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Voltage commanded to force divided by T (n, 1, 1), and the aliases of each sensor (n, n_y, 1)."""
@@ -473,19 +551,3 @@ def positive(name: str) -> bool:
     if name.startswith(("sensor.", "actuator.")) or name in INERTIAL:
         return True
     return last.startswith(("k_", "c_")) or (len(last) == 2 and last[0] in "de" and last[1].isdigit())
-
-
-def _force_derivative(d: Matrices, j: int, s, q, driven, floor) -> np.ndarray | float:
-    """dF U - dD q of parameter j; matrices that it does not enter are passed over."""
-    total: np.ndarray | float = 0.0
-    total = total + _nonzero(d.T[j], lambda X: X @ driven)
-    total = total + _nonzero(d.K_floor[j], lambda X: X[:, :3] @ (floor / s))
-    total = total + _nonzero(d.C_floor[j], lambda X: X[:, :3] @ floor)
-    total = total - _nonzero(d.K[j], lambda X: X @ q)
-    total = total - _nonzero(d.C[j], lambda X: X @ (s * q))
-    total = total - _nonzero(d.M[j], lambda X: X @ (s ** 2 * q))
-    return total if np.ndim(total) else np.zeros_like(q)
-
-
-def _nonzero(matrix: np.ndarray, product) -> np.ndarray | float:
-    return product(matrix) if np.any(matrix) else 0.0

@@ -203,6 +203,13 @@ def span(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Of dependent columns (an integrator inside a mount beside impulse and step on the body) the unknowns would be huge,
     of opposite sign, and of no meaning one by one.
     """
+    squares, V = np.linalg.eigh(columns.T @ columns)
+    if squares[0] > DEPENDENT * squares[-1]:
+        # Well apart: by their products, twice against round-off, in half the time of reflections.
+        X = V / np.sqrt(squares)
+        Q = columns @ X
+        again = np.linalg.inv(np.linalg.cholesky(Q.T @ Q)).T
+        return Q @ again, X @ again
     Q, R = np.linalg.qr(columns)
     U, s, Vt = np.linalg.svd(R)
     kept = s > DEPENDENT * s[0]

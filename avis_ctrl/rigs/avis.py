@@ -24,6 +24,8 @@ AXES = ("x", "y", "z")
 # A drive or sensor no further from a mount's attachment than this [m], and no further from an earth axis than this
 # [rad], sits in the mount: many tolerances of its place and direction, and much less than mounts are apart.
 IN_MOUNT_m, IN_MOUNT_rad = 0.03, 0.3
+# Derivative (3, 6) of `point_map` by each coordinate of the point.
+_ARM = tuple(point_map(unit) - point_map(np.zeros(3)) for unit in np.eye(3))
 INERTIA = ("J1", "J2", "J3", "J12", "J13", "J23")
 _ISOLATOR_PARAMETER = re.compile(r"isolator(\d+)\.(k|c|p)_([xyz])")
 _UNITS = {"k": "N/m", "c": "N s/m", "p": "m"}
@@ -152,22 +154,54 @@ class AvisTable(Rig):
                     one.direction[k], "", f"component of the unit direction of {one.name} along {AXES[k]}")
         return found
 
-    def channel_slope(self, name: str) -> tuple[str, str, np.ndarray] | None:
+    def slopes(self, name: str) -> list[tuple[str, str, np.ndarray]] | None:
         kind, _, rest = name.partition(".")
         if kind == "actuator":
-            one = self._by_name[rest]
-            return "T", rest, point_map(one.position).T @ np.array(one.direction)
-        if kind not in ("place", "direction"):
-            return None
-        rest, _, axis = rest.rpartition(".")
-        one, k = self._by_name[rest], AXES.index(axis)
+            return [("T", rest, point_map((one := self._by_name[rest]).position).T @ one.direction)]
+        if kind in ("place", "direction"):
+            return self._channel_slope(kind, *rest.rsplit(".", 1))
+        if match := _ISOLATOR_PARAMETER.fullmatch(name):
+            return self._isolator_slopes(int(match[1]), match[2], AXES.index(match[3]))
+        G = point_map(self.centre_of_mass)
+        if name in INERTIA:
+            i, j = int(name[1]) + 2, int(name[-1]) + 2
+            M = np.zeros((6, 6))
+            M[i, j] = M[j, i] = 1.0
+        elif name == "mass":
+            M = G.T @ G
+        else:
+            half = self.mass * _ARM[AXES.index(name[-1])].T @ G
+            M = half + half.T
+        return [("M", "", M)]
+
+    def _channel_slope(self, kind: str, channel: str, axis: str) -> list[tuple[str, str, np.ndarray]]:
+        """By a coordinate of a channel's place, or a component of its direction."""
+        one, k = self._by_name[channel], AXES.index(axis)
         if kind == "place":
-            slope = (point_map(np.eye(3)[k]) - point_map(np.zeros(3))).T @ np.array(one.direction)
+            slope = _ARM[k].T @ one.direction
         else:
             along = ({0, 1, 2} - set(_across(one.direction))).pop()
             turn = np.eye(3)[k] - np.eye(3)[along] * one.direction[k] / one.direction[along]
             slope = point_map(one.position).T @ turn
-        return ("T", rest, slope * one.constant_N_per_V) if isinstance(one, Drive) else ("R", rest, slope)
+        drive = isinstance(one, Drive)
+        return [("T" if drive else "R", channel, slope * one.constant_N_per_V if drive else slope)]
+
+    def _isolator_slopes(self, number: int, kind: str, k: int) -> list[tuple[str, str, np.ndarray]]:
+        """By stiffness, damping or position of an isolator along an axis; what is attached to it moves along."""
+        one, arm = self.isolators[number - 1], _ARM[k]
+        G, G_c = point_map(one.position), point_map(np.add(one.position, one.chassis_offset))
+        if kind != "p":
+            which = kind.upper()
+            return [(which, "", np.outer(G[k], G[k])), (f"{which}_floor", "", np.outer(G[k], G_c[k]))]
+        found = []
+        for which, values in (("K", np.diag(one.stiffness)), ("C", np.diag(one.damping))):
+            half = arm.T @ values @ G
+            found += [(which, "", half + half.T), (f"{which}_floor", "", arm.T @ values @ G_c + G.T @ values @ arm)]
+        found += [("T", motor.name, arm[AXES.index(motor.axis)] * motor.constant_N_per_V) for motor in self.motors
+                  if motor.isolator == number]
+        g = self.geophones
+        at = zip(g.names, g.isolator, g.axis, strict=True) if g else ()
+        return found + [("R", sensor, arm[AXES.index(axis)]) for sensor, own, axis in at if own == number]
 
     @cached_property
     def _by_name(self) -> dict[str, Any]:

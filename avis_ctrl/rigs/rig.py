@@ -128,9 +128,10 @@ class Rig(ABC):
         raise InputError("a rig file of this kind has one sensitivity for all; leave these out", field="parameters",
                          value=[f"sensor.{name}" for name in gains])
 
-    def channel_slope(self, name: str) -> tuple[str, str, np.ndarray] | None:
-        """Of a parameter that moves one channel only: "T" or "R", the channel, and the derivative (6,) of its column of
-        T or row of R; None for any other parameter."""
+    def slopes(self, name: str) -> list[tuple[str, str, np.ndarray]] | None:
+        """Derivatives of the matrices by a parameter, those that are not zero: (matrix, "", (6, 6)) of "M", "C", "K",
+        "C_floor" and "K_floor"; ("T" or "R", channel, (6,)) of a drive's column of T or a sensor's row of R. None where
+        the rig states none."""
         return None
 
     def sensor_rows(self) -> tuple[tuple[str, ...], np.ndarray]:

@@ -15,6 +15,7 @@ from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs import load_rig
+from avis_ctrl.rigs.instruments import PositionSensorAt
 
 RIG = load_rig("avis")
 # Displacements against the voltage itself: no chain, no hold, no aliases.
@@ -342,3 +343,31 @@ def test_reciprocity(name, place, values):
     if name == "base_compliance":  # forces between chassis and payload move these against each other
         inverse = inverse - made.chassis(inverse, np.zeros((len(OMEGA), 3, 6)))
     np.testing.assert_allclose(inverse, np.swapaxes(inverse, 1, 2), rtol=0, atol=1e-9 * np.abs(inverse).max())
+
+
+@pytest.mark.parametrize(("effect", "relative"), [
+    (None, True), (("geophone_corner", "Sz1", [5.0, 0.6]), False), (("actuator_lag", "actuators", [2e-3]), False),
+    (("attached_oscillator", "payload/z", [20.0, 12.0, 0.05, 0.3, 0.2]), False),
+    (("base_compliance", "chassis/rocking",
+      [900.0, 0.05, 9.0, 11.0, 14.0, 10.0, 12.0, 13.0, 0.4, 0.5, 0.6, -0.45, -0.2]), False)])
+def test_derivatives_by_parameters_and_tolerances_are_those_of_differences(effect, relative):
+    """Volts, floor and transient; an oblique sensor that reads against the chassis where nothing but the floor moves
+    it. Effects on mounts leave out that they move with an isolator's place."""
+    rig = RIG.with_channels_apart()
+    if relative:
+        one, *others = rig.instruments
+        rig = replace(rig, instruments=(PositionSensorAt(one.name, one.position, (0.6, 0.0, 0.8), 3e3), *others))
+    free = [name for name in ResponseModel.of(rig, ()).all_parameters()
+            if name != "loop_delay_s" and not (effect and effect[0] == "base_compliance" and ".p_" in name)]
+    model = TableModel(ResponseModel.of(rig, free))
+    if effect:
+        model = with_effect(*effect, model)
+    rng = np.random.default_rng(4)
+    U = rng.standard_normal((len(OMEGA), 23, 1)) + 1j * rng.standard_normal((len(OMEGA), 23, 1))
+    dY = model.driven(OMEGA, U).dY
+    assert dY.shape == (len(model.names), len(OMEGA), 6, 1)
+    for j, name in enumerate(free):
+        step = 1e-5 * max(abs(model.values[j]), 0.1) * np.eye(len(model.names))[j]
+        up, down = (model.at(model.values + sign * step).driven(OMEGA, U, False).Y for sign in (1, -1))
+        slope = (up - down) / (2 * step[j])
+        assert np.max(np.abs(dY[j] - slope)) <= 5e-6 * np.max(np.abs(slope)), name

@@ -10,10 +10,10 @@ from scipy.stats import chi2 as chi2_law
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification import campaign_fit
-from avis_ctrl.identification.maximum_likelihood import fit
+from avis_ctrl.identification.maximum_likelihood import SETTINGS, fit, whitened_real
 from avis_ctrl.identification.noise import relative_noise, residual_noise
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
+from avis_ctrl.identification.spectra import DEPENDENT, SpectralBlock, record_block, response_block, span
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
@@ -300,3 +300,33 @@ def test_noise_that_is_singular_is_answered(avis):
     block = responses(model, lines=5)
     with pytest.raises(InputError, match="positive definite"):
         fit(model, [block.with_noise(np.zeros((5, 6, 6)))])
+
+
+@pytest.mark.parametrize("apart", [1.0, 1e-2, 1e-5, 1e-9])
+def test_span_of_columns_however_close(apart, rng):
+    """Against the singular vectors of the columns themselves."""
+    columns = rng.normal(size=(400, 7))
+    columns[:, 3] = columns[:, 2] + apart * columns[:, 3]
+    columns /= np.linalg.norm(columns, axis=0)
+    Q, X = span(columns)
+    U, s, _ = np.linalg.svd(columns, full_matrices=False)
+    rank = 6 if apart < DEPENDENT else 7
+    assert Q.shape == (400, rank)
+    np.testing.assert_allclose(Q.T @ Q, np.eye(rank), atol=1e-13)
+    np.testing.assert_allclose(Q @ Q.T, U[:, :rank] @ U[:, :rank].T, atol=1e-15 * s[0] / s[rank - 1] + 1e-14)
+    np.testing.assert_allclose(columns @ X, Q, atol=1e-14 * s[0] / s[rank - 1])
+
+
+@pytest.mark.parametrize("m", [1, 3])
+@pytest.mark.parametrize("each", [False, True])
+def test_many_are_whitened_as_one(m, each, rng):
+    """One line and experiment after the other, more lines than fit in one go, none left over or twice."""
+    n, p = 2 * SETTINGS.at_once + 5, 4
+    L, dY = (rng.normal(size=shape) + 1j * rng.normal(size=shape) for shape in
+             ((n, m if each else 1, 6, 6), (p, n, 6, m)))
+    white = np.zeros_like(dY)
+    for k in range(n):
+        for i in range(m):
+            white[:, k, :, i] = dY[:, k, :, i] @ L[k, i if each else 0].T
+    flat = white.reshape(p, -1)
+    np.testing.assert_allclose(whitened_real(L, dY), np.hstack([flat.real, flat.imag]), rtol=1e-12, atol=1e-12)

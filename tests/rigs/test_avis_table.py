@@ -1,5 +1,7 @@
 """The linear AVIS against Newton's laws recomputed from positions (Rademakers, eqs. 2.8-2.21)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -128,3 +130,28 @@ def test_geophones_see_along_their_axes_at_their_isolators(rig):
 def test_points_for_the_drawing(rig):
     kinds = {name: place.kind for name, place in rig.points().items()}
     assert kinds["isolator3"] == "isolator" and kinds["Az4"] == "actuator" and kinds["Sx2"] == "sensor"
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_slopes_of_all_matrices_are_those_of_differences(skew, apart):
+    """By every parameter; a chassis attachment beside the payload's, motors and geophones in the isolators or apart."""
+    first = replace(skew.isolators[0], chassis_offset=(0.02, -0.01, -0.1))
+    rig = replace(skew, isolators=(first, *skew.isolators[1:]))
+    if apart:
+        rig = rig.with_channels_apart().with_parameters({"direction.Ay1.x": 0.3, "direction.Sz1.y": -0.2})
+
+    def matrices(rig):
+        eom, (_, R) = rig.equations_of_motion(), rig.sensor_rows()
+        return {"M": eom.M, "C": eom.C, "K": eom.K, "C_floor": eom.C_floor, "K_floor": eom.K_floor, "T": eom.T, "R": R}
+    channels = {"T": rig.equations_of_motion().actuators, "R": rig.sensor_rows()[0]}
+    for name, parameter in rig.parameters().items():
+        found = {which: np.zeros_like(matrix) for which, matrix in matrices(rig).items()}
+        for which, channel, slope in rig.slopes(name):
+            place = found[which].T if which == "T" else found[which]
+            place[channels[which].index(channel) if channel else slice(None)] = slope
+        # Directions alone are no polynomials of second degree, and ask for a small step.
+        step = 1e-5 if name.startswith("direction.") else 0.1 * abs(parameter.value) or 1e-3
+        up, down = (matrices(rig.with_parameters({name: parameter.value + sign * step})) for sign in (1, -1))
+        size = max(1.0, *(np.max(np.abs(slope)) for slope in found.values()))
+        for which, slope in found.items():
+            np.testing.assert_allclose(slope, (up[which] - down[which]) / (2 * step), atol=2e-9 * size, err_msg=name)
