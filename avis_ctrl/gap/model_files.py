@@ -46,7 +46,8 @@ class ModelFile(_Part):
     """A model in a file.
 
     rig : text of a rig file. rig_values : parameters of the rig that no rig file may hold, such as an inertia that the
-    data gave and no body has. period_s : 0 for responses against the voltage itself.
+    data gave and no body has. suspensions : corner [Hz] and damping ratio of geophones that are not as their filters
+    assume. period_s : 0 for responses against the voltage itself.
     """
 
     format: Literal["avis-gap-model"]
@@ -54,6 +55,7 @@ class ModelFile(_Part):
     rig: str
     rig_values: dict[str, float]
     loaded: bool
+    suspensions: dict[str, Annotated[list[Positive], Field(min_length=2, max_length=2)]] = {}
     free: list[str]
     unit: str
     sensors: Annotated[list[str], Field(min_length=1)]
@@ -80,6 +82,9 @@ def model_to_dict(model: TableModel) -> dict[str, Any]:
         "sensors": list(base.sensors.names), "sensitivity": [float(one) for one in base.sensors.sensitivity],
         "actuators": list(base.actuators), "period_s": float(base.period_s), "delay_s": float(base.delay_s),
         "amplifier_corner_Hz": None if base.amplifier_corner_Hz is None else float(base.amplifier_corner_Hz),
+        "suspensions": {name: list(own) for name, own, assumed in zip(
+            base.sensors.names, base.sensors.suspensions, base.sensors.assumed, strict=False)
+            if own is not None and own != assumed},
         "effects": [{"name": one.effect.name, "place": one.place,
                      "values": {name: float(value) for name, value in one.by_name.items()}} for one in model.effects],
         "fixed": sorted(model.fixed), "campaign_s": list(campaign_clock(model))}
@@ -173,7 +178,13 @@ def _made(file: ModelFile) -> TableModel:
     except (ValueError, RecursionError) as error:
         raise InputError(f"expected the text of a rig file; {' '.join(str(error).split())}", field="rig") from None
     sensors = sensor_model(rig, file.unit, file.sensors)
-    sensors = replace(sensors, sensitivity=np.array(file.sensitivity))
+    if unknown := sorted(set(file.suspensions) - {name for name, own in zip(sensors.names, sensors.suspensions,
+                                                                            strict=False) if own}):
+        raise InputError("expected geophones of the model", field="suspensions", value=unknown)
+    own = tuple((f, z) if (f, z) != (0, 0) else None for f, z in (
+        file.suspensions.get(name, old or (0, 0)) for name, old in zip(sensors.names, sensors.suspensions,
+                                                                       strict=False)))
+    sensors = replace(sensors, sensitivity=np.array(file.sensitivity), suspensions=own)
     base = ResponseModel(rig, tuple(file.free), sensors, tuple(file.actuators), file.period_s, file.delay_s,
                          file.amplifier_corner_Hz)
     model = TableModel(base)

@@ -57,6 +57,16 @@ class RecordMotion:
         """(samples,) on the campaign's clock."""
         return self.start_s + (np.arange(len(self.volts)) - self.before) / self.sample_rate_Hz
 
+    @cached_property
+    def largest_volts(self) -> float:
+        """Largest r.m.s. of a drive's voltage, V."""
+        return float(np.sqrt(np.mean(self.volts ** 2, axis=0)).max())
+
+    @cached_property
+    def rms_deflections(self) -> np.ndarray:
+        """(n_g,) m, r.m.s. over the record."""
+        return np.sqrt(np.mean(self.deflection ** 2, axis=0))
+
     def spectrum(self, samples: np.ndarray, omega: np.ndarray) -> np.ndarray:
         """(n, channels) of (samples, channels) on the block's lines, scaled as a `SpectralBlock` is."""
         own = samples[self.before:]

@@ -24,12 +24,11 @@ from avis_ctrl.gap.signal_effects import left_by, levels, named
 from avis_ctrl.gap_engine.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.gap_engine.preparation import Prepared, mended_with, prepare, with_second_order
 from avis_ctrl.gap_engine.score import EvidenceScore
-from avis_ctrl.gap_engine.search import Step, implausible, name_of, search, without_effect
+from avis_ctrl.gap_engine.search import Step, implausible, name_of, search, with_effect, without_effect
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
-from avis_ctrl.gap_engine.tolerances import of_effect, re_identified, with_tolerances
+from avis_ctrl.gap_engine.tolerances import of_effect, re_identified, tolerances_of, with_tolerances
 from avis_ctrl.gap_engine.validation import Power, halves, odds_against, share_of
 from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.rigs.instruments import Tolerances
 from avis_ctrl.rigs.rig import Rig
 
 Progress = Callable[[str], None]
@@ -92,11 +91,11 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
     data = prepared.data(prepared.fitted, settings.lines)
     progress("fit of mass, inertia, stiffness and damping")
     start, nominal = prepared.rough, prepared.nominal.base
-    large = of_effect(start.effects[0], settings)
+    large = of_effect(start.effects[0], tolerances_of(rig), settings)
     priors = re_identified(nominal.rig, settings).followed_by(large)
     base = fit(start, priors, priors.z(start.values), data, first_variances(data, settings), settings)
     progress("the same with all tolerances")
-    tolerances = with_tolerances(nominal, rig.tolerances or Tolerances(), settings)
+    tolerances = with_tolerances(nominal, tolerances_of(rig), settings)
     apart = replace(base.model, base=replace(base.model.base, names=tolerances.names),
                     nominal=replace(nominal, names=tolerances.names))
     priors = tolerances.followed_by(large)
@@ -126,7 +125,10 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
     data, held = (prepared.data(blocks, settings.lines) for blocks in (prepared.fitted, prepared.held_out))
     best, probability, rivals, refused = fits.best, {}, {}, []
     for step in fits.steps:
-        probability[step.label], rivals[step.label] = _probability(step, settings)
+        one, others = _probability(step, settings)
+        if one <= settings.sure and step is not fits.steps[-1]:
+            one, others = _probability(_again(step, fits.best, data, settings), settings)
+        probability[step.label], rivals[step.label] = one, others
     for step in fits.steps:
         label = step.label
         why = _refusal(fits.best, step, label, probability[label], held, settings)
@@ -137,6 +139,20 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
             best = without_effect(best, label, data, settings) or best
     kept = {label: value for label, value in probability.items() if label in best.labels}
     return Names(best, kept, {label: rivals[label] for label in kept}, tuple(refused))
+
+
+def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
+    """The choice of a step, beside what was found after it: until then several may have stood for the same."""
+    rest = without_effect(best, step.label, data, settings)
+    if rest is None:
+        return step
+    quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
+    known = {name_of(label) for label in best.labels}
+    tried = {step.label: best}
+    for label, fitted in step.tried.items():
+        if name_of(label) not in known and (one := with_effect(rest, fitted.model.effects[-1], data, quick)) is not None:
+            tried[label] = one
+    return Step(rest, best, tried, step.candidates, step.label)
 
 
 def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Data, settings: GapSettings) -> str:
@@ -211,7 +227,8 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     remainder = Remainder(after.nrmse, after.nrmse / max(after.noise_nrmse, 1e-300), power.share(excess),
                           None if growth is None else bool(growth[0] > LINEAR + 2 * growth[1]))
     closed = after.chi2_per_dof <= settings.within_noise or excess <= 0
-    verdict = _verdict(told, closed, remainder, settings)
+    small = math.sqrt(max(excess, 0.0)) < settings.small
+    verdict = _verdict(told, closed, closed or small, remainder, settings)
     where, remaining = places(before), places(after)
     onward = _next(told, fits, names)
     if onward is None and verdict in ("unexplained", "partly explained"):
@@ -266,10 +283,10 @@ def _share_of_signal(name: str, raw: Left, masked: Left, power: Power) -> float:
     return float(own / max(own + power.excess, 1e-300))
 
 
-def _verdict(told: Sequence[NamedEffect], closed: bool, left: Remainder, settings: GapSettings) -> Verdict:
-    """By the rules of the contract."""
+def _verdict(told: Sequence[NamedEffect], closed: bool, small: bool, left: Remainder, settings: GapSettings) -> Verdict:
+    """By the rules of the contract. closed : what remains is noise. small : that, or less than 1 % of the response."""
     if not told:
-        return "none" if closed or left.nrmse < settings.small else "unexplained"
+        return "none" if small else "unexplained"
     return "explained" if closed or left.share <= 1 - settings.explained else "partly explained"
 
 

@@ -7,8 +7,9 @@ z are standardised parameters; the whitened residual e is free of the transients
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -30,13 +31,21 @@ class Data:
 
 
 @dataclass(frozen=True, eq=False)
+class Evaluated:
+    """e (N,) whitened residual, J (n, N) its negative derivative by z, left (n, n_y) a block in the unit of y."""
+
+    e: np.ndarray
+    J: np.ndarray
+    left: list[np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
 class Fitted:
     """The most probable parameters of a model.
 
     model : at the estimate. priors, z (n,), covariance (n, n) of z. variances : of what is not explained.
-    log_evidence : Laplace. iterations : Gauss-Newton steps. e (N,) and J (n, N) : whitened, path errors integrated out.
-    rows : of e by level and band. log_likelihoods : by level and band; what is in `log_evidence` beside their sum is of
-        the priors.
+    log_evidence : Laplace. iterations : Gauss-Newton steps. weights : of the data. white : residual and Jacobian,
+    whitened by noise and distortion.
     """
 
     model: Any
@@ -46,15 +55,28 @@ class Fitted:
     variances: Variances
     log_evidence: float
     iterations: int
-    e: np.ndarray
-    J: np.ndarray
-    rows: Mapping[Group, np.ndarray]
-    log_likelihoods: Mapping[Group, float]
+    weights: Weights
+    white: Evaluated
+
+    @cached_property
+    def e(self) -> np.ndarray:
+        """(N,) residual, path errors integrated out."""
+        return self.weights.flatten(self.white.e[None])[0]
+
+    @cached_property
+    def J(self) -> np.ndarray:
+        """(n, N) negative derivative of `e` by z."""
+        return self.weights.flatten(self.white.J)
 
     @property
-    def by_name(self) -> dict[str, float]:
-        """Standardised values by name."""
-        return dict(zip(self.priors.names, map(float, self.z), strict=True))
+    def rows(self) -> dict[Group, np.ndarray]:
+        """Entries of `e` by level and band."""
+        return {one.group: one.rows for one in self.weights.paths}
+
+    @cached_property
+    def log_likelihoods(self) -> dict[Group, float]:
+        """By level and band; what is in `log_evidence` beside their sum is of the priors."""
+        return _by_group(self.weights, self.e)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -65,13 +87,11 @@ class Fitted:
         """(k, k) of some parameters in their units; zero for those that are not free."""
         slopes = self.priors.slopes(self.z)
         rows = [self.priors.names.index(name) if name in self.priors.names else -1 for name in names]
-        C = (self.covariance * slopes) * slopes[:, None]
-        C = np.pad(C, (0, 1))[np.ix_(rows, rows)]
-        return C
+        return np.pad((self.covariance * slopes) * slopes[:, None], (0, 1))[np.ix_(rows, rows)]
 
 
 def first_variances(data: Data, settings: GapSettings) -> Variances:
-    """Where nothing is known yet: a relative error of every path, distortion as large as a tenth of it."""
+    """Where nothing is known yet: a relative error of every path, and distortion as a part of it."""
     path: dict[Group, np.ndarray] = {}
     distortion: dict[Group, np.ndarray] = {}
     count: dict[Group, int] = {}
@@ -80,8 +100,8 @@ def first_variances(data: Data, settings: GapSettings) -> Variances:
         for band in np.unique(own):
             at, group = own == band, (level, int(band))
             path[group] = np.full(block.Y.shape[1], settings.first_error ** 2)
-            power = np.sum(np.abs(block.Y[at, :, 0]) ** 2, axis=0)
-            distortion[group] = distortion.get(group, 0.0) + settings.first_distortion * settings.first_error ** 2 * power
+            power = settings.first_error ** 2 * np.sum(np.abs(block.Y[at, :, 0]) ** 2, axis=0)
+            distortion[group] = distortion.get(group, 0.0) + settings.first_distortion * power
             count[group] = count.get(group, 0) + int(at.sum())
     return Variances(path, {group: value / count[group] for group, value in distortion.items()})
 
@@ -94,46 +114,39 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
     for k in range(settings.rounds + 1):
         paths = [path_contributions(model, block) for block in data.blocks]
         weights = weigh(data.blocks, data.levels, paths, variances, settings)
-        found = _evaluate(model, priors, z, data, weights)
+        now = _evaluate(model, priors, z, data, weights)
+        H, g, cost = weights.normal_equations(now.J, now.e)
         for _ in range(settings.iterations):
-            e, J, _ = found
-            flat, Jf = weights.flatten(e[None])[0], weights.flatten(J)
-            cost = flat @ flat + z @ z
-            H = Jf @ Jf.T + np.eye(len(z))
-            step = np.linalg.solve(H, Jf @ flat - z)
-            promised = step @ (Jf @ flat - z)
-            if promised < settings.converged * len(flat):
+            step = np.linalg.solve(H + np.eye(len(z)), g - z)
+            if step @ (g - z) < settings.converged * len(now.e):
                 break
             size = 1.0
-            while size > 1e-3:
+            while size > settings.shortest_step:
                 trial = z + size * step
                 moved = model.at(priors.values(trial))
                 own = _evaluate(moved, priors, trial, data, weights)
-                new = weights.flatten(own[0][None])[0]
-                if new @ new + trial @ trial < cost:
+                expansion = weights.normal_equations(own.J, own.e)
+                if expansion[2] + trial @ trial < cost + z @ z:
                     break
                 size /= 3
             else:
                 break
-            model, z, found, steps = moved, trial, own, steps + 1
+            model, z, now, (H, g, cost), steps = moved, trial, own, expansion, steps + 1
         if k < settings.rounds:
-            variances = estimated(weights, found[0], found[2], data.blocks, data.levels, variances, settings)
-    e, J, _ = found
-    flat, Jf = weights.flatten(e[None])[0], weights.flatten(J)
-    H = Jf @ Jf.T + np.eye(len(z))
+            variances = estimated(weights, now.e, now.left, data.blocks, data.levels, variances, settings)
+    H = H + np.eye(len(z))
     nu, v0 = settings.error_weight, settings.least_error ** 2
     hyper = sum(float(np.sum(-(nu / 2 + 1) * np.log(v) - nu * v0 / (2 * v))) for v in variances.path.values())
-    log_evidence = -0.5 * (flat @ flat + z @ z + weights.log_determinant + np.linalg.slogdet(H)[1]) + hyper
-    return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), steps, flat, Jf,
-                  {one.group: one.rows for one in weights.paths}, _by_group(weights, flat))
+    log_evidence = -0.5 * (cost + z @ z + weights.log_determinant + np.linalg.slogdet(H)[1]) + hyper
+    return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), steps, weights, now)
 
 
 def log_likelihoods(fitted: Fitted, data: Data, settings: GapSettings = SETTINGS) -> dict[Group, float]:
     """Of records that no fit has seen, by level and band, by the fitted parameters and variances."""
     paths = [path_contributions(fitted.model, block) for block in data.blocks]
     weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
-    e, _, _ = _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, derivative=False)
-    return _by_group(weights, weights.flatten(e[None])[0])
+    own = _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, derivative=False)
+    return _by_group(weights, weights.flatten(own.e[None])[0])
 
 
 def _by_group(weights: Weights, flat: np.ndarray) -> dict[Group, float]:
@@ -141,10 +154,14 @@ def _by_group(weights: Weights, flat: np.ndarray) -> dict[Group, float]:
             for one in weights.paths}
 
 
-def _evaluate(model: Any, priors: Priors, z: np.ndarray, data: Data, weights: Weights, derivative: bool = True):
-    """Whitened residual (N,), its negative Jacobian by z (n, N), and the residuals (n, n_y) of the blocks."""
+def _evaluate(model: Any, priors: Priors, z: np.ndarray, data: Data, weights: Weights, derivative: bool = True
+              ) -> Evaluated:
     parts = [block_residual(model, block, L[:, None], derivative=derivative)
              for block, L in zip(data.blocks, weights.L, strict=True)]
     e = np.concatenate([one[0] for one in parts])
-    J = np.concatenate([one[1] for one in parts], axis=1) * priors.slopes(z)[:, None] if derivative else np.empty(0)
-    return e, J, [one[2].error[:, :, 0] for one in parts]
+    J = np.empty((len(z) if derivative else 0, len(e)))
+    start, slopes = 0, priors.slopes(z)[:, None]
+    for own, rows, _ in parts if derivative else ():
+        np.multiply(rows, slopes, out=J[:, start:start + len(own)])
+        start += len(own)
+    return Evaluated(e, J, [one[2].error[:, :, 0] for one in parts])

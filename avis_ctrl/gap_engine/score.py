@@ -9,11 +9,12 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from avis_ctrl.gap.score import Part, Score
 from avis_ctrl.gap_engine.likelihood import Data, Fitted
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
-from avis_ctrl.gap_engine.weights import Weights, path_contributions, weigh, with_distortion
+from avis_ctrl.gap_engine.weights import with_distortion
 from avis_ctrl.identification.parameter_sets import default_parameters
 
 
@@ -29,15 +30,11 @@ class EvidenceScore(Score):
         blocks = [with_distortion(block, level, fitted.variances, settings)
                   for block, level in zip(data.blocks, data.levels, strict=True)]
         self.parts = [Part(self.model, block) for block in blocks]
-        paths = [path_contributions(self.model, block) for block in data.blocks]
-        self.weights: Weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
-        n = len(fitted.z)
-        e = np.concatenate([part.real((part.block.Y - part.answer.Y)[None])[0] for part in self.parts])
-        J = np.concatenate([part.real(full.answer(part.block, part.body, inner=part.inner).dY)
-                            for part in self.parts], axis=1) * fitted.priors.slopes(fitted.z)[:, None]
-        self.e = np.concatenate([self.weights.flatten(e[None])[0], -fitted.z])
-        J = np.concatenate([self.weights.flatten(J), np.eye(n)], axis=1)
-        self.basis = np.linalg.qr(J.T)[0].T
+        self.weights = fitted.weights
+        # Orthonormal rows that span the Jacobian with its priors.
+        root = np.linalg.cholesky(np.linalg.inv(fitted.covariance))
+        self.basis = solve_triangular(root, np.concatenate([fitted.J, np.eye(len(fitted.z))], axis=1), lower=True)
+        self.e = np.concatenate([fitted.e, -fitted.z])
         self.e = self.e - self.basis.T @ (self.basis @ self.e)
 
     @cached_property

@@ -24,7 +24,7 @@ from avis_ctrl.gap.table_model import ActiveEffect, active
 from avis_ctrl.gap_engine.likelihood import Data, Fitted, fit
 from avis_ctrl.gap_engine.score import EvidenceScore
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
-from avis_ctrl.gap_engine.tolerances import Priors, of_effect
+from avis_ctrl.gap_engine.tolerances import BEYOND, Priors, of_effect, tolerances_of
 
 Progress = Callable[[str], None]
 
@@ -45,17 +45,18 @@ class Candidate:
 class Step:
     """One more effect: the fit with it, and all fits that were tried in its place, by label.
 
-    before : the fit without it. candidates : how many effects and places were scored.
+    before : the fit without it. label : of the effect, the last one by default. candidates : how many effects and places were scored.
     """
 
     before: Fitted
     fitted: Fitted
     tried: dict[str, Fitted]
     candidates: int
+    label: str = ""
 
-    @property
-    def label(self) -> str:
-        return self.fitted.labels[-1]
+    def __post_init__(self) -> None:
+        if not self.label:
+            object.__setattr__(self, "label", self.fitted.labels[-1])
 
 
 def name_of(label: str) -> tuple[str, str]:
@@ -109,7 +110,7 @@ def other_laws(found: Sequence[Candidate], best: ActiveEffect) -> list[Candidate
 def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSettings) -> Fitted | None:
     """The fit with one effect more; None where it came to no end."""
     model = fitted.model.with_effect(one)
-    own = of_effect(one, settings).of([name for name in one.names if name in model.names])
+    own = of_effect(one, tolerances_of(model.rig), settings).of([name for name in one.names if name in model.names])
     own = _with_known(own, model.priors)
     values = dict(zip(one.names, one.values, strict=True))
     z = np.concatenate([fitted.z, own.z(np.array([values[name] for name in own.names]))])
@@ -142,34 +143,43 @@ def _try(fitted: Fitted, model, priors: Priors, z: np.ndarray, data: Data, setti
 def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
            progress: Progress = lambda text: None, each: Each = one_by_one,
            enough: Callable[[Step], bool] = lambda step: False) -> list[Step]:
-    """Effects in the order in which they are found.
+    """Effects in the order in which they are found; last of all the values of the rig file that are beyond their
+    tolerance, which show in how far one of them had to move, and hardly in what remains.
 
     enough : whether the search may end with a step, because what it found takes next to nothing.
     """
     steps: list[Step] = []
-    now = base
-    while len(steps) < settings.longest:
-        progress(f"effects that may be missing, step {len(steps) + 1}")
-        found = candidates(now, data, effects, settings, each)
-        chosen = shortlist(found, settings)
-        if not chosen:
-            break
-        tried = _tried(now, chosen, data, settings, each)
-        if not tried:
-            break
-        best = max(tried, key=lambda label: tried[label].log_evidence)
-        tried |= _tried(now, other_laws(found, tried[best].model.effects[-1]), data, settings, each)
-        best = max(tried, key=lambda label: tried[label].log_evidence)
-        if tried[best].log_evidence - now.log_evidence < settings.certain + math.log(len(found)):
-            break
-        start = tried[best]
-        full = fit(start.model, start.priors, start.z, data, start.variances, settings)
-        steps.append(Step(now, full, tried, len(found)))
-        progress(f"step {len(steps)}: {', '.join(full.labels)}")
-        if enough(steps[-1]):
-            break
-        now = full
+
+    def more(effects: Sequence[Effect], enough: Callable[[Step], bool]) -> None:
+        while len(steps) < settings.longest:
+            now = steps[-1].fitted if steps else base
+            progress(f"effects that may be missing, step {len(steps) + 1}")
+            step = _step(now, data, effects, settings, each)
+            if step is None:
+                return
+            steps.append(step)
+            progress(f"step {len(steps)}: {', '.join(step.fitted.labels)}")
+            if enough(step):
+                return
+    more(effects, enough)
+    if steps:
+        more([one for one in effects if one.name in BEYOND or one.name == "geophone_corner"], lambda step: False)
     return steps
+
+
+def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each) -> Step | None:
+    """The effect of the largest evidence; None where none beats the present model."""
+    found = candidates(now, data, effects, settings, each)
+    tried = _tried(now, shortlist(found, settings), data, settings, each)
+    if not tried:
+        return None
+    best = max(tried, key=lambda label: tried[label].log_evidence)
+    tried |= _tried(now, other_laws(found, tried[best].model.effects[-1]), data, settings, each)
+    best = max(tried, key=lambda label: tried[label].log_evidence)
+    start = tried[best]
+    if start.log_evidence - now.log_evidence < settings.certain + math.log(len(found)):
+        return None
+    return Step(now, fit(start.model, start.priors, start.z, data, start.variances, settings), tried, len(found))
 
 
 def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Each

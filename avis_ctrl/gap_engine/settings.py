@@ -32,6 +32,9 @@ class GapSettings:
         them, and they hang on a geometry known to some per cent.
     turning_percent : the same of the share of the rotation that turns the axes of motors and sensors [%], which a rig
         file does not state.
+    shortest_step : part of a Gauss-Newton step below which no shorter one is tried [1].
+    beyond_tolerance : prior standard deviation of a value that may be beyond its tolerance, in tolerances: as wide as
+        faults of wiring, mounting and data sheets are.
     effect_sizes : prior standard deviation of an effect's strength, in units of its parameter's size; broad, so that it
         costs some nats and bends nothing.
     shape_spread : prior standard deviation of a parameter that shapes an effect (a frequency), relative to its start.
@@ -46,6 +49,7 @@ class GapSettings:
         a hundred.
     outside_odds : how many times as probable an effect of the library is beforehand as one that has no name in it [1].
     rival : probability from which another name cannot be ruled out [1]; one in twenty.
+    sure : probability up to which an effect is compared with its rivals again, beside what was found after it [1].
     headline : probability below which a name is an alternative only [1].
     most_sure : largest probability that is reported [1]: what nobody thought of leaves so much.
     trace : share of the gap's power below which an effect is a trace [1].
@@ -81,6 +85,8 @@ class GapSettings:
     least_eigenvalue: float = 1e-8
     second_order_percent: float = 20.0
     turning_percent: float = 50.0
+    shortest_step: float = 1e-3
+    beyond_tolerance: float = 20.0
     effect_sizes: float = 100.0
     shape_spread: float = 1.0
     resonance_share: float = 0.1
@@ -93,6 +99,7 @@ class GapSettings:
     certain: float = 4.6
     outside_odds: float = 10.0
     rival: float = 0.05
+    sure: float = 0.9
     headline: float = 0.5
     most_sure: float = 0.99
     trace: float = 0.01

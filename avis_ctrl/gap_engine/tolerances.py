@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,15 +82,34 @@ def with_tolerances(model: ResponseModel, tolerances: Tolerances, settings: GapS
                   np.concatenate([first.positive, relative]))
 
 
-def of_effect(effect: ActiveEffect, settings: GapSettings = SETTINGS) -> Priors:
-    """Broad normal priors of an effect's parameters: about none for its strength, about where its fit begins for what
-    shapes it. Those of the second-order terms are narrow: they are known but for what turns with the payload."""
+def tolerances_of(rig: Rig) -> Tolerances:
+    """Of the rig file, or those of the contract."""
+    return getattr(rig, "tolerances", None) or Tolerances()
+
+
+# Effects that are one value of the rig file gone beyond its tolerance, and how many of their own units one tolerance
+# is.
+BEYOND: Mapping[str, Callable[[Tolerances], float]] = {
+    "sensor_gain": lambda t: t.sensor_gain_percent / 100, "actuator_gain": lambda t: t.actuator_gain_percent / 100,
+    "sensor_misalignment": lambda t: float(np.degrees(t.direction_rad)), "com_offset": lambda t: t.centre_of_mass_m,
+    "product_of_inertia": lambda t: t.product_of_inertia_kgm2}
+
+
+def of_effect(effect: ActiveEffect, tolerances: Tolerances, settings: GapSettings = SETTINGS) -> Priors:
+    """Broad normal priors of an effect's parameters: some tolerances wide for what is beyond its tolerance, about none
+    for the strength of others, about where its fit begins for what shapes it. Those of the second-order terms are
+    narrow: they are known but for what turns with the payload."""
     if isinstance(effect.effect, LargeMotion):
         sigma = np.array([settings.second_order_percent, *[settings.turning_percent] * 2]) / 100
         return Priors(effect.names, np.array(effect.values), sigma, np.zeros(3, bool))
     mean = np.array([p.none if p.linear else v for p, v in zip(effect.parameters, effect.values, strict=True)])
     sigma = np.array([settings.effect_sizes * p.size if p.linear else max(settings.shape_spread * abs(v), p.size)
                       for p, v in zip(effect.parameters, effect.values, strict=True)])
+    if (one := BEYOND.get(effect.effect.name)) is not None:
+        sigma = np.full(len(mean), settings.beyond_tolerance * one(tolerances))
+    elif effect.effect.name == "geophone_corner":
+        relative = np.array([tolerances.sensor_corner_percent, tolerances.sensor_damping_percent]) / 100
+        sigma = settings.beyond_tolerance * relative * mean
     low, high = (np.array([getattr(p, name) for p in effect.parameters]) for name in ("low", "high"))
     return Priors(effect.names, mean, sigma, np.zeros(len(mean), bool), low, high)
 

@@ -85,6 +85,18 @@ class Weights:
         return out
 
 
+    def normal_equations(self, J: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """J W J^T (n, n), J W e (n,) and e W e of whitened rows, W = inv(I + B B^T), without forming its root."""
+        H, g, cost = J @ J.T, J @ e, float(e @ e)
+        for one in self.paths:
+            along, of = J[:, one.rows] @ one.Q, one.Q.T @ e[one.rows]
+            less = one.size / (1 + one.size)
+            H -= (along * less) @ along.T
+            g -= along @ (less * of)
+            cost -= float(less @ of ** 2)
+        return H, g, cost
+
+
 def path_contributions(model: Any, block: SpectralBlock) -> np.ndarray:
     """(n, n_y, n_in): what each input of a record contributes to each sensor."""
     U = np.zeros((*block.U.shape[:2], block.U.shape[1]), complex)

@@ -19,6 +19,7 @@ from avis_ctrl.gap.signals.converter import nominal_converter
 from avis_ctrl.gap.simulate import simulate
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.gap.together import only_together
+from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.prediction import model_inputs, predict
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
@@ -67,7 +68,7 @@ def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
     names, known = model.base.names, rig.parameters()
     comments = {}
     if covariance is not None and covariance.shape == (len(model.names),) * 2:
-        shared = {name: group for group in only_together(model) for name in group}
+        shared = {name: group for group in only_together(_rig_alone(model)) for name in group}
         for k, name in enumerate(names):
             if name in shared:
                 others = " and ".join(other for other in shared[name] if other != name)
@@ -83,6 +84,12 @@ def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
         header.append("stiffness in this file is that in the middle of its drift; the change is told over that "
                       "at its begin")
     return rig_toml(rig, comments, "\n".join(header))
+
+
+def _rig_alone(model: TableModel) -> TableModel:
+    """With the parameters free that have no tolerance, which tells them apart from each other."""
+    free = tuple(name for name in default_parameters(model.rig) if name in model.base.names)
+    return replace(model, base=replace(model.base, names=free))
 
 
 def _as_reported(model: TableModel, one: ActiveEffect) -> list[str]:

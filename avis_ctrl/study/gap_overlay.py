@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.gap.data import SAME_LEVEL
-from avis_ctrl.gap.judgement import effects_of
+from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.record_motion import clock_of
 from avis_ctrl.gap.simulate import simulate
 from avis_ctrl.gap.table_model import TableModel
@@ -96,7 +96,8 @@ def _overlay(records: Campaign, baseline: TableModel, updated: TableModel, clock
     rows = [measured.outputs.index(name) for name in baseline.sensors.names]
     before, after = (_response(model, measured) for model in (baseline, linear))
     value = measured.value[:, rows] + (after if measured.method.startswith(BESIDE) else 0.0)
-    named = tuple(one.effect.name for one in effects_of(updated) if one.effect.nonlinear)
+    named = tuple(one.effect.name for one in updated.effects if one.effect.nonlinear
+                  and not isinstance(one.effect, LargeMotion))
     left_out = named
     if named:
         with suppress(AvisError):

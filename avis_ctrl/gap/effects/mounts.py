@@ -271,12 +271,12 @@ class CubicStiffness(_OfMounts):
 
 def largest_rms(model: TableModel) -> float:
     """Largest r.m.s. deflection of a mount [m] in any record; 10 micrometres where none is known."""
-    found = [float(np.sqrt(np.mean(one.deflection ** 2, axis=0)).max()) for one in model.motion.values()]
+    found = [float(one.rms_deflections.max()) for one in model.motion.values()]
     return max(found, default=1e-5) or 1e-5
 
 
 def median_rms(model: TableModel) -> float:
-    found = [float(np.median(np.sqrt(np.mean(one.deflection ** 2, axis=0)))) for one in model.motion.values()]
+    found = [float(np.median(one.rms_deflections)) for one in model.motion.values()]
     return float(np.median(found)) if found else 1e-5
 
 

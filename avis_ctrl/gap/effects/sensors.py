@@ -70,8 +70,9 @@ class GeophoneCorner(_OfSensor):
                 EffectParameter("damping", "1", "damping ratio of the suspension", z, z / 5, 5 * z, z))
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        assumed = second_order(ops.s, *suspensions(ops.base.rig)[place])
-        ops.sense[:, ops.sensor(place)] *= assumed / second_order(ops.s, values["corner_Hz"], values["damping"])
+        k = ops.sensor(place)
+        present = second_order(ops.s, *ops.base.sensors.suspensions[k])
+        ops.sense[:, k] *= present / second_order(ops.s, values["corner_Hz"], values["damping"])
 
 
 @register

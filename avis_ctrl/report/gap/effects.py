@@ -6,42 +6,64 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from avis_ctrl.gap.judgement import LARGE_MOTION
+from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.result import Gap, NamedEffect
 from avis_ctrl.gap.together import only_together
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.finding import Found
-from avis_ctrl.report.pieces import Bullets, Fold, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Bullets, Fold, Heading, Paragraph, Piece, Section, Table, table
+
+# Tolerances that are shown at once, and from how many standard deviations one counts as far.
+SHOWN, FAR = 10, 3.0
 
 
 def parameters(found: Found) -> Section:
     """Sizes with standard deviations, how each effect was confirmed, and the rig's parameters with and without."""
     gap = found.gap
     pieces: list[Piece] = []
-    if gap.effects:
-        pieces += [_sizes(gap), Bullets(tuple(_told(one) for one in gap.effects))]
+    if gap.effects or gap.traces:
+        pieces += [_sizes(gap), Bullets(tuple(_told(one) for one in (*gap.effects, *gap.traces)))]
     else:
-        pieces.append(Paragraph("No effect is named, so the updated model is the re-identified one."))
+        pieces.append(Paragraph("No effect is named: the updated model is the rig within its tolerances."))
     if len(gap.baseline.values):
         both = " and updated" if gap.effects else ""
-        groups = only_together(gap.updated)
+        groups = only_together(gap.baseline)
         pieces.append(Fold(f"The rig's own parameters, re-identified{both}",
                            (_rig(gap, groups), *_together(groups), *_always(gap))))
+    if gap.tolerances:
+        pieces += [Heading("Tolerances"), *_tolerances(gap)]
     return Section("Parameters", "parameters", tuple(pieces))
+
+
+def _tolerances(gap: Gap) -> list[Piece]:
+    """How far every value of the rig file with a tolerance had to move; the largest first."""
+    header = ("parameter", "value", "± 1 σ", "unit", "moved by")
+    rows = []
+    for one in gap.tolerances:
+        value, sigma = words.with_deviation(one.value, one.std)
+        rows.append((one.parameter, value, f"± {sigma}", words.unit(one.unit), f"{one.moved:+.1f}".replace("-", "−")))
+    moved = np.array([one.moved for one in gap.tolerances])
+    far = int(np.sum(np.abs(moved) > FAR))
+    told = (f"{len(rows)} values of the rig file have a tolerance. They moved by "
+            f"{words.number(float(np.sqrt(np.mean(moved ** 2))), 2)} of their tolerances, r.m.s., and {far or 'none'} "
+            f"of them by more than {FAR:g}.")
+    many = table("Values of the rig file that moved most, in units of their tolerance.", header, rows[:SHOWN], "lrrlr")
+    rest = Fold(f"{len(rows) - SHOWN} more tolerances", (table("The others.", header, rows[SHOWN:], "lrrlr"),))
+    return [Paragraph(told), many, *([rest] if rows[SHOWN:] else [])]
 
 
 def _sizes(gap: Gap) -> Table:
     rows = []
-    for one in gap.effects:
+    for one in (*gap.effects, *gap.traces):
         for name, p in one.parameters.items():
             value, sigma = words.with_deviation(p.value, p.std)
             known = np.isfinite(p.std) and p.std > 0
             rows.append((one.name, one.location, name, value, f"± {sigma}" if known else "none",
                          "" if p.unit == "1" else words.unit(p.unit)))
     return table("Parameters of the named effects. Those of the table are fitted together with all parameters of the "
-                 "rig, with one standard deviation from that fit, by noise or by how what the model leaves scatters, "
-                 "whichever is larger; those of hum, converters and floor are from the records themselves.",
+                 "rig and all tolerances, with one standard deviation that counts noise and what has no name; those of "
+                 "hum, converters and floor are from the records themselves.",
                  ("effect", "place", "parameter", "value", "± 1 σ", "unit"), rows, "lllrrl")
 
 
@@ -69,7 +91,7 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
     shared = {name for group in groups for name in group}
     rows = []
     for name, value in before.items():
-        if name.startswith(f"{LARGE_MOTION}@"):
+        if name.startswith(f"{LargeMotion.name}@"):
             continue
         new = after.get(name, np.nan)
         shown, spread = words.number(new, 5), "not by itself" if name in shared else "not stated"
@@ -98,7 +120,7 @@ def _together(groups: Sequence[Sequence[str]]) -> list[Piece]:
 def _always(gap: Gap) -> list[Piece]:
     """Second-order terms that every model holds, which are no effect."""
     own = [(name, value) for name, value in zip(gap.updated.names, gap.updated.values, strict=True)
-           if name.startswith(f"{LARGE_MOTION}@")]
+           if name.startswith(f"{LargeMotion.name}@")]
     if not own:
         return []
     sigma = _deviations(gap)

@@ -131,8 +131,7 @@ class _DriveLaw(_Drive):
 
 def largest_volts(model: TableModel) -> float:
     """Largest r.m.s. of a voltage in any record; one where none is known."""
-    found = [float(np.sqrt(np.mean(one.volts ** 2, axis=0)).max()) for one in model.motion.values()]
-    return max(found, default=1.0) or 1.0
+    return max((one.largest_volts for one in model.motion.values()), default=1.0) or 1.0
 
 
 class DriveQuadratic(_DriveLaw):
