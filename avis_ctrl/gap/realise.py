@@ -15,7 +15,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.additions import Table, addition, chassis, has_addition
-from avis_ctrl.gap.effects.sensors import GRAVITY
+from avis_ctrl.gap.effects.sensors import GRAVITY, suspensions
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.sampling import hold
@@ -210,12 +210,15 @@ def _sensor_filters(model: TableModel, factors: np.ndarray) -> list[StateSpace]:
     """Of each sensor over the nominal one: gain, and the corner that its filter does not undo."""
     found = [gain([[float(factor)]]) for factor in factors]
     sensors = model.base.sensors
-    named = {one.place: (one.by_name["corner_Hz"], one.by_name["damping"]) for one in model.effects
-             if one.effect.name == "geophone_corner"}
-    for k, (name, assumed, own) in enumerate(zip(sensors.names, sensors.assumed, sensors.suspensions, strict=False)):
-        actual = named.get(name, own)
-        if assumed is not None and actual is not None and actual != assumed:
-            found[k] = cascade(second_order_roots(*assumed), second_order_roots(*actual), 1.0) @ found[k]
+    for k, (assumed, own) in enumerate(zip(sensors.assumed, sensors.suspensions, strict=False)):
+        if assumed is not None and own is not None and own != assumed:
+            found[k] = cascade(second_order_roots(*assumed), second_order_roots(*own), 1.0) @ found[k]
+    known = suspensions(model.rig)
+    for one in model.effects:
+        if one.effect.name == "geophone_corner" and one.place in known:
+            k = sensors.names.index(one.place)
+            actual = second_order_roots(one.by_name["corner_Hz"], one.by_name["damping"])
+            found[k] = cascade(second_order_roots(*known[one.place]), actual, 1.0) @ found[k]
     return found
 
 

@@ -18,7 +18,7 @@ from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.gap_engine.tolerances import Priors
 from avis_ctrl.gap_engine.weights import Group, Variances, Weights, bands, estimated, path_contributions, weigh
-from avis_ctrl.identification.maximum_likelihood import block_residual
+from avis_ctrl.identification.maximum_likelihood import block_residual, transient_unknowns
 from avis_ctrl.identification.spectra import SpectralBlock
 
 
@@ -109,7 +109,7 @@ def first_variances(data: Data, settings: GapSettings) -> Variances:
 def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: GapSettings = SETTINGS
         ) -> Fitted:
     """Alternate Gauss-Newton steps in z with estimates of the variances."""
-    steps = 0
+    steps, before = 0, -np.inf
     model = model.at(priors.values(z))
     for k in range(settings.rounds + 1):
         paths = [path_contributions(model, block) for block in data.blocks]
@@ -132,13 +132,21 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
             else:
                 break
             model, z, now, (H, g, cost), steps = moved, trial, own, expansion, steps + 1
-        if k < settings.rounds:
-            variances = estimated(weights, now.e, now.left, data.blocks, data.levels, variances, settings)
+        reached = -0.5 * (cost + z @ z + weights.log_determinant) + _hyper(variances, settings)
+        if k == settings.rounds or reached - before < settings.settled:
+            break
+        before, variances = reached, estimated(now.left, data.blocks, data.levels, paths, variances, settings)
     H = H + np.eye(len(z))
-    nu, v0 = settings.error_weight, settings.least_error ** 2
-    hyper = sum(float(np.sum(-(nu / 2 + 1) * np.log(v) - nu * v0 / (2 * v))) for v in variances.path.values())
-    log_evidence = -0.5 * (cost + z @ z + weights.log_determinant + np.linalg.slogdet(H)[1]) + hyper
+    # The states at the ends of a record have no prior; each costs what one with unit information would (Schwarz 1978).
+    ends = sum(0.5 * transient_unknowns(block, model) * np.log(2 * block.Y.size) for block in data.blocks)
+    log_evidence = reached - ends - 0.5 * np.linalg.slogdet(H)[1]
     return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), steps, weights, now)
+
+
+def _hyper(variances: Variances, settings: GapSettings) -> float:
+    """Logarithm of the prior of the path variances, but for a constant."""
+    nu, v0 = settings.error_weight, settings.least_error ** 2
+    return sum(float(np.sum(-(nu / 2 + 1) * np.log(v) - nu * v0 / (2 * v))) for v in variances.path.values())
 
 
 def log_likelihoods(fitted: Fitted, data: Data, settings: GapSettings = SETTINGS) -> dict[Group, float]:

@@ -23,7 +23,9 @@ class GapSettings:
         glue change a response by 0.1 % from day to day.
     error_weight : degrees of freedom of that prior; two, the least with a finite mean of the precision.
     first_error : relative error of the paths in the first fit [1], before any residual is known.
-    rounds : estimates of the variances, each from the fit before it.
+    climbs : steps up the likelihood of the variances in each estimate.
+    rounds, settled : most estimates of the variances, each from the fit before it, and rise of the log-likelihood [nats]
+        below which they end: well below what decides between two effects.
     iterations : Gauss-Newton steps between two estimates of the variances.
     first_distortion : distortion in the first fit, over the square of `first_error` [1].
     least_distortion : distortion that nobody can exclude, over the noise [1]; below it an estimate is round-off.
@@ -78,7 +80,9 @@ class GapSettings:
     least_error: float = 1e-3
     error_weight: float = 2.0
     first_error: float = 0.05
-    rounds: int = 4
+    climbs: int = 60
+    rounds: int = 12
+    settled: float = 1.0
     iterations: int = 6
     first_distortion: float = 0.01
     least_distortion: float = 0.02
@@ -93,7 +97,7 @@ class GapSettings:
     refits: int = 8
     rough_iterations: int = 3
     not_far_behind: float = 0.3
-    quick_rounds: int = 1
+    quick_rounds: int = 4
     quick_iterations: int = 4
     longest: int = 5
     certain: float = 4.6

@@ -49,13 +49,10 @@ def bands(omega: np.ndarray, per_octave: int) -> np.ndarray:
 class PathError:
     """Lines of one level and band: rows (m,) of the stacked real residual, and Q (m, r), lambda (r,) of B B^T.
 
-    columns (m, k), sensor (k,), of relative error 1, kept for the estimate of the variances.
     """
 
     group: Group
     rows: np.ndarray
-    columns: np.ndarray
-    sensor: np.ndarray
     Q: np.ndarray
     size: np.ndarray
 
@@ -153,44 +150,47 @@ def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Seque
         values, vectors = np.linalg.eigh(B.T @ B)
         kept = values > settings.least_eigenvalue
         Q = B @ vectors[:, kept] / np.sqrt(values[kept])
-        errors.append(PathError(group, np.concatenate([part[0] for part in parts]), columns, sensor, Q, values[kept]))
+        errors.append(PathError(group, np.concatenate([part[0] for part in parts]), Q, values[kept]))
         determinants[group] += float(np.sum(np.log1p(values[kept])))
     return Weights(tuple(L), tuple(errors), determinants)
 
 
-def estimated(weights: Weights, e: np.ndarray, error: Sequence[np.ndarray], blocks: Sequence[SpectralBlock],
-              levels: Sequence[float], old: Variances, settings: GapSettings) -> Variances:
-    """One step of expectation-maximisation from whitened residuals e (N,) (before `flatten`).
+def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], levels: Sequence[float],
+              paths: Sequence[np.ndarray], old: Variances, settings: GapSettings) -> Variances:
+    """The most likely variances of path errors and distortion for residuals left (n, n_y) of each block.
 
-    error : (n, n_y) a block, the residual in the unit of y.
+    Sensor by sensor, with the mean noise n of a band: with U diag(lambda) U^H = G G^H of the contributions G (m, n_in) of
+    the inputs on its m lines, the rotated residual y = U^H e has independent parts of variance w = n + s + v lambda.
+    The likelihood is climbed by minorisation-maximisation (H. Zhou, L. Hu, J. Zhou, K. Lange, J. Comput. Graph. Stat.
+    28 (2019) 350-361),
+
+        v <- v sqrt((sum lambda |y|^2 / w^2 + nu v0 / 2 v^2) / (sum lambda / w + (nu / 2 + 1) / v)),
+
+    and s likewise without a prior.
     """
-    path, distortion = {}, {}
-    left = e.copy()
-    for one in weights.paths:
-        v = old.path[one.group][one.sensor] / 2
-        S = np.linalg.inv(np.diag(1 / v) + one.columns.T @ one.columns)
-        mean = S @ (one.columns.T @ e[one.rows])
-        power = mean ** 2 + np.diag(S)
-        nu, v0 = settings.error_weight, settings.least_error ** 2
-        path[one.group] = np.array([(2 * np.sum(power[one.sensor == c]) + nu * v0) / (np.sum(one.sensor == c) + nu)
-                                    if np.any(one.sensor == c) else v0 for c in range(len(old.path[one.group]))])
-        left[one.rows] -= one.columns @ mean
-    start = 0
-    sums: dict[Group, list] = {}
-    for block, level, L in zip(blocks, levels, weights.L, strict=True):
+    members: dict[Group, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
+    for e, block, level, path in zip(left, blocks, levels, paths, strict=True):
         assert block.noise is not None
-        n, n_y = len(block.omega), L.shape[-1]
-        flat = left[start:start + 2 * n * n_y].reshape(2, n, n_y)
-        start += 2 * n * n_y
-        back = np.linalg.solve(L, (flat[0] + 1j * flat[1])[:, :, None])[:, :, 0]
         noise = np.real(np.einsum("kii->ki", block.noise[:, 0]))
         own = bands(block.omega, settings.bands_per_octave)
         for band in np.unique(own):
-            at, group = own == band, (level, int(band))
-            entry = sums.setdefault(group, [0.0, 0.0, 0])
-            entry[0] = entry[0] + np.sum(np.abs(back[at]) ** 2, axis=0)
-            entry[1] = entry[1] + np.sum(noise[at], axis=0)
-            entry[2] += int(at.sum())
-    for group, (power, noise, count) in sums.items():
-        distortion[group] = np.maximum(power - noise, settings.least_distortion * noise) / count
-    return Variances(path, distortion)
+            at = own == band
+            members.setdefault((level, int(band)), []).append((e[at], path[at], noise[at]))
+    path_variance, distortion = {}, {}
+    nu, v0 = settings.error_weight, settings.least_error ** 2
+    for group, parts in members.items():
+        e, G, noise = (np.concatenate([part[k] for part in parts]) for k in range(3))
+        n = noise.mean(axis=0)[:, None]
+        U, sigma, _ = np.linalg.svd(np.swapaxes(G, 0, 1), full_matrices=True)
+        size = np.zeros(U.shape[:2])
+        size[:, :sigma.shape[1]] = sigma ** 2
+        power = np.abs(np.einsum("ymk,my->yk", U.conj(), e)) ** 2
+        v, s = (one[:, None].copy() for one in old.of(group))
+        for _ in range(settings.climbs):
+            w = n + s + v * size
+            rise = np.sum(size * power / w ** 2, axis=1, keepdims=True) + nu * v0 / (2 * v ** 2)
+            v *= np.sqrt(rise / (np.sum(size / w, axis=1, keepdims=True) + (nu / 2 + 1) / v))
+            s *= np.sqrt(np.sum(power / w ** 2, axis=1, keepdims=True) / np.sum(1 / w, axis=1, keepdims=True))
+            s = np.maximum(s, settings.least_distortion * n)
+        path_variance[group], distortion[group] = v[:, 0], s[:, 0]
+    return Variances(path_variance, distortion)

@@ -154,7 +154,7 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
                                next_step="check the findings of the gates, and start from better values")
     last = best.evaluate(best.model, residuals=True)
     scale = about.scales()
-    unknown = sum(_unknowns(block, model) for block in blocks)
+    unknown = sum(transient_unknowns(block, model) for block in blocks)
     information = Information(model.names, best.model.values, model.units, last.F / np.outer(scale, scale), scale)
     dof = sum(block.numbers for block in blocks) + len(priors) - unknown - information.rank
     return LikelihoodFit(best.model, information, last.chi2, dof, best.iterations, best.converged,
@@ -430,7 +430,8 @@ def as_real(white: np.ndarray) -> np.ndarray:
     return np.concatenate([flat.real, flat.imag], axis=1)
 
 
-def _unknowns(block: SpectralBlock, model: ResponseModel) -> int:
+def transient_unknowns(block: SpectralBlock, model: ResponseModel) -> int:
+    """How many unknowns the transient of a block has."""
     return len(transient_columns(block.lines(np.arange(1)), model)[1]) if block.transient else 0
 
 

@@ -148,9 +148,14 @@ def _all(thing: Any) -> list[_Line]:
 
 
 def _at_place(thing: Drive | Instrument) -> list[_Line]:
-    held = {"constant_N_per_V": (f"actuator.{thing.name}",)} if isinstance(thing, Drive) else {}
+    held = {"constant_N_per_V": (f"actuator.{thing.name}",), "position": _along("place", thing),
+            "direction": _along("direction", thing)}
     return [replace(line, key="position_m" if line.key == "position" else line.key, parameters=held.get(line.key, ()))
             for line in _all(thing)]
+
+
+def _along(kind: str, thing: Drive | Instrument) -> tuple[str, ...]:
+    return tuple(f"{kind}.{thing.name}.{axis}" for axis in AXES)
 
 
 def _tolerances(rig: Rig) -> list[_Section]:

@@ -71,8 +71,8 @@ class GeophoneCorner(_OfSensor):
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         k = ops.sensor(place)
-        present = second_order(ops.s, *ops.base.sensors.suspensions[k])
-        ops.sense[:, k] *= present / second_order(ops.s, values["corner_Hz"], values["damping"])
+        assumed = second_order(ops.s, *suspensions(ops.base.rig)[place])
+        ops.sense[:, k] *= assumed / second_order(ops.s, values["corner_Hz"], values["damping"])
 
 
 @register
