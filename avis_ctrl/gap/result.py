@@ -37,7 +37,7 @@ class NamedEffect:
     confirmed: float = 0.0
     label: str = ""
     confirmation: str = ""
-    share: float = 1.0
+    share: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As the contract has it."""
@@ -45,12 +45,13 @@ class NamedEffect:
                 "parameters": {key: {"value": p.value, "std": p.std, "unit": p.unit}
                                for key, p in self.parameters.items()},
                 "probability": self.probability, "indistinguishable_from": list(self.indistinguishable_from),
-                "share": self.share}
+                **({} if self.share is None else {"share": self.share})}
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """A value of the rig file with a tolerance: its estimate, standard deviation, and by how many tolerances it moved."""
+    """A value of the rig file with a tolerance: its estimate and standard deviation, and how many tolerances it moved.
+    """
 
     parameter: str
     value: float

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.data import all_silent, thinned
+from avis_ctrl.gap.data import Halves, all_silent, thinned
 from avis_ctrl.gap.in_words import in_words
 from avis_ctrl.gap.judgement import Judgement, effects_of
 from avis_ctrl.gap.next_measurement import of_unexplained
@@ -39,6 +39,19 @@ TOO_MUCH_NOISE = 0.8
 BANDS_PER_OCTAVE = 2
 # Lines of each record from which its place in level and time, and the shares of power, are told.
 SHOWN_LINES = 1200
+
+
+class Spectra(Protocol):
+    """Blocks of the fitted and of the held-out records."""
+
+    @property
+    def halves(self) -> Halves: ...
+
+    @property
+    def fitted(self) -> Sequence[SpectralBlock]: ...
+
+    @property
+    def held_out(self) -> Sequence[SpectralBlock]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +260,7 @@ def _ratios(left: Left, edges: np.ndarray) -> np.ndarray:
     return found
 
 
-def every_record(prepared: Prepared, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
+def every_record(prepared: Spectra, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
            ) -> tuple[tuple[RecordGap, ...], tuple[PowerShares, ...]]:
     """What the models leave of each record, fitted ones too, and what accounts for the outputs' power; on SHOWN_LINES
     lines of each record."""

@@ -85,6 +85,7 @@ class TableModel:
     motion : records in time by name, which effects that depend on amplitude or time need.
     nominal : the rig as its file has it, which sizes the steps of a fit: a parameter that a wrong model has driven to
         nothing must find its way back. None for the base itself.
+    corners_differ : no filter cancels a geophone's suspension exactly (`sensor_transients`).
     """
 
     base: ResponseModel
@@ -92,6 +93,7 @@ class TableModel:
     motion: Mapping[str, RecordMotion] = field(default_factory=dict)
     fixed: frozenset[str] = frozenset()
     nominal: ResponseModel | None = None
+    corners_differ: bool = False
 
     # What a fit and its blocks ask of a model.
     @property
@@ -245,16 +247,32 @@ class TableModel:
 
         Where they make r(s) times what the chain was, r a ratio of polynomials, r and s r are the transients of the
         poles of r beside a constant and a slope, and r^2 and s r^2 what a small change of these poles makes of it: a
-        fit's gradient need not know of them then.
+        fit's gradient need not know of them then. Where the corners of geophones have tolerances, no filter cancels a
+        suspension exactly, and each rings, whatever the effects: 1/p and s/p, p its polynomial, take their place.
         """
-        own, changed = self.base.sensor_transients(omega), self._changed_sensors
+        own, s = self.base.sensor_transients(omega), 1j * omega
+        if self.corners_differ:
+            return np.concatenate([own, self._suspensions_ring(omega)], axis=2)
+        changed = self._changed_sensors
         if not changed.size:
             return own
-        r, s = self._chain_ratio(omega), 1j * omega
+        r = self._chain_ratio(omega)
         ringing = np.zeros((len(omega), r.shape[1], len(changed), 4), complex)
         for j, k in enumerate(changed):
             ringing[:, k, j] = np.stack([r[:, k], s * r[:, k], r[:, k] ** 2, s * r[:, k] ** 2], axis=-1)
         return np.concatenate([own, ringing.reshape(len(omega), r.shape[1], -1)], axis=2)
+
+    def _suspensions_ring(self, omega: np.ndarray) -> np.ndarray:
+        """(n, n_y, 2 n_y) transients of every geophone's suspension, at the corner that its filter assumes: what a
+        corner within its tolerance changes of them is of second order."""
+        s, r, sensors = 1j * omega, self._chain_ratio(omega), self.base.sensors
+        found = np.zeros((len(omega), len(sensors.names), len(sensors.names), 2), complex)
+        for k, own in enumerate(sensors.assumed):
+            if own is not None:
+                w = 2 * np.pi * own[0]
+                ring = r[:, k] * w ** 2 / (s ** 2 + 2 * own[1] * w * s + w ** 2)
+                found[:, k, k] = np.stack([ring, s / w * ring], axis=-1)
+        return found.reshape(len(omega), len(sensors.names), -1)
 
     @cached_property
     def _changed_sensors(self) -> np.ndarray:
@@ -309,11 +327,11 @@ class TableModel:
             raise InputError("expected the record's motion in time for an effect that depends on it",
                              field=f"block {block.name}")
         added = [_added(one, record, block.omega) for one in self.effects]
-        volts, *others = (_sum(some) for some in zip(*added, strict=True))
+        volts, force, reading, output = (_sum(some) for some in zip(*added, strict=True))
         if volts is not None:
             U = U.copy()
             U[:, :len(self.actuators)] += volts
-        return Acting(U, *others, inner)
+        return Acting(U, force, reading, output, inner)
 
     def _by_effects(self, omega, U, block, made: Assembled, answer: _Answer, dY: np.ndarray) -> None:
         """Central differences by the effects' parameters: of what an effect adds to a record, which the response is

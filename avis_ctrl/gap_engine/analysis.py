@@ -18,7 +18,7 @@ from avis_ctrl.gap.effects.base import Effect, library
 from avis_ctrl.gap.effects.beyond import beyond
 from avis_ctrl.gap.in_words import in_words
 from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplained
-from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
+from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
 from avis_ctrl.gap.show import Left, every_record, heat_map, places
 from avis_ctrl.gap.signal_effects import left_by, levels, named
 from avis_ctrl.gap_engine.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
@@ -97,15 +97,15 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
     progress("the same with all tolerances")
     tolerances = with_tolerances(nominal, tolerances_of(rig), settings)
     apart = replace(base.model, base=replace(base.model.base, names=tolerances.names),
-                    nominal=replace(nominal, names=tolerances.names))
+                    nominal=replace(nominal, names=tolerances.names), corners_differ=True)
     priors = tolerances.followed_by(large)
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
-    ground = _excess(base, data)
+    ground, before = _excess(base, data), _excess(tolerant, data)
 
     def enough(step: Step) -> bool:
         """What was found takes next to nothing of the gap."""
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
-        return rise < settings.trace * ground
+        return rise < settings.trace * ground and rise < settings.minor * before
     steps = search(tolerant, data, [*effects, *beyond().values()], settings, progress, each, enough)
     return Fits(base, tolerant, tuple(steps))
 
@@ -135,7 +135,8 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
         if why:
             one = next(effect for effect in fits.best.model.effects if effect.label == label)
             refused.append(f"it behaves most like {one.effect.said(one.place, one.by_name)}, for which the library has "
-                           "no name" if one.effect.outside else f"{one.effect.name} comes nearest, but {why}: not named")
+                           "no name" if one.effect.outside else
+                           f"{one.effect.name} comes nearest, but {why}: not named")
             best = without_effect(best, label, data, settings) or best
     kept = {label: value for label, value in probability.items() if label in best.labels}
     return Names(best, kept, {label: rivals[label] for label in kept}, tuple(refused))
@@ -150,7 +151,10 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     known = {name_of(label) for label in best.labels}
     tried = {step.label: best}
     for label, fitted in step.tried.items():
-        if name_of(label) not in known and (one := with_effect(rest, fitted.model.effects[-1], data, quick)) is not None:
+        if name_of(label) in known:
+            continue
+        one = with_effect(rest, fitted.model.effects[-1], data, quick)
+        if one is not None:
             tried[label] = one
     return Step(rest, best, tried, step.candidates, step.label)
 
@@ -218,9 +222,9 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         left = left_by(prepared.campaign, updated.model, each)
         faults = replace(faults, noise=levels(left, updated.model, faults.hum, faults.converter))
     found += [replace(one, share=_share_of_signal(one.name, raw, before, power)) for one in named(faults)]
-    found.sort(key=lambda one: -one.share)
-    told = tuple(one for one in found if one.share >= settings.trace)
-    traces = tuple(one for one in found if one.share < settings.trace)
+    found.sort(key=lambda one: -(one.share or 0.0))
+    told = tuple(one for one in found if (one.share or 0.0) >= settings.trace)
+    traces = tuple(one for one in found if (one.share or 0.0) < settings.trace)
     excess = after.nrmse ** 2 - noise
     records, shares = every_record(prepared, fits.base.model, updated.model, _sensors(faults))
     growth = grows(records)
@@ -233,13 +237,13 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     onward = _next(told, fits, names)
     if onward is None and verdict in ("unexplained", "partly explained"):
         onward = of_unexplained(remaining, records)
-    limits = ()
+    limits: tuple[Detectable, ...] = ()
     if verdict == "none":
         progress("how large an effect would have had to be to be seen")
         data = prepared.data(prepared.fitted, settings.lines)
         limits = detectable(EvidenceScore(fits.tolerant, data, settings), effects)
-    sentences = (_opening(verdict, told, traces, stages, remainder, after), *names.refused, _remains(remainder, remaining),
-                 prepared.noise)
+    sentences = (_opening(verdict, told, traces, stages, remainder, after), *names.refused,
+                 _remains(remainder, remaining), prepared.noise)
     return Gap(verdict, told, tuple(stages), where if verdict != "none" else (), remaining, after.noise_nrmse, onward,
                fits.base.model, updated.model, _considered(fits, names, prepared, settings), heat_map(before, after),
                tuple(one for one in sentences if one), prepared.halves.how, seed, time.monotonic() - began,
@@ -277,8 +281,8 @@ def _named(one, updated: Fitted, names: Names, power: Power, with_it: float, pre
 
 
 def _share_of_signal(name: str, raw: Left, masked: Left, power: Power) -> float:
-    """Of what acts on the signals alone, over the baseline's excess with it: hum by the lines that it spoils; what is in
-    the noise (floor, converter) by the noise itself."""
+    """Of what acts on the signals alone, over the baseline's excess with it: hum by the lines that it spoils; what is
+    in the noise (floor, converter) by the noise itself."""
     own = max(raw.nrmse ** 2 - masked.nrmse ** 2, 0.0) if name == "mains_hum" else power.noise
     return float(own / max(own + power.excess, 1e-300))
 
@@ -345,8 +349,8 @@ def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[Nam
     if verdict == "unexplained":
         return (f"Something is missing that the library has no name for{beside}: with all tolerances the model leaves "
                 f"{_percent(left.nrmse)} of the held-out records, {rest}.")
-    return (f"Missing from the model: {' and '.join(map(in_words, told))}{beside}; with that and all tolerances the gap "
-            f"falls from {_percent(before)} to {_percent(left.nrmse)}, {rest}.")
+    return (f"Missing from the model: {' and '.join(map(in_words, told))}{beside}; with that and all tolerances the "
+            f"gap falls from {_percent(before)} to {_percent(left.nrmse)}, {rest}.")
 
 
 def _remains(left: Remainder, remaining: Sequence[Where]) -> str:
@@ -357,5 +361,5 @@ def _remains(left: Remainder, remaining: Sequence[Where]) -> str:
              None: ""}[left.grows_with_level]
     lies = f", most of it in {remaining[0].output} from {remaining[0].from_Hz:.3g} to {remaining[0].to_Hz:.3g} Hz" \
         if remaining else ""
-    return (f"{_percent(left.nrmse)} of the held-out records remains, {left.over_noise:.3g} times the noise{lies}{level}: "
-            f"{_percent(left.share)} of the power that the re-identified model leaves beyond noise")
+    return (f"{_percent(left.nrmse)} of the held-out records remains, {left.over_noise:.3g} times the "
+            f"noise{lies}{level}: {_percent(left.share)} of the power that the re-identified model leaves beyond noise")

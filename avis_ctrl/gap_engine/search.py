@@ -24,7 +24,7 @@ from avis_ctrl.gap.table_model import ActiveEffect, active
 from avis_ctrl.gap_engine.likelihood import Data, Fitted, fit
 from avis_ctrl.gap_engine.score import EvidenceScore
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
-from avis_ctrl.gap_engine.tolerances import BEYOND, Priors, of_effect, tolerances_of
+from avis_ctrl.gap_engine.tolerances import BEYOND, Priors, of_effect, tolerances_of, within_tolerance
 
 Progress = Callable[[str], None]
 
@@ -45,7 +45,8 @@ class Candidate:
 class Step:
     """One more effect: the fit with it, and all fits that were tried in its place, by label.
 
-    before : the fit without it. label : of the effect, the last one by default. candidates : how many effects and places were scored.
+    before : the fit without it. candidates : how many effects and places were scored. label : of the effect, the last
+    one by default.
     """
 
     before: Fitted
@@ -163,7 +164,7 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
                 return
     more(effects, enough)
     if steps:
-        more([one for one in effects if one.name in BEYOND or one.name == "geophone_corner"], lambda step: False)
+        more([one for one in effects if one.name in BEYOND], lambda step: False)
     return steps
 
 
@@ -185,7 +186,7 @@ def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSetti
 def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Each
            ) -> dict[str, Fitted]:
     """Fits of candidates by label: a few iterations for each, then more for those that are not far behind. Left out are
-    those that come to no end, or to values that physics forbids."""
+    those that come to no end, to values that physics forbids, or to one within its tolerance."""
     rough = replace(settings, rounds=0, iterations=settings.rough_iterations)
     quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
     # Against the variances that a fit starts with: what the fit before it makes of them would be no fair measure.
@@ -196,7 +197,9 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     most = max(one.log_evidence for one in made) - level
     near = [one for one in made if one.log_evidence - level >= settings.not_far_behind * most]
     further = each(lambda one: _try(one, one.model, one.priors, one.z, data, quick), near)
-    return {one.labels[-1]: one for one in further if one is not None and not implausible(one)}
+    stated = tolerances_of(now.model.rig)
+    return {one.labels[-1]: one for one in further if one is not None and not implausible(one)
+            and not within_tolerance(one.model.effects[-1], stated, settings)}
 
 
 def implausible(fitted: Fitted) -> str:

@@ -24,8 +24,8 @@ class GapSettings:
     error_weight : degrees of freedom of that prior; two, the least with a finite mean of the precision.
     first_error : relative error of the paths in the first fit [1], before any residual is known.
     climbs : steps up the likelihood of the variances in each estimate.
-    rounds, settled : most estimates of the variances, each from the fit before it, and rise of the log-likelihood [nats]
-        below which they end: well below what decides between two effects.
+    rounds, settled : most estimates of the variances, each from the fit before it, and rise of the log-likelihood
+        [nats] below which they end: well below what decides between two effects.
     iterations : Gauss-Newton steps between two estimates of the variances.
     first_distortion : distortion in the first fit, over the square of `first_error` [1].
     least_distortion : distortion that nobody can exclude, over the noise [1]; below it an estimate is round-off.
@@ -37,6 +37,7 @@ class GapSettings:
     shortest_step : part of a Gauss-Newton step below which no shorter one is tried [1].
     beyond_tolerance : prior standard deviation of a value that may be beyond its tolerance, in tolerances: as wide as
         faults of wiring, mounting and data sheets are.
+    beyond_least : tolerances by which a value must differ from the rig file's to be beyond its tolerance.
     effect_sizes : prior standard deviation of an effect's strength, in units of its parameter's size; broad, so that it
         costs some nats and bends nothing.
     shape_spread : prior standard deviation of a parameter that shapes an effect (a frequency), relative to its start.
@@ -55,6 +56,7 @@ class GapSettings:
     headline : probability below which a name is an alternative only [1].
     most_sure : largest probability that is reported [1]: what nobody thought of leaves so much.
     trace : share of the gap's power below which an effect is a trace [1].
+    minor : share of what the model with tolerances leaves below which a trace ends the search [1].
     law_p_value, law_change : an effect is refuted where its parameters from half of the data (by band, by level) differ
         from the whole with a smaller p-value than this [1] and by more than this share [1]; real elements follow their
         textbook law to some per cent only, which no p-value knows.
@@ -91,6 +93,7 @@ class GapSettings:
     turning_percent: float = 50.0
     shortest_step: float = 1e-3
     beyond_tolerance: float = 20.0
+    beyond_least: float = 3.0
     effect_sizes: float = 100.0
     shape_spread: float = 1.0
     resonance_share: float = 0.1
@@ -107,6 +110,7 @@ class GapSettings:
     headline: float = 0.5
     most_sure: float = 0.99
     trace: float = 0.01
+    minor: float = 0.1
     law_p_value: float = 1e-4
     law_change: float = 0.2
     least_difference: float = 1e-3

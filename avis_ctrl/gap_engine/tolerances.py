@@ -87,12 +87,28 @@ def tolerances_of(rig: Rig) -> Tolerances:
     return getattr(rig, "tolerances", None) or Tolerances()
 
 
-# Effects that are one value of the rig file gone beyond its tolerance, and how many of their own units one tolerance
-# is.
-BEYOND: Mapping[str, Callable[[Tolerances], float]] = {
-    "sensor_gain": lambda t: t.sensor_gain_percent / 100, "actuator_gain": lambda t: t.actuator_gain_percent / 100,
-    "sensor_misalignment": lambda t: float(np.degrees(t.direction_rad)), "com_offset": lambda t: t.centre_of_mass_m,
-    "product_of_inertia": lambda t: t.product_of_inertia_kgm2}
+# Effects that are one value of the rig file gone beyond its tolerance, and the tolerance of each of their parameters,
+# in its unit; of a geophone's corner and damping ratio relative to them.
+BEYOND: Mapping[str, Callable[[Tolerances], tuple[float, ...]]] = {
+    "sensor_gain": lambda t: (t.sensor_gain_percent / 100,), "actuator_gain": lambda t: (t.actuator_gain_percent / 100,),
+    "sensor_misalignment": lambda t: (float(np.degrees(t.direction_rad)),) * 2,
+    "com_offset": lambda t: (t.centre_of_mass_m,) * 3, "product_of_inertia": lambda t: (t.product_of_inertia_kgm2,),
+    "geophone_corner": lambda t: (t.sensor_corner_percent / 100, t.sensor_damping_percent / 100)}
+
+
+def tolerance_of(effect: ActiveEffect, tolerances: Tolerances) -> np.ndarray:
+    """(n,) of the parameters of an effect of `BEYOND`, in their units."""
+    relative = np.array(BEYOND[effect.effect.name](tolerances))
+    of = np.array([p.none for p in effect.parameters]) if effect.effect.name == "geophone_corner" else 1.0
+    return relative * of
+
+
+def within_tolerance(effect: ActiveEffect, tolerances: Tolerances, settings: GapSettings) -> bool:
+    """Whether a value that may be beyond its tolerance is not."""
+    if effect.effect.name not in BEYOND:
+        return False
+    away = np.array([value - p.none for value, p in zip(effect.values, effect.parameters, strict=True)])
+    return bool(np.all(np.abs(away) < settings.beyond_least * tolerance_of(effect, tolerances)))
 
 
 def of_effect(effect: ActiveEffect, tolerances: Tolerances, settings: GapSettings = SETTINGS) -> Priors:
@@ -105,11 +121,8 @@ def of_effect(effect: ActiveEffect, tolerances: Tolerances, settings: GapSetting
     mean = np.array([p.none if p.linear else v for p, v in zip(effect.parameters, effect.values, strict=True)])
     sigma = np.array([settings.effect_sizes * p.size if p.linear else max(settings.shape_spread * abs(v), p.size)
                       for p, v in zip(effect.parameters, effect.values, strict=True)])
-    if (one := BEYOND.get(effect.effect.name)) is not None:
-        sigma = np.full(len(mean), settings.beyond_tolerance * one(tolerances))
-    elif effect.effect.name == "geophone_corner":
-        relative = np.array([tolerances.sensor_corner_percent, tolerances.sensor_damping_percent]) / 100
-        sigma = settings.beyond_tolerance * relative * mean
+    if effect.effect.name in BEYOND:
+        sigma = settings.beyond_tolerance * tolerance_of(effect, tolerances)
     low, high = (np.array([getattr(p, name) for p in effect.parameters]) for name in ("low", "high"))
     return Priors(effect.names, mean, sigma, np.zeros(len(mean), bool), low, high)
 

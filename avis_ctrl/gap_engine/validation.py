@@ -93,7 +93,7 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings) -> list[
 
 def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, list[Group]]]:
     """Halves of the groups: by band, each with half of the information on the parameters, and by level."""
-    information: dict[Group, float] = {group: float(np.sum(fitted.J[np.ix_(rows, at)] ** 2))
+    information: dict[Group, float] = {group: float(np.sum(fitted.J[rows][:, at] ** 2))
                                        for group, at in fitted.rows.items()}
     found = []
     for k, words in ((1, ("the lower part of the band", "the upper part of the band")),

@@ -159,8 +159,8 @@ def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], level
               paths: Sequence[np.ndarray], old: Variances, settings: GapSettings) -> Variances:
     """The most likely variances of path errors and distortion for residuals left (n, n_y) of each block.
 
-    Sensor by sensor, with the mean noise n of a band: with U diag(lambda) U^H = G G^H of the contributions G (m, n_in) of
-    the inputs on its m lines, the rotated residual y = U^H e has independent parts of variance w = n + s + v lambda.
+    Sensor by sensor, with the mean noise n of a band: with U diag(lambda) U^H = G G^H of the contributions G (m, n_in)
+    of the inputs on its m lines, the rotated residual y = U^H e has independent parts of variance w = n + s + v lambda.
     The likelihood is climbed by minorisation-maximisation (H. Zhou, L. Hu, J. Zhou, K. Lange, J. Comput. Graph. Stat.
     28 (2019) 350-361),
 

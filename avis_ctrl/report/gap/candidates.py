@@ -17,7 +17,8 @@ def candidates(found: Found) -> Section:
     ranked = sorted(found.gap.considered, key=lambda one: (-one.probability, one.chi2_per_dof))
     if not ranked:
         return Section("Runners-up", "considered", (Paragraph(_none(found)),))
-    header = ("candidate", "chi-square / dof", "odds", "best size", "why it was not named")
+    header = ("candidate", "chi-square / dof", "odds" if found.gap.tolerances else "probability", "best size",
+              "why it was not named")
     rows = [(wording.candidate(one), words.number(one.chi2_per_dof, 4), wording.probability(one.probability),
              wording.quantities(one.parameters, MOST) or "not stated", one.reason) for one in ranked]
     pieces: list[Piece] = [table("Candidates that were refitted together with all parameters of the rig, with "
