@@ -24,10 +24,9 @@ def gap_axis(
     sample_rate_Hz: SAMPLE_RATE = None,
     band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; for an "
                                                                 "oscillator or for levels")] = None,
-    cutoff_Hz: Annotated[float | None, typer.Option("--cutoff", metavar="HZ", help="low-pass of a drive's data; 60 Hz "
-                                                    "by default")] = None,
+    cutoff_Hz: Annotated[float | None, typer.Option("--cutoff", metavar="HZ", help="low-pass of a drive's data; by "
+                                                    "default as far as force and motion are coherent")] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="folder for gap.json")] = None,
-    seed: Annotated[int, typer.Option("--seed")] = 1,
 ) -> None:
     """Name the effect that a model of one axis lacks, with its size, its probability, and the gap before and after.
 
@@ -48,13 +47,15 @@ def gap_axis(
     console = Console(highlight=False)
     with output_folder(out, ("gap.json",)) if out else nullcontext() as folder:
         with Progress(console) as progress:
-            found = find_axis_gap_in(kind, path, roles, scale=factors, sample_rate_Hz=sample_rate_Hz, seed=seed,
+            found = find_axis_gap_in(kind, path, roles, scale=factors, sample_rate_Hz=sample_rate_Hz,
                                      progress=progress, **options)
         if folder:
             write_whole(folder / "gap.json", json.dumps(found.to_json(), indent=2, allow_nan=False).encode())
     console.print(f"verdict: {found.verdict}")
     for sentence in found.sentences:
         console.print(sentence, soft_wrap=True, markup=False)
+    for one in (*found.base_parameters, *found.ratios()):
+        console.print(f"{one.name} = {one.value:.6g}{f' +- {one.std:.2g}' if one.std >= 0 else ''} {one.unit}".rstrip())
     for stage in (*found.stages, *found.references):
         noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
         console.print(f"- {stage.stage}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True,

@@ -17,6 +17,8 @@ from scipy.interpolate import make_interp_spline
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.single_axis.machine import bumps, octaves
+from avis_ctrl.gap.single_axis.orientation import require_oriented
+from avis_ctrl.gap.single_axis.settings import SETTINGS
 from avis_ctrl.gap.single_axis.terms import AxisParameter, Term, register
 from avis_ctrl.measurement.gates.finding import Picture, Series, thinned
 
@@ -32,7 +34,8 @@ class DriveData:
     Parameters
     ----------
     time : (n,) s, uniform. position : (n,) m. force : (n,) N. reference : (n,) m, for finding repetitions.
-    cutoff_Hz : of the fourth-order Butterworth filter, run forth and back.
+    cutoff_Hz : of the fourth-order Butterworth filter, run forth and back. By default as far up as force and motion
+        are coherent, for only there a delay and a lag part; 60 Hz at the least.
 
     Raises
     ------
@@ -42,9 +45,10 @@ class DriveData:
     kind = "drive"
 
     def __init__(self, time: np.ndarray, position: np.ndarray, force: np.ndarray, reference: np.ndarray | None = None,
-                 cutoff_Hz: float = 60.0):
+                 cutoff_Hz: float | None = None):
         time, position, force, reference = _checked(time, position, force, reference)
         self.rate = (len(time) - 1) / (time[-1] - time[0])
+        cutoff_Hz = _coherent_to(position, force, self.rate) if cutoff_Hz is None else cutoff_Hz
         if not 0 < cutoff_Hz < self.rate / 2:
             raise InputError(f"expected a cutoff between 0 and {self.rate / 2:g} Hz", field="cutoff_Hz",
                              value=cutoff_Hz)
@@ -74,7 +78,9 @@ class DriveData:
         self.speed = float(np.sqrt(np.mean(self.v ** 2)))
         if not self.speed * self.t[-1] > 1e-9 * (np.ptp(position) + np.finfo(float).tiny) or not self.size[0] > 0:
             raise InputError("expected a drive that moves and a force that is not zero", field="position, force")
-        self.noise, self.repeats_s = self._repetition(position if reference is None else reference)
+        require_oriented(self._fitted, force, position, "force, position")
+        # Of the measured position: a reference repeats even where forces are added to the loop that do not.
+        self.noise, self.repeats_s = self._repetition(position)
         level = self.size[0]
         self.base = (AxisParameter("M", "kg", level / np.sqrt(np.mean(self.a ** 2)), 0, np.inf,
                                    level / np.sqrt(np.mean(self.a ** 2))),
@@ -83,6 +89,15 @@ class DriveData:
         self.notes = () if self.repeats_s is None else (
             f"The motion repeats every {self.repeats_s:.4g} s; the force scatters by {np.sqrt(self.noise or 0):.3g} N "
             "from one repetition to the next, which is the measured noise.",)
+
+    def _fitted(self, force: np.ndarray, position: np.ndarray) -> tuple[float, bool]:
+        """Mass, viscous and Coulomb friction and offset by least squares; see `require_oriented`."""
+        F, spline = self.filtered(force), make_interp_spline(self.t, self.filtered(position), k=5)
+        v = spline.derivative(1)(self.t)
+        X = np.column_stack([np.ones_like(v), v, np.sign(v), spline.derivative(2)(self.t)])[self.keep]
+        F = F[self.keep]
+        x, *_ = np.linalg.lstsq(X / (size := np.maximum(np.linalg.norm(X, axis=0), 1e-300)), F, rcond=None)
+        return float(np.std(F - X / size @ x) / max(float(np.std(F)), 1e-300)), bool(x[3] > 0)
 
     def filtered(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(signal.sosfiltfilt(self.sections, x))
@@ -180,6 +195,18 @@ def _checked(time: np.ndarray, position: np.ndarray, force: np.ndarray, referenc
     if not (np.ptp(position) > 0 and np.ptp(force) > 0):
         raise InputError("expected a position and a force that change", field="position, force")
     return time, position, force, reference
+
+
+def _coherent_to(position: np.ndarray, force: np.ndarray, rate: float) -> float:
+    """Hz, upper end of the last third of an octave in which acceleration and force are coherent."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # no acceleration at all: coherent nowhere
+        f, coherence = signal.coherence(np.diff(position, 2), force[1:-1], rate, nperseg=len(force) // BLOCKS)
+    top = min(SETTINGS.least_cutoff_Hz, 0.4 * rate)
+    for upper in top * 2 ** (np.arange(1, 40) / 3):
+        band = (f >= upper / 2 ** (1 / 3)) & (f < upper)
+        if upper <= 0.4 * rate and band.any() and np.mean(coherence[band]) >= SETTINGS.coherent:
+            top = float(upper)
+    return top
 
 
 class DriveTerm(Term):
@@ -334,11 +361,12 @@ class Cogging(DriveTerm):
 
 
 class Delay(DriveTerm):
-    name, words = "delay", "a delay between force and position"
+    name = "delay"
+    words = "a delay between force and position (negative: the force was logged late)"
     separated_by = "faster motion: a delay and a lag differ at high frequency"
 
     def parameters(self, data: DriveData) -> tuple[AxisParameter, ...]:
-        return (AxisParameter("delay_s", "s", 1e-4, 0.0, 0.1, 1e-3),)
+        return (AxisParameter("delay_s", "s", 1e-4, -0.1, 0.1, 1e-3),)
 
     def after(self, data: DriveData, F: np.ndarray, p: np.ndarray) -> np.ndarray:
         # The position comes late: the force of now is seen in the motion of later.

@@ -36,7 +36,7 @@ PROBLEMS: dict[str, Callable[..., Any]] = {"drive": DriveData, "oscillator": Osc
                                            "seismometer": SeismometerData}
 
 
-def find_axis_gap(kind: str, *, seed: int = 1, progress: Progress | None = None, **data: Any) -> AxisGap:
+def find_axis_gap(kind: str, *, progress: Progress | None = None, **data: Any) -> AxisGap:
     """What a model of one axis lacks, with a probability, or that nothing of the library explains it.
 
     Parameters
@@ -45,7 +45,6 @@ def find_axis_gap(kind: str, *, seed: int = 1, progress: Progress | None = None,
     data : drive: time (n,) s, position (n,) m, force (n,) N, reference (n,) m and cutoff_Hz where wanted. oscillator:
         u, y (n,), sample_rate_Hz, band_Hz where wanted. seismometer: responses (`Responses`), distortion (n,) where
         known. levels: campaign, periodic records at two levels.
-    seed : of the resampling of blocks.
 
     Raises
     ------
@@ -63,12 +62,12 @@ def find_axis_gap(kind: str, *, seed: int = 1, progress: Progress | None = None,
         raise InputError(f"expected for kind {kind} the data {said} (in brackets what may be left out)", field="data",
                          value=sorted(data))
     problem = make(**data)
-    found = problem if isinstance(problem, AxisGap) else gap_of(problem, list(library(kind).values()), seed, told)
+    found = problem if isinstance(problem, AxisGap) else gap_of(problem, list(library(kind).values()), told)
     return replace(found, seconds=time.perf_counter() - begun)
 
 
 def find_axis_gap_in(kind: str, path: str | Path, columns: Mapping[str, str] | None = None, *,
-                     scale: Mapping[str, float] | None = None, sample_rate_Hz: float | None = None, seed: int = 1,
+                     scale: Mapping[str, float] | None = None, sample_rate_Hz: float | None = None,
                      progress: Progress | None = None, **options: Any) -> AxisGap:
     """The same from files: a record (drive, oscillator), a folder of sine records (seismometer: drive, coil,
     displacement), or a folder of u_*.npy and y_*.npy (levels: samples x channels x realisations x periods, the level in
@@ -86,7 +85,7 @@ def find_axis_gap_in(kind: str, path: str | Path, columns: Mapping[str, str] | N
         if columns or scale:
             raise InputError("expected no columns and no scale: the names of the files say what they are",
                              field="columns", value=dict(columns or scale or {}))
-        return find_axis_gap(kind, campaign=read_levels(path, sample_rate_Hz), transient="none", seed=seed,
+        return find_axis_gap(kind, campaign=read_levels(path, sample_rate_Hz), transient="none",
                              progress=progress, **options)
     if kind not in PROBLEMS:
         raise InputError(f"expected one of {', '.join((*PROBLEMS, 'levels'))}", field="kind", value=kind)
@@ -94,7 +93,7 @@ def find_axis_gap_in(kind: str, path: str | Path, columns: Mapping[str, str] | N
     campaign, driven, measured = _read(kind, path, dict(columns or {}), factors, sample_rate_Hz)
     if kind == "seismometer":
         records, refused = sine_records(campaign, driven, measured, factors)
-        found = find_axis_gap(kind, seed=seed, progress=progress, **SeismometerData.of(records, measured, driven),
+        found = find_axis_gap(kind, progress=progress, **SeismometerData.of(records, measured, driven),
                               **options)
         return replace(found, sentences=(*found.sentences, *(f"Left out: {reason}." for reason in refused)))
     if len(campaign.records) != 1:
@@ -105,7 +104,7 @@ def find_axis_gap_in(kind: str, path: str | Path, columns: Mapping[str, str] | N
     rate = campaign.sample_rate_Hz
     clock: dict[str, Any] = {"time": np.arange(len(record.u)) / rate} if kind == "drive" else {"sample_rate_Hz": rate}
     try:
-        return find_axis_gap(kind, seed=seed, progress=progress, **clock, **channel, **options)
+        return find_axis_gap(kind, progress=progress, **clock, **channel, **options)
     except InputError as error:
         raise error.in_file(path) from None
 

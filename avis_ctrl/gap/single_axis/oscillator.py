@@ -15,8 +15,9 @@ import numpy as np
 from scipy import signal
 from scipy.interpolate import make_interp_spline
 
-from avis_ctrl.errors import InputError
+from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.single_axis.machine import bumps, octaves
+from avis_ctrl.gap.single_axis.orientation import require_oriented
 from avis_ctrl.gap.single_axis.terms import AxisParameter, Term, register
 from avis_ctrl.identification.single_axis.oscillator import TRANSIENT, fit_oscillator
 from avis_ctrl.measurement.gates.finding import Picture, Series, thinned
@@ -51,6 +52,12 @@ class OscillatorData:
         if len(y) == len(u) and np.count_nonzero(_between(n, sample_rate_Hz, band)) < LEAST_LINES:
             raise InputError(f"expected at least {LEAST_LINES} lines of the band in each of {BLOCKS} blocks: a longer "
                              "record or a wider band", field="u, y", value=len(u))
+        def fitted(u: np.ndarray, y: np.ndarray) -> tuple[float, bool]:
+            try:
+                return fit_oscillator(u, y, sample_rate_Hz, band).residual.share, True
+            except ComputationError:
+                return 1.0, False
+        require_oriented(fitted, u, y, "u, y")
         start = fit_oscillator(u, y, sample_rate_Hz, band)  # checks its input too
         self.rate, self.band = sample_rate_Hz, band
         self.line = _between(n, sample_rate_Hz, band)

@@ -24,7 +24,8 @@ class Estimate:
 class AxisEffect:
     """A named effect.
 
-    probability : of this effect among the candidates of its stage and "nothing more", given that the library holds it.
+    probability : of this effect, or of one that predicts the same, among the candidates of its stage and "nothing
+        more", given that the library holds it; 0.99 at the most.
     indistinguishable_from : candidates that share 95 % of the probability with it.
     """
 
@@ -71,6 +72,15 @@ class AxisGap:
     pictures: tuple[Picture, ...] = ()
     seconds: float = 0.0
 
+    def ratios(self) -> tuple[Estimate, ...]:
+        """Resonance, damping ratio and k3/k of an oscillator, without deviations."""
+        p = {one.name: one.value for one in (*self.base_parameters, *(q for e in self.effects for q in e.parameters))}
+        if self.kind != "oscillator" or not {"m", "d", "k"} <= set(p):
+            return ()
+        found = [Estimate("resonance", float(np.sqrt(p["k"] / p["m"]) / (2 * np.pi)), np.nan, "Hz"),
+                 Estimate("damping ratio", float(p["d"] / (2 * np.sqrt(p["k"] * p["m"]))), np.nan, "")]
+        return (*found, *([Estimate("k3/k", p["k3"] / p["k"], np.nan, "a unit of y^2")] if "k3" in p else []))
+
     def to_json(self) -> dict[str, Any]:
         """Plain data in the shape of the contract's gap.json; numbers that are not finite become None."""
         return {
@@ -83,6 +93,7 @@ class AxisGap:
             "where": [{key: _number(float(value)) if isinstance(value, (float, np.floating)) else value
                        for key, value in place.items()} for place in self.where],
             "base_parameters": _parameters(self.base_parameters),
+            "ratios": _parameters(self.ratios()),
             "runners_up": [{"name": name, "probability": _number(p)} for name, p in self.runners_up],
             "sentences": list(self.sentences), "next_experiment": self.next_experiment,
             "seconds": round(self.seconds, 2)}

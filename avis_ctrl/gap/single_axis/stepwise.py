@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 
 import numpy as np
 from scipy import stats
@@ -22,6 +23,7 @@ from avis_ctrl.gap.single_axis.machine import (
     held_out,
     held_out_refitted,
 )
+from avis_ctrl.gap.single_axis.settings import SETTINGS
 from avis_ctrl.gap.single_axis.terms import Term
 
 # Chance of naming something on data whose model is complete, over all candidates of a stage.
@@ -43,14 +45,28 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A term added to a model: the fit, its held-out score, why it may not be named (empty: it may)."""
+    """Terms added to a model, one or two: the fit, its held-out score, why they may not be named (empty: they may).
 
-    term: Term
+    probability : among the candidates and "nothing more"; candidates that predict the same share theirs.
+    """
+
+    terms: tuple[Term, ...]
     fitted: Fitted
     judged: HeldOut
     gain: float = 0.0
     probability: float = 0.0
     refused: str = ""
+
+    @property
+    def key(self) -> str:
+        return " + ".join(term.key for term in self.terms)
+
+    @property
+    def name(self) -> str:
+        return " + ".join(term.name for term in self.terms)
+
+    def predicts_like(self, other: Candidate) -> bool:
+        return bool(np.linalg.norm(self.judged.e - other.judged.e) < SETTINGS.same * np.linalg.norm(other.judged.e))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,65 +83,88 @@ class Step:
     candidates: tuple[Candidate, ...] = ()
 
 
-def search(problem: AxisProblem, library: Sequence[Term], rng: np.random.Generator, progress: Progress
+def search(problem: AxisProblem, library: Sequence[Term], progress: Progress
            ) -> tuple[list[Step], tuple[Candidate, ...]]:
-    """The ladder of stages, and the candidates of the stage at which nothing helped any more."""
+    """The ladder of stages, and the candidates of the stage at which nothing helped any more.
+
+    Where no term alone may be named on the base, or none is more likely than not, pairs are tried: friction beside a
+    constant force, neither of which shows as long as the other is missing.
+    """
     progress("base model")
     base = fit(problem, (), np.array([p.start for p in problem.base]))
     steps = [Step(base, held_out_refitted(problem, base))]
     while len(steps) <= MOST_EFFECTS:
-        candidates = _candidates(problem, steps, library, rng, progress)
+        candidates = _candidates(problem, steps, library, 1, progress)
+        if all(c.refused for c in candidates) and (len(steps) == 1 or _unsure(candidates[0])):
+            pairs = _candidates(problem, steps, library, 2, progress)
+            candidates = pairs if any(not c.refused for c in pairs) else candidates
         accepted = [c for c in candidates if not c.refused]
         if not accepted:
             return steps, candidates
         best = accepted[0]
         rivals, held = [], best.probability
         for other in candidates:
-            if other is not best and held < CREDIBLE and other.probability > 0:
+            twin = other.predicts_like(best)
+            if other is not best and other.probability > 0 and (twin or held < CREDIBLE):
                 rivals.append(other)
-                held += other.probability
-        progress(f"refit with {best.term.name}")
+                held += 0.0 if twin else other.probability
+        progress(f"refit with {best.name}")
         steps.append(Step(best.fitted, held_out_refitted(problem, best.fitted), best, tuple(rivals), candidates))
     return steps, ()
 
 
-def _candidates(problem: AxisProblem, steps: Sequence[Step], library: Sequence[Term], rng: np.random.Generator,
-                progress: Progress) -> tuple[Candidate, ...]:
-    """All terms that may be added, by probability; the first ones with their refusals."""
+def _candidates(problem: AxisProblem, steps: Sequence[Step], library: Sequence[Term], many: int, progress: Progress
+                ) -> tuple[Candidate, ...]:
+    """All sets of `many` terms that may be added, by probability; the first ones with their refusals."""
     now = steps[-1].fitted
     names = {term.name for term in now.terms}
     keys = {term.key for term in now.terms}
-    open_ = [term for term in library if term.key not in keys and set(term.needs) <= names]
-    progress(f"{len(open_)} candidates on top of {' + '.join(sorted(names)) or 'the base'}")
-    found = [_added(problem, now, term) for term in open_]
+    sets = [terms for terms in combinations([term for term in library if term.key not in keys], many)
+            if all(set(term.needs) <= names | {one.name for one in terms} for term in terms)]
+    what = "candidates" if many == 1 else "pairs"
+    progress(f"{len(sets)} {what} on top of {' + '.join(sorted(names)) or 'the base'}")
+    found = [_added(problem, now, terms) for terms in sets]
     if not found:
         return ()
     current = held_out(problem, now)
     best = min(found, key=lambda c: float(np.sum((c.judged.e / now.sigma) ** 2)))
-    # Nothing more against something: residuals as correlated as those of the present model. Among candidates: as
-    # those of the best one, which is the noise if one of them is right.
-    tau_now, tau_best = correlation_time(problem, current), correlation_time(problem, best.judged)
+    # Nothing more against something: residuals as correlated as those of the present model. Among candidates, and for
+    # pairs, which come where the present model is far off: as those of the best one, the noise if one of them is right.
+    tau_best = correlation_time(problem, best.judged)
+    tau_now = correlation_time(problem, current) if many == 1 else tau_best
     block = problem.block
     gain = np.array([c.judged.blocks(block, tau_now) - current.blocks(block, tau_now) for c in found])
     among = np.array([c.judged.blocks(block, tau_best) - best.judged.blocks(block, tau_best) for c in found])
-    draws = rng.dirichlet(np.ones(gain.shape[1]), DRAWS) * gain.shape[1]
+    # The same weights for all candidates and all data, so that no verdict hangs on a draw.
+    draws = np.random.default_rng(0).dirichlet(np.ones(gain.shape[1]), DRAWS) * gain.shape[1]
     sure = np.mean(draws @ gain.T > 0, axis=0)
     weight = _softmax(draws @ among.T).mean(axis=0)
+    alike = np.array([[one.predicts_like(other) or one is other for other in found] for one in found], float)
     nothing = float(np.mean(1 / (1 + np.exp(np.clip((draws @ gain.T).max(axis=1), -500, 500)))))
     least = float(np.log(len(found) / FALSE_ALARM))
-    judged = [Candidate(c.term, c.fitted, c.judged, float(g.sum()), float(w) * (1 - nothing),
+    judged = [Candidate(c.terms, c.fitted, c.judged, float(g.sum()), min(float(w) * (1 - nothing), SETTINGS.most_sure),
                         _too_small(float(g.sum()), float(s), least))
-              for c, g, w, s in zip(found, gain, weight, sure, strict=True)]
+              for c, g, w, s in zip(found, gain, alike @ weight, sure, strict=True)]
     if now.terms:
         judged = [replace(c, refused=c.refused or _immaterial(current, c.judged)) for c in judged]
-    judged.sort(key=lambda c: (-c.probability, -c.gain))
+    judged.sort(key=_rank)
     return tuple(_checked(problem, _without_limits(judged, len(now.theta)), len(now.theta)))
 
 
-def _added(problem: AxisProblem, now: Fitted, term: Term) -> Candidate:
-    fits = [fit(problem, (*now.terms, term), np.r_[now.theta, start]) for start in term.starts(problem, now.e)]
+def _added(problem: AxisProblem, now: Fitted, terms: tuple[Term, ...]) -> Candidate:
+    fits = [fit(problem, (*now.terms, *terms), np.concatenate([now.theta, *starts]))
+            for starts in product(*(term.starts(problem, now.e) for term in terms))]
     best = min(fits, key=lambda f: float(np.sum((f.e / now.sigma) ** 2)))
-    return Candidate(term, best, held_out(problem, best))
+    return Candidate(terms, best, held_out(problem, best))
+
+
+def _rank(c: Candidate) -> tuple[float, int, float]:
+    """By probability in per cent; of those that predict the same, the one that needs no other."""
+    return -round(c.probability, 2), sum(len(term.needs) for term in c.terms), -c.gain
+
+
+def _unsure(leader: Candidate) -> str:
+    return "" if leader.probability >= SETTINGS.headline else f"has a probability of {leader.probability:.2f} only"
 
 
 def _softmax(x: np.ndarray) -> np.ndarray:
@@ -158,15 +197,15 @@ def _without_limits(candidates: list[Candidate], first: int) -> list[Candidate]:
                 for c, end in zip(candidates, ended, strict=True)]
     left = sum(c.probability for c, end in zip(candidates, ended, strict=True) if not end)
     whole = sum(c.probability for c in candidates)
-    kept = [replace(c, probability=0.0 if end else c.probability * whole / max(left, 1e-300),
+    kept = [replace(c, probability=0.0 if end else min(c.probability * whole / max(left, 1e-300), SETTINGS.most_sure),
                     refused=c.refused or (limit if end else "")) for c, end in zip(candidates, ended, strict=True)]
-    return sorted(kept, key=lambda c: (-c.probability, -c.gain))
+    return sorted(kept, key=_rank)
 
 
 def _checked(problem: AxisProblem, candidates: list[Candidate], first: int) -> list[Candidate]:
     """The leader must agree with itself; where it does not, no other takes its place."""
     leader = candidates[0]
-    reason = leader.refused or disagreement(problem, leader.fitted, first)
+    reason = leader.refused or _unsure(leader) or disagreement(problem, leader.fitted, first)
     return [replace(leader, refused=reason),
             *(replace(c, refused=c.refused or "less probable than what leads") for c in candidates[1:])]
 

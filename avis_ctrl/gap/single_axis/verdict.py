@@ -10,6 +10,7 @@ from scipy import stats
 
 from avis_ctrl.gap.single_axis.machine import AxisProblem, HeldOut, correlation_time, held_out
 from avis_ctrl.gap.single_axis.result import AxisEffect, AxisGap, AxisStage, Estimate
+from avis_ctrl.gap.single_axis.settings import SETTINGS
 from avis_ctrl.gap.single_axis.stepwise import (
     AT_THE_NOISE,
     DRAWS,
@@ -38,29 +39,29 @@ class _Reference:
     certain: bool
 
 
-def gap_of(problem: AxisProblem, library: Sequence[Term], seed: int, progress: Progress) -> AxisGap:
+def gap_of(problem: AxisProblem, library: Sequence[Term], progress: Progress) -> AxisGap:
     """Search, verdict and words."""
-    rng = np.random.default_rng(seed)
-    steps, last = search(problem, library, rng, progress)
+    rng = np.random.default_rng(0)
+    steps, last = search(problem, library, progress)
     progress("models without physics")
     left = _references(problem, steps[-1], rng)
     on_base = left if len(steps) == 1 else _references(problem, steps[0], rng)
     steps, refused = _enough(problem, steps, on_base, left)
     verdict = _verdict(problem, steps, left)
-    stages = tuple(AxisStage("base" if step.named is None else step.named.term.name, *_figures(problem, step.judged))
+    stages = tuple(AxisStage("base" if step.named is None else step.named.name, *_figures(problem, step.judged))
                    for step in steps)
     references = tuple(AxisStage(f"{where}, {one.name}", *_figures(problem, one.judged))
                        for where, several in (("base", on_base), ("all named", left if len(steps) > 1 else ()))
                        for one in several)
     effects = _effects(problem, steps)
     first = steps[1].candidates if len(steps) > 1 else last
-    experiments = [step.named.term.separated_by for step, effect in zip(steps[1:], effects, strict=True)
-                   if effect.indistinguishable_from and step.named]
+    experiments = [term.separated_by for term, effect in zip(_named(steps), effects, strict=True)
+                   if effect.indistinguishable_from]
     return AxisGap(problem.kind, verdict, effects, stages, references, problem.where(steps[-1].judged.e),
                    tuple(_sentences(problem, verdict, stages, effects, steps, left, last, refused)),
                    "; ".join(dict.fromkeys(experiments)) or None,
                    _estimates(steps[-1].fitted.parameters, steps[-1], 0, len(problem.base)),
-                   tuple((c.term.key, c.probability) for c in first),
+                   tuple((c.key, c.probability) for c in first),
                    (_picture(stages), problem.picture([step.judged.e for step in steps],
                                                       [stage.stage for stage in stages])))
 
@@ -93,7 +94,7 @@ def _enough(problem: AxisProblem, steps: list[Step], on_base: Sequence[_Referenc
     share = (before - after) / max(before - floor, np.finfo(float).tiny)
     if share >= LEAST_SHARE:
         return _of_right_shape(problem, steps)
-    names = ", ".join(step.named.term.name for step in steps[1:] if step.named)
+    names = ", ".join(step.named.name for step in steps[1:] if step.named)
     return steps[:1], (f"{names} would take up {100 * share:.0f} % of the squared error that can be taken up: a "
                        "neighbour of what is missing, and not named")
 
@@ -143,27 +144,43 @@ def _estimates(parameters: Sequence[AxisParameter], step: Step, start: int, stop
 def _effects(problem: AxisProblem, steps: Sequence[Step]) -> tuple[AxisEffect, ...]:
     """Each with its parameters in the last model, where all are fitted together."""
     found, at = [], len(problem.base)
-    named = {step.named.term.key for step in steps[1:] if step.named}
+    named = {term.key for term in _named(steps)}
     for step in steps[1:]:
         assert step.named is not None
-        stop = at + len(step.named.term.parameters(problem))
-        found.append(AxisEffect(step.named.term.name, step.named.term.location,
-                                _estimates(steps[-1].fitted.parameters, steps[-1], at, stop), step.named.probability,
-                                tuple(c.term.key for c in step.rivals if c.term.key not in named)))
-        at = stop
+        for term in step.named.terms:
+            stop = at + len(term.parameters(problem))
+            # Of a pair, one is as sure as all pairs that hold it; its rivals are what stands in its place.
+            sure = step.named.probability if len(step.named.terms) == 1 else min(
+                sum(c.probability for c in _distinct(step.candidates) if term in c.terms), SETTINGS.most_sure)
+            rivals = {one.key for c in step.rivals if term not in c.terms for one in c.terms} - named
+            sizes = _estimates(steps[-1].fitted.parameters, steps[-1], at, stop)
+            found.append(AxisEffect(term.name, term.location, sizes, sure, tuple(sorted(rivals))))
+            at = stop
     return tuple(found)
+
+
+def _named(steps: Sequence[Step]) -> list[Term]:
+    return [term for step in steps[1:] if step.named for term in step.named.terms]
+
+
+def _distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """One of those that predict the same, which share their probability."""
+    found: list[Candidate] = []
+    for c in candidates:
+        if not any(c.predicts_like(one) for one in found):
+            found.append(c)
+    return found
 
 
 def _sentences(problem: AxisProblem, verdict: str, stages: Sequence[AxisStage], effects: Sequence[AxisEffect],
                steps: Sequence[Step], left: Sequence[_Reference], last: Sequence[Candidate], refused: str
                ) -> list[str]:
     said = [_answer(verdict, stages, effects, steps)]
-    for step, effect in zip(steps[1:], effects, strict=True):
-        if effect.indistinguishable_from and step.named:
-            rivals = " or ".join(f"{c.term.words} ({100 * c.probability:.0f} %)" for c in step.rivals
-                                 if c.term.key in effect.indistinguishable_from)
-            said.append(f"{step.named.term.name}: these data cannot tell it from {rivals}; what would: "
-                        f"{step.named.term.separated_by}.")
+    words = {term.key: term.words for step in steps for c in step.candidates for term in c.terms}
+    for term, effect in zip(_named(steps), effects, strict=True):
+        if effect.indistinguishable_from:
+            rivals = " or ".join(words[key] for key in effect.indistinguishable_from)
+            said.append(f"{term.name}: these data cannot tell it from {rivals}; what would: {term.separated_by}.")
     if stages[-1].chi2_per_dof is not None:
         said.append(f"What is left on unseen data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured noise.")
     else:
@@ -175,13 +192,13 @@ def _sentences(problem: AxisProblem, verdict: str, stages: Sequence[AxisStage], 
                     + (", certainly." if one.certain else ", which may be chance."))
     if len(effects) > 1:
         power = [stage.nrmse ** 2 for stage in stages]
-        shares = [f"{effect.name} takes {100 * (power[k] - power[k + 1]) / power[0]:.3g} %"
-                  for k, effect in enumerate(effects)]
+        shares = [f"{stage.stage} takes {100 * (power[k] - power[k + 1]) / power[0]:.3g} %"
+                  for k, stage in enumerate(stages[1:])]
         said.append(f"Of the squared error of the base model, {', '.join(shares)}.")
     said += problem.notes
     if refused:
         said.append(refused + ".")
-    lost = [f"{c.term.key} {c.refused}" for c in last if c.gain > 0 and c.refused][:3]
+    lost = [f"{c.key} {c.refused}" for c in last if c.gain > 0 and c.refused][:3]
     if lost:
         said.append("Not named: " + "; ".join(lost) + ".")
     return said
@@ -195,10 +212,10 @@ def _answer(verdict: str, stages: Sequence[AxisStage], effects: Sequence[AxisEff
         return (f"The base model leaves {first:.3g} % on unseen data, significantly more than a model without physics "
                 "or the noise, and no effect of the library accounts for it: unexplained.")
     names = []
-    for effect, step in zip(effects, steps[1:], strict=True):
+    for term, effect in zip(_named(steps), effects, strict=True):
         sizes = ", ".join(f"{p.name} {p.value:.4g} +- {p.std:.2g} {p.unit}".rstrip() for p in effect.parameters)
-        words = step.named.term.words if step.named else ""
-        names.append(f"{words} ({effect.name} at {effect.location}: {sizes}; probability {effect.probability:.2f})")
+        names.append(f"{term.words} ({effect.name} at {effect.location}: {sizes}; "
+                     f"probability {effect.probability:.2f})")
     tail = "" if verdict == "explained" else ", and something more is missing that the library does not hold"
     return (f"The model lacks {'; then '.join(names)}; with that the gap on unseen data falls from {first:.3g} % to "
             f"{last:.3g} %{tail}.")
