@@ -27,6 +27,7 @@ def gap_axis(
     cutoff_Hz: Annotated[float | None, typer.Option("--cutoff", metavar="HZ", help="low-pass of a drive's data; by "
                                                     "default as far as force and motion are coherent")] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="folder for gap.json")] = None,
+    seed: Annotated[int, typer.Option("--seed", hidden=True, help="has no influence any more")] = 1,
 ) -> None:
     """Name the effect that a model of one axis lacks, with its size, its probability, and the gap before and after.
 

@@ -90,7 +90,8 @@ def tolerances_of(rig: Rig) -> Tolerances:
 # Effects that are one value of the rig file gone beyond its tolerance, and the tolerance of each of their parameters,
 # in its unit; of a geophone's corner and damping ratio relative to them.
 BEYOND: Mapping[str, Callable[[Tolerances], tuple[float, ...]]] = {
-    "sensor_gain": lambda t: (t.sensor_gain_percent / 100,), "actuator_gain": lambda t: (t.actuator_gain_percent / 100,),
+    "sensor_gain": lambda t: (t.sensor_gain_percent / 100,),
+    "actuator_gain": lambda t: (t.actuator_gain_percent / 100,),
     "sensor_misalignment": lambda t: (float(np.degrees(t.direction_rad)),) * 2,
     "com_offset": lambda t: (t.centre_of_mass_m,) * 3, "product_of_inertia": lambda t: (t.product_of_inertia_kgm2,),
     "geophone_corner": lambda t: (t.sensor_corner_percent / 100, t.sensor_damping_percent / 100)}

@@ -36,7 +36,7 @@ PROBLEMS: dict[str, Callable[..., Any]] = {"drive": DriveData, "oscillator": Osc
                                            "seismometer": SeismometerData}
 
 
-def find_axis_gap(kind: str, *, progress: Progress | None = None, **data: Any) -> AxisGap:
+def find_axis_gap(kind: str, *, seed: int = 1, progress: Progress | None = None, **data: Any) -> AxisGap:
     """What a model of one axis lacks, with a probability, or that nothing of the library explains it.
 
     Parameters
@@ -45,6 +45,7 @@ def find_axis_gap(kind: str, *, progress: Progress | None = None, **data: Any) -
     data : drive: time (n,) s, position (n,) m, force (n,) N, reference (n,) m and cutoff_Hz where wanted. oscillator:
         u, y (n,), sample_rate_Hz, band_Hz where wanted. seismometer: responses (`Responses`), distortion (n,) where
         known. levels: campaign, periodic records at two levels.
+    seed : has no influence any more; accepted for scripts that give one.
 
     Raises
     ------
@@ -67,7 +68,7 @@ def find_axis_gap(kind: str, *, progress: Progress | None = None, **data: Any) -
 
 
 def find_axis_gap_in(kind: str, path: str | Path, columns: Mapping[str, str] | None = None, *,
-                     scale: Mapping[str, float] | None = None, sample_rate_Hz: float | None = None,
+                     scale: Mapping[str, float] | None = None, sample_rate_Hz: float | None = None, seed: int = 1,
                      progress: Progress | None = None, **options: Any) -> AxisGap:
     """The same from files: a record (drive, oscillator), a folder of sine records (seismometer: drive, coil,
     displacement), or a folder of u_*.npy and y_*.npy (levels: samples x channels x realisations x periods, the level in
@@ -93,7 +94,7 @@ def find_axis_gap_in(kind: str, path: str | Path, columns: Mapping[str, str] | N
     campaign, driven, measured = _read(kind, path, dict(columns or {}), factors, sample_rate_Hz)
     if kind == "seismometer":
         records, refused = sine_records(campaign, driven, measured, factors)
-        found = find_axis_gap(kind, progress=progress, **SeismometerData.of(records, measured, driven),
+        found = find_axis_gap(kind, seed=seed, progress=progress, **SeismometerData.of(records, measured, driven),
                               **options)
         return replace(found, sentences=(*found.sentences, *(f"Left out: {reason}." for reason in refused)))
     if len(campaign.records) != 1:
