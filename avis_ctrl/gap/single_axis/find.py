@@ -86,7 +86,7 @@ def find_axis_gap_in(kind: str, path: str | Path, columns: Mapping[str, str] | N
         if columns or scale:
             raise InputError("expected no columns and no scale: the names of the files say what they are",
                              field="columns", value=dict(columns or scale or {}))
-        return find_axis_gap(kind, campaign=read_levels(path, sample_rate_Hz), transient="none",
+        return find_axis_gap(kind, campaign=read_levels(path, sample_rate_Hz), transient="none", seed=seed,
                              progress=progress, **options)
     if kind not in PROBLEMS:
         raise InputError(f"expected one of {', '.join((*PROBLEMS, 'levels'))}", field="kind", value=kind)
@@ -105,7 +105,7 @@ def find_axis_gap_in(kind: str, path: str | Path, columns: Mapping[str, str] | N
     rate = campaign.sample_rate_Hz
     clock: dict[str, Any] = {"time": np.arange(len(record.u)) / rate} if kind == "drive" else {"sample_rate_Hz": rate}
     try:
-        return find_axis_gap(kind, progress=progress, **clock, **channel, **options)
+        return find_axis_gap(kind, seed=seed, progress=progress, **clock, **channel, **options)
     except InputError as error:
         raise error.in_file(path) from None
 
