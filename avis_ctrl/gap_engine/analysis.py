@@ -274,7 +274,9 @@ def _sensors(faults) -> dict[str, float] | None:
 
 
 def _named(one, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared) -> NamedEffect:
+    held = {p.name for p, name in zip(one.parameters, one.names, strict=True) if name in updated.model.fixed}
     reported = one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names))
+    reported = {name: value for name, value in reported.items() if name not in held}
     return NamedEffect(one.effect.name, name_of(one.label)[1], one.effect.title, reported,
                        names.probability[one.label], names.rivals[one.label], label=one.label,
                        share=share_of(updated.model, one.label, prepared.held_out, power, with_it))

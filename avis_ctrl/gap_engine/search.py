@@ -24,7 +24,14 @@ from avis_ctrl.gap.table_model import ActiveEffect, active
 from avis_ctrl.gap_engine.likelihood import Data, Fitted, fit
 from avis_ctrl.gap_engine.score import EvidenceScore
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
-from avis_ctrl.gap_engine.tolerances import BEYOND, Priors, of_effect, tolerances_of, within_tolerance
+from avis_ctrl.gap_engine.tolerances import (
+    BEYOND,
+    Priors,
+    of_effect,
+    tolerances_behind,
+    tolerances_of,
+    within_tolerance,
+)
 
 Progress = Callable[[str], None]
 
@@ -114,7 +121,9 @@ def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSett
     own = of_effect(one, tolerances_of(model.rig), settings).of([name for name in one.names if name in model.names])
     own = _with_known(own, model.priors)
     values = dict(zip(one.names, one.values, strict=True))
-    z = np.concatenate([fitted.z, own.z(np.array([values[name] for name in own.names]))])
+    before = fitted.z.copy()
+    before[tolerances_behind(one, fitted.priors.names)] = 0  # the effect begins with what these had to make up for
+    z = np.concatenate([before, own.z(np.array([values[name] for name in own.names]))])
     return _try(fitted, model, fitted.priors.followed_by(own), z, data, settings)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avis_ctrl.gap.effects.large_motion import LargeMotion
+from avis_ctrl.gap.effects.payload import PRODUCTS
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.identification.parameter_sets import default_parameters
@@ -102,6 +103,16 @@ def tolerance_of(effect: ActiveEffect, tolerances: Tolerances) -> np.ndarray:
     relative = np.array(BEYOND[effect.effect.name](tolerances))
     of = np.array([p.none for p in effect.parameters]) if effect.effect.name == "geophone_corner" else 1.0
     return relative * of
+
+
+def tolerances_behind(effect: ActiveEffect, names: Sequence[str]) -> list[int]:
+    """Indices of the tolerances of the values that an effect of `BEYOND` takes further."""
+    place = effect.place
+    own = {"sensor_gain": (f"sensor.{place}",), "actuator_gain": (f"actuator.{place}",),
+           "sensor_misalignment": (f"direction.{place}.",), "com_offset": ("com_",),
+           "product_of_inertia": (PRODUCTS.get(place, ""),), "geophone_corner": (f"corner.{place}", f"damping.{place}")}
+    starts = own.get(effect.effect.name)
+    return [k for k, name in enumerate(names) if starts and name.startswith(starts)]
 
 
 def within_tolerance(effect: ActiveEffect, tolerances: Tolerances, settings: GapSettings) -> bool:

@@ -67,6 +67,7 @@ class Named(_Part):
     parameters: dict[str, Estimate]
     probability: Probability
     indistinguishable_from: list[str]
+    share: Probability | None = None
 
 
 class Stage(_Part):
