@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.optimize import minimize
 
+from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.model_files import model_from_dict, model_to_dict
+from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap_engine.likelihood import Data, first_variances, fit
 from avis_ctrl.gap_engine.settings import GapSettings
-from avis_ctrl.gap_engine.tolerances import Priors, re_identified, with_tolerances
-from avis_ctrl.gap_engine.weights import Variances, path_contributions, weigh
+from avis_ctrl.gap_engine.tolerances import (
+    Priors,
+    re_identified,
+    tolerances_behind,
+    with_tolerances,
+    within_tolerance,
+)
+from avis_ctrl.gap_engine.validation import halves, odds_against
+from avis_ctrl.gap_engine.weights import Variances, estimated, path_contributions, weigh
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.instruments import Tolerances
+from avis_ctrl.study.gap import find_gap
 
 RIG = load_rig("avis").with_channels_apart()
 TOLERANCES = Tolerances()
@@ -110,3 +123,128 @@ def test_parameters_stay_within_their_bounds():
     priors = Priors(("a", "b"), np.array([0.0, 1.0]), np.array([1.0, 0.1]), np.array([False, True]),
                     np.array([-0.5, 0.0]), np.array([0.5, 2.0]))
     assert_allclose(priors.values(np.array([3.0, 1.0])), [0.5, np.exp(0.1)])
+
+
+def found_at(seed: int = 7, bend: float = 0.0):
+    """A fit of one sensor's gain; bend : by how much it is another one above 8 Hz."""
+    settings = GapSettings(rounds=0)
+    k_y = bare().sensors.names.index("Sz1")
+    priors = Priors(("sensor.Sz1",), bare().sensors.sensitivity[[k_y]], np.array([0.1]), np.ones(1, bool))
+    model = bare(priors.names)
+    blocks = []
+    for k in (seed, seed + 1):
+        one = block(model, k, 120, 1e-5)
+        factor = np.ones(one.Y.shape)
+        factor[one.omega > 2 * np.pi * 8, k_y] += bend
+        blocks.append(replace(one, Y=one.Y * factor))
+    data = Data(tuple(blocks), (0.2, 0.2))
+    first = first_variances(data, settings)
+    little = Variances({group: 1e-4 * v for group, v in first.path.items()},
+                       {group: 1e-9 * s for group, s in first.distortion.items()})
+    return fit(model, priors, np.zeros(1), data, little, settings), data, settings
+
+
+def test_normal_equations_are_those_of_the_flattened_rows():
+    found, _, _ = found_at()
+    J = np.random.default_rng(3).standard_normal((5, len(found.e)))
+    H, g, cost = found.weights.normal_equations(J, found.white.e)
+    flat = found.weights.flatten(J)
+    assert_allclose(H, flat @ flat.T, rtol=1e-9, atol=1e-9 * np.abs(H).max())
+    assert_allclose(g, flat @ found.e, rtol=1e-9, atol=1e-9 * np.abs(g).max())
+    assert cost == pytest.approx(found.e @ found.e, rel=1e-9)
+    assert sum(found.log_likelihoods.values()) == pytest.approx(-0.5 * (cost + found.weights.log_determinant))
+
+
+def test_variances_are_the_most_likely_ones():
+    """Against a general optimiser on the dense covariance of one sensor in one band."""
+    settings, rng = GapSettings(bands_per_octave=1, climbs=2000), np.random.default_rng(5)
+    omega, noise = 2 * np.pi * np.linspace(2.6, 5.0, 30), 1e-4
+    U = np.zeros((30, 11, 1), complex)
+    U[:, :3, 0] = np.exp(2j * np.pi * rng.uniform(size=(30, 3)))
+    path = np.zeros((30, 6, 11), complex)
+    path[:, :, :3] = rng.standard_normal((30, 6, 3)) + 1j * rng.standard_normal((30, 6, 3))
+    circular = rng.standard_normal((2, 30, 6)) / np.sqrt(2)
+    errors = 0.05 * (rng.standard_normal((6, 3)) + 1j * rng.standard_normal((6, 3))) / np.sqrt(2)
+    e = np.einsum("kcj,cj->kc", path[:, :, :3], errors) + 0.03 * (circular[0] + 1j * circular[1])
+    whole = np.broadcast_to(noise * np.eye(6, dtype=complex), (30, 1, 6, 6))
+    one = SpectralBlock("01", omega, U, e[:, :, None], whole, transient=False, samples=60000)
+    band = int(np.floor(np.log2(omega[0]) + 1e-9))
+    assert np.all(np.floor(np.log2(omega) + 1e-9) == band)
+    start = Variances({(0.2, band): np.full(6, 1e-2)}, {(0.2, band): np.full(6, 1e-3)})
+    found = estimated([e], [one], [0.2], [path], start, settings)
+    nu, v0 = settings.error_weight, settings.least_error ** 2
+
+    def cost(x, c):
+        v, s = np.exp(x)
+        C = (noise + s) * np.eye(30) + v * path[:, c] @ path[:, c].conj().T
+        return float(np.real(e[:, c].conj() @ np.linalg.solve(C, e[:, c])) + np.linalg.slogdet(C)[1]
+                     + (nu / 2 + 1) * x[0] + nu * v0 / (2 * v))
+    for c in range(6):
+        best = minimize(cost, np.log([1e-3, 1e-3]), args=(c,), method="Nelder-Mead",
+                        options={"xatol": 1e-6, "fatol": 1e-9, "maxiter": 4000})
+        assert_allclose(np.log([found.path[0.2, band][c], found.distortion[0.2, band][c]]), best.x, atol=0.02)
+
+
+def test_a_parameter_that_moves_with_the_band_refutes_its_law():
+    good, bent = (halves(found, ("sensor.Sz1",), settings) for found, _, settings in (found_at(), found_at(bend=0.3)))
+    assert min(one.p_value for one in good) > 1e-3
+    assert max(one.change for one in bent) > 0.05 and min(one.p_value for one in bent) < 1e-4
+    assert {one.words for one in bent} == {"the lower part of the band", "the upper part of the band"}
+
+
+def test_odds_by_how_evenly_two_models_differ():
+    groups = [(0.2, k) for k in range(20)]
+    none = dict.fromkeys(groups, 0.0)
+    even = {group: 3.0 + 0.1 * (k % 3) for k, group in enumerate(groups)}
+    uneven = {group: 40.0 if k == 0 else -2.0 for k, group in enumerate(groups)}
+    assert odds_against(even, none) < 1e-12
+    assert odds_against(uneven, none) > 0.4
+    assert odds_against(none, uneven) * odds_against(uneven, none) == pytest.approx(1.0)
+
+
+def test_what_is_beyond_a_tolerance_and_the_tolerance_behind_it():
+    model = TableModel(bare())
+    priors = with_tolerances(bare(), TOLERANCES)
+    for name, place, value, behind in (("sensor_gain", "Sz1", 1.02, ["sensor.Sz1"]),
+                                       ("product_of_inertia", "Jxz", 0.5, ["J13"]),
+                                       ("geophone_corner", "Sy1", None, ["corner.Sy1", "damping.Sy1"])):
+        effect = library()[name]
+        none = [p.none for p in effect.parameters(model, place)]
+        near = active(effect, model, place, none if value is None else [value])
+        assert [priors.names[k] for k in tolerances_behind(near, priors.names)] == behind
+        assert within_tolerance(near, TOLERANCES, GapSettings())
+        assert not within_tolerance(near.at([v + 0.1 * max(abs(v), 10) for v in none]), TOLERANCES, GapSettings())
+
+
+def test_a_channel_knows_its_mount_wherever_it_is_listed():
+    table = load_rig("avis")
+    for one in (*table.all_drives, *table.sensors()):
+        assert RIG.mount_of(one.name) == table.mount_of(one.name)
+    assert RIG.mount_of("Az1") == ("isolator1.z", 1.0)
+    away = RIG.with_parameters({"place.Az1.x": RIG.parameters()["place.Az1.x"].value + 0.2})
+    assert away.mount_of("Az1") is None
+
+
+def test_corners_within_their_tolerance_are_kept_in_a_model_file():
+    base = ResponseModel.of(RIG, ("corner.Sz1", "damping.Sy3"))
+    model = TableModel(base.at(base.values * [1.03, 0.9]))
+    omega = 2 * np.pi * np.geomspace(0.5, 50, 20)
+    again = model_from_dict(json.loads(json.dumps(model_to_dict(model))))
+    assert_allclose(again.response(omega), model.response(omega), rtol=1e-12)
+    assert np.max(np.abs(again.response(omega) / TableModel(base).response(omega) - 1)) > 0.01
+
+
+@pytest.mark.slow
+def test_a_lagging_amplifier_is_named_on_a_table_that_is_off_its_file_in_everything():
+    """An independent simulator: tolerances drawn, traces of friction, stiffening and hum always on."""
+    from truth.cases import draw_case, simulate_case
+
+    case = draw_case(41, kind="one", effect="actuator_lag", strength="clear", duration_s=30.0, clutter=True)
+    rig = replace(load_rig("avis"), tolerances=TOLERANCES)
+    gap = find_gap(simulate_case(case), rig).gap
+    first = gap.effects[0]
+    corner = first.parameters["corner_Hz"]
+    assert first.name == "actuator_lag" and first.probability > 0.9 and gap.verdict == "explained"
+    assert corner.value == pytest.approx(case.effects[0].parameters["corner_Hz"], rel=0.01)
+    assert {one.name: one.nrmse for one in gap.stages}["re-identified"] > 2 * gap.stages[-1].nrmse
+    assert gap.to_json()["remaining"]["share"] < 0.1
