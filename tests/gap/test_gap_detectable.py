@@ -10,11 +10,18 @@ from avis_ctrl.gap.detectable import detectable
 from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.refit import refit
 from avis_ctrl.gap.score import Score
+from avis_ctrl.gap.search import known_noise
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 
 OWN = library()
+
+
+def limits(model, blocks, effects):
+    """Of five standard deviations, of noise or of what the model leaves."""
+    score = Score(model, blocks)
+    return detectable(score, effects, max(1.0, score.chi2 / score.dof) * known_noise(blocks))
 
 
 def nothing_missing(seed=1):
@@ -26,7 +33,7 @@ def test_limits_are_five_deviations_of_a_fit_with_the_effect():
     """By another path: a fit of all parameters, from whose information the rig's are eliminated."""
     model, blocks = nothing_missing()
     names = ("sensor_gain", "com_offset", "loop_delay", "structural_damping")
-    rows = {(one.name, one.location, one.parameter): one for one in detectable(model, blocks, [OWN[n] for n in names])}
+    rows = {(one.name, one.location, one.parameter): one for one in limits(model, blocks, [OWN[n] for n in names])}
     misfit = max(1.0, np.sqrt(Score(model, blocks).chi2 / Score(model, blocks).dof))
     for name, place, shown in (("sensor_gain", "Sz2", "Sz2"), ("com_offset", "payload", "payload")):
         added = model.with_effect(effect(name, place, None, model))
@@ -43,7 +50,7 @@ def test_limits_are_five_deviations_of_a_fit_with_the_effect():
 
 def test_what_lies_well_above_its_limit_is_seen():
     model, blocks = nothing_missing()
-    limit = next(one.value for one in detectable(model, blocks, [OWN["sensor_gain"]]) if one.location == "Sz3")
+    limit = next(one.value for one in limits(model, blocks, [OWN["sensor_gain"]]) if one.location == "Sz3")
     for factor, seen in ((3.0, True), (0.1, False)):
         truth = MODEL.with_effect(effect("sensor_gain", "Sz3", [1 + factor * limit]))
         made = [block(truth, np.random.default_rng(7), name=name) for name in ("00", "01")]
@@ -55,11 +62,11 @@ def test_what_lies_well_above_its_limit_is_seen():
 def test_what_re_identification_absorbs_has_no_limit():
     free = TableModel(ResponseModel.of(MODEL.rig, (*default_parameters(MODEL.rig), "sensor.Sz2")))
     blocks = [block(MODEL, np.random.default_rng(2))]
-    rows = {one.location: one.value for one in detectable(free, blocks, [OWN["sensor_gain"]])}
+    rows = {one.location: one.value for one in limits(free, blocks, [OWN["sensor_gain"]])}
     assert rows.pop("Sz2") == np.inf
     assert np.all(np.isfinite(list(rows.values())))
 
 
 def test_effects_that_have_a_shape_are_left_out():
     model, blocks = nothing_missing()
-    assert detectable(model, blocks, [OWN["mount_relaxation"], OWN["actuator_saturation"]]) == ()
+    assert limits(model, blocks, [OWN["mount_relaxation"], OWN["actuator_saturation"]]) == ()
