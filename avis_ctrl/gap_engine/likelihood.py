@@ -7,8 +7,8 @@ z are standardised parameters; the whitened residual e is free of the transients
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -44,8 +44,9 @@ class Fitted:
     """The most probable parameters of a model.
 
     model : at the estimate. priors, z (n,), covariance (n, n) of z. variances : of what is not explained.
-    log_evidence : Laplace. iterations : Gauss-Newton steps. weights : of the data. white : residual and Jacobian,
-    whitened by noise and distortion.
+    log_evidence : Laplace. log_likelihoods : by level and band; what is in the evidence beside their sum is of priors.
+    iterations : Gauss-Newton steps. weights : of the data. white : residual and Jacobian, whitened by noise and
+    distortion; both empty once only the evidence is of interest (`bare`).
     """
 
     model: Any
@@ -54,9 +55,14 @@ class Fitted:
     covariance: np.ndarray
     variances: Variances
     log_evidence: float
+    log_likelihoods: Mapping[Group, float]
     iterations: int
     weights: Weights
     white: Evaluated
+
+    def bare(self) -> Fitted:
+        """Without residual, Jacobian and weights, which take most of the memory."""
+        return replace(self, weights=Weights((), (), {}), white=Evaluated(np.empty(0), np.empty((0, 0)), []))
 
     @cached_property
     def e(self) -> np.ndarray:
@@ -72,11 +78,6 @@ class Fitted:
     def rows(self) -> dict[Group, np.ndarray]:
         """Entries of `e` by level and band."""
         return {one.group: one.rows for one in self.weights.paths}
-
-    @cached_property
-    def log_likelihoods(self) -> dict[Group, float]:
-        """By level and band; what is in `log_evidence` beside their sum is of the priors."""
-        return _by_group(self.weights, self.e)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -140,7 +141,8 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
     # The states at the ends of a record have no prior; each costs what one with unit information would (Schwarz 1978).
     ends = sum(0.5 * transient_unknowns(block, model) * np.log(2 * block.Y.size) for block in data.blocks)
     log_evidence = reached - ends - 0.5 * np.linalg.slogdet(H)[1]
-    return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), steps, weights, now)
+    by_group = _by_group(weights, weights.flatten(now.e[None])[0])
+    return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), by_group, steps, weights, now)
 
 
 def _hyper(variances: Variances, settings: GapSettings) -> float:

@@ -114,8 +114,9 @@ def mended_with(prepared: Prepared, model: TableModel, progress: Progress, each:
     assert prepared.clipped is not None
     expected = predicted(prepared.clipped, model, each)
     campaign = repair(prepared.clipped, model.rig, expected, prepared.faults.converter).campaign
-    return _ready(campaign, divide(campaign), prepared.nominal, prepared.rough, prepared.band_Hz,
-                  prepared.faults.converter, prepared.clipped, progress, each, settings)
+    rough = replace(prepared.rough, effects=())
+    return _ready(campaign, divide(campaign), prepared.nominal, rough, prepared.band_Hz, prepared.faults.converter,
+                  prepared.clipped, progress, each, settings)
 
 
 def _band(halves: Halves, band_Hz: tuple[float, float] | None, settings: GapSettings) -> tuple[float, float]:

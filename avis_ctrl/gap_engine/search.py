@@ -189,7 +189,8 @@ def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSetti
     start = tried[best]
     if start.log_evidence - now.log_evidence < settings.certain + math.log(len(found)):
         return None
-    return Step(now, fit(start.model, start.priors, start.z, data, start.variances, settings), tried, len(found))
+    full = fit(start.model, start.priors, start.z, data, start.variances, settings)
+    return Step(now.bare(), full, {label: one.bare() for label, one in tried.items()}, len(found))
 
 
 def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Each

@@ -10,8 +10,8 @@ SOURCES = (
     "problems of estimation, Proc. Camb. Phil. Soc. 44 (1948) 50-57 (score test).",
     "G. H. Golub, V. Pereyra: The differentiation of pseudo-inverses and nonlinear least squares problems whose "
     "variables separate, SIAM J. Numer. Anal. 10 (1973) 413-432 (variable projection).",
-    "A. P. Dempster, N. M. Laird, D. B. Rubin: Maximum likelihood from incomplete data via the EM algorithm, J. R. "
-    "Statist. Soc. B 39 (1977) 1-38 (variances of what has no name).",
+    "H. Zhou, L. Hu, J. Zhou, K. Lange: MM algorithms for variance components models, J. Comput. Graph. Stat. 28 "
+    "(2019) 350-361 (variances of what has no name).",
     "D. J. C. MacKay: Bayesian interpolation, Neural Computation 4 (1992) 415-447 (evidence, Laplace's method).",
     "Q. H. Vuong: Likelihood ratio tests for model selection and non-nested hypotheses, Econometrica 57 (1989) 307-333 "
     "(how certain one law is ahead of another).",

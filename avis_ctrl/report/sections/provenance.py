@@ -21,9 +21,15 @@ def provenance(result: DesignResult) -> Section:
 
 def provenance_table(made: Mapping[str, Any], caption: str) -> Section:
     """What made a result."""
-    rows = [(NAMES.get(key, key), words.number(value) if isinstance(value, float) else str(value))
+    rows = [(NAMES.get(key, key), _said(value))
             for key, value in made.items() if value is not None]
     return Section("Provenance", "provenance", (table(caption, ("what", "value"), rows, "ll"),))
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "; ".join(f"{key} {_said(one)}" for key, one in value.items())
+    return words.number(value) if isinstance(value, float) else str(value)
 
 
 def stamp(result: DesignResult) -> str:
