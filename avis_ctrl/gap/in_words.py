@@ -28,6 +28,6 @@ def sized(p: Reported) -> str:
     if not (np.isfinite(p.std) and p.std > 0 and np.isfinite(p.value)):
         return f"{p.value:.5g}{unit}"
     places = 1 - int(np.floor(np.log10(float(f"{p.std:.1e}"))))
-    power = int(np.floor(np.log10(max(abs(p.value), p.std)))) if places > 6 else 0
+    power = int(np.floor(np.log10(max(abs(p.value), p.std)))) if not -4 <= places <= 6 else 0
     value, std = (f"{v / 10.0 ** power:.{max(places + power, 0)}f}" for v in (p.value, p.std))
     return f"({value} +- {std})e{power}{unit}" if power else f"{value} +- {std}{unit}"
