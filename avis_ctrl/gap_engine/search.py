@@ -190,7 +190,7 @@ def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSetti
     if start.log_evidence - now.log_evidence < settings.certain + math.log(len(found)):
         return None
     full = fit(start.model, start.priors, start.z, data, start.variances, settings)
-    return Step(now.bare(), full, {label: one.bare() for label, one in tried.items()}, len(found))
+    return Step(now.bare(), full, tried, len(found))
 
 
 def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Each
@@ -199,17 +199,33 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     those that come to no end, to values that physics forbids, or to one within its tolerance."""
     rough = replace(settings, rounds=0, iterations=settings.rough_iterations)
     quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
-    # Against the variances that a fit starts with: what the fit before it makes of them would be no fair measure.
-    level = now.log_evidence
-    made = [one for one in each(lambda one: with_effect(now, one.effect, data, rough), chosen) if one is not None]
+
+    def begun(one: Candidate) -> Fitted | None:
+        return _small(with_effect(now, one.effect, data, rough))
+
+    def ended(one: Fitted) -> Fitted | None:
+        whole = _whole(one, now)
+        return _small(_try(whole, whole.model, whole.priors, whole.z, data, quick))
+    made = [one for one in each(begun, chosen) if one is not None]
     if not made:
         return {}
+    # Against the variances that a fit starts with: what the fit before it makes of them would be no fair measure.
+    level = now.log_evidence
     most = max(one.log_evidence for one in made) - level
     near = [one for one in made if one.log_evidence - level >= settings.not_far_behind * most]
-    further = each(lambda one: _try(one, one.model, one.priors, one.z, data, quick), near)
+    further = [_whole(one, now) for one in each(ended, near) if one is not None]
     stated = tolerances_of(now.model.rig)
-    return {one.labels[-1]: one for one in further if one is not None and not implausible(one)
+    return {one.labels[-1]: one for one in further if not implausible(one)
             and not within_tolerance(one.model.effects[-1], stated, settings)}
+
+
+def _small(found: Fitted | None) -> Fitted | None:
+    """Without what takes room on the way back from another process, the motion of the records first of all."""
+    return found and replace(found.bare(), model=replace(found.model, motion={}))
+
+
+def _whole(found: Fitted, like: Fitted) -> Fitted:
+    return replace(found, model=replace(found.model, motion=like.model.motion))
 
 
 def implausible(fitted: Fitted) -> str:
