@@ -120,8 +120,8 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
 
 
 def with_tolerances(rig: Rig) -> bool:
-    """Whether the rig file states tolerances, and the rig knows of each channel by itself."""
-    return getattr(rig, "tolerances", None) is not None and hasattr(rig, "with_channels_apart")
+    """Whether the rig knows of each channel by itself."""
+    return hasattr(rig, "with_channels_apart")
 
 
 def _require_records(measured: Campaign, rig: Rig) -> None:
