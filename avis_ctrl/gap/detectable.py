@@ -2,8 +2,8 @@
 
 Of an effect that is linear in its parameters near none, the directions A of the score test (whitened, with everything
 that re-identification absorbs projected out) are also what a fit would know them by: the covariance of the parameters
-is inv(A A^T). The search asks that a score stand out of all candidates and that the criterion fall by
-`search.LEAST_FALL`, which one parameter reaches at between four and five of its deviations: five are given.
+is inv(A A^T). A parameter gains the evidence that a name needs at between four and five of its standard deviations:
+five are given.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from avis_ctrl.gap.covariance import directions
 from avis_ctrl.gap.effects.base import Effect, library
 from avis_ctrl.gap.result import Detectable
 from avis_ctrl.gap.score import LEFT, Score
-from avis_ctrl.gap.search import location
 from avis_ctrl.gap.table_model import active
 
 DEVIATIONS = 5.0
+# Share of the largest eigenvalue of a scaled information matrix below which there is only round-off, 1e-16 of it.
+ROUND_OFF = 1e-12
 
 
-def detectable(score: Score, effects: Sequence[Effect] | None = None, stretch: float = 1.0) -> tuple[Detectable, ...]:
+def detectable(score: Score, effects: Sequence[Effect] | None = None) -> tuple[Detectable, ...]:
     """For every effect, place and parameter the departure from none of five standard deviations.
 
     Of effects whose parameters are all linear, each parameter with the others of its effect free; of two laws of one
@@ -30,10 +30,9 @@ def detectable(score: Score, effects: Sequence[Effect] | None = None, stretch: f
 
     Parameters
     ----------
-    score : at the fitted model. effects : the library where None. stretch : of variances, by which the noise may be
-        larger than it was taken for.
+    score : at the fitted model. effects : the library where None.
     """
-    model, deviation = score.model, DEVIATIONS * np.sqrt(stretch)
+    model = score.model
     rows: dict[tuple[str, str, str], Detectable] = {}
     for effect in list(library().values()) if effects is None else effects:
         if effect.nonlinear and not model.motion:
@@ -44,7 +43,7 @@ def detectable(score: Score, effects: Sequence[Effect] | None = None, stretch: f
                 continue
             std = _deviations(score.of_effect(active(effect, model, place, [one.none for one in parameters])))
             for one, own in zip(parameters, std, strict=True):
-                row = Detectable(effect.name, location(place), one.name, float(deviation * own), one.unit)
+                row = Detectable(effect.name, place.partition("/")[0], one.name, float(DEVIATIONS * own), one.unit)
                 key = (row.name, row.location, row.parameter)
                 if key not in rows or rows[key].value < row.value:
                     rows[key] = row
@@ -53,10 +52,11 @@ def detectable(score: Score, effects: Sequence[Effect] | None = None, stretch: f
 
 def _deviations(A: np.ndarray) -> np.ndarray:
     """(k,) standard deviations of the parameters behind directions A (k, N); infinite where they are not determined."""
-    B = directions(A @ A.T)
-    variance = np.sum(B ** 2, axis=1)
-    # What moves a parameter and changes nothing: there its deviation has no bound.
     size = np.linalg.norm(A, axis=1)
-    dark = np.eye(len(A)) - B @ (B.T @ (A @ A.T))
-    loose = (size == 0) | (np.abs(np.diag(dark)) > LEFT)
+    size = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh((A @ A.T) / np.outer(size, size))
+    known = values > ROUND_OFF * max(values[-1], 1e-300)
+    variance = np.sum(vectors[:, known] ** 2 / values[known], axis=1) / size ** 2
+    # What moves a parameter and changes nothing: there its deviation has no bound.
+    loose = np.sum(vectors[:, ~known] ** 2, axis=1) > LEFT
     return np.where(loose, np.inf, np.sqrt(variance))

@@ -65,7 +65,7 @@ class ModelFile(_Part):
     delay_s: Annotated[float, Field(ge=0, lt=1)]
     amplifier_corner_Hz: Positive | None
     effects: list[EffectFile]
-    fixed: list[str]
+    fixed: list[str] = []  # of files before 0.5: says nothing of the model's response
     campaign_s: Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
@@ -87,7 +87,7 @@ def model_to_dict(model: TableModel) -> dict[str, Any]:
             if own is not None and own != assumed},
         "effects": [{"name": one.effect.name, "place": one.place,
                      "values": {name: float(value) for name, value in one.by_name.items()}} for one in model.effects],
-        "fixed": sorted(model.fixed), "campaign_s": list(campaign_clock(model))}
+        "campaign_s": list(campaign_clock(model))}
 
 
 def _rig_text(rig: Rig) -> tuple[str, dict[str, float]]:
@@ -190,10 +190,6 @@ def _made(file: ModelFile) -> TableModel:
     model = TableModel(base)
     for k, one in enumerate(file.effects):
         model = model.with_effect(_effect(model, one, f"effects[{k}]"))
-    model = replace(model, fixed=frozenset(file.fixed))
-    known = {name for one in model.effects for name in one.names}
-    if unknown := sorted(model.fixed - known):
-        raise InputError("expected names of parameters of the effects", field="fixed", value=unknown)
     _require_answer(model)
     return model
 

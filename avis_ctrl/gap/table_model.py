@@ -45,11 +45,6 @@ class ActiveEffect:
     def by_name(self) -> dict[str, float]:
         return dict(zip((one.name for one in self.parameters), self.values, strict=True))
 
-    @property
-    def late(self) -> frozenset[str]:
-        """Names of the parameters that only the last fit frees."""
-        return frozenset(name for name, one in zip(self.names, self.parameters, strict=True) if one.late)
-
     def at(self, values: Sequence[float]) -> ActiveEffect:
         return replace(self, values=tuple(float(v) for v in values))
 
@@ -68,10 +63,9 @@ class Acting:
 
 
 def active(effect: Effect, model: TableModel, place: str, values: Sequence[float] | None = None) -> ActiveEffect:
-    """An effect at a place of a model, without strength where no values are given; late parameters may be left out."""
+    """An effect at a place of a model, without strength where no values are given."""
     parameters = effect.parameters(model, place)
     values = effect.starts(model, place)[0].tolist() if values is None else list(values)
-    values += [one.none for one in parameters[len(values):] if one.late]
     if len(values) != len(parameters):
         raise InputError(f"expected {len(parameters)} values", field=effect.name, value=list(values))
     return ActiveEffect(effect, place, parameters, tuple(float(v) for v in values))
@@ -81,7 +75,7 @@ def active(effect: Effect, model: TableModel, place: str, values: Sequence[float
 class TableModel:
     """`ResponseModel` with effects.
 
-    base : the rig and its free parameters. effects : added, all their parameters free but those in `fixed`.
+    base : the rig and its free parameters. effects : added, all their parameters free.
     motion : records in time by name, which effects that depend on amplitude or time need.
     nominal : the rig as its file has it, which sizes the steps of a fit: a parameter that a wrong model has driven to
         nothing must find its way back. None for the base itself.
@@ -91,7 +85,6 @@ class TableModel:
     base: ResponseModel
     effects: tuple[ActiveEffect, ...] = ()
     motion: Mapping[str, RecordMotion] = field(default_factory=dict)
-    fixed: frozenset[str] = frozenset()
     nominal: ResponseModel | None = None
     corners_differ: bool = False
 
@@ -127,8 +120,7 @@ class TableModel:
     @cached_property
     def _free(self) -> list[tuple[int, int]]:
         """(effect, parameter) of each free parameter of the effects."""
-        return [(k, j) for k, one in enumerate(self.effects) for j, name in enumerate(one.names)
-                if name not in self.fixed]
+        return [(k, j) for k, one in enumerate(self.effects) for j in range(len(one.names))]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -192,17 +184,12 @@ class TableModel:
         return replace(self, effects=(*self.effects[:k], self.effects[k].at(values), *self.effects[k + 1:]))
 
     def with_effect(self, effect: ActiveEffect, at: int | None = None) -> TableModel:
-        """The model with one effect more, the last or as number `at`; its late parameters held where they are."""
+        """The model with one effect more, the last or as number `at`."""
         at = len(self.effects) if at is None else at
-        return replace(self, effects=(*self.effects[:at], effect, *self.effects[at:]), fixed=self.fixed | effect.late)
-
-    def with_late_free(self) -> TableModel:
-        """The same with the late parameters of its effects free, too."""
-        return replace(self, fixed=self.fixed.difference(*(effect.late for effect in self.effects)))
+        return replace(self, effects=(*self.effects[:at], effect, *self.effects[at:]))
 
     def without(self, label: str) -> TableModel:
-        gone = {name for one in self.effects if one.label == label for name in one.names}
-        return replace(self, effects=tuple(one for one in self.effects if one.label != label), fixed=self.fixed - gone)
+        return replace(self, effects=tuple(one for one in self.effects if one.label != label))
 
     @cached_property
     def effective(self) -> ResponseModel:

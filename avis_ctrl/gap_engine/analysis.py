@@ -18,8 +18,8 @@ from avis_ctrl.gap.effects.base import Effect, library
 from avis_ctrl.gap.effects.beyond import beyond
 from avis_ctrl.gap.in_words import in_words
 from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplained
+from avis_ctrl.gap.residual import Left, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
-from avis_ctrl.gap.show import Left, every_record, heat_map, places
 from avis_ctrl.gap.signal_effects import left_by, levels, named
 from avis_ctrl.gap_engine.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.gap_engine.preparation import Prepared, mended_with, prepare, with_second_order
@@ -168,8 +168,10 @@ def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Dat
         return f"another explanation is as probable ({probability:.2f})"
     if reason := implausible(replace(best, model=replace(best.model, effects=(one,)))):
         return reason
-    after, before = (log_likelihoods(one, held, settings) for one in (step.fitted, step.before))
-    if sum(after.values()) <= sum(before.values()):
+    # With the priors: a value beyond its tolerance shows in how far others had to move, and hardly in a residual.
+    after, before = (sum(log_likelihoods(one, held, settings).values()) - 0.5 * float(one.z @ one.z)
+                     for one in (step.fitted, step.before))
+    if after <= before:
         return "held-out records do not bear it out"
     strength = [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
     for half in halves(best, strength, settings):
@@ -274,9 +276,7 @@ def _sensors(faults) -> dict[str, float] | None:
 
 
 def _named(one, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared) -> NamedEffect:
-    held = {p.name for p, name in zip(one.parameters, one.names, strict=True) if name in updated.model.fixed}
     reported = one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names))
-    reported = {name: value for name, value in reported.items() if name not in held}
     return NamedEffect(one.effect.name, name_of(one.label)[1], one.effect.title, reported,
                        names.probability[one.label], names.rivals[one.label], label=one.label,
                        share=share_of(updated.model, one.label, prepared.held_out, power, with_it))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.show import Left
+from avis_ctrl.gap.residual import Left
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.gap_engine.likelihood import Fitted
 from avis_ctrl.gap_engine.settings import GapSettings

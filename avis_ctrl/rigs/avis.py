@@ -210,17 +210,22 @@ class AvisTable(Rig):
     def mount_of(self, channel: str) -> tuple[str, float] | None:
         """Mount and earth axis ("isolator1.x") that a drive or sensor sits in, and the sign of its direction along that
         axis; None for one that sits in none."""
-        return self._in_mounts[channel]
+        found, inside = self._nearest_mounts[channel]
+        return found if inside else None
+
+    def nearest_mount(self, channel: str) -> tuple[str, float]:
+        """The same of the mount that is nearest, however far; a fit may move a channel on its way."""
+        return self._nearest_mounts[channel][0]
 
     @cached_property
-    def _in_mounts(self) -> dict[str, tuple[str, float] | None]:
+    def _nearest_mounts(self) -> dict[str, tuple[tuple[str, float], bool]]:
         at = np.array([one.position for one in self.isolators])
-        found: dict[str, tuple[str, float] | None] = {}
+        found: dict[str, tuple[tuple[str, float], bool]] = {}
         for one in (*self.all_drives, *self._attached(), *self.instruments):
             away, k = np.linalg.norm(at - one.position, axis=1), int(np.argmax(np.abs(one.direction)))
             nearest, along = int(np.argmin(away)), one.direction[k]
             inside = away[nearest] < IN_MOUNT_m and abs(along) > np.cos(IN_MOUNT_rad)
-            found[one.name] = (f"isolator{nearest + 1}.{AXES[k]}", float(np.sign(along))) if inside else None
+            found[one.name] = (f"isolator{nearest + 1}.{AXES[k]}", float(np.sign(along))), bool(inside)
         return found
 
     def with_channels_apart(self) -> AvisTable:

@@ -18,12 +18,11 @@ from threadpoolctl import threadpool_limits
 
 import avis_ctrl
 from avis_ctrl.errors import AvisError, InputError
-from avis_ctrl.gap.analysis import analyse
 from avis_ctrl.gap.effects.own import OwnEffects, try_out
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.signal_effects import predicted
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.gap_engine.analysis import analyse as analyse_with_tolerances
+from avis_ctrl.gap_engine.analysis import analyse
 from avis_ctrl.gap_engine.settings import SETTINGS
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, digest
@@ -109,19 +108,12 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
         known = (amplifier_words(corner, options.amplifier_corner_Hz),) if corner else ()
         for words in known:
             progress(words)
-        # Where the rig file states tolerances they are part of the model.
-        find = analyse_with_tolerances if with_tolerances(rig) else analyse
-        gap = find(measured, rig, options.seed, options.band_Hz, corner, None, progress, each)
+        gap = analyse(measured, rig, options.seed, options.band_Hz, corner, None, progress, each)
         seconds = time.monotonic() - began
         stops = tuple(f"gate {one.gate}: {one.sentence}" for one in findings if one.severity == "stop")
         gap = replace(gap, seconds=seconds, sentences=(*gap.sentences, *known, *stops))
         design, note = _design(gap, options, progress)
     return GapFinding(gap, measured, findings, provenance(measured, rig, options, seconds), design, note)
-
-
-def with_tolerances(rig: Rig) -> bool:
-    """Whether the rig knows of each channel by itself."""
-    return hasattr(rig, "with_channels_apart")
 
 
 def _require_records(measured: Campaign, rig: Rig) -> None:
@@ -172,7 +164,7 @@ def provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float
             told["design_sha256"] = hashlib.sha256(options.design_file.read_bytes()).hexdigest()
     return {"avis_ctrl": avis_ctrl.__version__, "measurement": measured.source, **told,
             "measurement_sha256": data, "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
-            "settings": asdict(SETTINGS) if with_tolerances(rig) else None, "seed": options.seed,
+            "settings": asdict(SETTINGS), "seed": options.seed,
             "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
             "python": platform.python_version(),
             **{name: metadata.version(name) for name in ("numpy", "scipy", "numba", "h5py")}}

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, library
+from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.effects.beyond import beyond
 from avis_ctrl.gap.effects.beyond.base import FirstOrder
-from avis_ctrl.gap.judgement import unequal_levels
 from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.record_motion import mount_rows
-from avis_ctrl.gap.refit import refit
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.search import GIVEN_UP, Found, Rival, contested, search, weaker
 from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.gap_engine.likelihood import Data, first_variances, fit
+from avis_ctrl.gap_engine.search import search
+from avis_ctrl.gap_engine.settings import GapSettings
+from avis_ctrl.gap_engine.tolerances import re_identified
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
@@ -73,112 +73,34 @@ def test_first_order_is_the_slope_of_the_whole_model(name):
         assert np.linalg.norm(by_differences - closed, axis=1) == pytest.approx(0 * size, abs=2e-2 * size.max())
 
 
-def searched(truth, names):
-    fitted, held = [block(truth, "00"), block(truth, "01")], [block(truth, "02"), block(truth, "03")]
-    base = refit(MODEL, fitted, held)
-    return search(base, fitted, held, effects=[library()[name] for name in names])
+def searched(truth, *names):
+    """The steps of a search among these effects and all faults that the library has no name for."""
+    data = Data((block(truth, "00"), block(truth, "01")), (0.1, 0.5))
+    settings = GapSettings()
+    base = fit(MODEL, re_identified(RIG), np.zeros(len(MODEL.names)), data, first_variances(data, settings), settings)
+    return search(base, data, [*(library()[name] for name in names), *beyond().values()])
 
 
 def test_crosstalk_is_no_misalignment():
-    found = searched(MODEL.with_effect(active(beyond()["sensor_crosstalk"], MODEL, "Sz1/Sz3", (0.03,))),
-                     ["sensor_misalignment", "sensor_gain"])
-    assert len(found.chain) == 1
-    assert found.beaten is not None and found.beaten.words == "a share of Sz3's signal in Sz1"
-    last = found.beaten.refit.model.effects[-1]
-    assert last.values[0] == pytest.approx(0.03, abs=4 * np.sqrt(found.beaten.refit.covariance_of(last)[0, 0]))
+    truth = MODEL.with_effect(active(beyond()["sensor_crosstalk"], MODEL, "Sz1/Sz3", (0.03,)))
+    step = searched(truth, "sensor_misalignment", "sensor_gain")[0]
+    one = step.fitted.model.effects[-1]
+    assert one.effect.outside
+    assert one.effect.said(one.place, one.by_name) == "a share of Sz3's signal in Sz1"
+    assert one.values[0] == pytest.approx(0.03, abs=4 * np.sqrt(step.fitted.covariance_of(one.names)[0, 0]))
 
 
 def test_a_misalignment_keeps_its_name():
     truth = MODEL.with_effect(active(library()["sensor_misalignment"], MODEL, "Sz1", (1.5, 1.0)))
-    found = searched(truth, ["sensor_misalignment", "sensor_gain"])
-    assert found.beaten is None
-    assert found.best.labels == ("sensor_misalignment@Sz1",)
+    assert [one.label for one in searched(truth, "sensor_misalignment", "sensor_gain")] == ["sensor_misalignment@Sz1"]
 
 
 def test_a_dead_zone_is_no_force_constant():
     truth = MODEL.with_effect(active(beyond()["dead_zone"], MODEL, "Az2", (0.01,)))
-    blocks = [block(truth, "00"), block(truth, "01")]
-    gain = refit(MODEL.with_effect(active(library()["actuator_gain"], MODEL, "Az2")), blocks, blocks)
-    assert "differs" in unequal_levels(blocks, gain)
-    found = searched(truth, ["actuator_gain"])
-    assert found.beaten is not None and found.beaten.words == "a dead zone of Az2"
+    one = searched(truth, "actuator_gain")[0].fitted.model.effects[-1]
+    assert one.effect.said(one.place, one.by_name) == "a dead zone of Az2"
 
 
-def test_a_force_constant_is_the_same_at_every_level():
+def test_a_force_constant_is_no_dead_zone():
     truth = MODEL.with_effect(active(library()["actuator_gain"], MODEL, "Az2", (1.05,)))
-    blocks = [block(truth, "00"), block(truth, "01")]
-    gain = refit(MODEL.with_effect(active(library()["actuator_gain"], MODEL, "Az2")), blocks, blocks)
-    assert unequal_levels(blocks, gain) == ""
-
-
-class LateSensor(Effect):
-    """A user's own: what a competitor describes, too, with one parameter more."""
-
-    name = "late_sensor"
-    title = "a sensor is late"
-    looks_like = "one output lags"
-
-    def places(self, model):
-        return model.sensors.names
-
-    def parameters(self, model, place):
-        return (EffectParameter("tau_s", "s", "time constant", 0.0, 0.0, 0.1, 1e-3),)
-
-    def change(self, ops, place, values):
-        ops.sense[:, ops.sensor(place)] /= 1 + ops.s * values["tau_s"]
-
-
-def test_a_user_s_own_effect_that_closes_the_gap_is_not_taken_away():
-    """A low pass with a little delay: the competitor that has both fits better, but both leave noise."""
-    truth = MODEL.with_effect(active(beyond()["sensor_late"], MODEL, "Sz1", (2e-5, 2e-3)))
-    blocks = {name: block(truth, name) for name in MOTION}
-    fitted, held = [blocks["00"], blocks["01"]], [blocks["02"], blocks["03"]]
-    found = search(refit(MODEL, fitted, held), fitted, held, effects=[LateSensor()])
-    assert found.best.labels == ("late_sensor@Sz1",)
-    rival = found.rivals[0]
-    assert rival.refit.excess_held < rival.against.excess_held and not rival.wins
-    # The same odds against an effect of the library would have counted.
-    shipped = replace(rival, against=replace(rival.against, model=MODEL.with_effect(
-        active(library()["sensor_gain"], MODEL, "Sz1"))))
-    assert shipped.left == rival.left and shipped.wins == (rival.left < GIVEN_UP)
-
-
-@dataclass(frozen=True)
-class Weighed:
-    """What a contest asks of a refit; of so many numbers that the held-out residual is noise."""
-
-    criterion: float
-    excess_held: float = 1000.0
-    excess_fit: float = 0.0
-    held_per_dof: float = 1.0
-    model = SimpleNamespace(effects=())
-
-
-def test_what_came_near_is_contested_anew():
-    base, named, far, near = (Weighed(c) for c in (5000.0, 1000.0, 2000.0, 1100.0))
-    # Held against what was found before it was refitted, the competitor would win; against the refit it does not.
-    rival = Rival(replace(near, excess_fit=100.0), replace(far, excess_fit=1000.0, excess_held=1001.0), "a competitor")
-    assert rival.left < GIVEN_UP
-    # What the held-out data do not bear out counts for nothing: ten to one beforehand.
-    assert replace(rival, refit=replace(rival.refit, excess_held=1001.0)).left == pytest.approx(10 / 11)
-    found = Found((base, named), (), True, (), (rival,))
-    kept = contested(found)
-    assert kept.chain is found.chain and kept.rivals[0].against is named
-    # By what it falls short: odds of e^((1100 - 1000)/2), ten to one beforehand.
-    assert replace(rival, against=named).odds == pytest.approx(2 * np.log(10.0) + 100.0)
-    better = replace(rival, refit=Weighed(800.0, 990.0, -200.0))
-    beaten = contested(replace(found, rivals=(better,)))
-    assert beaten.chain == (base,)
-    assert not beaten.reached_noise
-    assert beaten.beaten is not None
-    assert beaten.beaten.against is named
-    # What has been decided stays.
-    kept = replace(found, rivals=(better,), beaten=rival)
-    assert contested(kept) is kept
-
-
-def test_a_weaker_start_goes_to_a_tenth_of_the_way():
-    one = active(library()["sensor_gain"], MODEL, "Sz1", (1.5,))
-    assert weaker(one).values == pytest.approx((1.05,))
-    drift = active(library()["stiffness_drift"], MODEL, "isolators/settling", (0.4, 20.0))
-    assert weaker(drift).values == pytest.approx((0.04, 20.0))
+    assert [one.label for one in searched(truth, "actuator_gain")] == ["actuator_gain@Az2"]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from noise_fit import fitted
 from test_score import MODEL, block, effect
 
 from avis_ctrl.gap.detectable import detectable
 from avis_ctrl.gap.effects.base import library
-from avis_ctrl.gap.refit import refit
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.search import known_noise
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
@@ -19,14 +18,13 @@ OWN = library()
 
 
 def limits(model, blocks, effects):
-    """Of five standard deviations, of noise or of what the model leaves."""
-    score = Score(model, blocks)
-    return detectable(score, effects, max(1.0, score.chi2 / score.dof) * known_noise(blocks))
+    """Of five standard deviations by noise."""
+    return detectable(Score(model, blocks), effects)
 
 
 def nothing_missing(seed=1):
     blocks = [block(MODEL, np.random.default_rng(seed), name=name) for name in ("00", "01")]
-    return refit(MODEL, blocks, blocks).model, blocks
+    return fitted(MODEL, blocks).model, blocks
 
 
 def test_limits_are_five_deviations_of_a_fit_with_the_effect():
@@ -34,14 +32,14 @@ def test_limits_are_five_deviations_of_a_fit_with_the_effect():
     model, blocks = nothing_missing()
     names = ("sensor_gain", "com_offset", "loop_delay", "structural_damping")
     rows = {(one.name, one.location, one.parameter): one for one in limits(model, blocks, [OWN[n] for n in names])}
-    misfit = max(1.0, np.sqrt(Score(model, blocks).chi2 / Score(model, blocks).dof))
     for name, place, shown in (("sensor_gain", "Sz2", "Sz2"), ("com_offset", "payload", "payload")):
         added = model.with_effect(effect(name, place, None, model))
-        found = refit(added, blocks, blocks, 0)
-        std = np.sqrt(np.diag(found.covariance_of(found.model.effects[-1])))
+        found = fitted(added, blocks, 0)
+        whole = np.linalg.inv(found.information.relative) * np.outer(*[found.information.scale] * 2)
+        std = np.sqrt(np.diag(whole)[-len(found.model.effects[-1].parameters):])
         for parameter, own in zip(found.model.effects[-1].parameters, std, strict=True):
             row = rows[name, shown, parameter.name]
-            assert row.value == pytest.approx(5 * own * misfit, rel=1e-2)
+            assert row.value == pytest.approx(5 * own, rel=1e-2)
             assert row.unit == parameter.unit
     # Of two laws of one effect one row, at the place that is reported.
     assert [key for key in rows if key[0] == "structural_damping"] == [("structural_damping", "isolators",
@@ -54,7 +52,7 @@ def test_what_lies_well_above_its_limit_is_seen():
     for factor, seen in ((3.0, True), (0.1, False)):
         truth = MODEL.with_effect(effect("sensor_gain", "Sz3", [1 + factor * limit]))
         made = [block(truth, np.random.default_rng(7), name=name) for name in ("00", "01")]
-        score = Score(refit(MODEL, made, made).model, made)
+        score = Score(fitted(MODEL, made).model, made)
         took = score.reduction(score.of_effect(effect("sensor_gain", "Sz3", None, score.model)))
         assert (took.chi2 > 25.0) == seen
 

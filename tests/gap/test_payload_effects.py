@@ -7,17 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assembled_table import Assembly, mount_map
+from noise_fit import fitted, reported
 
-from avis_ctrl.gap.data import thinned
-from avis_ctrl.gap.each import one_by_one
-from avis_ctrl.gap.effects.base import Seed, library
+from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.effects.impedance import peaks
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.realise import realise
-from avis_ctrl.gap.refit import at_the_edge, refit
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.search import _beside, _Data, _grown, _sought_again, summits
 from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.gap_engine.search import at_the_edge
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
@@ -237,13 +235,14 @@ def test_what_no_record_tells_of_a_mode_is_in_the_deviation_of_its_frequency():
     rng = np.random.default_rng(3)
     seen = [17.0, 0.02, *0.015 * rng.standard_normal(12)]
     parameters = library()["payload_flexible_mode"].parameters(IDENTIFIED, "payload")
-    start = [0.0 if one.optional and one.group else value for one, value in zip(parameters, seen, strict=True)]
+    start = [0.0 if one.optional and one.name.startswith("shape") else value
+             for one, value in zip(parameters, seen, strict=True)]
     assert start.count(0.0) == 4
     truth, begin = (with_effect("payload_flexible_mode", "payload", values, IDENTIFIED) for values in (seen, start))
     block = measured(truth, rng)
-    found = refit(begin, [block], [block], 40)
-    told = found.reported(found.model.effects[0])
-    assert found.held_per_dof == pytest.approx(1.0, abs=0.1)
+    found = fitted(begin, [block], 40)
+    told = reported(found)
+    assert found.chi2_per_dof == pytest.approx(1.0, abs=0.1)
     for name, true in (("frequency_Hz", 17.0), ("damping", 0.02)):
         assert abs(told[name].value - true) < 3 * told[name].std
     # By noise alone it would be known to a few parts in a million.
@@ -257,8 +256,8 @@ def test_a_fit_reaches_how_a_resonance_scatters_over_the_mounts():
     truth = with_effect("mount_surge", "isolators z", hidden, IDENTIFIED)
     begin = with_effect("mount_surge", "isolators z", [60.0, 0.5, 0.05, 0.0, 0.0, 0.0], IDENTIFIED)
     block = measured(truth, rng)
-    found = refit(begin, [block], [block], 12)
-    assert found.held_per_dof == pytest.approx(1.0, abs=0.1)
+    found = fitted(begin, [block], 12)
+    assert found.chi2_per_dof == pytest.approx(1.0, abs=0.1)
     np.testing.assert_allclose(found.model.effects[0].values[3:], hidden[3:], atol=0.02)
 
 
@@ -323,22 +322,6 @@ def test_along_its_line_of_action_a_place_may_end_anywhere():
     assert "line of action" in of((2.0, 0.0, 0.1))
 
 
-def test_another_summit_of_the_score_is_kept():
-    parameters = library()["mount_surge"].parameters(FREE, "isolators z")
-
-    def seeds(*of):
-        return [Seed((f, 0.5, zeta, 0.0, 0.0, 0.0), chi2, 6) for f, zeta, chi2 in of]
-    far = seeds((150.0, 0.015, 9.0), (134.0, 0.015, 8.5), (56.0, 0.015, 8.0), (120.0, 0.015, 7.0), (150.0, 0.05, 6.0))
-    assert summits(far, parameters) == [far[0], far[2]]
-    # A slope that is still high an octave below.
-    broad = seeds((150.0, 0.015, 9.0), (120.0, 0.015, 8.0), (90.0, 0.015, 7.0), (70.0, 0.015, 6.0), (60.0, 0.015, 5.0))
-    assert summits(broad, parameters) == [broad[0], broad[3]]
-    # A slope, not a summit: each beside a better one. And one that is far lower.
-    for one in (seeds((150.0, 0.015, 9.0), (120.0, 0.015, 8.0), (90.0, 0.015, 7.0)),
-                seeds((150.0, 0.015, 9.0), (30.0, 0.015, 4.0)), seeds((150.0, 0.015, 9.0)), []):
-        assert summits(one, parameters) == one[:1]
-
-
 def test_seeds_of_as_many_modes_as_there_are():
     rng = np.random.default_rng(8)
     first, second = (3e-3 * rng.standard_normal(12) for _ in range(2))
@@ -349,71 +332,6 @@ def test_seeds_of_as_many_modes_as_there_are():
     two = with_effect("payload_flexible_mode", "payload/two", [22.0, 0.01, *first, 41.0, 0.01, *second], FREE)
     _, found = seeds_of(two, "payload_flexible_mode", "payload/two", 1e-6)
     np.testing.assert_allclose([found[0].values[0], found[0].values[14]], [22.0, 41.0], rtol=0.03)
-
-
-def test_a_further_mode_is_found_beside_those_of_a_model():
-    rng = np.random.default_rng(8)
-    values = [value for f in (22.0, 41.0, 55.0) for value in (f, 0.01, *(0.02 * rng.standard_normal(12)))]
-    block = block_of(with_effect("payload_flexible_mode", "payload/three", values, FREE))
-    two = with_effect("payload_flexible_mode", "payload/two", values[:28], FREE)
-    found = two.effects[0].effect.grown(two.effects[0], two, [block])
-    assert found[0].place == "payload/three"
-    assert found[0].values[:28] == tuple(values[:28])
-    assert found[0].values[28] == pytest.approx(55.0, rel=0.03)
-    shape = np.array(found[0].values[30:])
-    driven = [not one.optional for one in found[0].parameters[30:]]
-    assert abs(shape[driven] @ np.array(values[30:])[driven]) > 0.95 * np.linalg.norm(shape[driven]) * np.linalg.norm(
-        np.array(values[30:])[driven])
-    three = two.without(two.effects[0].label).with_effect(found[0])
-    assert found[0].effect.grown(found[0], three, [block]) == []
-    # What acts once cannot have more of it.
-    once = with_effect("mount_surge", "isolators z", active(library()["mount_surge"], FREE, "isolators z").values, FREE)
-    assert once.effects[0].effect.grown(once.effects[0], once, [block]) == []
-
-
-def test_an_earlier_effect_of_a_chain_grows_in_its_place():
-    rng = np.random.default_rng(8)
-    values = [value for f in (22.0, 41.0, 55.0) for value in (f, 0.02, *(0.01 * rng.standard_normal(12)))]
-
-    def damped(model):
-        return model.with_effect(active(library()["structural_damping"], model, "isolators/causal", [0.08]))
-    block = measured(damped(with_effect("payload_flexible_mode", "payload/three", values, IDENTIFIED)), rng)
-    two = with_effect("payload_flexible_mode", "payload/two", values[:28], IDENTIFIED)
-    chain = tuple(refit(model, [block], [block], 4) for model in (IDENTIFIED, two, damped(two)))
-    data = _Data([block], [block], [thinned(block, 140, seed=1)], lambda text: None, one_by_one)
-    grown = _grown(chain, data)
-    mode, damping = "payload_flexible_mode@payload/three", "structural_damping@isolators/causal"
-    assert [one.labels for one in grown] == [(), (mode,), (mode, damping)]
-    assert grown[-1].held_per_dof == pytest.approx(1.0, abs=0.1)
-    assert grown[-1].model.effects[0].values[28] == pytest.approx(55.0, rel=1e-3)
-    assert grown[-1].model.effects[1].values[0] == pytest.approx(0.08, rel=0.02)
-    assert _grown(grown, data) is grown
-
-
-def test_an_effect_that_stood_for_another_is_sought_anew_beside_it():
-    """A sprung mass and a delay: found alone, the mass has taken a part of the delay, and its frequency along x is that
-    of another resonance, from where no fit comes back."""
-    rng = np.random.default_rng(4)
-    hidden, place = [11.0, 10.0, 7.0, 9.9, 0.03, -0.28, 0.38, 0.08], "payload/axes"
-
-    def late(model, name="loop_delay", where="loop", values=(1.5e-3,)):
-        return model.with_effect(active(library()[name], model, where, values))
-    block = measured(late(with_effect("attached_oscillator", place, hidden, IDENTIFIED)), rng)
-    wrong = with_effect("attached_oscillator", place, [10.6, 63.0, *hidden[2:]], IDENTIFIED)
-    chain = tuple(refit(model, [block], [block], 6) for model in (IDENTIFIED, wrong, late(wrong)))
-    assert chain[-1].held_per_dof > 10
-    data = _Data([block], [block], [thinned(block, 140, seed=1)], lambda text: None, one_by_one)
-    found = _sought_again(chain, data)
-    assert found[:2] == chain[:2]
-    assert found[-1].labels == ("attached_oscillator@payload/axes", "loop_delay@loop")
-    assert found[-1].held_per_dof == pytest.approx(1.0, abs=0.1)
-    np.testing.assert_allclose(found[-1].model.effects[0].values[:4], hidden[:4], rtol=0.01)
-    assert _sought_again(found, data) is found
-    # What else may be late is refitted beside the mass as it is now.
-    lag = refit(late(chain[-1].model.without("loop_delay@loop"), "actuator_lag", "actuators"), [block], [block], 6)
-    beside = _beside(found, (*chain[:2], lag), data)
-    assert beside[-1].labels == ("attached_oscillator@payload/axes", "actuator_lag@actuators")
-    assert found[-1].held_per_dof < beside[-1].held_per_dof < 0.5 * lag.held_per_dof
 
 
 def test_a_mass_without_strength_changes_nothing():

@@ -37,7 +37,6 @@ class AttachedOscillator(AtPoint):
     name = "attached_oscillator"
     title = "a sprung mass on the payload"
     looks_like = "a pair of peak and dip at its own frequency, in every channel that moves its place"
-    confusable = ("payload_flexible_mode", "mount_surge", "base_compliance")
     holds_states = True
     resonant = True
 
@@ -54,7 +53,7 @@ class AttachedOscillator(AtPoint):
         if variant == "oblique":
             most = float(np.sqrt(mass))
             along = [EffectParameter(f"along_{axis}", "sqrt(kg)", f"root of the mass times its direction's {axis}", 0.0,
-                                     -most, most, 0.1 * most, group="along") for axis in "xyz"]
+                                     -most, most, 0.1 * most) for axis in "xyz"]
             # Along the line of action a place makes no difference and may end anywhere.
             return (*along, frequency, damping, *(replace(one, optional=True) for one in self.position()))
         if variant == "axes":

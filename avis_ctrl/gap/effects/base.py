@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from avis_ctrl.gap.motion import RecordMotion
     from avis_ctrl.gap.operators import Operators
     from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-    from avis_ctrl.identification.spectra import SpectralBlock
+    from avis_ctrl.gap.table_model import TableModel
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,6 @@ class EffectParameter:
     none : value without the effect. low, high : what physics allows. size : one unit of it in a fit.
     linear : the effect vanishes as this goes to `none`, at first in proportion.
     grid : for one that is not linear, where to look for it. optional : one that may end at its bounds.
-    group : parameters of one group are judged by the size of the largest of them. late : one that the search leaves at
-        `none` and only the last fit frees: what an effect takes for equal.
     """
 
     name: str
@@ -53,8 +50,6 @@ class EffectParameter:
     linear: bool = True
     grid: tuple[float, ...] = ()
     optional: bool = False
-    group: str = ""
-    late: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,26 +93,21 @@ class Effect(ABC):
     Attributes
     ----------
     name : of the contract. title : in words, for a sentence. looks_like : what it does to responses.
-    confusable : names of effects that look alike in part of the data.
     nonlinear : depends on amplitude or time; acts through `volts` or `force`.
     strength : the parameter to which `force` is in proportion, empty where to none.
     holds_states : has resonances of its own, whose states at the ends of a record are to be found with its transient.
     resonant : adds resonances of many parameters, of which a mode of any shape is a first description.
     outside : of `effects.beyond`, refitted beside the library and never named.
-    idealised : its law stands for several of real tables (friction, loss, bending): a little that it leaves is more
-        likely its own law than a second effect. Not so of geometry, gains and first-order lags.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
     looks_like: ClassVar[str]
-    confusable: ClassVar[tuple[str, ...]] = ()
     nonlinear: ClassVar[bool] = False
     strength: ClassVar[str] = ""
     holds_states: ClassVar[bool] = False
     resonant: ClassVar[bool] = False
     outside: ClassVar[bool] = False
-    idealised: ClassVar[bool] = True
 
     @property
     def shipped(self) -> bool:
@@ -221,11 +211,6 @@ class Effect(ABC):
             if not wrong:
                 found.append(Seed(tuple(values), took.chi2, took.rank, len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
-
-    def grown(self, one: ActiveEffect, model: TableModel, blocks: Sequence[SpectralBlock]) -> list[ActiveEffect]:
-        """One of a fitted model with one more of what it may have several of (modes), the most promising first; none
-        where it may not have more."""
-        return []
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         """Why physics forbids these values, empty where it does not."""

@@ -35,7 +35,6 @@ class CableStiffness(AtPoint):
     name = "cable_stiffness"
     title = "a cable or hose ties the payload to ground"
     looks_like = "stiffness at a place and height where no mount is: it shifts and couples the lowest resonances"
-    confusable = ("com_offset", "leveling_loop")
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return ("payload/axes", "payload/oblique")
@@ -45,8 +44,8 @@ class CableStiffness(AtPoint):
         most = 200 * size
         if place.endswith("oblique"):
             own = [EffectParameter(f"along_{axis}", "sqrt(N/m)", f"root of the stiffness times its direction's {axis}",
-                                   0.0, -float(np.sqrt(most)), float(np.sqrt(most)), float(np.sqrt(size)),
-                                   group="along") for axis in "xyz"]
+                                   0.0, -float(np.sqrt(most)), float(np.sqrt(most)), float(np.sqrt(size)))
+                   for axis in "xyz"]
         else:
             own = [EffectParameter(f"k_{axis}_N_per_m", "N/m", f"stiffness along {axis}", 0.0, 0.0, most, size)
                    for axis in "xyz"]

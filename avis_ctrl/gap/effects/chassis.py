@@ -15,12 +15,12 @@ from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register, 
 from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.mounts import has_mounts
 from avis_ctrl.gap.effects.sensors import receptance
-from avis_ctrl.gap.refit import likelihood
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.score_algebra import reduction
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-from avis_ctrl.identification.maximum_likelihood import LikelihoodFit
+from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, fit
 from avis_ctrl.identification.noise import relative_noise
+from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs.rigid_body import point_map
 
@@ -70,7 +70,6 @@ class BaseCompliance(Effect):
     name = "base_compliance"
     title = "the chassis stands on something soft and recoils"
     looks_like = "one more resonance in every channel, and less floor motion above it"
-    confusable = ("payload_flexible_mode", "attached_oscillator", "mount_surge")
     holds_states = True
     resonant = True
 
@@ -306,7 +305,7 @@ def _chi2(one: LikelihoodFit) -> float:
 
 def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock], iterations: int) -> LikelihoodFit | None:
     try:
-        return likelihood(model, blocks, iterations)
+        return fit(cast(ResponseModel, model), blocks, model.priors, max_iterations=iterations)
     except (AvisError, np.linalg.LinAlgError, FloatingPointError):
         return None
 

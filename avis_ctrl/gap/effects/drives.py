@@ -21,9 +21,7 @@ class ActuatorGain(Effect):
 
     name = "actuator_gain"
     title = "an actuator's force constant is not the one of the rig file"
-    idealised = False
     looks_like = "the response to one input is off by the same real factor at every frequency and output"
-    confusable = ("actuator_saturation",)
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return model.actuators
@@ -43,9 +41,7 @@ class ActuatorLag(Effect):
 
     name = "actuator_lag"
     title = "the current amplifiers lag, first order"
-    idealised = False
     looks_like = "phase lag that grows with frequency, the same in every channel, with a loss of gain"
-    confusable = ("loop_delay",)
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return ("actuators",)
@@ -75,9 +71,7 @@ class LoopDelay(Effect):
 
     name = "loop_delay"
     title = "a delay of transport or computing beyond the nominal one"
-    idealised = False
     looks_like = "phase lag in proportion to frequency, the same in every channel, without loss of gain"
-    confusable = ("actuator_lag",)
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return ("loop",)
@@ -100,9 +94,7 @@ class ActuatorSaturation(Effect):
 
     name = "actuator_saturation"
     title = "the drives clip below their nominal limit"
-    idealised = False
     looks_like = "less response than expected in records at high level only, and harmonics of the input"
-    confusable = ("actuator_gain", "contact_friction")
     nonlinear = True
 
     def places(self, model: TableModel) -> tuple[str, ...]:

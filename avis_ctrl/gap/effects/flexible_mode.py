@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
@@ -18,8 +17,7 @@ from avis_ctrl.gap.score_algebra import reduction
 if TYPE_CHECKING:
     from avis_ctrl.gap.operators import Operators
     from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-    from avis_ctrl.identification.spectra import SpectralBlock
+    from avis_ctrl.gap.table_model import TableModel
 
 # Frequencies at which a mode is looked for [Hz].
 FREQUENCIES_Hz = tuple(np.geomspace(7.0, 140.0, 22).tolist())
@@ -45,7 +43,6 @@ class PayloadFlexibleMode(Effect):
     name = "payload_flexible_mode"
     title = "the payload bends: a mode beside its rigid motion"
     looks_like = "a resonance above the suspension's, in rows and columns that share one shape"
-    confusable = ("attached_oscillator", "mount_surge", "base_compliance")
     holds_states = True
 
     def places(self, model: TableModel) -> tuple[str, ...]:
@@ -63,8 +60,8 @@ class PayloadFlexibleMode(Effect):
                 EffectParameter(f"damping{of}", "1", f"damping ratio {of_mode}", 0.0, 1e-4, 0.5, 0.02, False, (0.02,),
                                 True),
                 *(EffectParameter(f"shape{of}_{name.replace('.', '_')}", "1/sqrt(kg)",
-                                  f"mass-normalised shape {of_mode} at {name}", 0.0, -1.0, 1.0, 0.01, optional=not own,
-                                  group=f"shape{of}") for name, own in zip(names, driven, strict=True))]
+                                  f"mass-normalised shape {of_mode} at {name}", 0.0, -1.0, 1.0, 0.01, optional=not own)
+                  for name, own in zip(names, driven, strict=True))]
         return tuple(found)
 
     def priors(self, model: TableModel, place: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
@@ -74,11 +71,12 @@ class PayloadFlexibleMode(Effect):
         from the mode's own, and along one combination of them no force on the payload shows them either.
         """
         found: dict[str, tuple[float, float]] = {}
-        parameters = [one for one in self.parameters(model, place) if one.group]
-        for group in {one.group for one in parameters}:
-            seen = [values[one.name] for one in parameters if one.group == group and not one.optional]
-            size = max(float(np.sqrt(np.mean(np.square(seen)))), SMALLEST_SHAPE)
-            found |= {one.name: (0.0, size) for one in parameters if one.group == group and one.optional}
+        parameters = self.parameters(model, place)
+        own = len(parameters) // COUNTS[place.partition("/")[2]]
+        for k in range(0, len(parameters), own):
+            shape = parameters[k + 2:k + own]
+            size = np.sqrt(np.mean(np.square([values[one.name] for one in shape if not one.optional])))
+            found |= {one.name: (0.0, max(float(size), SMALLEST_SHAPE)) for one in shape if one.optional}
         return found
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -94,23 +92,6 @@ class PayloadFlexibleMode(Effect):
         count = COUNTS[place.partition("/")[2]]
         return [seed for n, seed in _modes_one_by_one(score)
                 if n == count]
-
-    def grown(self, one: ActiveEffect, model: TableModel, blocks: Sequence[SpectralBlock]) -> list[ActiveEffect]:
-        """With one mode more, away from those it has: a weak one shows only once the strong ones are fitted."""
-        from avis_ctrl.gap.score import Score
-
-        count = COUNTS[one.place.partition("/")[2]]
-        if count == max(COUNTS.values()):
-            return []
-        known = np.log([frequency for frequency, _, _ in modes(one.by_name)])
-        score = Score(model, blocks)
-        further = [seed for _, seed in _modes_one_by_one(score, 1)
-                   if seed.chi2 > FURTHER * (score.chi2 - score.dof)
-                   and np.min(np.abs(np.log(seed.values[0]) - known)) > APART]
-        larger = next(f"payload/{name}" for name, modes_of in COUNTS.items() if modes_of == count + 1)
-        parameters = self.parameters(model, larger)
-        return [replace(one, place=larger, parameters=parameters, values=(*one.values, *seed.values))
-                for seed in further]
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
@@ -135,7 +116,7 @@ def shape_points(model: TableModel) -> bool:
 
 def shape_rows(rig, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """(n_u, n_g) and (n_y, n_g): which mount and axis each motor and each sensor sits in, with its sign."""
-    return _shape_rows(tuple(rig.mount_of(name) for name in actuators), tuple(rig.mount_of(name) for name in sensors),
+    return _shape_rows(tuple(map(rig.nearest_mount, actuators)), tuple(map(rig.nearest_mount, sensors)),
                        mount_geometry(rig).names)
 
 

@@ -22,7 +22,6 @@ class LargeMotion(Effect):
 
     name = "large_motion"
     title = "second-order terms of large rotations"
-    idealised = False
     looks_like = "a residual that grows with the square of the level, at low frequency first"
     nonlinear = True
 

@@ -55,7 +55,6 @@ class MountRelaxation(_OfMounts):
     name = "mount_relaxation"
     title = "the vertical stiffness of the mounts rises with frequency (a second chamber, a Maxwell branch)"
     looks_like = "vertical resonances higher and more damped than low frequencies say"
-    confusable = ("structural_damping", "leveling_loop", "attached_oscillator")
     holds_states = True
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
@@ -83,7 +82,6 @@ class StructuralDamping(_OfMounts):
     name = "structural_damping"
     title = "the mounts lose energy nearly independently of frequency, not in proportion to velocity"
     looks_like = "damping at low resonances larger, at high ones smaller than one dashpot gives"
-    confusable = ("mount_relaxation",)
     where = "isolators"
 
     def places(self, model: TableModel) -> tuple[str, ...]:
@@ -112,7 +110,6 @@ class MountSurge(_OfMounts):
     name = "mount_surge"
     title = "an internal resonance of the mounts (mass of spring, diaphragm or piston)"
     looks_like = "a resonance far above the suspension's along z, in every vertical channel alike"
-    confusable = ("payload_flexible_mode", "attached_oscillator", "base_compliance")
     holds_states = True
     resonant = True
 
@@ -197,7 +194,6 @@ class LevelingLoop(_OfMounts):
     name = "leveling_loop"
     title = "the leveling integrates the position of isolators 1-3"
     looks_like = "phase and gain change at the lowest frequencies, vertical and tilting channels only"
-    confusable = ("mount_relaxation", "tilt_coupling", "cable_stiffness")
     holds_states = True
 
     def places(self, model: TableModel) -> tuple[str, ...]:
@@ -252,7 +248,6 @@ class CubicStiffness(_OfMounts):
     name = "cubic_stiffness"
     title = "the mounts stiffen with amplitude"
     looks_like = "vertical resonances rise with level, and third harmonics appear"
-    confusable = ("actuator_saturation", "contact_friction")
     nonlinear = True
     strength = "k3_N_per_m3"
 
@@ -291,7 +286,6 @@ class ContactFriction(Effect):
     name = "contact_friction"
     title = "friction at the actuators' contact points: stiff at small amplitude, slipping at large"
     looks_like = "stiffness and damping that depend on level: stiffer at the low one, lossier between"
-    confusable = ("cubic_stiffness", "structural_damping", "actuator_saturation")
     nonlinear = True
     strength = "stiffness_N_per_m"
 
@@ -305,7 +299,7 @@ class ContactFriction(Effect):
                 EffectParameter("slip_m", "m", "displacement at which a contact slips", 0.0, 1e-3 * rms, 1e3 * rms, rms,
                                 False, tuple(rms * x for x in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0))),
                 *(EffectParameter(f"uneven_{name}", "1", f"stiffness of the contact of {name} over the mean, less one",
-                                  0.0, -0.9, 0.9, 0.1, False, (0.0,), True, late=True)
+                                  0.0, -0.9, 0.9, 0.1, False, (0.0,), True)
                   for name in model.actuators[:-1]))
 
     def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
@@ -370,7 +364,6 @@ class StiffnessDrift(Effect):
     name = "stiffness_drift"
     title = "the mounts' stiffness changes over the campaign"
     looks_like = "resonances move from record to record, in the order of time and not of level"
-    confusable = ("cubic_stiffness",)
     nonlinear = True
     strength = "relative_change"
 

@@ -22,9 +22,7 @@ class ComOffset(Effect):
 
     name = "com_offset"
     title = "the centre of mass is not where the model has it"
-    idealised = False
     looks_like = "coupling between translations and rotations, at every frequency above the resonances too"
-    confusable = ("product_of_inertia", "sensor_misalignment", "cable_stiffness")
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return ("payload",) if "com_x" in model.rig.parameters() else ()
@@ -44,9 +42,7 @@ class ProductOfInertia(Effect):
 
     name = "product_of_inertia"
     title = "a product of inertia of the payload"
-    idealised = False
     looks_like = "coupling between two rotations"
-    confusable = ("com_offset", "payload_flexible_mode")
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return tuple(PRODUCTS) if "J12" in model.rig.parameters() else ()

@@ -56,9 +56,7 @@ class GeophoneCorner(_OfSensor):
 
     name = "geophone_corner"
     title = "a geophone's suspension frequency is not the one that its compensation filter assumes"
-    idealised = False
     looks_like = "one output is off around and below the suspension frequency, by the same factor from every input"
-    confusable = ("sensor_gain",)
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         known = suspensions(model.rig)
@@ -81,9 +79,7 @@ class SensorGain(_OfSensor):
 
     name = "sensor_gain"
     title = "a sensor's sensitivity is not the one of the rig file"
-    idealised = False
     looks_like = "one output is off by the same real factor at every frequency and from every input"
-    confusable = ("geophone_corner",)
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("gain", "1", "sensitivity over that of the rig file", 1.0, 0.1, 10.0, 1.0),)
@@ -98,9 +94,7 @@ class SensorMisalignment(_OfSensor):
 
     name = "sensor_misalignment"
     title = "a sensor's axis is tilted, so that it sees another axis too"
-    idealised = False
     looks_like = "one output holds a share of the motion along another axis at its place, at every frequency"
-    confusable = ("sensor_gain", "com_offset")
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         return tuple(name for name in model.sensors.names if axis_of(model, name))
@@ -132,9 +126,7 @@ class TiltCoupling(Effect):
 
     name = "tilt_coupling"
     title = "gravity: the horizontal sensors read g times the tilt as an acceleration"
-    idealised = False
     looks_like = "horizontal outputs rise towards low frequency where the payload tilts, as g over frequency squared"
-    confusable = ("leveling_loop", "com_offset")
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         horizontal = [name for name in model.sensors.names if axis_of(model, name) in ("x", "y")]

@@ -13,11 +13,11 @@ MOST = 4
 
 
 def candidates(found: Found) -> Section:
-    """Candidates that were refitted, the most probable first (`judgement` hands on a dozen at most)."""
+    """Candidates that were refitted, the most probable first."""
     ranked = sorted(found.gap.considered, key=lambda one: (-one.probability, one.chi2_per_dof))
     if not ranked:
         return Section("Runners-up", "considered", (Paragraph(_none(found)),))
-    header = ("candidate", "chi-square / dof", "odds" if found.gap.tolerances else "probability", "best size",
+    header = ("candidate", "chi-square / dof", "odds", "best size",
               "why it was not named")
     rows = [(wording.candidate(one), words.number(one.chi2_per_dof, 4), wording.probability(one.probability),
              wording.quantities(one.parameters, MOST) or "not stated", one.reason) for one in ranked]

@@ -10,7 +10,6 @@ from avis_ctrl.report.gap.effects import parameters
 from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.gap.measurement import measurement
 from avis_ctrl.report.gap.method import method
-from avis_ctrl.report.gap.method_tolerances import method as method_with_tolerances
 from avis_ctrl.report.gap.opening import opening
 from avis_ctrl.report.gap.places import places
 from avis_ctrl.report.gap.remaining import remaining
@@ -24,8 +23,7 @@ def document(found: Found) -> Document:
     made = str(found.provenance.get("date", ""))[:10]
     sections = [make(found) for make in (opening, before_after, places, dependence, parameters, candidates, remaining)]
     sections += [part for part in (controller(found),) if part is not None]
-    how = method_with_tolerances if found.gap.tolerances else method
-    sections += [measurement(found), gates_of(found.findings), how(found.gap)]
+    sections += [measurement(found), gates_of(found.findings), method(found.gap)]
     told = {"seed": found.gap.seed, "seconds": found.gap.seconds, **found.provenance}
     sections.append(provenance_table(told, "With the same measurement, rig, options, seed, library versions and "
                                      "processor the same figures come out."))

@@ -25,8 +25,7 @@ def parameters(found: Found) -> Section:
     if gap.effects or gap.traces:
         pieces += [_sizes(gap), Bullets(tuple(_told(one) for one in (*gap.effects, *gap.traces)))]
     else:
-        pieces.append(Paragraph("No effect is named: the updated model is the " + (
-            "rig within its tolerances." if gap.tolerances else "re-identified one.")))
+        pieces.append(Paragraph("No effect is named: the updated model is the rig within its tolerances."))
     if len(gap.baseline.values):
         both = " and updated" if gap.effects else ""
         groups = only_together(gap.baseline)
@@ -62,11 +61,9 @@ def _sizes(gap: Gap) -> Table:
             known = np.isfinite(p.std) and p.std > 0
             rows.append((one.name, one.location, name, value, f"± {sigma}" if known else "none",
                          "" if p.unit == "1" else words.unit(p.unit)))
-    deviation = (" and all tolerances, with one standard deviation that counts noise and what has no name"
-                 if gap.tolerances else ", with one standard deviation from that fit, by noise or by how what the "
-                 "model leaves scatters, whichever is larger")
     return table("Parameters of the named effects. Those of the table are fitted together with all parameters of the "
-                 f"rig{deviation}; those of hum, converters and floor are from the records themselves.",
+                 "rig and all tolerances, with one standard deviation that counts noise and what has no name; those "
+                 "of hum, converters and floor are from the records themselves.",
                  ("effect", "place", "parameter", "value", "± 1 σ", "unit"), rows, "lllrrl")
 
 
@@ -76,9 +73,6 @@ def _told(one: NamedEffect) -> str:
     text = f"{wording.titled(one.name).capitalize()} ({one.location}): {wording.what_it_is(one)}."
     if effect is not None:
         text += f" What it does to responses: {effect.looks_like}."
-    if one.confirmed:
-        text += f" With it the held-out log-likelihood {'rises' if one.confirmed > 0 else 'falls'} by "
-        text += f"{words.number(abs(one.confirmed))}."
     if one.confirmation:
         text += f" {one.confirmation[:1].upper()}{one.confirmation[1:].rstrip('.')}."
     if one.indistinguishable_from:

@@ -23,7 +23,7 @@ def opening(found: Found) -> Section:
     if numbers := in_numbers(gap):
         pieces.append(Paragraph(numbers))
     if gap.effects or gap.traces:
-        pieces.append(_shares(gap) if gap.tolerances else _named(gap))
+        pieces.append(_named(gap))
     pieces += [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from]
     if gap.detectable:
         pieces.append(Paragraph("How large an effect could be told from none stands in the section on what remains."))
@@ -82,7 +82,7 @@ def _stage(name: str) -> str:
             "tolerances": "with all tolerances"}.get(name, f"with {wording.titled(name)}")
 
 
-def _shares(gap: Gap) -> Table:
+def _named(gap: Gap) -> Table:
     rows = [(f"{wording.titled(one.name)}{' (trace)' if one in gap.traces else ''}", one.location,
              wording.quantities(one.parameters, MOST), wording.percent(np.nan if one.share is None else one.share),
              wording.probability(one.probability),
@@ -94,15 +94,3 @@ def _shares(gap: Gap) -> Table:
                  "has no name; that of hum, a converter and the floor's motion is one less the chance of such a signal "
                  "without them. None is stated above 99 %. Sizes with one standard deviation.",
                  ("effect", "place", "size", "share", "probability", "cannot be told from"), rows, "lllrrl")
-
-
-def _named(gap: Gap) -> Table:
-    rows = [(wording.titled(one.name), one.location, wording.quantities(one.parameters, MOST),
-             wording.probability(one.probability),
-             ", ".join(map(wording.titled, one.indistinguishable_from)) or "none")
-            for one in gap.effects]
-    return table("What is named. The probability of an effect of the table is that among the candidates that were "
-                 "refitted in its place, given the data; it does not count what nobody thought of. That of hum, "
-                 "a converter and the floor's motion is one less the chance of such a signal without them. None is "
-                 "stated above 99 %. Sizes with one standard deviation.",
-                 ("effect", "place", "size", "probability", "cannot be told from"), rows, "lllrl")

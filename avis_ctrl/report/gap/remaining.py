@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.gap.in_words import spoken
-from avis_ctrl.gap.result import Detectable, Gap, Remainder
+from avis_ctrl.gap.result import Detectable, Gap
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.finding import Found
@@ -51,22 +51,13 @@ def _seen(one: Detectable) -> str:
 
 
 def _left(gap: Gap) -> str:
-    if gap.left is not None and not gap.raised:
-        return _in_figures(gap, gap.left)
-    if gap.verdict in ("none", "explained"):
-        after = " with the named effects" if gap.effects else ""
-        return (f"No band of any channel stands out of the measured noise{after}." if not gap.remaining else
-                f"The held-out residual{after} counts as noise as a whole; the places below stand out by themselves.")
-    if gap.raised:
-        return ("The held-out residual is the measured noise. That of these sensors is above the rig file's ambient "
-                "level, in the band where it was measured.")
-    what = "What the named effects leave" if gap.effects else "The whole gap"
-    return (f"{what} is significant, and no effect of the library that was tried accounts for it."
-            + (" The places below hold it." if gap.remaining else " Its places were not stated."))
-
-
-def _in_figures(gap: Gap, left: Remainder) -> str:
     """How much remains, beside what, and how it grows."""
+    if gap.raised:
+        return (f"The held-out residual is the measured noise. That of {words.joined(list(gap.raised))} is above the "
+                "rig file's ambient level.")
+    left = gap.left
+    if left is None:
+        return "What remains was not computed."
     after = " with the named effects" if gap.effects else ""
     level = {True: "It grows faster than the drives: its cause is not linear.",
              False: "It does not grow faster than the drives.",

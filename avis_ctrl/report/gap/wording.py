@@ -8,30 +8,11 @@ import numpy as np
 
 from avis_ctrl.gap.effects.base import Effect, Reported, library
 from avis_ctrl.gap.in_words import spoken
-from avis_ctrl.gap.judgement import UNEXPLAINED
 from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Where
-from avis_ctrl.gap.search import CLOSED
 from avis_ctrl.report import words
 
 # What each verdict claims, and what it does not.
 CLAIMS = {
-    "none": "Verdict: none. After re-identification of its own parameters what the rig's model leaves of the held-out "
-            f"data is, as a whole, within {UNEXPLAINED ** 0.5:.3g} times the r.m.s. of the measured noise, and no "
-            "effect is named. Nothing was added. An effect that is too weak for this campaign, or that these records "
-            "do not excite, would not show.",
-    "explained": "Verdict: explained. With what is named above, the model leaves of the held-out data, as a whole, "
-                 f"no more than {CLOSED ** 0.5:.3g} times the r.m.s. of the measured noise, which counts as closed. "
-                 "What hides below that this campaign cannot show.",
-    "partly explained": "Verdict: partly explained. What is named above is confirmed by the held-out data, but a "
-                        "significant part of the gap remains, and no further effect is named: at most two effects of "
-                        "the table are looked for, and a second one must take most of what the first leaves. The "
-                        "updated model is better, not complete.",
-    "unexplained": "Verdict: unexplained. Model and held-out data disagree significantly and no effect of the library "
-                   "accounts for it, so none is named: the nearest one would be wrong. The updated model is the "
-                   "re-identified one.",
-}
-# The same where the values of the rig file have tolerances.
-WITH_TOLERANCES = {
     "none": "Verdict: none. With its own parameters re-identified and every value of the rig file within its "
             "tolerance, the model leaves noise, or less than 1 % of the response, and no effect is named. An effect "
             "that is too weak for this campaign, or that these records do not excite, would not show.",
@@ -54,8 +35,7 @@ LEAST = 1e-5
 
 def claim(gap: Gap) -> str:
     """What the verdict claims, and what it does not."""
-    claims = WITH_TOLERANCES if gap.tolerances else CLAIMS
-    return claims[gap.verdict] if not gap.raised else RAISED.format(
+    return CLAIMS[gap.verdict] if not gap.raised else RAISED.format(
         verdict=gap.verdict, sensors=words.joined(list(gap.raised)),
         with_effects=", with what is named above," if gap.effects else "")
 

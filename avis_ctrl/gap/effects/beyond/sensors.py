@@ -65,8 +65,8 @@ class SensorCrosstalkOfAll(FirstOrder):
         return model.sensors.names if len(model.sensors.names) > 2 else ()
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        return tuple(EffectParameter(f"share_of_{name}", "1", f"share of {name}'s signal", 0.0, -2.0, 2.0, 0.01,
-                                     group="share") for name in model.sensors.names if name != place)
+        return tuple(EffectParameter(f"share_of_{name}", "1", f"share of {name}'s signal", 0.0, -2.0, 2.0, 0.01)
+                     for name in model.sensors.names if name != place)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         mix(ops, place, {name.removeprefix("share_of_"): share for name, share in values.items()})

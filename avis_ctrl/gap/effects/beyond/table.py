@@ -77,8 +77,8 @@ class Gyroscope(Beyond):
         return ("payload",)
 
     def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
-        return tuple(EffectParameter(f"h{axis}_Nms", "N m s", f"angular momentum about {axis}", 0.0, -1e6, 1e6, 1.0,
-                                     group="h") for axis in "xyz")
+        return tuple(EffectParameter(f"h{axis}_Nms", "N m s", f"angular momentum about {axis}", 0.0, -1e6, 1e6, 1.0)
+                     for axis in "xyz")
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         x, y, z = (values[f"h{axis}_Nms"] for axis in "xyz")

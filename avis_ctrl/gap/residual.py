@@ -1,41 +1,26 @@
-"""Figures, maps and sentences of a judged gap, all on held-out data."""
+"""What a model leaves of records that no fit has seen: how much, in which bands and channels, at which level."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import Protocol, cast
 
 import numpy as np
 from scipy import stats
 
 from avis_ctrl.gap.data import Halves, all_silent, thinned
-from avis_ctrl.gap.in_words import in_words
-from avis_ctrl.gap.judgement import Judgement, effects_of
-from avis_ctrl.gap.next_measurement import of_unexplained
 from avis_ctrl.gap.power_shares import power_shares
-from avis_ctrl.gap.refit import Refit
-from avis_ctrl.gap.result import Gap, HeatMap, PowerShares, RecordGap, Stage, Where
-from avis_ctrl.gap.search import CLOSED, Found
-from avis_ctrl.gap.signals.noise_level import SENSOR_BAND, NoiseLevels
+from avis_ctrl.gap.result import HeatMap, PowerShares, RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction_error import PredictionError, prediction_error
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
 
-if TYPE_CHECKING:
-    from avis_ctrl.gap.analysis import Prepared
-
 # Residual over noise that is shown as a place of the gap: significant at this level over all places together.
 PLACE_ALARM = 0.01
 MOST_PLACES = 10
-# Error over that of noise alone up to which a sentence may call it the noise.
-IS_NOISE = 1.05
-# Of faults in the signals alone: share of the error above which nothing is said to fall.
-UNCHANGED = 0.95
-# Error over that of noise below which the noise was over-estimated.
-TOO_MUCH_NOISE = 0.8
 BANDS_PER_OCTAVE = 2
 # Lines of each record from which its place in level and time, and the shares of power, are told.
 SHOWN_LINES = 1200
@@ -86,104 +71,6 @@ class Left:
 def _relative(power: np.ndarray, errors: Sequence[PredictionError]) -> float:
     whole = np.sum([np.sum(np.abs(e.block.Y) ** 2, axis=(0, 2)) for e in errors], axis=0)
     return float(np.sqrt(np.mean(power / whole)))
-
-
-def shown(prepared: Prepared, found: Found, base: Refit, updated: Refit, judgement: Judgement, seed: int,
-          seconds: float, noise: NoiseLevels | None = None) -> Gap:
-    """The gap as it is reported. noise : of floor and sensors, where it is known."""
-    blocks, unmasked = prepared.held_out, prepared.unmasked
-    before, after = Left.of(base.model, blocks), Left.of(judgement.updated.model, blocks)
-    ladder = [Stage("nominal", *_figures(Left.of(prepared.nominal, unmasked))),
-              Stage("re-identified", *_figures(Left.of(base.model, unmasked)))]
-    ladder += _steps(found, base, judgement, before, after)
-    where = places(before)
-    # Of a gap that counts as closed, too: some band may stand out by itself.
-    remaining = places(after)
-    sentences = (opening(judgement, ladder, after), *judgement.reasons, *bent(*ladder[:2]), prepared.noise)
-    sensors = None if noise is None else {name: one.value for name, one in noise.sensors.items()}
-    records, shares = every_record(prepared, base.model, judgement.updated.model, sensors)
-    onward = judgement.next_experiment
-    if onward is None and judgement.verdict in ("unexplained", "partly explained"):
-        onward = of_unexplained(remaining, records)
-    if judgement.raised and noise is not None:
-        remaining = _noisy(noise, judgement.raised, prepared.campaign.records[0].header.sample_rate_Hz)
-        where = where if judgement.effects else remaining
-    return Gap(judgement.verdict, judgement.effects, tuple(ladder), where if judgement.verdict != "none" else (),
-               remaining, after.noise_nrmse, onward, base.model, judgement.updated.model,
-               judgement.considered, heat_map(before, after), sentences,
-               prepared.halves.how, seed, seconds, judgement.updated.covariance,
-               shares=shares, records=records, raised=judgement.raised)
-
-
-def _noisy(noise: NoiseLevels, raised: Sequence[str], rate_Hz: float) -> tuple[Where, ...]:
-    """Sensors of raised noise, in the band where it was measured, with their shares of its excess over ambient."""
-    excess = {one.channel: one.ratio ** 2 - 1 for one in noise.raised if one.channel in raised}
-    low, high = (part * rate_Hz for part in SENSOR_BAND)
-    return tuple(Where(low, high, "", name, part / sum(excess.values()), part + 1)
-                 for name, part in sorted(excess.items(), key=lambda item: -item[1]))
-
-
-def _figures(left: Left) -> tuple[float, float]:
-    return left.nrmse, left.chi2_per_dof
-
-
-def _steps(found: Found, base: Refit, judgement: Judgement, before: Left, after: Left) -> list[Stage]:
-    """A stage for each named effect: those of the table in the order in which they were found, signals first."""
-    signal = [one for one in judgement.effects if not one.label]
-    steps = [Stage(one.name, *_figures(before)) for one in signal]
-    table = effects_of(judgement.updated.model)
-    blocks = [e.block for e in before.errors]
-    for depth in range(1, len(table) + 1):
-        label = table[depth - 1].effect.name
-        if depth == len(table):
-            steps.append(Stage(label, *_figures(after)))
-        elif {one.label for one in effects_of(found.chain[depth].model)} == {one.label for one in table[:depth]}:
-            steps.append(Stage(label, *_figures(Left.of(found.chain[depth].model, blocks))))
-    return steps
-
-
-def bent(nominal: Stage, again: Stage) -> tuple[str, ...]:
-    """A sentence where re-identification takes a model further from the held-out records than its file had it."""
-    closer = again.nrmse <= nominal.nrmse and again.chi2_per_dof <= nominal.chi2_per_dof
-    if closer or again.chi2_per_dof <= CLOSED:
-        return ()
-    figures = (f"{_percent(again.nrmse)} of the held-out records instead of {_percent(nominal.nrmse)}, chi-square per "
-               f"degree of freedom {again.chi2_per_dof:.3g} instead of {nominal.chi2_per_dof:.3g}")
-    return (f"re-identified without what it misses, the model leaves {figures}: its parameters bend to what they "
-            "cannot describe, and those of the baseline are not the table's",)
-
-
-def opening(judgement: Judgement, ladder: Sequence[Stage], after: Left) -> str:
-    """The one sentence."""
-    first, last = ladder[1], ladder[-1]
-    if judgement.raised and not judgement.effects:
-        return (f"The noise of {' and '.join(judgement.raised)} is above the rig file's ambient level, for which the "
-                f"library has no name; no other missing effect shows: after re-identification the model leaves "
-                f"{_percent(first.nrmse)} of the held-out records, noise alone {_percent(after.noise_nrmse)}.")
-    if judgement.verdict == "none":
-        return (f"No missing effect shows: after re-identification the model leaves {_percent(first.nrmse)} of the "
-                f"held-out records, noise alone {_percent(after.noise_nrmse)}.")
-    if judgement.verdict == "unexplained":
-        like = f"; it behaves most like {judgement.like}" if judgement.like else ""
-        return (f"Something is missing that the library has no name for{like}: after re-identification the model "
-                f"leaves {_percent(first.nrmse)} of the held-out records, noise alone {_percent(after.noise_nrmse)}.")
-    named = " and ".join(in_words(one) for one in judgement.effects)
-    end = "and something else remains" if judgement.verdict != "explained" and not judgement.raised else (
-        f"less than the noise as it was estimated ({_percent(after.noise_nrmse)}), which is too much then"
-        if last.nrmse < TOO_MUCH_NOISE * after.noise_nrmse else
-        "which is the noise" if last.nrmse <= IS_NOISE * after.noise_nrmse else
-        f"beside {_percent(after.noise_nrmse)} of noise")
-    if judgement.raised:
-        end += f", and {' and '.join(judgement.raised)} have more noise than the rig file says"
-    if not any(one.label for one in judgement.effects) and last.nrmse > UNCHANGED * first.nrmse:
-        return (f"Missing from the model: {named}; that is in the signals alone, of which the model leaves "
-                f"{_percent(last.nrmse)}, {end}.")
-    return (f"Missing from the model: {named}; with that in it the gap falls from {_percent(first.nrmse)} to "
-            f"{_percent(last.nrmse)}, {end}.")
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
 
 
 def edges_of(errors: Sequence[PredictionError]) -> np.ndarray:

@@ -1,0 +1,20 @@
+"""A table model fitted to blocks by their noise alone: least squares without tolerances and path errors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, fit
+
+
+def fitted(model, blocks, iterations=20) -> LikelihoodFit:
+    return fit(model, blocks, model.priors, max_iterations=iterations)
+
+
+def reported(found):
+    """Parameters of the first effect with standard deviations by the information of the fit."""
+    one, names = found.model.effects[0], found.model.names
+    size = found.information.scale
+    whole = np.linalg.pinv(found.information.relative, 1e-12, hermitian=True) * np.outer(size, size)
+    rows = [names.index(name) for name in one.names]
+    return one.effect.reported(found.model, one.place, one.by_name, whole[np.ix_(rows, rows)])
