@@ -14,7 +14,7 @@ def fitted(model, blocks, iterations=20) -> LikelihoodFit:
 def reported(found):
     """Parameters of the first effect with standard deviations by the information of the fit."""
     one, names = found.model.effects[0], found.model.names
-    size = found.information.scale
-    whole = np.linalg.pinv(found.information.relative, 1e-12, hermitian=True) * np.outer(size, size)
+    size = np.sqrt(np.diag(found.information.matrix))
+    whole = np.linalg.inv(found.information.matrix / np.outer(size, size)) / np.outer(size, size)
     rows = [names.index(name) for name in one.names]
     return one.effect.reported(found.model, one.place, one.by_name, whole[np.ix_(rows, rows)])

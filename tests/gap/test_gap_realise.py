@@ -143,7 +143,7 @@ def assemble_with_mass(model: TableModel, omega: np.ndarray, M: np.ndarray, kept
 
 
 def test_friction_at_rest_is_stiffness_of_the_driven_mounts(rig, plain):
-    model = with_one(plain, "contact_friction", "actuators", (7e3, 1e-5))
+    model = with_one(plain, "contact_friction", "actuators", (7e3, 1e-5, *(0.0,) * 7))
     changes = {f"isolator{m.isolator}.k_{m.axis}": rig.parameters()[f"isolator{m.isolator}.k_{m.axis}"].value + 7e3
                for m in rig.motors}
     stiffer = realise(replace(plain, base=replace(plain.base, rig=rig.with_parameters(changes))))

@@ -25,6 +25,8 @@ from avis_ctrl.simulation.rehearsal import perturbed_truth
 RIG = load_rig("avis")
 BARE = TableModel(ResponseModel.of(RIG, ()))
 FS = 1000.0
+# All contacts alike.
+EVEN = (0.0,) * 7
 
 
 def noise(samples, channels, rms, seed=1):
@@ -128,10 +130,10 @@ def test_linear_effects_as_runge_kutta(name, place, values, table, given):
 NONLINEAR = [  # name, place, values, what Runge-Kutta takes, when, least effect on y, largest error
     ("cubic_stiffness", "isolators z", [1e13], {"cubic": 1e13}, {}, 0.2, 1e-4),
     ("cubic_stiffness", "isolators z", [1e14], {"cubic": 1e14}, {}, 0.5, 2e-3),
-    ("contact_friction", "actuators", [3e3, 1e-5], {"friction": (3e3, 1e-5)}, {}, 0.1, 1e-4),
-    ("contact_friction", "actuators", [3e4, 1e-7], {"friction": (3e4, 1e-7)}, {}, 0.01, 1e-4),
-    ("contact_friction", "actuators", [3e4, 1e-3], {"friction": (3e4, 1e-3)}, {}, 0.5, 2e-3),
-    ("contact_friction", "actuators", [3e5, 1e-6], {"friction": (3e5, 1e-6)}, {}, 0.5, 2e-2),
+    ("contact_friction", "actuators", [3e3, 1e-5, *EVEN], {"friction": (3e3, 1e-5)}, {}, 0.1, 1e-4),
+    ("contact_friction", "actuators", [3e4, 1e-7, *EVEN], {"friction": (3e4, 1e-7)}, {}, 0.01, 1e-4),
+    ("contact_friction", "actuators", [3e4, 1e-3, *EVEN], {"friction": (3e4, 1e-3)}, {}, 0.5, 2e-3),
+    ("contact_friction", "actuators", [3e5, 1e-6, *EVEN], {"friction": (3e5, 1e-6)}, {}, 0.5, 2e-2),
     ("stiffness_drift", "isolators/linear", [0.3], {"drift": (0.3, -100.0, 150.0)}, {"start_s": 100.0,
                                                                               "campaign_s": (0.0, 150.0)}, 0.1, 1e-4),
 ]
@@ -161,7 +163,7 @@ def test_saturation_and_the_drive_limit():
 def test_two_effects_at_once():
     """Cubic mounts and friction, with drives that saturate."""
     model = with_effect("cubic_stiffness", "isolators z", [1e13])
-    model = with_effect("contact_friction", "actuators", [3e3, 1e-5], model)
+    model = with_effect("contact_friction", "actuators", [3e3, 1e-5, *EVEN], model)
     model = with_effect("actuator_saturation", "actuators", [0.5], model)
     y, _ = Table(RIG).run(np.clip(U, -0.5, 0.5), FS, cubic=1e13, friction=(3e3, 1e-5))
     assert error(simulate(model, U, None, FS).y, y) < 2e-4
@@ -334,7 +336,7 @@ def test_where_the_motors_and_mounts_are():
 def test_records_at_rest_and_short_ones(samples, rms):
     """Noise of the sensors alone moves no mount by more than they could have felt of it."""
     y = rms * np.random.default_rng(1).standard_normal((samples, 6))
-    model = with_effect("contact_friction", "actuators", [3e4, 1e-6])
+    model = with_effect("contact_friction", "actuators", [3e4, 1e-6, *EVEN])
     model = with_effect("cubic_stiffness", "isolators z", [1e13], model)
     model = model.with_effect(active(LargeMotion(), model, "payload", [1.0, 0.0, 0.0]))
     found = motion_of(Campaign("avis", (record_of(np.zeros((samples, 8)), y),)), model)["00"]

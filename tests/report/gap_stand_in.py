@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Reported, library
-from avis_ctrl.gap.result import Considered, Gap, HeatMap, NamedEffect, PowerShares, RecordGap, Stage, Where
+from avis_ctrl.gap.result import Considered, Gap, HeatMap, NamedEffect, PowerShares, RecordGap, Remainder, Stage, Where
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
@@ -107,7 +107,7 @@ def explained(campaign: Campaign) -> Gap:
                 "The held-out records confirm it at both levels."),
                "records 04, 05 held out, each beside a fitted one of its level", 1, 41.5,
                np.diag((1e-3 * np.maximum(np.abs(updated.values), 1e-3)) ** 2) if n else None,
-               shares=shares(), records=by_record())
+               shares=shares(), records=by_record(), left=Remainder(0.0104, 1.03, 0.004, False))
 
 
 def minimal(gap: Gap, verdict: str = "none") -> Gap:

@@ -129,7 +129,7 @@ def moved(plant, size: float) -> np.ndarray:
 
 @pytest.mark.parametrize("name, place, values, seen", [
     (*LAG_40_HZ, True), ("loop_delay", "loop", (3e-3,), True), ("com_offset", "payload", (0.01, 0.03, -0.02), True),
-    ("product_of_inertia", "Jxy", (4.0,), False), ("contact_friction", "actuators", (6e3, 1e-5), True),
+    ("product_of_inertia", "Jxy", (4.0,), False), ("contact_friction", "actuators", (6e3, 1e-5, *(0.0,) * 7), True),
     ("actuator_saturation", "actuators", (2.0,), True)])
 def test_the_files_hold_what_they_say(baseline, design, tmp_path, name, place, values, seen):
     """The plant that `avis design` makes of rig.toml and design.toml is the updated one."""
