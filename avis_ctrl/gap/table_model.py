@@ -11,6 +11,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import Effect, EffectParameter
+from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.operators import Assembled, Operators, assemble
 from avis_ctrl.identification.response import N_Q, Driven, Matrices, Operands, ResponseModel, SensorModel, kept_lines
@@ -208,6 +209,11 @@ class TableModel:
         """Of the rig's free parameters; zero for stiffness and damping of mounts, which effects may change."""
         others = np.array([not _MOUNT.fullmatch(name) for name in self.base.names], bool)
         return Matrices(*(slopes * others[:, None, None] for slopes in self.effective.derivative_matrices))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Of the effects, but for the second-order terms."""
+        return tuple(one.label for one in self.effects if not isinstance(one.effect, LargeMotion))
 
     @property
     def nonlinear(self) -> bool:

@@ -21,13 +21,14 @@ from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplaine
 from avis_ctrl.gap.residual import Left, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
 from avis_ctrl.gap.signal_effects import left_by, levels, named
-from avis_ctrl.gap_engine.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.gap_engine.preparation import Prepared, mended_with, prepare, with_second_order
 from avis_ctrl.gap_engine.score import EvidenceScore
 from avis_ctrl.gap_engine.search import Step, implausible, name_of, search, with_effect, without_effect
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
-from avis_ctrl.gap_engine.tolerances import of_effect, re_identified, tolerances_of, with_tolerances
+from avis_ctrl.gap_engine.tolerances import of_effect
 from avis_ctrl.gap_engine.validation import Power, halves, odds_against, share_of
+from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
+from avis_ctrl.identification.priors import re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.rig import Rig
 

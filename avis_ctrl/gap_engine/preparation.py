@@ -23,9 +23,9 @@ from avis_ctrl.gap.signals.hum import HumFinding, find_hum, polluted
 from avis_ctrl.gap.signals.leftover import Leftover
 from avis_ctrl.gap.signals.repair import repair
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.gap_engine.likelihood import Data
 from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.identification.campaign_fit import excited_band
+from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.maximum_likelihood import fit
 from avis_ctrl.identification.noise import relative_noise
 from avis_ctrl.identification.parameter_sets import default_parameters

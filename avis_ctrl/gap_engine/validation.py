@@ -10,10 +10,10 @@ from scipy import stats
 
 from avis_ctrl.gap.residual import Left
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.gap_engine.likelihood import Fitted
 from avis_ctrl.gap_engine.settings import GapSettings
-from avis_ctrl.gap_engine.weights import Group
+from avis_ctrl.identification.likelihood import Fitted
 from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.weights import Group
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
-from avis_ctrl.gap_engine.tolerances import Priors
-from avis_ctrl.gap_engine.weights import Group, Variances, Weights, bands, estimated, path_contributions, weigh
+from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.maximum_likelihood import block_residual, transient_unknowns
+from avis_ctrl.identification.priors import Priors
 from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.weights import Group, Variances, Weights, bands, estimated, path_contributions, weigh
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +81,7 @@ class Fitted:
     @property
     def labels(self) -> tuple[str, ...]:
         """Effects of the model but the second-order terms."""
-        return tuple(one.label for one in self.model.effects if not isinstance(one.effect, LargeMotion))
+        return tuple(self.model.labels)
 
     def covariance_of(self, names: Sequence[str]) -> np.ndarray:
         """(k, k) of some parameters in their units; zero for those that are not free."""
@@ -91,7 +90,7 @@ class Fitted:
         return np.pad((self.covariance * slopes) * slopes[:, None], (0, 1))[np.ix_(rows, rows)]
 
 
-def first_variances(data: Data, settings: GapSettings) -> Variances:
+def first_variances(data: Data, settings: FitSettings) -> Variances:
     """Where nothing is known yet: a relative error of every path, and distortion as a part of it."""
     path: dict[Group, np.ndarray] = {}
     distortion: dict[Group, np.ndarray] = {}
@@ -107,7 +106,7 @@ def first_variances(data: Data, settings: GapSettings) -> Variances:
     return Variances(path, {group: value / count[group] for group, value in distortion.items()})
 
 
-def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: GapSettings = SETTINGS
+def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: FitSettings = SETTINGS
         ) -> Fitted:
     """Alternate Gauss-Newton steps in z with estimates of the variances."""
     steps, before = 0, -np.inf
@@ -145,13 +144,13 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
     return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), by_group, steps, weights, now)
 
 
-def _hyper(variances: Variances, settings: GapSettings) -> float:
+def _hyper(variances: Variances, settings: FitSettings) -> float:
     """Logarithm of the prior of the path variances, but for a constant."""
     nu, v0 = settings.error_weight, settings.least_error ** 2
     return sum(float(np.sum(-(nu / 2 + 1) * np.log(v) - nu * v0 / (2 * v))) for v in variances.path.values())
 
 
-def log_likelihoods(fitted: Fitted, data: Data, settings: GapSettings = SETTINGS) -> dict[Group, float]:
+def log_likelihoods(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> dict[Group, float]:
     """Of records that no fit has seen, by level and band, by the fitted parameters and variances."""
     paths = [path_contributions(fitted.model, block) for block in data.blocks]
     weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)

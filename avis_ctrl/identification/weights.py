@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl.gap_engine.settings import GapSettings
+from avis_ctrl.identification.fit_settings import FitSettings
 from avis_ctrl.identification.spectra import SpectralBlock
 
 Group = tuple[float, int]
@@ -102,7 +102,7 @@ def path_contributions(model: Any, block: SpectralBlock) -> np.ndarray:
     return model.driven(block.omega, U, derivative=False).Y
 
 
-def with_distortion(block: SpectralBlock, level: float, variances: Variances, settings: GapSettings) -> SpectralBlock:
+def with_distortion(block: SpectralBlock, level: float, variances: Variances, settings: FitSettings) -> SpectralBlock:
     """The block with noise and distortion as its covariance."""
     assert block.noise is not None
     own = bands(block.omega, settings.bands_per_octave)
@@ -111,7 +111,7 @@ def with_distortion(block: SpectralBlock, level: float, variances: Variances, se
 
 
 def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Sequence[np.ndarray], variances: Variances,
-          settings: GapSettings) -> Weights:
+          settings: FitSettings) -> Weights:
     """Weights of blocks; paths : (n, n_y, n_in) G_cj u_j of each block by the present model."""
     L, start = [], 0
     determinants: dict[Group, float] = {}
@@ -156,7 +156,7 @@ def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Seque
 
 
 def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], levels: Sequence[float],
-              paths: Sequence[np.ndarray], old: Variances, settings: GapSettings) -> Variances:
+              paths: Sequence[np.ndarray], old: Variances, settings: FitSettings) -> Variances:
     """The most likely variances of path errors and distortion for residuals left (n, n_y) of each block.
 
     Sensor by sensor, with the mean noise n of a band: with U diag(lambda) U^H = G G^H of the contributions G (m, n_in)

@@ -1,0 +1,103 @@
+"""The parameters of a rig with their priors: what is re-identified, and the tolerances of what the rig file states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
+from avis_ctrl.identification.parameter_sets import default_parameters
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.rigs.instruments import Tolerances
+from avis_ctrl.rigs.rig import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """Normal priors of free parameters: value = mean + sigma z, z standard normal; of positive ones log value is so.
+
+    names : (n,). mean, sigma : (n,), units of the parameters; of a positive one sigma is that of the logarithm.
+    positive : (n,) bool.
+    """
+
+    names: tuple[str, ...]
+    mean: np.ndarray
+    sigma: np.ndarray
+    positive: np.ndarray
+    low: np.ndarray | float = -np.inf
+    high: np.ndarray | float = np.inf
+
+    def values(self, z: np.ndarray) -> np.ndarray:
+        """(n,) of the parameters at standardised values z (n,)."""
+        found = np.where(self.positive, self.mean * np.exp(np.where(self.positive, self.sigma, 0.0) * z),
+                         self.mean + self.sigma * z)
+        return np.clip(found, self.low, self.high)
+
+    def z(self, values: np.ndarray) -> np.ndarray:
+        """(n,) standardised values; the inverse of `values`."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.positive, np.log(values / self.mean) / self.sigma, (values - self.mean) / self.sigma)
+
+    def followed_by(self, other: Priors) -> Priors:
+        """Both, one after the other."""
+        def both(name: str) -> np.ndarray:
+            return np.concatenate([np.broadcast_to(getattr(one, name), len(one.names)) for one in (self, other)])
+        return Priors((*self.names, *other.names), *map(both, _FIELDS))
+
+    def of(self, names: Sequence[str]) -> Priors:
+        """Those of some parameters, in their order. Raises ValueError for one that is not there."""
+        rows = [self.names.index(name) for name in names]
+        return Priors(tuple(names), *(np.broadcast_to(getattr(self, field), len(self.names))[rows]
+                                      for field in _FIELDS))
+
+    def slopes(self, z: np.ndarray) -> np.ndarray:
+        """(n,) derivative of the values by z."""
+        return np.where(self.positive, self.sigma * self.values(z), self.sigma)
+
+
+_FIELDS = ("mean", "sigma", "positive", "low", "high")
+
+
+def re_identified(rig: Rig, settings: FitSettings = SETTINGS) -> Priors:
+    """Mass, moments of inertia, stiffness and damping: what every identification leaves free."""
+    known, names = rig.parameters(), default_parameters(rig)
+    mean = np.array([known[name].value for name in names])
+    damping = np.array([known[name].unit.startswith("N s") or known[name].unit.startswith("N m s") for name in names])
+    sigma = np.asarray(np.where(damping, settings.damping_percent, settings.stiffness_percent)) / 100
+    return Priors(names, mean, sigma, np.ones(len(names), bool))
+
+
+def with_tolerances(model: ResponseModel, tolerances: Tolerances, settings: FitSettings = SETTINGS) -> Priors:
+    """The same and every value of the rig file that has a tolerance; the model has its channels apart."""
+    first, known = re_identified(model.rig, settings), model.all_parameters()
+    rest = {name: sigma for name in known if name not in first.names and (sigma := _sigma(name, tolerances))}
+    mean = np.array([known[name].value for name in rest])
+    relative = np.array([name.partition(".")[0] in _RELATIVE for name in rest])
+    own = np.array(list(rest.values()))
+    return Priors((*first.names, *rest), np.concatenate([first.mean, mean]), np.concatenate([first.sigma, own]),
+                  np.concatenate([first.positive, relative]))
+
+
+def tolerances_of(rig: Rig) -> Tolerances:
+    """Of the rig file, or those of the contract."""
+    return getattr(rig, "tolerances", None) or Tolerances()
+
+
+_RELATIVE: Mapping[str, str] = {"actuator": "actuator_gain_percent", "sensor": "sensor_gain_percent",
+                                "corner": "sensor_corner_percent", "damping": "sensor_damping_percent"}
+
+
+def _sigma(name: str, t: Tolerances) -> float:
+    """Standard deviation of a parameter, relative for gains, corners and damping ratios; 0 without a tolerance."""
+    kind = name.partition(".")[0]
+    if kind in _RELATIVE:
+        return float(getattr(t, _RELATIVE[kind])) / 100
+    if kind == "place" or ".p_" in name:
+        return t.place_m
+    if kind == "direction":
+        return t.direction_rad
+    if name.startswith("com_"):
+        return t.centre_of_mass_m
+    return t.product_of_inertia_kgm2 if name in ("J12", "J13", "J23") else 0.0
