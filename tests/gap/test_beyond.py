@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from avis_ctrl.gap.likelihood import Data, first_variances, fit
 
 from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.effects.beyond import beyond
@@ -13,11 +14,10 @@ from avis_ctrl.gap.effects.beyond.base import FirstOrder
 from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.record_motion import mount_rows
 from avis_ctrl.gap.score import Score
+from avis_ctrl.gap.search import search
+from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.gap_engine.likelihood import Data, first_variances, fit
-from avis_ctrl.gap_engine.search import search
-from avis_ctrl.gap_engine.settings import GapSettings
-from avis_ctrl.gap_engine.tolerances import re_identified
+from avis_ctrl.gap.tolerances import re_identified
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock

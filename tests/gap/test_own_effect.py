@@ -16,10 +16,10 @@ import pytest
 from truth.cases import draw_case, rig, simulate_case
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.gap.analysis import analyse
 from avis_ctrl.gap.effects import base
 from avis_ctrl.gap.effects.own import load_effects, try_out
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.gap_engine.analysis import analyse
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.measurement.formats.hdf5 import write_campaign

@@ -14,8 +14,8 @@ from avis_ctrl.gap.effects.impedance import peaks
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.realise import realise
 from avis_ctrl.gap.score import Score
+from avis_ctrl.gap.search import at_the_edge
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.gap_engine.search import at_the_edge
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock

@@ -10,11 +10,11 @@ from noise_fit import fitted
 from test_score import MODEL, gaussian
 from truth.cases import draw_case, rig, simulate_case
 
+from avis_ctrl.gap.analysis import analyse
 from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.gap_engine.analysis import analyse
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock

@@ -9,8 +9,8 @@ import numpy as np
 from scipy import stats
 
 from avis_ctrl.gap.residual import Left
+from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.gap_engine.settings import GapSettings
 from avis_ctrl.identification.likelihood import Fitted
 from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.identification.weights import Group

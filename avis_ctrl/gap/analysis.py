@@ -16,17 +16,17 @@ from avis_ctrl.gap.detectable import detectable
 from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Effect, library
 from avis_ctrl.gap.effects.beyond import beyond
+from avis_ctrl.gap.evidence_score import EvidenceScore
 from avis_ctrl.gap.in_words import in_words
 from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplained
+from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_second_order
 from avis_ctrl.gap.residual import Left, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
+from avis_ctrl.gap.search import Step, implausible, name_of, search, with_effect, without_effect
+from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import left_by, levels, named
-from avis_ctrl.gap_engine.preparation import Prepared, mended_with, prepare, with_second_order
-from avis_ctrl.gap_engine.score import EvidenceScore
-from avis_ctrl.gap_engine.search import Step, implausible, name_of, search, with_effect, without_effect
-from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
-from avis_ctrl.gap_engine.tolerances import of_effect
-from avis_ctrl.gap_engine.validation import Power, halves, odds_against, share_of
+from avis_ctrl.gap.tolerances import of_effect
+from avis_ctrl.gap.validation import Power, halves, odds_against, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign

@@ -17,13 +17,13 @@ from avis_ctrl.gap.data import Halves, blocks_of, divide, of_one_level, thinned,
 from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
+from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, converter_faults, left_by, predicted, without_hum
 from avis_ctrl.gap.signals.converter import ConverterFinding
 from avis_ctrl.gap.signals.hum import HumFinding, find_hum, polluted
 from avis_ctrl.gap.signals.leftover import Leftover
 from avis_ctrl.gap.signals.repair import repair
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.identification.campaign_fit import excited_band
 from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.maximum_likelihood import fit

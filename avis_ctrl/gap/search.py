@@ -20,10 +20,10 @@ from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.flexible_mode import resonance
+from avis_ctrl.gap.evidence_score import EvidenceScore
+from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.table_model import ActiveEffect, active
-from avis_ctrl.gap_engine.score import EvidenceScore
-from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
-from avis_ctrl.gap_engine.tolerances import BEYOND, of_effect, tolerances_behind, within_tolerance
+from avis_ctrl.gap.tolerances import BEYOND, of_effect, tolerances_behind, within_tolerance
 from avis_ctrl.identification.likelihood import Data, Fitted, fit
 from avis_ctrl.identification.priors import Priors, tolerances_of
 

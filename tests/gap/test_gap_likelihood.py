@@ -12,10 +12,10 @@ from scipy.optimize import minimize
 
 from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.model_files import model_from_dict, model_to_dict
+from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.gap_engine.settings import GapSettings
-from avis_ctrl.gap_engine.tolerances import tolerances_behind, within_tolerance
-from avis_ctrl.gap_engine.validation import halves, odds_against
+from avis_ctrl.gap.tolerances import tolerances_behind, within_tolerance
+from avis_ctrl.gap.validation import halves, odds_against
 from avis_ctrl.identification.likelihood import Data, first_variances, fit
 from avis_ctrl.identification.priors import Priors, re_identified, with_tolerances
 from avis_ctrl.identification.response import ResponseModel

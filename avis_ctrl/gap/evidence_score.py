@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from avis_ctrl.gap.score import Part, Score
-from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
+from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.identification.likelihood import Data, Fitted
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.weights import with_distortion

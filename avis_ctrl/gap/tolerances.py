@@ -8,8 +8,8 @@ import numpy as np
 
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.effects.payload import PRODUCTS
+from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.table_model import ActiveEffect
-from avis_ctrl.gap_engine.settings import SETTINGS, GapSettings
 from avis_ctrl.identification.priors import Priors
 from avis_ctrl.rigs.instruments import Tolerances
 

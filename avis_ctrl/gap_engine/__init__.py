@@ -1,1 +1,0 @@
-"""Which effect a model of a table lacks: tolerances, unexplained response and selection by evidence."""
