@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from avis_ctrl.gap.likelihood import Data, first_variances, fit
 
 from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.effects.beyond import beyond
@@ -17,8 +16,9 @@ from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.search import search
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.gap.tolerances import re_identified
+from avis_ctrl.identification.likelihood import Data, first_variances, fit
 from avis_ctrl.identification.parameter_sets import default_parameters
+from avis_ctrl.identification.priors import re_identified
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs import load_rig
