@@ -256,15 +256,15 @@ class TableModel:
         return np.concatenate([own, ringing.reshape(len(omega), r.shape[1], -1)], axis=2)
 
     def _suspensions_ring(self, omega: np.ndarray) -> np.ndarray:
-        """(n, n_y, 2 n_y) transients of every geophone's suspension, at the corner that its filter assumes: what a
-        corner within its tolerance changes of them is of second order."""
+        """(n, n_y, 2 n_g) transients of the suspensions of the n_g geophones, at the corners that their filters assume:
+        what a corner within its tolerance changes of them is of second order."""
         s, r, sensors = 1j * omega, self._chain_ratio(omega), self.base.sensors
-        found = np.zeros((len(omega), len(sensors.names), len(sensors.names), 2), complex)
-        for k, own in enumerate(sensors.assumed):
-            if own is not None:
-                w = 2 * np.pi * own[0]
-                ring = r[:, k] * w ** 2 / (s ** 2 + 2 * own[1] * w * s + w ** 2)
-                found[:, k, k] = np.stack([ring, s / w * ring], axis=-1)
+        known = [(k, own) for k, own in enumerate(sensors.assumed) if own is not None]
+        found = np.zeros((len(omega), len(sensors.names), len(known), 2), complex)
+        for j, (k, (frequency, zeta)) in enumerate(known):
+            w = 2 * np.pi * frequency
+            ring = r[:, k] * w ** 2 / (s ** 2 + 2 * zeta * w * s + w ** 2)
+            found[:, k, j] = np.stack([ring, s / w * ring], axis=-1)
         return found.reshape(len(omega), len(sensors.names), -1)
 
     @cached_property
