@@ -68,6 +68,12 @@ LAG, GAIN = hidden("actuator_lag", "actuators"), hidden("sensor_gain", "Sz2")
     ("one", [LAG], answer("none"), "missed"),
     ("two", [LAG, GAIN], answer("explained", named("sensor_gain", "Sz2"), named("actuator_lag")), "both right"),
     ("two", [LAG, GAIN], answer("partly explained", named("sensor_gain", "Sz2")), "one right"),
+    # 1 % is the tolerance: no missing effect below three of it, nor a false name.
+    ("one", [hidden("sensor_gain", "Sz2", gain=1.02)], answer("none"), "quiet"),
+    ("one", [hidden("sensor_gain", "Sz2", gain=1.02)], answer("explained", named("sensor_gain", "Sz2")), "quiet"),
+    ("one", [hidden("sensor_gain", "Sz2", gain=0.96)], answer("none"), "missed"),
+    ("two", [LAG, hidden("com_offset", x_m=1e-3, y_m=-2e-3, z_m=0.0)],
+     answer("explained", named("actuator_lag", "actuators")), "right"),
     ("two", [LAG, GAIN], answer("explained", named("sensor_gain"), named("com_offset")), "one right, one wrong"),
     ("two", [LAG, GAIN], answer("explained", named("com_offset")), "wrong"),
     # One named effect cannot stand for two hidden ones, nor two named ones for one.
