@@ -44,6 +44,8 @@ class FitUncertaintySettings:
         bears those bears a tenth more of them, and mu hardly rises.
     without_dynamics : share of the response instead, for a design that declares no neglected dynamics.
     band_Hz, points : where the response is judged: the range of transmissibility, dense against the modes' width.
+    alike : combinations of drives that move the table by less than this share of the strongest one stand for no sensor:
+        drives side by side would push against each other by many times their force, to make up for a tilt.
     draws : tables from the covariance on which products of changes are looked at.
     """
 
@@ -51,6 +53,7 @@ class FitUncertaintySettings:
     without_dynamics: float = NEGLIGIBLE
     band_Hz: tuple[float, float] = (0.1, 100.0)
     points: int = 200
+    alike: float = 0.02
     draws: int = 64
 
     @property
@@ -144,7 +147,8 @@ def fit_uncertainty(design: Design, model: TableModel, covariance: np.ndarray, w
     inside[held] = relative_changes(base, [slope for _, slope in felt], omega, A)[0]
     # A sensor that reads more is to the loop a drive that pushes harder: the records told their product only.
     drives = [k for k in held if names[k] in {f"actuator.{name}" for name in wiring.actuators}]
-    alike = _nearest(inside[drives] / allowed[:, None, None], seen[others] / allowed[:, None, None])
+    alike = _nearest(inside[drives] / allowed[:, None, None], seen[others] / allowed[:, None, None],
+                     settings.alike)
     inside[others] = np.tensordot(alike, inside[drives], 1)
     elsewhere = _box(_turned(np.tensordot(S.T, seen - inside, 1)), confidence)
     root = S.copy()
@@ -210,9 +214,10 @@ def _real(parts: np.ndarray) -> np.ndarray:
     return np.concatenate([flat.real, flat.imag], axis=1)
 
 
-def _nearest(basis: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """(n, m) real combinations of m responses (m, ...) nearest to n others (n, ...)."""
-    return np.linalg.lstsq(_real(basis).T, _real(parts).T)[0].T
+def _nearest(basis: np.ndarray, parts: np.ndarray, weakest: float) -> np.ndarray:
+    """(n, m) smallest real combinations of m responses (m, ...) nearest to n others (n, ...), those of the m left out
+    that are less than a share of the strongest."""
+    return np.linalg.lstsq(_real(basis).T, _real(parts).T, rcond=weakest)[0].T
 
 
 def _rotation(parts: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import pytest
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.lti.connect import lft_upper
+from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.gap_design import PARAMETERS_PERCENT, without_ranges
@@ -19,7 +20,9 @@ from avis_ctrl.study.gap_uncertainty import SETTINGS, FitUncertainty, fit_uncert
 from avis_ctrl.study.identification_design import default_design
 from avis_ctrl.uncertainty.uncertain_rig import UncertainEquation, uncertain_rig
 
-RIG = load_rig("avis").with_channels_apart()
+AVIS = load_rig("avis")
+assert isinstance(AVIS, AvisTable)
+RIG = AVIS.with_channels_apart()
 DESIGN = without_ranges(default_design(RIG, "z and phi_x", PARAMETERS_PERCENT))
 MECHANICS = ("mass", "J1", "com_y", "isolator1.k_z", "isolator2.k_z", "isolator3.k_z", "isolator4.k_z",
              "isolator1.c_z", "isolator2.p_y", "actuator.Az1", "actuator.Az2")
@@ -111,6 +114,20 @@ def test_the_product_of_drives_and_sensors_is_what_counts():
     together, drives, sensors = (of(names, 0.02 * one[:, None]) for one in (up - down, up, down))
     assert together.blocks == () and np.max(together.rest) < 1e-6 and np.max(together.elsewhere) < 1e-6
     assert np.max(drives.effect) == pytest.approx(np.max(sensors.effect), rel=1e-6) and len(drives.blocks) > 0
+
+
+def test_what_sensors_read_is_made_up_for_by_all_drives_alike():
+    """Also where motors side by side are tilted a little: no force constant moves by more than the sensors' own."""
+    names = tuple(name for name in RIG.parameters() if name.startswith("direction.A"))
+    model = TableModel(ResponseModel.of(RIG, (*SENSORS, *DRIVES, *names)))
+    tilt = 1e-3 * np.random.default_rng(5).standard_normal(len(names))
+    model = model.at(np.concatenate([model.values[:-len(names)], model.values[-len(names):] + tilt]))
+    size = np.concatenate([0.01 * model.values[:len(SENSORS)], np.zeros(len(model.names) - len(SENSORS))])
+    wiring = wiring_of(plant_of(DESIGN, TableModel(ResponseModel.of(RIG, ())))[0], model)
+    found = fit_uncertainty(DESIGN, model, np.diag(size ** 2), wiring, replace(SETTINGS, left_out=1e-3))
+    own = -np.array([model.effective.rig.equations_of_motion().T[2]])
+    for one in found.blocks:
+        assert np.max(np.abs(one.change[6:])) < 0.1 * np.max(np.abs(own))
 
 
 def test_little_needs_no_block_and_what_is_left_is_within_its_share(rng):
