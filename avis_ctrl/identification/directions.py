@@ -23,6 +23,7 @@ from avis_ctrl.rigs.rig import Rig
 
 # Directions that together change the response by less than this share of it, at every frequency, are not kept.
 NEGLIGIBLE = 1e-3
+KeptMatrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,31 +109,45 @@ def relative_sensitivity(rig: Rig, names: Sequence[str], keep: Sequence[str], om
     and inv(T) dT = inv(F) (dF - dB inv(B) F) of the response to the floor. A change of the actuators' constants dT_u
     counts as dT_u A, with A the allocation.
     """
-    known, s = rig.parameters(), 1j * np.asarray(omega, float)[:, None, None]
-    M, C, K, _ = _kept(rig, keep)
-    allocation = np.linalg.pinv(_kept(rig, keep)[3])
-    F = K + s * C
-    inverse = np.linalg.inv(F + s ** 2 * M)
-    driven, floor = [], []
+    return relative_changes(kept_matrices(rig, keep), matrix_slopes(rig, names, keep), omega)
+
+
+def matrix_slopes(rig: Rig, names: Sequence[str], keep: Sequence[str]) -> list[KeptMatrices]:
+    """Derivatives of M, C, K, T of the kept coordinates by each parameter, per its unit."""
+    known, slopes = rig.parameters(), []
     for name in names:
         value = known[name].value
         # Polynomials of second degree: a central difference is exact at any step.
         step = 0.1 * abs(value) or 1e-3
-        up, down = (_kept(rig.with_parameters({name: value + sign * step}), keep) for sign in (1, -1))
-        dM, dC, dK, dT = ((a - b) / (2 * step) for a, b in zip(up, down, strict=True))
+        up, down = (kept_matrices(rig.with_parameters({name: value + sign * step}), keep, rig.edge_m)
+                    for sign in (1, -1))
+        M, C, K, T = ((a - b) / (2 * step) for a, b in zip(up, down, strict=True))
+        slopes.append((M, C, K, T))
+    return slopes
+
+
+def relative_changes(base: KeptMatrices, changes: Sequence[KeptMatrices], omega: np.ndarray,
+                     allocation: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """As `relative_sensitivity`, by changes of M, C, K, T; allocation (n_u, k): A, by default the inverse of T."""
+    (M, C, K, T), s = base, 1j * np.asarray(omega, float)[:, None, None]
+    allocation, F = np.linalg.pinv(T) if allocation is None else allocation, K + s * C
+    inverse = np.linalg.inv(F + s ** 2 * M)
+    driven, floor = [], []
+    for dM, dC, dK, dT in changes:
         dF = dK + s * dC
         dB = dF + s ** 2 * dM
         driven.append(dT @ allocation - dB @ inverse)
         floor.append(np.linalg.solve(F, dF - dB @ inverse @ F))
-    shape = (len(names), len(s), len(keep), len(keep))
+    shape = (len(changes), len(s), len(M), len(M))
     return np.reshape(driven, shape), np.reshape(floor, shape)
 
 
-def _kept(rig: Rig, keep: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """M, C, K, T of the kept coordinates, rotations as displacement of the edge."""
+def kept_matrices(rig: Rig, keep: Sequence[str], edge_m: float | None = None) -> KeptMatrices:
+    """M, C, K, T of the kept coordinates, rotations as displacement of the edge: by default the rig's own, which moves
+    where its isolators do."""
     eom = rig.equations_of_motion()
     kept = [eom.coordinates.index(name) for name in keep]
-    S = np.diag([1 / rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
+    S = np.diag([1 / (edge_m or rig.edge_m) if name.startswith("phi") else 1.0 for name in keep])
     M, C, K = (S @ X[np.ix_(kept, kept)] @ S for X in (eom.M, eom.C, eom.K))
     return M, C, K, S @ eom.T[kept]
 

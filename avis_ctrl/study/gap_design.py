@@ -29,10 +29,12 @@ from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
-from avis_ctrl.study.gap_plant import CARRIED, carried, delay_order, plant_of, six_dof_is_stable
+from avis_ctrl.study.gap_plant import CARRIED, carried, delay_order, plant_of, six_dof_is_stable, wiring_of
+from avis_ctrl.study.gap_uncertainty import FitUncertainty, fit_uncertainty
 from avis_ctrl.study.identification_design import default_design, default_keep, design_toml
 from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
-from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
+from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
 Progress = Callable[[str], None]
 SLACK = 5e-3
@@ -76,6 +78,7 @@ class DesignEffect:
     in_files, not_in_files : labels of effects that rig.toml and design.toml hold, and of those that only this holds.
     files : contents of rig.toml and design.toml by name: `avis design` runs on them.
     sentences : the outcome first. seconds : wall clock.
+    uncertainty : of the fit, as blocks of every loop, and what has none; None where no fit told its covariance.
     not_checked : labels of named effects against which no controller was checked, and why: the loops do not contain
         them, so that no figure here says whether they matter.
     """
@@ -92,6 +95,7 @@ class DesignEffect:
     sentences: tuple[str, ...]
     seconds: float
     not_checked: dict[str, str] = field(default_factory=dict)
+    uncertainty: FitUncertainty | None = None
 
     @property
     def mu_before(self) -> float:
@@ -110,6 +114,7 @@ class DesignEffect:
         loops = {"before": self.before, "after": self.after, "new": self.new}
         return {**{name: asdict(loop) if loop else None for name, loop in loops.items()},
                 "in_files": list(self.in_files), "not_in_files": list(self.not_in_files),
+                "uncertainty": self.uncertainty.to_json() if self.uncertainty else None,
                 "not_checked": dict(self.not_checked), "sentences": list(self.sentences), "seconds": self.seconds}
 
 
@@ -132,15 +137,35 @@ def design_effect(gap: Gap, design: Path | Design | None = None,
         # The second-order terms of large rotations are nothing at rest.
         before, after = (model.without(f"{LargeMotion.name}@payload") for model in (gap.baseline, gap.updated))
         signals = [f"{one.name}@{one.location}" for one in getattr(gap, "effects", ()) if not one.label]
-        return compare_designs(before, after, design_for(gap.baseline.rig, design), progress, signals)
+        asked, covariance = design_for(gap.baseline.rig, design), getattr(gap, "covariance", None)
+        uncertainty = None
+        if covariance is not None:
+            progress("uncertainty: the fit's covariance as a few blocks")
+            own = [gap.updated.names.index(name) for name in after.names]
+            # The default's ranges stand in for a measurement.
+            judged = without_ranges(asked) if design is None else asked
+            wiring = wiring_of(build_plant(judged, before.effective.rig), before)
+            uncertainty = fit_uncertainty(judged, after, covariance[np.ix_(own, own)], wiring)
+        return compare_designs(before, after, asked, progress, signals, uncertainty)
+
+
+def without_ranges(design: Design) -> Design:
+    """The same without ranges of parameters."""
+    return design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
+        update={"parameters_percent": {}, "parameters_absolute": {}})})
 
 
 def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
-                    progress: Progress = lambda text: None, signals: Sequence[str] = ()) -> DesignEffect:
-    """`design_effect` of two models; signals : named effects that add to the signals and are in no model."""
-    began = time.monotonic()
+                    progress: Progress = lambda text: None, signals: Sequence[str] = (),
+                    uncertainty: FitUncertainty | None = None) -> DesignEffect:
+    """`design_effect` of two models; signals : named effects that add to the signals and are in no model.
+    uncertainty : of the fit, for whose design the loops are made; the files hold `design`, for they have no place for
+    the blocks of a fit."""
+    began, fit, in_files_design = time.monotonic(), uncertainty.blocks if uncertainty else (), design
+    design = uncertainty.design if uncertainty else design
     progress("controller for the baseline: mu synthesis")
-    plant, asked, rig = plant_of(design, baseline)
+    plant, asked, rig = plant_of(design, baseline, fit=fit)
+    wiring = wiring_of(plant, baseline)
     new_rig = rig
     K = mu_optimal(asked, plant, rig)[0].K
     assert K is not None
@@ -148,10 +173,10 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
     progress(f"  mu {before.mu_upper:.3f} on the baseline")
     after, new, K_new, when, notes = None, None, None, 0.0, []
     if updated.effects:
-        after, when = _worst_moment(design, updated, plant.allocation, K)
+        after, when = _worst_moment(design, updated, wiring, K, fit)
         progress(f"  mu {after.mu_upper:.3f} on the updated model")
         progress("controller for the updated model: mu synthesis")
-        new_plant, new_design, new_rig = plant_of(design, updated, plant.allocation, when)
+        new_plant, new_design, new_rig = plant_of(design, updated, wiring, when, fit)
         try:
             candidate, made = mu_optimal(new_design, new_plant, new_rig)
             K_new = candidate.K
@@ -163,14 +188,15 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
         except ComputationError as error:
             notes.append(f"No controller was found for the updated model: {error}")
     realised = realise(updated)
-    files, in_files, not_in_files = start_files(design, updated, when)
+    files, in_files, not_in_files = start_files(in_files_design, updated, when)
     left_out = not_realised(updated)
     not_checked = left_out | dict.fromkeys(signals, "it acts on the measured signals and is not part of the loop")
     held = "all" if not left_out else "none" if len(left_out) == len(updated.effects) else "some"
     words = (*_outcome(before, after, new, design.synthesis.target_mu, held), *_unchecked(not_checked), *notes,
+             *(uncertainty.sentences() if uncertainty else ()), *_other_ranges(in_files_design, uncertainty),
              *_told(realised, design, new_rig, updated, when, in_files, not_in_files))
     return DesignEffect(before, after, new, K, K_new, realised, in_files, not_in_files, files, words,
-                        time.monotonic() - began, not_checked)
+                        time.monotonic() - began, not_checked, uncertainty)
 
 
 def design_for(rig: Rig, design: Path | Design | None = None) -> Design:
@@ -189,13 +215,13 @@ def design_for(rig: Rig, design: Path | Design | None = None) -> Design:
     return asked
 
 
-def _worst_moment(design: Design, model: TableModel, allocation: np.ndarray, K: StateSpace
-                  ) -> tuple[LoopFigures, float]:
+def _worst_moment(design: Design, model: TableModel, wiring: Wiring, K: StateSpace,
+                  fit: Sequence[Uncertain] = ()) -> tuple[LoopFigures, float]:
     """The controller on the model; where something drifts, at that end of the campaign which has the larger mu."""
     drifts = any(one.effect.name == "stiffness_drift" for one in model.effects)
     found = []
     for when in (-0.5, 0.5) if drifts else (0.0,):
-        plant, asked, _ = plant_of(design, model, allocation, when)
+        plant, asked, _ = plant_of(design, model, wiring, when, fit)
         found.append((figures(asked, model, plant, K, when), when))
     return max(found, key=lambda one: one[0].mu_upper)
 
@@ -297,6 +323,15 @@ def _verdict(before: float, after: float, held: str) -> str:
                 "none": "mu stays because this loop contains none of the named effects"}[held]
     kept = "robust performance is kept" if after < 1 else "robust performance is missed on both"
     return f"it is {'worse' if after > before else 'better'}, {kept}"
+
+
+def _other_ranges(design: Design, uncertainty: FitUncertainty | None) -> list[str]:
+    """That the files' uncertainty is not that of the loops; empty where it is."""
+    if uncertainty is None or (not uncertainty.blocks and uncertainty.design is design):
+        return []
+    ranges = ", ".join(f"{name} {size:g} %" for name, size in design.uncertainty.parameters_percent.items())
+    return [f"design.toml has no place for the blocks of a fit; the parameters' ranges in it are "
+            f"{ranges or 'none'}, so that `avis design` finds another mu."]
 
 
 def _told(realised: Realised, design: Design, plant_rig: Rig, model: TableModel, when: float, inside: Sequence[str],

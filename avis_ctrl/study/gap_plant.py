@@ -3,12 +3,13 @@
     floor -> (chassis) -> rig, its uncertain parameters -> + effects -> what the sensors see -> decoding as before
 
 Uncertainty stays where the design has it. What the effects multiply (the branch of a mount, the recoil of the chassis)
-is taken with nominal values. Allocation and decoding are those of the first plant: the controller does not know.
+is taken with nominal values. Allocation, decoding and sensitivities are those of the first plant: the controller does
+not know that a motor or sensor is another, or elsewhere, than its rig file says.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,9 +24,11 @@ from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
 from avis_ctrl.uncertainty.generalized_plant import Part
+from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
 # Effects whose linear content a rig or design file holds, and where.
 CARRIED: Mapping[str, str] = {
@@ -51,23 +54,31 @@ class Carried:
     outside: tuple[str, ...]
 
 
-def plant_of(design: Design, model: TableModel, allocation: np.ndarray | None = None, when: float = 0.0
-             ) -> tuple[DesignPlant, Design, Rig]:
+def wiring_of(plant: DesignPlant, model: TableModel) -> Wiring:
+    """Volts by force and velocity by volts of the controller of a plant: decoding over the model's sensitivities."""
+    sensors = model.sensors
+    decoding = plant.decoding[:, [plant.sensors.index(name) for name in sensors.names]] / sensors.sensitivity
+    return Wiring(plant.actuators, plant.allocation, tuple(sensors.names), decoding)
+
+
+def plant_of(design: Design, model: TableModel, wiring: Wiring | None = None, when: float = 0.0,
+             fit: Sequence[Uncertain] = ()) -> tuple[DesignPlant, Design, Rig]:
     """Plant of a design on a model with its effects; with it the design and rig whose loop it has.
 
     Parameters
     ----------
-    allocation : (n_actuators, n_axes) volts per newton; by default that of the model's own rig.
+    wiring : of the controller (`wiring_of`); by default that for the model's own rig.
     when : -0.5 .. 0.5 through the campaign, for what drifts.
+    fit : uncertain beside what the design says (`gap_uncertainty`).
 
     Raises
     ------
     InputError : as `build_plant`; values of an effect that no system has.
     """
     rig, asked = _loop(model.effective.rig, design, model)
-    plant = build_plant(asked, rig)
-    if allocation is not None and allocation.shape == plant.allocation.shape:
-        plant = _with_allocation(plant, allocation)
+    if wiring is not None:
+        wiring = replace(wiring, decoding=wiring.decoding * model.sensors.sensitivity)
+    plant = build_plant(asked, rig, wiring, fit)
     if not model.effects:
         return plant, asked, rig
     wrapped = with_effects(plant.rig.system, model, asked.keep, when)
@@ -75,6 +86,7 @@ def plant_of(design: Design, model: TableModel, allocation: np.ndarray | None = 
     systems["rig"] = Part("rig", "rig", _rig_part(plant, model, wrapped))
     for axis in plant.axes:
         name = f"sensor chain {axis}"
+        systems.pop(f"motion of {name}", None)  # the new parts read each sensor by itself
         systems[name] = Part(name, "sensor", _sensor_chain(plant, axis))
     return _rebuilt(plant, tuple(systems.values()), wrapped), asked, rig
 
@@ -98,15 +110,6 @@ def delay_order(design: Design, rig: Rig) -> tuple[int, float]:
     return sufficient_order(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, omega, DELAY_ERROR, 6, design.loop.pade_order)
 
 
-def _with_allocation(plant: DesignPlant, allocation: np.ndarray) -> DesignPlant:
-    """The same volts for the same command as before."""
-    if np.array_equal(allocation, plant.allocation):
-        return plant
-    parts = tuple(replace(part, system=gain(allocation, part.system.inputs, part.system.outputs))
-                  if part.name in ("allocation", "identified response error") else part for part in plant.full.parts)
-    return replace(_rebuilt(plant, parts, plant.rig.system), allocation=allocation)
-
-
 def _rebuilt(plant: DesignPlant, parts: tuple[Part, ...], rig: StateSpace) -> DesignPlant:
     """The connection with other parts; signals and blocks as they were."""
     old = plant.full
@@ -120,13 +123,17 @@ def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> Sta
     """Motion, and what decoding makes of the sensors' deviations and of gravity."""
     old = next(part.system for part in plant.full.parts if part.name == "rig")
     sensors, n = list(model.sensors.names), len(plant.axes)
+    lever = np.array([1 / model.rig.edge_m if axis.endswith("_edge") else 1.0 for axis in plant.axes])
     known = [k for k, name in enumerate(plant.sensors) if name in sensors]
     decoding = plant.decoding[:, known]
     names = [plant.sensors[k] for k in known]
     plain = wrapped.select(list(old.outputs), list(old.inputs))
     dot = wrapped.select([f"{a}_dot" for a in plant.axes] + [f"{kind}_{k}" for kind in ("deviation", "tilt")
                                                              for k in names], list(old.inputs))
-    left = np.block([[np.eye(n), decoding, np.zeros_like(decoding)],
+    _, rows = model.effective.rig.sensor_rows()
+    kept = [COORDINATES.index(axis.removesuffix("_edge")) for axis in plant.axes]
+    own = plant.decoding @ (rows[:, kept] * lever)
+    left = np.block([[own, decoding, np.zeros_like(decoding)],
                      [np.zeros((n, n)), np.zeros_like(decoding), decoding]])
     C, D = np.vstack([plain.C, left @ dot.C]), np.vstack([plain.D, left @ dot.D])
     outputs = (*old.outputs, *(f"sensed_{a}_dot" for a in plant.axes), *(f"tilt_{a}" for a in plant.axes))

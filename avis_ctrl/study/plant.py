@@ -29,7 +29,7 @@ from avis_ctrl.study.identified_uncertainty import RESPONSE, InDesign, in_design
 from avis_ctrl.uncertainty.blocks import ComplexFull
 from avis_ctrl.uncertainty.generalized_plant import Diagram, GeneralizedPlant
 from avis_ctrl.uncertainty.performance_weights import Band, ComplianceBound, ControlEffort, TransmissibilityBound
-from avis_ctrl.uncertainty.uncertain_rig import UncertainRig, uncertain_rig
+from avis_ctrl.uncertainty.uncertain_rig import Uncertain, UncertainRig, uncertain_rig
 from avis_ctrl.uncertainty.weight_base import Weight
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
@@ -94,8 +94,25 @@ class DesignPlant:
         return [f"{name}_command" for name in self.actuators]
 
 
-def build_plant(design: Design, rig: Rig) -> DesignPlant:
+@dataclass(frozen=True, eq=False)
+class Wiring:
+    """How a controller that exists is connected.
+
+    allocation : (n_u, n_axes) volts per newton of the actuators named. decoding : (n_axes, n_y) axis velocity by the
+    velocity along the sensors named; sensors that are not named are not read.
+    """
+
+    actuators: tuple[str, ...]
+    allocation: np.ndarray
+    sensors: tuple[str, ...]
+    decoding: np.ndarray
+
+
+def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Sequence[Uncertain] = ()) -> DesignPlant:
     """The generalized plant of a design.
+
+    wiring : of a controller that knows another rig; by default that for this one. fit : uncertain beside what the
+        design says.
 
     Raises
     ------
@@ -104,17 +121,23 @@ def build_plant(design: Design, rig: Rig) -> DesignPlant:
     """
     identified = _identified(design, rig)
     directions = identified.directions if identified else ()
-    uncertain = uncertain_rig(rig, [*design.uncertainty.of(rig), *directions], design.keep)
+    uncertain = uncertain_rig(rig, [*design.uncertainty.of(rig), *directions, *fit], design.keep)
     axes = uncertain.coordinates
     lever = np.array([rig.edge_m if name != axis else 1.0 for name, axis in zip(axes, design.keep, strict=True)])
     allocation = actuator_axes(rig, design.keep)
     # An edge force F at lever e is a moment F e.
     matrix = allocation.allocation * lever
+    if wiring is not None:
+        matrix = np.zeros_like(matrix)
+        matrix[[allocation.actuators.index(name) for name in wiring.actuators]] = wiring.allocation
     used = [k for k in range(len(allocation.actuators)) if np.any(np.abs(matrix[k]) > 1e-9 * np.abs(matrix).max())]
     actuators = tuple(allocation.actuators[k] for k in used)
     seen = sensing(rig, design.keep, design.loop.integrator_corner_Hz)
     decoder = seen.decoder
     decoding = decoder.decoding * lever[:, None]
+    if wiring is not None:
+        decoding = np.zeros_like(decoding)
+        decoding[:, [decoder.sensors.index(name) for name in wiring.sensors]] = wiring.decoding
     # Motion that each sensor measures per unit of the kept axes, rotations at the edge.
     rows = decoder.matrix[:, [COORDINATES.index(name) for name in design.keep]] / lever
 

@@ -17,6 +17,8 @@ from avis_ctrl.errors import ComputationError
 
 Exponents = tuple[int, ...]
 MatrixFunction = Callable[[np.ndarray], np.ndarray]
+# Share of an entry below which a coefficient is round-off: a few hundred operations make an entry.
+ROUND_OFF = 1e3 * np.finfo(float).eps
 
 
 def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float = 1e-11,
@@ -24,8 +26,8 @@ def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float =
     """Coefficients N_a of function(delta) = sum_a delta^a N_a, delta in [-1, 1]^n.
 
     Exponents go up to 2 in one parameter (3 where `cubic`: one that moves a mass and its position) and to 3 in all.
-    Entries smaller than `tolerance` times the largest variation are set to zero. A fresh random sample checks the
-    result.
+    Entries smaller than `tolerance` times the largest variation, or than the round-off of the function itself, are set
+    to zero. A fresh random sample checks the result.
 
     Raises
     ------
@@ -42,10 +44,12 @@ def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float =
     coefficients, *_ = np.linalg.lstsq(powers, values.reshape(len(samples), -1), rcond=None)
     # Each entry has its own unit: compare with the largest variation of that entry's row and column kind.
     size = np.max(np.abs(values), axis=0)
+    # An entry that hardly varies has the round-off of all that it is made of, which would pass for a dependence.
+    least = np.maximum(tolerance * size, ROUND_OFF * np.abs(base))
     found = {(0,) * n: base}
     for exponents, coefficient in zip(monomials, coefficients, strict=True):
         matrix = coefficient.reshape(base.shape)
-        matrix = np.where(np.abs(matrix) > tolerance * size, matrix, 0.0)
+        matrix = np.where(np.abs(matrix) > least, matrix, 0.0)
         if np.any(matrix):
             found[exponents] = matrix
     _check(function, found, rng.uniform(-1, 1, (5, n)), size)

@@ -119,7 +119,28 @@ class UncertainDirection:
         return max(1.0, share / largest)
 
 
-Uncertain = UncertainParameter | UncertainDirection
+@dataclass(frozen=True, eq=False)
+class UncertainEquation:
+    """The equation of motion of one coordinate, known to within delta times a row: one copy of delta.
+
+    change : (3 n + n_u,) what delta = 1 adds to the coordinate's row of N = [M, C, K, -T], of the kept coordinates,
+        rotations as displacement of the edge, and all actuators.
+    """
+
+    name: str
+    coordinate: str
+    change: np.ndarray
+
+    def half_ranges(self, nominal: Mapping[str, float]) -> dict[str, float]:
+        """Nothing: no physical parameter stands for one row alone."""
+        return {}
+
+    def words(self, delta: float, nominal: Mapping[str, float], units: Mapping[str, str]) -> str:
+        """Such as "fit 1 of z at +0.8"."""
+        return f"{self.name} at {delta:+.2g}"
+
+
+Uncertain = UncertainParameter | UncertainDirection | UncertainEquation
 
 
 @dataclass(frozen=True)
@@ -202,17 +223,23 @@ def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str]
     scale = np.array([1.0 / rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
     stretch = _stretches(parameters, nominal)
 
+    rows = {k: (list(keep).index(p.coordinate), p.change) for k, p in enumerate(parameters)
+            if isinstance(p, UncertainEquation)}
+
     def N(delta: np.ndarray) -> np.ndarray:
         values = _moved(parameters, delta * stretch, nominal)
-        return _stacked(rig.with_parameters(values).equations_of_motion() if values else equations, kept, scale)
+        found = _stacked(rig.with_parameters(values).equations_of_motion() if values else equations, kept, scale)
+        for k, (row, change) in rows.items():
+            found[row] += delta[k] * change
+        return found
 
     coefficients = {exponents: matrix / np.prod(stretch ** np.array(exponents, float))
                     for exponents, matrix in polynomial_coefficients(N, len(parameters), cubic=any(
                         isinstance(p, UncertainDirection) for p in parameters)).items()}
-    rows = _sensor_rows(rig, sensor_names, kept, scale)
+    seen = _sensor_rows(rig, sensor_names, kept, scale)
     names = tuple(edge_name(name) for name in keep)
     lft = _pull_out(coefficients, len(parameters))
-    system = _realise(lft, names, equations.actuators, rows, [p.name for p in parameters])
+    system = _realise(lft, names, equations.actuators, seen, [p.name for p in parameters])
     # A parameter of coordinates that are locked has no copy left.
     felt = [(p, copies) for p, copies in zip(parameters, lft.copies, strict=True) if copies]
     blocks = BlockStructure(tuple(RealScalar(copies, p.name) for p, copies in felt))
@@ -221,6 +248,8 @@ def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str]
 
 
 def _names(parameter: Uncertain) -> list[str]:
+    if isinstance(parameter, UncertainEquation):
+        return []
     return [name for name, _ in parameter.changes] if isinstance(parameter, UncertainDirection) else [parameter.name]
 
 

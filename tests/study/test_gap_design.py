@@ -28,7 +28,7 @@ from avis_ctrl.study.gap_design import (
     figures,
     start_files,
 )
-from avis_ctrl.study.gap_plant import carried, plant_of, six_dof_is_stable
+from avis_ctrl.study.gap_plant import carried, plant_of, six_dof_is_stable, wiring_of
 from avis_ctrl.study.identification_design import default_design
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.skyhooks import classical_skyhook
@@ -114,10 +114,44 @@ def test_the_controller_keeps_its_allocation(rig, baseline, design):
     plain, _, _ = plant_of(design, baseline)
     constant = rig.parameters()["actuator.Az1"].value
     stronger = replace(baseline, base=replace(baseline.base, rig=rig.with_parameters({"actuator.Az1": 2 * constant})))
-    plant, _, _ = plant_of(design, stronger, plain.allocation)
+    plant, _, _ = plant_of(design, stronger, wiring_of(plain, baseline))
     gained, _, _ = plant_of(design, with_one(baseline, "actuator_gain", "Az1", (2.0,)))
     assert same(response(plant), response(gained))
     assert not same(response(plant), response(plain), 1e-2)
+
+
+def test_the_controller_keeps_its_decoding(rig, design):
+    """Of a sensor that is elsewhere, turned and of another sensitivity: seen = decoding g rows of the new table times
+    its motion; with an effect (of no strength) the plant is put together in another way, and is the same."""
+    base = TableModel(ResponseModel.of(rig.with_channels_apart(), ("place.Sz2.y", "direction.Sz2.x", "sensor.Sz2")))
+    other = base.at(base.values * [1, 0, 1.03] + [0.02, 0.05, 0])
+    plain, moved_rig = plant_of(design, base)[0], other.effective.rig
+    plant, _, _ = plant_of(design, other, wiring_of(plain, base))
+    _, rows = moved_rig.sensor_rows()
+    gains = np.where(np.array(plain.sensors) == "Sz2", 1.03, 1.0)
+    mixing = (plain.decoding * gains) @ rows[:, [2, 3]] / np.array([1.0, rig.edge_m])
+    assert np.abs(mixing - np.eye(2)).max() > 0.01
+    inputs, outputs = list(plain.full.u), list(plain.full.y)
+    before = plain.full.P.select(outputs, inputs).frequency_response(OMEGA)
+    assert np.allclose(plant.full.P.select(outputs, inputs).frequency_response(OMEGA), mixing @ before, rtol=1e-9)
+    again, _, _ = plant_of(design, with_one(other, "mount_relaxation", "isolators z", (0.0, 3.0)),
+                           wiring_of(plain, base))
+    assert same(response(again), response(plant))
+
+
+def test_tolerances_bring_no_drive_and_no_copy_more(rig, design):
+    """A motor that is tilted within its tolerance is no further drive of yesterday's loop, and round-off of places
+    makes no stiffness enter squared."""
+    apart = rig.with_channels_apart()
+    names = [name for name in apart.parameters() if ".p_" in name or name.startswith(("com_", "direction.A"))]
+    base = TableModel(ResponseModel.of(apart, names))
+    other = base.at(base.values + 1e-3 * np.random.default_rng(3).standard_normal(len(names)))
+    plain = plant_of(design, base)[0]
+    plant, _, _ = plant_of(design, other, wiring_of(plain, base))
+    assert plant.actuators == plain.actuators
+    copies = {block.name: block.rows for block in plant.full.blocks.blocks}
+    assert copies.pop("mass") == 2  # its centre is off the middle
+    assert set(copies.values()) == {1}
 
 
 def moved(plant, size: float) -> np.ndarray:
@@ -207,7 +241,7 @@ def test_two_ways_to_the_same_limit_of_stability(rig, baseline, design):
 
     def stable(ms: float) -> tuple[bool, bool]:
         model = with_one(baseline, "loop_delay", "loop", (1e-3 * ms,))
-        plant, own, _ = plant_of(design, model, plain.allocation)
+        plant, own, _ = plant_of(design, model, wiring_of(plain, baseline))
         return plant.full.closed(K).is_stable(), six_dof_is_stable(own, model, plant, K)
 
     def limit(way: int) -> float:

@@ -14,7 +14,7 @@ from avis_ctrl.report.sections.transmissibility import asked_dB, upper_bound
 from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.model import ControllerResult, DesignResult
 from avis_ctrl.study.plant import EFFORT, DesignPlant
-from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection
+from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection, UncertainEquation
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
 ROLES = {"w": "disturbance", "z": "performance", "u": "command", "y": "measurement", "internal": "internal",
@@ -69,6 +69,8 @@ def _blocks(result: DesignResult) -> Table:
         if isinstance(one := real.get(block.name), UncertainDirection):
             spread = f"{len(one.changes)} parameters together, see the table"
             meaning = "direction in which the identified parameters are uncertain"
+        elif isinstance(one, UncertainEquation):
+            spread, meaning = "a row of the equations", f"what a fit leaves uncertain of the equation of {one.coordinate}"
         elif block.name == RESPONSE:
             spread, meaning = "|W| of the weight", "error of the identified model's response, of any phase"
         elif one is not None:

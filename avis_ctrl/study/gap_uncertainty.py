@@ -1,0 +1,283 @@
+"""What the covariance of a fit leaves uncertain of a table, as a few real blocks of a plant, and what these leave out.
+
+    theta = theta_0 + S z,  z standard normal in r numbers;   row a of N = [M, C, K, -T]:  n_a = n_a0 + z' Q_a
+
+For the equation of each coordinate a, z is turned so that its first number changes the response most, by that equation
+alone, its second most of what is left, and so on. Multiples of the equations, added to one, change nothing. The fewest
+of all these become blocks |delta| <= 1, one copy each: no product of changes enters, and no scaling is a matrix. What
+is left out is less than a share of the dynamics that the design takes for unknown anyway. It is not in the plant; its
+size is stated.
+
+Coverage: the numbers of all equations, each within k standard deviations with probability p^(1/(r n)), hold together
+with probability p or more, however correlated (Sidak 1967), where the errors of the fit are normal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm
+
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.directions import (
+    NEGLIGIBLE,
+    KeptMatrices,
+    kept_matrices,
+    matrix_slopes,
+    relative_changes,
+)
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.plant import Wiring
+from avis_ctrl.uncertainty.uncertain_rig import UncertainEquation
+from avis_ctrl.uncertainty.weights import NeglectedDynamics
+
+
+@dataclass(frozen=True)
+class FitUncertaintySettings:
+    """When a combination of parameters needs a block.
+
+    left_out : share of the drives' neglected dynamics that all combinations without a block may add up to: a loop that
+        bears those bears a tenth more of them, and mu hardly rises.
+    without_dynamics : share of the response instead, for a design that declares no neglected dynamics.
+    band_Hz, points : where the response is judged: the range of transmissibility, dense against the modes' width.
+    alike : combinations of drives that move the table by less than this share of the strongest one stand for no sensor:
+        drives side by side would push against each other by many times their force, to make up for a tilt.
+    draws : tables from the covariance on which products of changes are looked at.
+    """
+
+    left_out: float = 0.1
+    without_dynamics: float = NEGLIGIBLE
+    band_Hz: tuple[float, float] = (0.1, 100.0)
+    points: int = 200
+    alike: float = 0.02
+    draws: int = 64
+
+    @property
+    def omega(self) -> np.ndarray:
+        """(n,) rad/s."""
+        return 2 * np.pi * np.geomspace(*self.band_Hz, self.points)
+
+
+SETTINGS = FitUncertaintySettings()
+
+
+@dataclass(frozen=True, eq=False)
+class FitUncertainty:
+    """Blocks of a fit, and what they leave out, all relative to the response at omega (n,) [rad/s].
+
+    Attributes
+    ----------
+    design : whose ranges are beside them. blocks : for `plant_of`. effect : (q,) largest change of the response
+        by each at delta = 1.
+    n_parameters : of the covariance that no range of the design holds. confidence : p of all numbers together.
+    rest, rest_floor : (n,) bound on what has no block, of the response to drives and to the floor.
+    elsewhere : (n,) bound on what the plant's equations do not hold of the response from drives to what the controller
+        sees, on all six coordinates: by the dynamics of sensors, by effects, through coordinates that are locked.
+    products : largest change by products of changes, of tables drawn from the covariance.
+    dynamics : (n,) neglected dynamics of the design's drives.
+    """
+
+    design: Design
+    blocks: tuple[UncertainEquation, ...]
+    effect: np.ndarray
+    n_parameters: int
+    confidence: float
+    omega: np.ndarray
+    rest: np.ndarray
+    rest_floor: np.ndarray
+    elsewhere: np.ndarray
+    products: float
+    dynamics: np.ndarray
+
+    def to_json(self) -> dict[str, Any]:
+        """Figures, shares of the response."""
+        return {"confidence": self.confidence, "parameters": self.n_parameters,
+                "blocks": {one.name: float(size) for one, size in zip(self.blocks, self.effect, strict=True)},
+                "left_out_drives": float(np.max(self.rest)), "left_out_floor": float(np.max(self.rest_floor)),
+                "left_out_over_neglected_dynamics": float(np.max(self.rest / self.dynamics)),
+                "products": self.products, "not_in_equations": float(np.max(self.elsewhere))}
+
+    def sentences(self) -> tuple[str, str]:
+        """What is uncertain, and what of it has no block."""
+        own = self.to_json()
+        sizes = ", ".join(f"{name} {_percent(size)}" for name, size in own["blocks"].items())
+        blocks = f"{len(self.blocks)} real blocks that change the response by at most {sizes}" if sizes else \
+            "too little for a block of its own"
+        share = f" ({_percent(own['left_out_over_neglected_dynamics'])} of the drives' neglected dynamics)"
+        return (f"Uncertain in every loop: the {self.n_parameters} parameters of the fit at "
+                f"{_percent(self.confidence)}, {blocks}. "
+                "What changes after the measurement is not in it: for that, give a design with ranges.",
+                f"Left out of the loops: combinations of parameters that change the response to the drives by at most "
+                f"{_percent(own['left_out_drives'])}{share} and that to the floor by at most "
+                f"{_percent(own['left_out_floor'])}; products of changes, {_percent(own['products'])} in tables drawn; "
+                f"what sensors, effects and locked coordinates add, at most {_percent(own['not_in_equations'])}, those "
+                "parameters not looked at whose effect depends on amplitude.")
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"
+
+
+def fit_uncertainty(design: Design, model: TableModel, covariance: np.ndarray, wiring: Wiring,
+                    settings: FitUncertaintySettings = SETTINGS) -> FitUncertainty:
+    """The uncertainty of a fit, beside the ranges that a design has itself.
+
+    Parameters
+    ----------
+    model : at the estimate. covariance : (n_p, n_p) of `model.names`, in their units.
+    wiring : of the controller, by whose axes the response is judged.
+    """
+    rig, omega, confidence = model.effective.rig, settings.omega, design.uncertainty.confidence_percent / 100
+    ranged = {one.name for one in design.uncertainty.of(rig)}
+    free = [k for k, name in enumerate(model.names) if name not in ranged]
+    names, S = [model.names[k] for k in free], _root(covariance[np.ix_(free, free)])
+    own = [k for k, name in enumerate(names) if name in rig.parameters()]
+    base, slopes = kept_matrices(rig, design.keep), matrix_slopes(rig, [names[k] for k in own], design.keep)
+    felt = [(k, slope) for k, slope in zip(own, slopes, strict=True) if any(np.any(part) for part in slope)]
+    held, others = [k for k, _ in felt], [k for k in range(len(names)) if k not in dict(felt)]
+    dynamics, allowed = _allowed(design, omega, settings)
+    actuators = list(rig.equations_of_motion().actuators)
+    A = np.zeros((len(actuators), len(base[0])))
+    A[[actuators.index(name) for name in wiring.actuators]] = wiring.allocation
+    seen, inside = _seen(model, names, wiring, omega), np.zeros((len(names), len(omega), *base[0].shape), complex)
+    inside[held] = relative_changes(base, [slope for _, slope in felt], omega, A)[0]
+    # A sensor that reads more is to the loop a drive that pushes harder: the records told their product only.
+    drives = [k for k in held if names[k] in {f"actuator.{name}" for name in wiring.actuators}]
+    alike = _nearest(inside[drives] / allowed[:, None, None], seen[others] / allowed[:, None, None],
+                     settings.alike)
+    inside[others] = np.tensordot(alike, inside[drives], 1)
+    elsewhere = _box(_turned(np.tensordot(S.T, seen - inside, 1)), confidence)
+    root = S.copy()
+    root[drives] += alike.T @ S[others]
+    k, n_u = len(base[0]), len(A)
+    Q = np.reshape([np.hstack([*slope[:3], -slope[3]]) for _, slope in felt], (len(held), k, 3 * k + n_u))
+    blocks, effect, rest, rest_floor = _by_equation(base, np.tensordot(root[held].T, Q, 1), design.keep, A, omega,
+                                                    allowed, confidence)
+    products = _products(rig, [names[k] for k in held], S[held], [slope for _, slope in felt], base, design.keep,
+                         A, omega, settings)
+    return FitUncertainty(design, blocks, effect, len(free), confidence, omega, rest, rest_floor, elsewhere, products,
+                          dynamics)
+
+
+def _by_equation(base: KeptMatrices, Q: np.ndarray, keep: Sequence[str], A: np.ndarray, omega: np.ndarray,
+                 allowed: np.ndarray, confidence: float
+                 ) -> tuple[tuple[UncertainEquation, ...], np.ndarray, np.ndarray, np.ndarray]:
+    """Blocks, their effects, and bounds (n,) on what they leave; Q (r, k, 3 k + n_u) changes of N by each z."""
+    n, k, found = len(Q), len(keep), []
+    for a, name in enumerate(keep):
+        own = np.zeros_like(Q)
+        own[:, a] = Q[:, a]
+        driven, floor = relative_changes(base, [_split(one) for one in own], omega, A)
+        weighted = np.stack([driven, floor], axis=1) / allowed[:, None, None]
+        V = _rotation(weighted)
+        driven, floor, row = (np.tensordot(V, one, 1) for one in (driven, floor, Q[:, a]))
+        found += [(name, row[j], driven[j], floor[j]) for j in range(n)]
+    # Each number of each equation by itself.
+    box = _quantile(n * k, confidence)
+    sizes = [box * np.stack([np.linalg.norm(one, 2, axis=(1, 2)) for one in (driven, floor)])
+             for _, _, driven, floor in found]
+    order = sorted(range(len(sizes)), key=lambda j: -float(np.max(sizes[j] / allowed)))
+    left = np.reshape([sizes[j] for j in order[::-1]], (len(order), 2, len(omega)))
+    rests = np.concatenate([np.zeros((1, 2, len(omega))), np.cumsum(left, axis=0)])[::-1]
+    q = next(j for j, rest in enumerate(rests) if np.all(rest <= allowed))
+    count: dict[str, int] = {}
+    blocks = []
+    for j in order[:q]:
+        name, row, *_ = found[j]
+        count[name] = count.get(name, 0) + 1
+        blocks.append(UncertainEquation(f"fit {count[name]} of {name}", name, box * row))
+    return tuple(blocks), np.array([np.max(sizes[j]) for j in order[:q]]), rests[q][0], rests[q][1]
+
+
+def _split(N: np.ndarray) -> KeptMatrices:
+    """M, C, K, T of N (k, 3 k + n_u)."""
+    k = len(N)
+    return N[:, :k], N[:, k:2 * k], N[:, 2 * k:3 * k], -N[:, 3 * k:]
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """S (n, r) with S S^T the covariance, of rank r."""
+    sizes = np.sqrt(np.diag(covariance))
+    unit = np.where(sizes > 0, sizes, 1.0)
+    values, V = np.linalg.eigh(covariance / np.outer(unit, unit))
+    there = values > len(values) * np.finfo(float).eps * values[-1]
+    return sizes[:, None] * V[:, there] * np.sqrt(values[there])
+
+
+def _real(parts: np.ndarray) -> np.ndarray:
+    """(m, N) real numbers of complex responses (m, ...)."""
+    flat = parts.reshape(len(parts), int(np.prod(parts.shape[1:])))
+    return np.concatenate([flat.real, flat.imag], axis=1)
+
+
+def _nearest(basis: np.ndarray, parts: np.ndarray, weakest: float) -> np.ndarray:
+    """(n, m) smallest real combinations of m responses (m, ...) nearest to n others (n, ...), those of the m left out
+    that are less than a share of the strongest."""
+    return np.linalg.lstsq(_real(basis).T, _real(parts).T, rcond=weakest)[0].T
+
+
+def _rotation(parts: np.ndarray) -> np.ndarray:
+    """V (r, r), orthonormal: V parts has its largest response first, and the largest of what is left next."""
+    return np.linalg.eigh((J := _real(parts)) @ J.T)[1].T[::-1]
+
+
+def _turned(parts: np.ndarray) -> np.ndarray:
+    return np.tensordot(_rotation(parts), parts, 1)
+
+
+def _quantile(n: int, confidence: float) -> float:
+    """k with P(|x| <= k)^n = p of standard normal x."""
+    return float(norm.ppf((1 + confidence ** (1 / max(n, 1))) / 2))
+
+
+def _box(parts: np.ndarray, confidence: float) -> np.ndarray:
+    """(n,) bound on the gain of sum_i z_i parts_i (r, n, k, k) over a box of that probability."""
+    return _quantile(len(parts), confidence) * np.sum(np.linalg.norm(parts, 2, axis=(2, 3)), axis=0)
+
+
+def _allowed(design: Design, omega: np.ndarray, settings: FitUncertaintySettings) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) neglected dynamics of the drives, and what may be left out; of a design without them, shares of one."""
+    chains = design.uncertainty.actuator_chains
+    if chains is None:
+        return np.ones(len(omega)), np.full(len(omega), settings.without_dynamics)
+    dynamics = NeglectedDynamics(chains.low_percent / 100, chains.crossover_Hz, chains.high_percent / 100
+                                 ).magnitude(omega)
+    return dynamics, settings.left_out * dynamics
+
+
+def _seen(model: TableModel, names: Sequence[str], wiring: Wiring, omega: np.ndarray) -> np.ndarray:
+    """(n_p, n, k, k) relative change of the response from forces asked to velocities seen, on six coordinates, by some
+    parameters of a model per their units; zero by those of effects that depend on amplitude."""
+    model = replace(model, effects=tuple(one for one in model.effects if not one.effect.nonlinear))
+    sensors = list(model.sensors.names)
+    A = np.zeros((len(omega), len(model.inputs), wiring.allocation.shape[1]), complex)
+    A[:, [model.inputs.index(name) for name in wiring.actuators]] = wiring.allocation
+    D = np.zeros((len(wiring.decoding), len(sensors)))
+    D[:, [sensors.index(name) for name in wiring.sensors]] = wiring.decoding
+    answer = model.driven(omega, A)
+    rows = {name: k for k, name in enumerate(model.names)}
+    known = [k for k, name in enumerate(names) if name in rows]
+    Y = D @ answer.Y
+    found = np.zeros((len(names), *Y.shape), complex)
+    found[known] = np.linalg.solve(Y[None], D @ answer.dY[[rows[names[k]] for k in known]])
+    return found
+
+
+def _products(rig: Rig, names: Sequence[str], S: np.ndarray, slopes: Sequence[KeptMatrices], base: KeptMatrices,
+              keep: Sequence[str], A: np.ndarray, omega: np.ndarray, settings: FitUncertaintySettings) -> float:
+    """Largest relative change of tables drawn from the covariance beyond that in proportion to their parameters."""
+    known, beyond = rig.parameters(), []
+    if not names:
+        return 0.0
+    for z in np.random.default_rng(0).standard_normal((settings.draws, S.shape[1])):
+        change = S @ z
+        moved = rig.with_parameters({name: known[name].value + float(d) for name, d in zip(names, change, strict=True)})
+        M, C, K, T = (one - old - np.tensordot(change, np.array(slope), 1) for one, old, slope in
+                      zip(kept_matrices(moved, keep, rig.edge_m), base, zip(*slopes, strict=True), strict=True))
+        beyond.append((M, C, K, T))
+    return max(float(np.max(np.linalg.norm(one, 2, axis=(2, 3)))) for one in
+               relative_changes(base, beyond, omega, A))
