@@ -70,7 +70,8 @@ def _blocks(result: DesignResult) -> Table:
             spread = f"{len(one.changes)} parameters together, see the table"
             meaning = "direction in which the identified parameters are uncertain"
         elif isinstance(one, UncertainEquation):
-            spread, meaning = "a row of the equations", f"what a fit leaves uncertain of the equation of {one.coordinate}"
+            spread = "a row of the equations"
+            meaning = f"what a fit leaves uncertain of the equation of {one.coordinate}"
         elif block.name == RESPONSE:
             spread, meaning = "|W| of the weight", "error of the identified model's response, of any phase"
         elif one is not None:
