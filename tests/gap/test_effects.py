@@ -352,13 +352,15 @@ def test_reciprocity(name, place, values):
       [900.0, 0.05, 9.0, 11.0, 14.0, 10.0, 12.0, 13.0, 0.4, 0.5, 0.6, -0.45, -0.2]), False)])
 def test_derivatives_by_parameters_and_tolerances_are_those_of_differences(effect, relative):
     """Volts, floor and transient; an oblique sensor that reads against the chassis where nothing but the floor moves
-    it. Effects on mounts leave out that they move with an isolator's place."""
+    it. Effects on mounts leave out that they move with an isolator's place. The slope by a corner's tolerance is that
+    without the effect on the same corner: beside a large effect it is good to the effect's size only, and left out."""
     rig = RIG.with_channels_apart()
     if relative:
         one, *others = rig.instruments
         rig = replace(rig, instruments=(PositionSensorAt(one.name, one.position, (0.6, 0.0, 0.8), 3e3), *others))
+    same = ("corner.Sz1", "damping.Sz1") if effect and effect[0] == "geophone_corner" else ()
     free = [name for name in ResponseModel.of(rig, ()).all_parameters()
-            if name != "loop_delay_s" and not (effect and effect[0] == "base_compliance" and ".p_" in name)]
+            if name != "loop_delay_s" and name not in same and not (effect and effect[0] == "base_compliance" and ".p_" in name)]
     model = TableModel(ResponseModel.of(rig, free))
     if effect:
         model = with_effect(*effect, model)

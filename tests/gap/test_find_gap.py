@@ -34,22 +34,23 @@ def test_nothing_is_missing(seed):
     _, found = found_in(seed=seed, kind="none")
     assert found.gap.verdict == "none"
     assert found.gap.effects == ()
-    assert [stage.name for stage in found.gap.stages] == ["nominal", "re-identified"]
+    assert [stage.name for stage in found.gap.stages] == ["nominal", "re-identified", "tolerances"]
     assert found.gap.stages[1].chi2_per_dof < 1.21
     assert found.gap.next_experiment is None
     assert found.gap.where == ()
 
 
-# One of each family: seed, strength, duration, and the truth's name of the parameter by the report's.
-ONE = {"geophone_corner": (2, "clear", 20.0, {"corner_Hz": "corner_Hz"}),
+# One of each family: seed, strength (gross where a small departure is within tolerance), duration, and the truth's
+# name of the parameter by the report's.
+ONE = {"geophone_corner": (2, "gross", 20.0, {"corner_Hz": "corner_Hz"}),
        "mains_hum": (3, "clear", 20.0, {"frequency_Hz": "frequency_Hz", "amplitude_V": "amplitude_V"}),
-       "actuator_gain": (5, "clear", 20.0, {"gain": "gain"}),
+       "actuator_gain": (5, "gross", 20.0, {"gain": "gain"}),
        "actuator_lag": (6, "clear", 20.0, {"corner_Hz": "corner_Hz"}),
        "actuator_saturation": (7, "clear", 20.0, {"limit_V": "limit_V"}),
        "contact_friction": (9, "clear", 20.0, {}),  # each contact of its own: no one value is the true one
        "cable_stiffness": (13, "clear", 20.0, {}),  # one oblique direction: nine numbers of which the truth tells one
        "mount_relaxation": (12, "clear", 20.0, {"stiffness_ratio": "stiffness_ratio", "corner_Hz": "corner_Hz"}),
-       "product_of_inertia": (10, "clear", 20.0, {"Jxy_kgm2": "product_kgm2"})}
+       "product_of_inertia": (10, "gross", 20.0, {"Jxy_kgm2": "product_kgm2"})}
 
 
 @pytest.mark.slow

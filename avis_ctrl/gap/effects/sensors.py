@@ -68,9 +68,12 @@ class GeophoneCorner(_OfSensor):
                 EffectParameter("damping", "1", "damping ratio of the suspension", z, z / 5, 5 * z, z))
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        k = ops.sensor(place)
-        assumed = second_order(ops.s, *suspensions(ops.base.rig)[place])
-        ops.sense[:, k] *= assumed / second_order(ops.s, values["corner_Hz"], values["damping"])
+        # Times the corner as it is within its tolerance: to first order both are the same parameter wherever that is.
+        k, (f, z) = ops.sensor(place), suspensions(ops.base.rig)[place]
+        own = ops.base.sensors.suspensions
+        f_own, z_own = (own[k] if own else None) or (f, z)
+        changed = second_order(ops.s, f_own * values["corner_Hz"] / f, z_own * values["damping"] / z)
+        ops.sense[:, k] *= second_order(ops.s, f_own, z_own) / changed
 
 
 @register
