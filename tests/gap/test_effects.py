@@ -360,7 +360,8 @@ def test_derivatives_by_parameters_and_tolerances_are_those_of_differences(effec
         rig = replace(rig, instruments=(PositionSensorAt(one.name, one.position, (0.6, 0.0, 0.8), 3e3), *others))
     same = ("corner.Sz1", "damping.Sz1") if effect and effect[0] == "geophone_corner" else ()
     free = [name for name in ResponseModel.of(rig, ()).all_parameters()
-            if name != "loop_delay_s" and name not in same and not (effect and effect[0] == "base_compliance" and ".p_" in name)]
+            if name != "loop_delay_s" and name not in same
+            and not (effect and effect[0] == "base_compliance" and ".p_" in name)]
     model = TableModel(ResponseModel.of(rig, free))
     if effect:
         model = with_effect(*effect, model)
