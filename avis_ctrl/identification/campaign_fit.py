@@ -365,7 +365,7 @@ def _within_tolerances(campaign: Campaign, model: ResponseModel, band_Hz: tuple[
         blocks = noise_from_residuals(first.residuals, blocks, model=first.model)
     levels = {one.name: group[0].level_V for group in of_one_level(
         [record.header for record in campaign.records], lambda header: ("", header.level_V)) for one in group}
-    begun = begin(replace(first.model, turning=turning), model, without(blocks, added), levels, tolerances, priors)
+    begun = begin(replace(first.model, turning=turning), without(blocks, added), levels, tolerances, priors)
     say(f"with {int(np.sum(~begun.flat))} tolerances of the rig file: {begun.fitted.iterations} iterations")
     linear = without(blocks, [one[0] for one in terms(campaign, blocks, begun.fitted.model)])
     ended = end(begun, linear, levels)

@@ -12,8 +12,9 @@ class FitSettings:
     stiffness_percent : prior standard deviation of mass, moments of inertia and stiffnesses [%]; a rig file is drawn
         from scales and data sheets.
     damping_percent : the same of dampings [%], which data sheets hardly state.
-    unknown_percent : the same of what a user identifies without saying what is known of it [%]: no information to
-        speak of, and no step of a fit to a value that nothing has.
+    unknown_percent : standard deviation [%] about where a fit begins, of parameters of which nothing is stated: far
+        more than data leave open of what they determine, and little enough that the rest stays where it was (Levenberg
+        and Marquardt's damping, as a prior).
     lines : spectral lines of a record that are fitted; with 8 drives and 6 sensors the response needs about 100, and
         twice as many make the estimate of the unexplained part precise.
     final_lines : the same at the end of an identification, where lines only add precision; with more than these
@@ -38,7 +39,7 @@ class FitSettings:
 
     stiffness_percent: float = 5.0
     damping_percent: float = 20.0
-    unknown_percent: float = 100.0
+    unknown_percent: float = 10.0
     lines: int = 200
     final_lines: int = 800
     final_rounds: int = 3

@@ -86,8 +86,8 @@ def beside(model: ResponseModel, names: Sequence[str], tolerances: Tolerances) -
 
 def identified(model: ResponseModel, stated: Mapping[str, tuple[float, float]], settings: FitSettings = SETTINGS
                ) -> Priors:
-    """The free parameters of a model: as stated (mean, standard deviation), otherwise so broad about the present values
-    that only what the data do not determine feels it."""
+    """The free parameters of a model: as stated (mean, standard deviation), otherwise about their present values, and
+    so broadly that only what the data do not determine feels it."""
     mean, scale = model.values.copy(), model.scales()
     sigma = settings.unknown_percent / 100 * scale
     for name, (value, deviation) in stated.items():

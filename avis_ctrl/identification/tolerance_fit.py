@@ -30,24 +30,24 @@ from avis_ctrl.rigs.instruments import Tolerances
 
 
 class ToleranceFit(NamedTuple):
-    """fitted : parameters and tolerances. flat : (n,) which have a prior that stands for none."""
+    """fitted : parameters and tolerances. flat : (n,) which have a prior that stands for none, about where their fit
+    began."""
 
     fitted: Fitted
     flat: np.ndarray
 
 
-def begin(model: ResponseModel, nominal: ResponseModel, blocks: Sequence[SpectralBlock], levels: Mapping[str, float],
-          tolerances: Tolerances, stated: Mapping[str, Prior], settings: FitSettings = SETTINGS) -> ToleranceFit:
+def begin(model: ResponseModel, blocks: Sequence[SpectralBlock], levels: Mapping[str, float], tolerances: Tolerances,
+          stated: Mapping[str, Prior], settings: FitSettings = SETTINGS) -> ToleranceFit:
     """From parameters that were fitted with the rest as the file states it, on some lines of each block.
 
     Parameters
     ----------
-    model : where the fit begins; nominal : the rig file's values, about which the parameters are free.
-    levels : [V] by record. stated : (mean, standard deviation) of parameters that have a prior.
+    model : with these parameters free. levels : [V] by record. stated : (mean, standard deviation) of parameters that have a prior.
     """
     rig = model.rig.with_channels_apart()  # type: ignore[attr-defined]
     rest = beside(replace(model, rig=rig, names=()), model.names, tolerances)
-    priors = identified(nominal, stated, settings).followed_by(rest)
+    priors = identified(model, stated, settings).followed_by(rest)
     apart = replace(model, rig=rig, names=priors.names)
     data = _data(blocks, levels, settings.lines)
     flat = np.array([name in model.names and name not in stated for name in priors.names])
@@ -59,8 +59,10 @@ def end(begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[st
         settings: FitSettings = SETTINGS) -> ToleranceFit:
     """The same on more lines, which the precision of the parameters is worth."""
     one, data = begun.fitted, _data(blocks, levels, settings.final_lines)
+    priors = replace(one.priors, mean=np.where(begun.flat, one.priors.values(one.z), one.priors.mean))
     rounds = replace(settings, rounds=settings.final_rounds)
-    return begun._replace(fitted=fit(one.model, one.priors, one.z, data, one.variances, rounds))
+    found = fit(one.model, priors, np.where(begun.flat, 0.0, one.z), data, one.variances, rounds)
+    return begun._replace(fitted=found)
 
 
 def _data(blocks: Sequence[SpectralBlock], levels: Mapping[str, float], lines: int) -> Data:
