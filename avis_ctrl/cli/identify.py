@@ -170,7 +170,7 @@ def _prior(text: str) -> tuple[str, tuple[float, float]]:
 def _summary(console, found) -> None:
     from rich.table import Table
 
-    information = found.campaign_fit.fit.information
+    information = found.information
     loaded = " with its load" if getattr(found.rig, "load", None) else ""
     start = {name: one.value for name, one in found.campaign_fit.first.model.all_parameters().items()}
     start |= {name: one.value for name, one in found.start.parameters().items()}

@@ -10,8 +10,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from avis_ctrl.gap.detectable import detectable
 from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Effect, library
@@ -299,13 +297,8 @@ def _verdict(told: Sequence[NamedEffect], closed: bool, small: bool, left: Remai
 
 def _moved(fitted: Fitted) -> tuple[Tolerance, ...]:
     """Every value of the rig file with a tolerance, the most moved first."""
-    units = dict(zip(fitted.model.names, fitted.model.units, strict=True))
     known = re_identified(fitted.model.rig).names
-    values = fitted.priors.values(fitted.z)
-    std = np.sqrt(np.diag(fitted.covariance)) * fitted.priors.slopes(fitted.z)
-    rows = [Tolerance(name, float(values[k]), float(std[k]), float(fitted.z[k]), units[name])
-            for k, name in enumerate(fitted.priors.names) if "@" not in name and name not in known]
-    return tuple(sorted(rows, key=lambda one: -abs(one.moved)))
+    return fitted.moved([name for name in fitted.priors.names if "@" not in name and name not in known])
 
 
 def _next(told: Sequence[NamedEffect], fits: Fits, names: Names) -> str | None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar, cast
+from typing import cast
 
 import numpy as np
 
@@ -16,25 +16,22 @@ from avis_ctrl.identification.campaign_fit import (
     driven_inputs,
     excites_as_well,
     measured_noise,
+    of_one_level,
 )
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.prediction_error import prediction_error
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, record_block
+from avis_ctrl.identification.spectra import SpectralBlock, record_block, thinned
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 
-Item = TypeVar("Item")
-# Records at levels within this factor are of one level.
-SAME_LEVEL = 1.25
-# Lines of a record on which candidates are compared; the updated model is fitted to more (`analysis.FINAL_LINES`).
-THIN_LINES = 450
-# Below this [Hz] lie the resonances of a table: there no line is left out before the others.
-DENSE_BELOW_Hz = 8.0
 # Bands to the octave in which silent lines are weighted by what is left of them, and how often.
 PER_OCTAVE, WEIGHTINGS = 2, 4
 # Periods of a record from which the first one may be left to the transient.
 SETTLED = 3
+
+
+__all__ = ["Halves", "all_silent", "blocks_of", "divide", "of_one_level", "thinned", "with_noise"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,22 +41,6 @@ class Halves:
     fitted: Campaign
     held_out: Campaign
     how: str
-
-
-def of_one_level(items: Sequence[Item], told: Callable[[Item], tuple[str, float]]) -> list[list[Item]]:
-    """Items of one kind and level, within SAME_LEVEL of the lowest of a group, together; sorted by kind, then level.
-
-    told : kind and level of an item.
-    """
-    groups: list[list[Item]] = []
-    for item in sorted(items, key=told):
-        kind, level = told(item)
-        first = told(groups[-1][0]) if groups else None
-        if first and kind == first[0] and level <= SAME_LEVEL * first[1]:
-            groups[-1].append(item)
-        else:
-            groups.append([item])
-    return groups
 
 
 def divide(campaign: Campaign) -> Halves:
@@ -187,18 +168,3 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
         found = np.mean(np.abs(left.error) ** 2, axis=2)
         power = np.stack([(np.bincount(octave, one) / lines)[octave] for one in found.T], axis=1)
     return Residual(block, left.error, left.white, np.zeros_like(left.error))
-
-
-def thinned(block: SpectralBlock, lines: int = THIN_LINES, seed: int = 0) -> SpectralBlock:
-    """Some lines of a block: those that the input drives, dense where the resonances are, drawn above."""
-    n = len(block.omega)
-    if n <= lines:
-        return block
-    rng = np.random.default_rng((seed, n))
-    power = np.sum(np.abs(block.U) ** 2, axis=(1, 2))
-    driven = power > 1e-3 * np.max(power)
-    frequency = block.omega / (2 * np.pi)
-    # Equal numbers per octave above DENSE_BELOW_Hz, all the same below it.
-    weight = np.where(frequency < DENSE_BELOW_Hz, 1.0, DENSE_BELOW_Hz / frequency) * np.where(driven, 1.0, 0.05)
-    keep = np.argsort(rng.exponential(size=n) / weight)[:lines]
-    return block.lines(np.sort(keep))

@@ -10,6 +10,7 @@ import numpy as np
 
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.priors import Tolerance
 
 Verdict = Literal["none", "explained", "partly explained", "unexplained"]
 VERDICTS: tuple[str, ...] = ("none", "explained", "partly explained", "unexplained")
@@ -46,18 +47,6 @@ class NamedEffect:
                                for key, p in self.parameters.items()},
                 "probability": self.probability, "indistinguishable_from": list(self.indistinguishable_from),
                 **({} if self.share is None else {"share": self.share})}
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """A value of the rig file with a tolerance: its estimate and standard deviation, and how many tolerances it moved.
-    """
-
-    parameter: str
-    value: float
-    std: float
-    moved: float
-    unit: str = ""
 
 
 @dataclass(frozen=True)

@@ -243,9 +243,10 @@ class TableModel:
         fit's gradient need not know of them then. Where the corners of geophones have tolerances, no filter cancels a
         suspension exactly, and each rings, whatever the effects: 1/p and s/p, p its polynomial, take their place.
         """
-        own, s = self.base.sensor_transients(omega), 1j * omega
+        own, s = self.base.chains_ring(omega), 1j * omega
         if self.corners_differ:
-            return np.concatenate([own, self._suspensions_ring(omega)], axis=2)
+            ring = self._chain_ratio(omega)[:, :, None] * self.base.suspensions_ring(omega)
+            return np.concatenate([own, ring], axis=2)
         changed = self._changed_sensors
         if not changed.size:
             return own
@@ -254,18 +255,6 @@ class TableModel:
         for j, k in enumerate(changed):
             ringing[:, k, j] = np.stack([r[:, k], s * r[:, k], r[:, k] ** 2, s * r[:, k] ** 2], axis=-1)
         return np.concatenate([own, ringing.reshape(len(omega), r.shape[1], -1)], axis=2)
-
-    def _suspensions_ring(self, omega: np.ndarray) -> np.ndarray:
-        """(n, n_y, 2 n_g) transients of the suspensions of the n_g geophones, at the corners that their filters assume:
-        what a corner within its tolerance changes of them is of second order."""
-        s, r, sensors = 1j * omega, self._chain_ratio(omega), self.base.sensors
-        known = [(k, own) for k, own in enumerate(sensors.assumed) if own is not None]
-        found = np.zeros((len(omega), len(sensors.names), len(known), 2), complex)
-        for j, (k, (frequency, zeta)) in enumerate(known):
-            w = 2 * np.pi * frequency
-            ring = r[:, k] * w ** 2 / (s ** 2 + 2 * zeta * w * s + w ** 2)
-            found[:, k, j] = np.stack([ring, s / w * ring], axis=-1)
-        return found.reshape(len(omega), len(sensors.names), -1)
 
     @cached_property
     def _changed_sensors(self) -> np.ndarray:

@@ -4,23 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import cached_property
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import AvisError, InputError
+from avis_ctrl.identification.fit_settings import SETTINGS as FIT
+from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, Prior, fit
-from avis_ctrl.identification.noise import relative_noise, residual_noise
+from avis_ctrl.identification.noise import noise_from_residuals, relative_noise, residual_noise
 from avis_ctrl.identification.portion import Portion
+from avis_ctrl.identification.priors import Tolerance
 from avis_ctrl.identification.response import MOMENTS, ResponseModel
 from avis_ctrl.identification.second_order import chosen_turning, terms, without
-from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
+from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block, thinned
+from avis_ctrl.identification.tolerance_fit import as_likelihood_fit, begin, end
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import noise_covariance
+from avis_ctrl.rigs.instruments import Tolerances
 
 Progress = Callable[[str], None]
+Item = TypeVar("Item")
+# Records at levels within this factor are of one level.
+SAME_LEVEL = 1.25
 
 
 @dataclass(frozen=True)
@@ -96,6 +105,22 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
     return Split(replace(campaign, records=tuple(first for first, _ in parts)),
                  replace(campaign, records=tuple(last for _, last in parts)),
                  "the last third of every record held out, because too few records excite every input")
+
+
+def of_one_level(items: Sequence[Item], told: Callable[[Item], tuple[str, float]]) -> list[list[Item]]:
+    """Items of one kind and level, within SAME_LEVEL of the lowest of a group, together; sorted by kind, then level.
+
+    told : kind and level of an item.
+    """
+    groups: list[list[Item]] = []
+    for item in sorted(items, key=told):
+        kind, level = told(item)
+        first = told(groups[-1][0]) if groups else None
+        if first and kind == first[0] and level <= SAME_LEVEL * first[1]:
+            groups[-1].append(item)
+        else:
+            groups.append([item])
+    return groups
 
 
 def drive_power(record: RecordSource) -> np.ndarray:
@@ -258,6 +283,8 @@ class CampaignFit:
     for local models take some of the response's curvature for noise), and none otherwise. The held-out chi-square
     judges.
     start : the model before the fit. notes : sentences.
+    tolerances : values of the rig file that were fitted within their tolerance, the most moved first; they are among
+    the parameters of `fit`, and `first` is the fit that takes them for exact. Empty where they were not free.
     """
 
     fit: LikelihoodFit
@@ -266,18 +293,34 @@ class CampaignFit:
     notes: tuple[str, ...]
     start: ResponseModel
     measured: bool = True
+    tolerances: tuple[Tolerance, ...] = ()
+
+    @property
+    def model(self) -> ResponseModel:
+        """That of the fit with the identified parameters free, tolerances where the fit left them."""
+        return replace(self.fit.model, names=self.start.names)
+
+    @cached_property
+    def information(self) -> Information:
+        """Of the identified parameters, whatever the tolerances are."""
+        return self.fit.information.of_some(self.start.names) if self.tolerances else self.fit.information
 
 
 def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, band_Hz: tuple[float, float],
                  priors: Mapping[str, Prior] | None = None, starts: int = 1, seed: int = 1, reweights: int = 2,
-                 progress: Progress | None = None) -> CampaignFit:
+                 progress: Progress | None = None, tolerances: Tolerances | None = None) -> CampaignFit:
     """The most likely parameters, first with measured noise, then with the noise of the residuals.
+
+    tolerances : of the values of the rig file, which are fitted beside the parameters then; records of a rig whose
+        channels can be taken apart only.
 
     Raises
     ------
     InputError, ComputationError : as `fit`, `record_block`, `response_block`.
     """
     known = True
+    if tolerances is not None and isinstance(campaign, Campaign) and hasattr(model.rig, "with_channels_apart"):
+        return _within_tolerances(campaign, model, band_Hz, priors or {}, starts, seed, progress, tolerances)
     if isinstance(campaign, FrequencyResponse):
         blocks = [response_block(campaign.between(*band_Hz), model)]
         notes = [f"frequency responses: {campaign.method or 'as measured'}"]
@@ -305,6 +348,32 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
         if progress:
             progress(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
     return CampaignFit(replace(found, starts=first.starts), first, band_Hz, (*notes, *_bounds(found)), model, known)
+
+
+def _within_tolerances(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float],
+                       priors: Mapping[str, Prior], starts: int, seed: int, progress: Progress | None,
+                       tolerances: Tolerances) -> CampaignFit:
+    """First with the rig file taken for exact, then with every tolerance free."""
+    say = progress or (lambda text: None)
+    raw, notes = campaign_blocks(campaign, model, band_Hz)
+    every, said, known = weighted(raw, campaign, band_Hz)
+    blocks = [thinned(block, FIT.final_lines) for block in every]
+    few = [thinned(block, FIT.lines) for block in blocks]
+    first = fit(model, few, priors, starts, seed=seed, progress=progress)
+    turning, added = chosen_turning(campaign, blocks, first.model)
+    if not known:
+        blocks = noise_from_residuals(first.residuals, blocks, model=first.model)
+    levels = {one.name: group[0].level_V for group in of_one_level(
+        [record.header for record in campaign.records], lambda header: ("", header.level_V)) for one in group}
+    begun = begin(replace(first.model, turning=turning), without(blocks, added), levels, tolerances, priors)
+    say(f"with {int(np.sum(~begun.flat))} tolerances of the rig file: {begun.fitted.iterations} iterations")
+    linear = without(blocks, [one[0] for one in terms(campaign, blocks, begun.fitted.model)])
+    ended = end(begun, linear, levels)
+    say(f"on {FIT.final_lines} lines of each record: {ended.fitted.iterations} iterations")
+    found = as_likelihood_fit(ended, linear, first)
+    moved = ended.fitted.moved([name for name in found.model.names if name not in model.names])
+    notes = [*notes, said, f"{turning.sentence}: {_share(blocks, added)}"]
+    return CampaignFit(found, first, band_Hz, tuple(notes), model, known, moved)
 
 
 def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:

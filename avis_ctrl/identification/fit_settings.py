@@ -12,8 +12,14 @@ class FitSettings:
     stiffness_percent : prior standard deviation of mass, moments of inertia and stiffnesses [%]; a rig file is drawn
         from scales and data sheets.
     damping_percent : the same of dampings [%], which data sheets hardly state.
+    unknown_percent : standard deviation [%] about where a fit begins, of parameters of which nothing is stated: far
+        more than data leave open of what they determine, and little enough that the rest stays where it was (Levenberg
+        and Marquardt's damping, as a prior).
     lines : spectral lines of a record that are fitted; with 8 drives and 6 sensors the response needs about 100, and
         twice as many make the estimate of the unexplained part precise.
+    final_lines : the same at the end of an identification, where lines only add precision; with more than these
+        round-off of the path errors, and not the noise, is what remains.
+    final_rounds : `rounds` of that fit, which begins where the other ended.
     bands_per_octave : bands over which the relative error of a path counts as constant; a third of an octave is what a
         mode's flank takes to change by a factor of two.
     least_error : relative error of every path that nobody can exclude [1], the scale of its prior: cables, threads and
@@ -33,7 +39,10 @@ class FitSettings:
 
     stiffness_percent: float = 5.0
     damping_percent: float = 20.0
+    unknown_percent: float = 10.0
     lines: int = 200
+    final_lines: int = 800
+    final_rounds: int = 3
     bands_per_octave: int = 3
     least_error: float = 1e-3
     error_weight: float = 2.0

@@ -145,6 +145,16 @@ class Information:
         return Information(tuple(self.names[j] for j in keep), self.values[keep], tuple(self.units[j] for j in keep),
                            self.matrix[np.ix_(keep, keep)], self.scale[keep])
 
+    def of_some(self, names: Sequence[str]) -> Information:
+        """Of some of the parameters, whatever the others are (Schur complement)."""
+        keep = np.array([self.names.index(name) for name in names], int)
+        rest = np.setdiff1d(np.arange(len(self.names)), keep)
+        across = self.relative[np.ix_(keep, rest)]
+        left = self.relative[np.ix_(keep, keep)] - across @ np.linalg.solve(self.relative[np.ix_(rest, rest)], across.T)
+        scale = self.scale[keep]
+        return Information(tuple(names), self.values[keep], tuple(self.units[k] for k in keep),
+                           left / np.outer(scale, scale), scale)
+
     def _priors(self, deviations: Mapping[str, float]) -> np.ndarray:
         diagonal = np.zeros(len(self.names))
         for name, sigma in deviations.items():

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.errors import InputError
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.maximum_likelihood import block_residual, transient_unknowns
-from avis_ctrl.identification.priors import Priors
+from avis_ctrl.identification.priors import Priors, Tolerance
 from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.identification.weights import Group, Variances, Weights, bands, estimated, path_contributions, weigh
 
@@ -83,6 +84,15 @@ class Fitted:
         """Effects of the model but the second-order terms."""
         return tuple(self.model.labels)
 
+    def moved(self, names: Sequence[str]) -> tuple[Tolerance, ...]:
+        """Of values of the rig file that have a tolerance, the most moved first."""
+        units = dict(zip(self.model.names, self.model.units, strict=True))
+        values, std = self.priors.values(self.z), np.sqrt(np.diag(self.covariance)) * self.priors.slopes(self.z)
+        at = [self.priors.names.index(name) for name in names]
+        rows = [Tolerance(name, float(values[k]), float(std[k]), float(self.z[k]), units[name])
+                for name, k in zip(names, at, strict=True)]
+        return tuple(sorted(rows, key=lambda one: -abs(one.moved)))
+
     def covariance_of(self, names: Sequence[str]) -> np.ndarray:
         """(k, k) of some parameters in their units; zero for those that are not free."""
         slopes = self.priors.slopes(self.z)
@@ -123,11 +133,14 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
             size = 1.0
             while size > settings.shortest_step:
                 trial = z + size * step
-                moved = model.at(priors.values(trial))
-                own = _evaluate(moved, priors, trial, data, weights)
-                expansion = weights.normal_equations(own.J, own.e)
-                if expansion[2] + trial @ trial < cost + z @ z:
-                    break
+                try:
+                    moved = model.at(priors.values(trial))
+                    own = _evaluate(moved, priors, trial, data, weights)
+                    expansion = weights.normal_equations(own.J, own.e)
+                    if expansion[2] + trial @ trial < cost + z @ z:
+                        break
+                except InputError:
+                    pass  # no rig has these values: a shorter step
                 size /= 3
             else:
                 break

@@ -37,7 +37,7 @@ def continuous(model: ResponseModel, beside: bool = False) -> Continuous:
     """
     m, n_u, rows = model.matrices, len(model.actuators), model.matrices.R
     body = la.solve(m.M, np.hstack([-m.K, -m.C, m.K_floor[:, :3], m.T, m.C_floor[:, :3]]))
-    sensors, gains = model.sensors, model.sensors.sensitivity
+    sensors, gains = model.sensors.realised, model.sensors.sensitivity
     n_y, own = len(rows), chain_states(sensors)
     corner = 2 * np.pi * model.amplifier_corner_Hz if model.amplifier_corner_Hz else None
     n_a = n_u if corner else 0
@@ -132,7 +132,7 @@ class Predictor:
         model, m = self.model, self.model.matrices
         n_u, corner = len(model.actuators), model.amplifier_corner_Hz
         known = [one.name for one in model.rig.mounted_body().actuators]
-        first = chain_states(model.sensors)[-1].stop if corner else -1
+        first = chain_states(model.sensors.realised)[-1].stop if corner else -1
         body = la.solve(m.M, np.hstack([-m.K, -m.C, m.K_floor[:, :3], m.T, m.C_floor[:, :3]]))
         of_x, of_volts, of_floor = (np.ascontiguousarray(one) for one in
                                     (body[:, :15], body[:, 15:15 + n_u], body[:, 15 + n_u:]))

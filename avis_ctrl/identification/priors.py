@@ -9,7 +9,7 @@ import numpy as np
 
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.parameter_sets import default_parameters
-from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.response import ResponseModel, positive
 from avis_ctrl.rigs.instruments import Tolerances
 from avis_ctrl.rigs.rig import Rig
 
@@ -71,13 +71,41 @@ def re_identified(rig: Rig, settings: FitSettings = SETTINGS) -> Priors:
 
 def with_tolerances(model: ResponseModel, tolerances: Tolerances, settings: FitSettings = SETTINGS) -> Priors:
     """The same and every value of the rig file that has a tolerance; the model has its channels apart."""
-    first, known = re_identified(model.rig, settings), model.all_parameters()
-    rest = {name: sigma for name in known if name not in first.names and (sigma := _sigma(name, tolerances))}
+    first = re_identified(model.rig, settings)
+    return first.followed_by(beside(model, first.names, tolerances))
+
+
+def beside(model: ResponseModel, names: Sequence[str], tolerances: Tolerances) -> Priors:
+    """Every value of the rig file that has a tolerance, but for `names`; the model has its channels apart."""
+    known = model.all_parameters()
+    rest = {name: sigma for name in known if name not in names and (sigma := _sigma(name, tolerances))}
     mean = np.array([known[name].value for name in rest])
-    relative = np.array([name.partition(".")[0] in _RELATIVE for name in rest])
-    own = np.array(list(rest.values()))
-    return Priors((*first.names, *rest), np.concatenate([first.mean, mean]), np.concatenate([first.sigma, own]),
-                  np.concatenate([first.positive, relative]))
+    relative = np.array([name.partition(".")[0] in _RELATIVE for name in rest], bool)
+    return Priors(tuple(rest), mean, np.array(list(rest.values())), relative)
+
+
+def identified(model: ResponseModel, stated: Mapping[str, tuple[float, float]], settings: FitSettings = SETTINGS
+               ) -> Priors:
+    """The free parameters of a model: as stated (mean, standard deviation), otherwise about their present values, and
+    so broadly that only what the data do not determine feels it."""
+    mean, scale = model.values.copy(), model.scales()
+    sigma = settings.unknown_percent / 100 * scale
+    for name, (value, deviation) in stated.items():
+        mean[model.names.index(name)], sigma[model.names.index(name)] = value, deviation
+    above = np.array([positive(name) for name in model.names], bool) & (mean > 0)
+    return Priors(model.names, mean, np.where(above, sigma / np.abs(np.where(mean == 0, 1.0, mean)), sigma), above)
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """A value of the rig file with a tolerance: its estimate and standard deviation, and how many tolerances it moved.
+    """
+
+    parameter: str
+    value: float
+    std: float
+    moved: float
+    unit: str = ""
 
 
 def tolerances_of(rig: Rig) -> Tolerances:

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, wraps
+from itertools import zip_longest
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
@@ -25,7 +26,9 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
 from avis_ctrl.identification.sampling import Motion, aliases, hold
+from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.geophone import second_order_roots
 from avis_ctrl.rigs.rig import Parameter, Rig
 
 if TYPE_CHECKING:
@@ -100,6 +103,16 @@ class SensorModel:
         w = 2 * np.pi * f
         den = s ** 2 + 2 * z * w * s + w ** 2
         return -2 * np.pi * (2 * z * s + 2 * w) / den, -2 * w * s / den
+
+    @property
+    def realised(self) -> SensorModel:
+        """The same with every suspension that its filter does not match as part of the sensor's chain."""
+        chains = []
+        for chain, known, own in zip_longest(self.chains, self.assumed, self.suspensions):
+            if chain is not None and known and own and known != own:
+                chain = cascade(second_order_roots(*known), second_order_roots(*own), 1.0) @ chain
+            chains.append(chain)
+        return replace(self, chains=tuple(chains), assumed=self.suspensions)
 
     def picked(self, index: Sequence[int]) -> SensorModel:
         """The sensors at `index` (from the first), in that order; an index may come again."""
@@ -430,6 +443,25 @@ class ResponseModel:
         return self.driven(block.omega, U, derivative)
 
     def sensor_transients(self, omega: np.ndarray) -> np.ndarray:
+        """(n, n_y, n_t): what the ends of a record leave in the sensors: in their chains, and in the suspensions of
+        geophones whose corners are free, for no filter cancels these exactly then."""
+        own = self.chains_ring(omega)
+        if not any(name.startswith("corner.") for name in self.names):
+            return own
+        return np.concatenate([own, self.suspensions_ring(omega)], axis=2)
+
+    def suspensions_ring(self, omega: np.ndarray) -> np.ndarray:
+        """(n, n_y, 2 m) transients 1/p and s/p of the suspensions of m geophones, p the polynomial of each, at the
+        corner that its filter assumes: what a corner within its tolerance changes of them is of second order."""
+        s, known = 1j * omega, [(k, own) for k, own in enumerate(self.sensors.assumed) if own is not None]
+        found = np.zeros((len(omega), len(self.sensors.names), len(known), 2), complex)
+        for j, (k, (corner, damping)) in enumerate(known):
+            w = 2 * np.pi * corner
+            ring = w ** 2 / (s ** 2 + 2 * damping * w * s + w ** 2)
+            found[:, k, j] = np.stack([ring, s / w * ring], axis=-1)
+        return found.reshape(*found.shape[:2], -1)
+
+    def chains_ring(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y, n_t): `chain_transients` of each sensor."""
         each, start = self.chain_transients(1j * omega), 0
         found = np.zeros((len(omega), len(each), sum(own.shape[1] for own in each)), complex)

@@ -20,6 +20,11 @@ from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.response import GRAM_TOLERANCE
 
+# Lines of a record on which models are compared.
+THIN_LINES = 450
+# Below this [Hz] lie the resonances of a table: there no line is left out before the others.
+DENSE_BELOW_Hz = 8.0
+
 
 @dataclass(frozen=True, eq=False)
 class SpectralBlock:
@@ -214,3 +219,18 @@ def span(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     U, s, Vt = np.linalg.svd(R)
     kept = s > DEPENDENT * s[0]
     return Q @ U[:, kept], Vt[kept].T / s[kept]
+
+
+def thinned(block: SpectralBlock, lines: int = THIN_LINES, seed: int = 0) -> SpectralBlock:
+    """Some lines of a block: those that the input drives, dense where the resonances are, drawn above."""
+    n = len(block.omega)
+    if n <= lines:
+        return block
+    rng = np.random.default_rng((seed, n))
+    power = np.sum(np.abs(block.U) ** 2, axis=(1, 2))
+    driven = power > 1e-3 * np.max(power)
+    frequency = block.omega / (2 * np.pi)
+    # Equal numbers per octave above DENSE_BELOW_Hz, all the same below it.
+    weight = np.where(frequency < DENSE_BELOW_Hz, 1.0, DENSE_BELOW_Hz / frequency) * np.where(driven, 1.0, 0.05)
+    keep = np.argsort(rng.exponential(size=n) / weight)[:lines]
+    return block.lines(np.sort(keep))

@@ -31,8 +31,10 @@ from avis_ctrl.identification.excited_space import excited_space
 from avis_ctrl.identification.experiment_plan import needed_experiment
 from avis_ctrl.identification.experiments import Drive, campaign_noise
 from avis_ctrl.identification.identifiability import IdentifiabilityReport, identifiability_report
+from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.maximum_likelihood import Prior
 from avis_ctrl.identification.parameter_sets import default_parameters, named_parameters
+from avis_ctrl.identification.priors import tolerances_of
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.validation import Validation, validate
 from avis_ctrl.measurement.campaign import Campaign, digest
@@ -100,6 +102,11 @@ class Identification:
     def model(self) -> ResponseModel:
         return self.campaign_fit.fit.model
 
+    @property
+    def information(self) -> Information:
+        """Of the identified parameters, whatever the tolerances are."""
+        return self.campaign_fit.information
+
 
 def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions | None = None,
              progress: Progress = lambda text: None) -> Identification:
@@ -125,15 +132,16 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
             progress(amplifier_words(model.amplifier_corner_Hz, options.amplifier_corner_Hz))
         progress(f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
                  + (f"; {split.how}" if split else ""))
-        found = fit_campaign(fitted, model, band, options.priors, options.starts, options.seed, progress=progress)
-        far = far_from_file(model, found.fit)
+        found = fit_campaign(fitted, model, band, options.priors, options.starts, options.seed, progress=progress,
+                             tolerances=tolerances_of(rig))
+        far = far_from_file(model, found.information)
         for sentence in far:
             progress(f"  warning: {sentence}")
         found = replace(found, notes=(*far, *found.notes, *([unplayed] if unplayed else [])))
         floor = any(block.block.kind == "floor measured" for block in found.fit.residuals)
-        report = identifiability_report(found.fit.information, found.fit.model, floor,
-                                        {name: sigma for name, (_, sigma) in found.fit.priors.items()})
-        progress(f"the data determine {found.fit.information.rank} of {len(model.names)} combinations of parameters")
+        report = identifiability_report(found.information, found.model, floor,
+                                        {name: sigma for name, (_, sigma) in options.priors.items()})
+        progress(f"the data determine {found.information.rank} of {len(model.names)} combinations of parameters")
         advice = _advice(found, fitted, report, progress)
         kalman, note = _kalman(split.fitted if split else measured, rig, model.names, options, progress)
         progress("validation on held-out data")
@@ -231,8 +239,8 @@ def _divided_lines(measured: FrequencyResponse) -> tuple[FrequencyResponse, Freq
 def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, report: IdentifiabilityReport,
             progress: Progress) -> tuple[str, ...]:
     """What another record like the fitted ones would bring, or one of another kind."""
-    model = found.fit.model
-    if found.fit.information.rank == len(model.names) or not isinstance(fitted, Campaign):
+    model = found.model
+    if found.information.rank == len(model.names) or not isinstance(fitted, Campaign):
         return ()
     progress("searching for a further record that would determine the rest")
     driven = [record.header for record in fitted.records if record.header.level_V > 0]
@@ -241,7 +249,7 @@ def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, report: Id
     level = float(np.mean([h.level_V for h in driven]))
     try:
         drive = Drive(level, sum(h.duration_s for h in driven), found.band_Hz)
-        return needed_experiment(found.fit.information, model, drive, campaign_noise(
+        return needed_experiment(found.information, model, drive, campaign_noise(
             [one.block for one in found.fit.residuals]), report=report)
     except AvisError as error:
         return (f"No advice on further records: {error}",)

@@ -79,7 +79,7 @@ def design_start(found: Identification, template: Path | Design | None = None) -
     """
     design = _template(found, template)
     spread = measured_spread(found, tuple(design.keep))
-    content = uncertainty_content(found.rig, found.campaign_fit.fit.information, [spread], found.provenance)
+    content = uncertainty_content(found.rig, found.information, [spread], found.provenance)
     made = in_design(content, found.rig, design.keep, design.uncertainty.confidence_percent / 100)
     text = identification_design(content, design, found.rig)
     if template is None:

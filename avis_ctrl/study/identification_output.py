@@ -15,7 +15,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
 from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
 from avis_ctrl.identification.prediction import Predictor, model_inputs
-from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.response import ResponseModel, SensorModel
 from avis_ctrl.measurement.campaign import Campaign, ranges
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.rigs.avis import AvisTable
@@ -57,7 +57,7 @@ def require_readable(found: Identification) -> None:
 
 def identified_toml(found: Identification) -> str:
     """The rig file of an identification: each identified value with its standard deviation beside it."""
-    information = found.campaign_fit.fit.information
+    information = found.information
     known, start = found.rig.parameters(), found.start.parameters()
     comments = {}
     for name, sigma in zip(information.names, information.standard_deviation, strict=True):
@@ -75,7 +75,7 @@ def identified_toml(found: Identification) -> str:
 
 def result_dict(found: Identification) -> dict[str, Any]:
     """What programs read: numbers without a report."""
-    fit, information = found.campaign_fit.fit, found.campaign_fit.fit.information
+    fit, information = found.campaign_fit.fit, found.information
     start = found.start.parameters()
     rows = {}
     for name, value, sigma, unit in zip(information.names, information.values, information.standard_deviation,
@@ -98,6 +98,9 @@ def result_dict(found: Identification) -> dict[str, Any]:
                    "records": list(f.records)} for f in found.findings],
         "unit_of_y": found.model.sensors.unit, "amplifier_corner_Hz": found.model.amplifier_corner_Hz,
         "turning": found.model.turning._asdict(),
+        "tolerances": [{"parameter": one.parameter, "value": one.value, "std": one.std, "unit": one.unit,
+                        "tolerances_moved": one.moved} for one in found.campaign_fit.tolerances],
+        "suspensions": {name: list(own) for name, own in detuned(found.model.sensors).items()},
         "provenance": dict(found.provenance), "seconds": found.seconds}
 
 
@@ -110,11 +113,41 @@ def write_identification(found: Identification, folder: Path, html: bytes | None
                           [folder / name for name in FILES])
 
 
+def detuned(sensors: SensorModel) -> dict[str, tuple[float, float]]:
+    """Corner [Hz] and damping ratio of the geophones that their filters do not match: a rig file has no place for them.
+    """
+    known = zip(sensors.names, sensors.suspensions, sensors.assumed, strict=False)
+    return {name: own for name, own, assumed in known if own is not None and own != assumed}
+
+
 def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:
     """Rig in an identification's folder, the corner of its amplifiers, and which axes turn with the payload.
 
     Raises InputError where the folder holds no identification, or half of one.
     """
+    result, path = _result(folder), folder / RESULT_FILE
+    turning = result.get("turning", AS_SIMULATED._asdict())
+    try:
+        turns = Turning(float(turning["motors"]), float(turning["sensors"]))
+    except (KeyError, TypeError, ValueError):
+        raise InputError("expected numbers motors and sensors", file=path, field="turning", value=turning) from None
+    rig = load_rig(folder / RIG_FILE, bool(result.get("loaded")), check=False)
+    return rig, result.get("amplifier_corner_Hz"), turns
+
+
+def _suspended(model: ResponseModel, folder: Path) -> ResponseModel:
+    """The model with its geophones' suspensions as an identification found them. Raises InputError as above."""
+    known = _result(folder).get("suspensions", {})
+    try:
+        own = tuple((float(known[name][0]), float(known[name][1])) if name in known else old
+                    for name, old in zip(model.sensors.names, model.sensors.suspensions, strict=False))
+    except (KeyError, IndexError, TypeError, ValueError):
+        raise InputError("expected corner and damping ratio by name", file=folder / RESULT_FILE, field="suspensions",
+                         value=known) from None
+    return replace(model, sensors=replace(model.sensors, suspensions=own))
+
+
+def _result(folder: Path) -> dict[str, Any]:
     path = folder / RESULT_FILE
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
@@ -126,13 +159,7 @@ def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:
     if not isinstance(result, dict) or result.get("format") != "avis-identification":
         raise InputError("expected the result of avis identify", file=path, field="format",
                          value=result.get("format") if isinstance(result, dict) else type(result).__name__)
-    turning = result.get("turning", AS_SIMULATED._asdict())
-    try:
-        turns = Turning(float(turning["motors"]), float(turning["sensors"]))
-    except (KeyError, TypeError, ValueError):
-        raise InputError("expected numbers motors and sensors", file=path, field="turning", value=turning) from None
-    rig = load_rig(folder / RIG_FILE, bool(result.get("loaded")), check=False)
-    return rig, result.get("amplifier_corner_Hz"), turns
+    return result
 
 
 def write_predictions(folder: Path, campaign: Campaign, out: Path,
@@ -148,6 +175,7 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
     rig, corner, turning = read_identified(folder)
     model = replace(ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner),
                     turning=turning)
+    model = _suspended(model, folder)
     limits = _converter_limits(rig) if campaign.y_unit == "V" else None
     with replacing(out) as file:
         file.attrs.update({"format": "avis-prediction", "version": 1, "rig": rig.name})

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avis_ctrl.identification.maximum_likelihood import LikelihoodFit
+from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import INERTIAL, ResponseModel
 
 
@@ -26,13 +26,13 @@ class FitPlausibility:
     known: float = 0.1
 
 
-def far_from_file(start: ResponseModel, fit: LikelihoodFit, settings: FitPlausibility = FitPlausibility()
+def far_from_file(start: ResponseModel, information: Information, settings: FitPlausibility = FitPlausibility()
                   ) -> tuple[str, ...]:
     """A sentence with the likely cause if a mass or moment of inertia is far from the rig file's, else nothing."""
     before = dict(zip(start.names, start.values, strict=True))
     found = [(name, float(value / before[name]), float(value), unit)
-             for name, value, unit, sigma in zip(fit.model.names, fit.values, fit.model.units,
-                                                 fit.information.standard_deviation, strict=True)
+             for name, value, unit, sigma in zip(
+                 information.names, information.values, information.units, information.standard_deviation, strict=True)
              if before[name] > 0 and value > 0 and sigma <= settings.known * value]
     far = [one for one in found if one[0] in INERTIAL and not 1 / settings.far < one[1] < settings.far]
     if not far:

@@ -24,7 +24,7 @@ def _upper(text: str) -> str:
 
 
 def _sentence(found: Identification) -> Paragraph:
-    information = found.campaign_fit.fit.information
+    information = found.information
     alone = int(np.count_nonzero(information.known))
     warned = [f for f in found.findings if f.severity in ("warning", "stop")]
     stops = any(f.severity == "stop" for f in found.findings)
@@ -44,7 +44,7 @@ def _sentence(found: Identification) -> Paragraph:
 
 
 def _parameters(found: Identification) -> Table:
-    information, start = found.campaign_fit.fit.information, found.campaign_fit.start.values
+    information, start = found.information, found.campaign_fit.start.values
     rows = []
     for name, unit, before, value, sigma in zip(information.names, information.units, start, information.values,
                                                 information.standard_deviation, strict=True):
@@ -64,7 +64,7 @@ def _parameters(found: Identification) -> Table:
 
 
 def _changes(found: Identification) -> Figure:
-    information, start = found.campaign_fit.fit.information, found.campaign_fit.start.values
+    information, start = found.information, found.campaign_fit.start.values
     size = np.where(start == 0, information.scale, np.abs(start))
     change = 100 * (information.values - start) / size
     bars = 200 * information.standard_deviation / size

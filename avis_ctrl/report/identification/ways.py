@@ -38,7 +38,7 @@ def _sequential(found: Identification) -> Paragraph:
 
 def _differences(found: Identification, result: EkfResult) -> np.ndarray:
     """(combinations, 5): both values, both standard deviations, and the difference over the root of their squares."""
-    information, order = found.campaign_fit.fit.information, list(result.names)
+    information, order = found.information, list(result.names)
     rows = []
     for one in found.identifiability.combinations:
         w = np.zeros(len(order))
@@ -86,7 +86,7 @@ def _table(found: Identification, result: EkfResult) -> Table:
 
 
 def _figure(found: Identification, curves: ParameterCurves, number: int) -> Figure:
-    information = found.campaign_fit.fit.information
+    information = found.information
     t = curves.time_s
     frame = (float(t[0]), float(max(t[-1], curves.boundaries_s[-1])))
     panels = []

@@ -1,0 +1,94 @@
+"""A rig's parameters together with every value of its file that has a tolerance, by the likelihood of `likelihood`.
+
+What the file states is never exact: with places, directions, gains and corners taken for exact, their errors end up in
+mass, stiffness and damping, and in the residual. Here each is free within its tolerance; noise, path errors that nobody
+has named, and distortion weigh the residual. The parameters have no prior unless one is stated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
+from avis_ctrl.identification.information import Information
+from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit
+from avis_ctrl.identification.maximum_likelihood import (
+    LikelihoodFit,
+    Prior,
+    block_residual,
+    transient_unknowns,
+    whitener,
+)
+from avis_ctrl.identification.priors import Priors, beside, identified
+from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import SpectralBlock, thinned
+from avis_ctrl.rigs.instruments import Tolerances
+
+
+class ToleranceFit(NamedTuple):
+    """fitted : parameters and tolerances. flat : (n,) which have a prior that stands for none, about where their fit
+    began."""
+
+    fitted: Fitted
+    flat: np.ndarray
+
+
+def begin(model: ResponseModel, blocks: Sequence[SpectralBlock], levels: Mapping[str, float], tolerances: Tolerances,
+          stated: Mapping[str, Prior], settings: FitSettings = SETTINGS) -> ToleranceFit:
+    """From parameters that were fitted with the rest as the file states it, on some lines of each block.
+
+    Parameters
+    ----------
+    model : with these parameters free. levels : [V] by record. stated : (mean, standard deviation) of parameters that have a prior.
+    """
+    rig = model.rig.with_channels_apart()  # type: ignore[attr-defined]
+    rest = beside(replace(model, rig=rig, names=()), model.names, tolerances)
+    priors = identified(model, stated, settings).followed_by(rest)
+    apart = replace(model, rig=rig, names=priors.names)
+    data = _data(blocks, levels, settings.lines)
+    flat = np.array([name in model.names and name not in stated for name in priors.names])
+    found = fit(apart, priors, priors.z(apart.values), data, first_variances(data, settings), settings)
+    return ToleranceFit(found, flat)
+
+
+def end(begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[str, float],
+        settings: FitSettings = SETTINGS) -> ToleranceFit:
+    """The same on more lines, which the precision of the parameters is worth."""
+    one, data = begun.fitted, _data(blocks, levels, settings.final_lines)
+    priors = replace(one.priors, mean=np.where(begun.flat, one.priors.values(one.z), one.priors.mean))
+    rounds = replace(settings, rounds=settings.final_rounds)
+    found = fit(one.model, priors, np.where(begun.flat, 0.0, one.z), data, one.variances, rounds)
+    return begun._replace(fitted=found)
+
+
+def _data(blocks: Sequence[SpectralBlock], levels: Mapping[str, float], lines: int) -> Data:
+    return Data(tuple(thinned(block, lines) for block in blocks), tuple(levels[block.name] for block in blocks))
+
+
+def as_likelihood_fit(found: ToleranceFit, blocks: Sequence[SpectralBlock], first: LikelihoodFit,
+                      settings: FitSettings = SETTINGS) -> LikelihoodFit:
+    """In the form of a fit by noise alone, tolerances among the parameters; residuals on all lines of the blocks."""
+    one, model = found.fitted, found.fitted.model
+    H, g, cost = one.weights.normal_equations(one.white.J, one.white.e)
+    known = np.where(found.flat, 0.0, 1.0)
+    slopes = one.priors.slopes(one.z)
+    information = Information(model.names, model.values, model.units,
+                              (H + np.diag(known)) / np.outer(slopes, slopes), model.scales())
+    step = np.linalg.solve(H + np.eye(len(g)), g - one.z)
+    numbers, unknown = len(one.white.e), sum(transient_unknowns(block, model) for block in blocks)
+    dof = numbers + int(known.sum()) - unknown - information.rank
+    residuals = tuple(block_residual(model, block, whitener(block), derivative=False)[2] for block in blocks)
+    return LikelihoodFit(model, information, cost + float(known @ one.z ** 2), dof, first.iterations + one.iterations,
+                         bool(step @ (g - one.z) < settings.converged * numbers), first.history, residuals,
+                         first.starts, _with_prior(one.priors, ~found.flat))
+
+
+def _with_prior(priors: Priors, which: np.ndarray) -> dict[str, Prior]:
+    """(mean, standard deviation) by name, in the parameters' units."""
+    sigma = priors.sigma * np.where(priors.positive, priors.mean, 1.0)
+    return {name: (float(mean), float(deviation)) for name, mean, deviation, own in
+            zip(priors.names, priors.mean, sigma, which, strict=True) if own}
