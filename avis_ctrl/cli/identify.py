@@ -180,13 +180,14 @@ def _summary(console, found) -> None:
                                         information.units, strict=True):
         table.add_row(name, f"{start[name]:.6g}", f"{value:.6g}",
                       f"{sigma:.2g}" if sigma < float("inf") else "only in combination", unit)
-    from avis_ctrl.study.identification import CAUTION
-
     console.print(table)
     verdict, *validation = found.validation.sentences
     console.print(f"{verdict[:1].upper()}{verdict[1:]}.")
-    for sentence in (CAUTION, *found.campaign_fit.notes, *validation, *found.identifiability.sentences):
+    for sentence in (found.caution, *found.campaign_fit.notes, *validation, *found.identifiability.sentences):
         console.print(f"- {sentence}")
+    for one in found.campaign_fit.tolerances[:5]:
+        console.print(f"- {one.parameter}: {one.value:.6g} +- {one.std:.2g} {one.unit}, moved by {one.moved:+.1f} "
+                      "tolerances")
     if found.advice:
         console.print(f"- {found.advice[0]} (Other records that would help are in section 5 of the report.)")
 

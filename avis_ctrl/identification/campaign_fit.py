@@ -24,6 +24,7 @@ from avis_ctrl.identification.tolerance_fit import as_likelihood_fit, begin, end
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import noise_covariance
+from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.instruments import Tolerances
 
 Progress = Callable[[str], None]
@@ -300,10 +301,21 @@ class CampaignFit:
         """That of the fit with the identified parameters free, tolerances where the fit left them."""
         return replace(self.fit.model, names=self.start.names)
 
+    @property
+    def structure(self) -> ResponseModel:
+        """What tells which combinations of the identified parameters can be determined: the geometry of the file."""
+        return self.first.model if self.tolerances else self.model
+
     @cached_property
     def information(self) -> Information:
-        """Of the identified parameters, whatever the tolerances are."""
-        return self.fit.information.of_some(self.start.names) if self.tolerances else self.fit.information
+        """Of the identified parameters, whatever the tolerances are.
+
+        What the file's own geometry leaves undetermined (how a stiffness is shared between mounts) is not counted where
+        places moved by their tolerance tell it apart.
+        """
+        if not self.tolerances:
+            return self.fit.information
+        return self.fit.information.of_some(self.start.names).along(self.first.information)
 
 
 def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, band_Hz: tuple[float, float],
@@ -319,7 +331,7 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     InputError, ComputationError : as `fit`, `record_block`, `response_block`.
     """
     known = True
-    if tolerances is not None and isinstance(campaign, Campaign) and hasattr(model.rig, "with_channels_apart"):
+    if tolerances is not None and isinstance(campaign, Campaign) and isinstance(model.rig, AvisTable):
         return _within_tolerances(campaign, model, band_Hz, priors or {}, starts, seed, progress, tolerances)
     if isinstance(campaign, FrequencyResponse):
         blocks = [response_block(campaign.between(*band_Hz), model)]
@@ -357,7 +369,7 @@ def _within_tolerances(campaign: Campaign, model: ResponseModel, band_Hz: tuple[
     say = progress or (lambda text: None)
     raw, notes = campaign_blocks(campaign, model, band_Hz)
     every, said, known = weighted(raw, campaign, band_Hz)
-    blocks = [thinned(block, FIT.final_lines) for block in every]
+    blocks = [thinned(block, FIT.residual_lines) for block in every]
     few = [thinned(block, FIT.lines) for block in blocks]
     first = fit(model, few, priors, starts, seed=seed, progress=progress)
     turning, added = chosen_turning(campaign, blocks, first.model)
@@ -369,7 +381,7 @@ def _within_tolerances(campaign: Campaign, model: ResponseModel, band_Hz: tuple[
     say(f"with {int(np.sum(~begun.flat))} tolerances of the rig file: {begun.fitted.iterations} iterations")
     linear = without(blocks, [one[0] for one in terms(campaign, blocks, begun.fitted.model)])
     ended = end(begun, linear, levels)
-    say(f"on {FIT.final_lines} lines of each record: {ended.fitted.iterations} iterations")
+    say(f"with their second-order terms: {ended.fitted.iterations} iterations")
     found = as_likelihood_fit(ended, linear, first)
     moved = ended.fitted.moved([name for name in found.model.names if name not in model.names])
     notes = [*notes, said, f"{turning.sentence}: {_share(blocks, added)}"]

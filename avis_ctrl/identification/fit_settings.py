@@ -17,9 +17,10 @@ class FitSettings:
         and Marquardt's damping, as a prior).
     lines : spectral lines of a record that are fitted; with 8 drives and 6 sensors the response needs about 100, and
         twice as many make the estimate of the unexplained part precise.
-    final_lines : the same at the end of an identification, where lines only add precision; with more than these
-        round-off of the path errors, and not the noise, is what remains.
-    final_rounds : `rounds` of that fit, which begins where the other ended.
+    residual_lines : lines of a record whose residuals tell the noise of an identification. They are not all fitted:
+        the path errors do not go together from line to line as what nobody has named does, and with more lines
+        tolerances moved by seven of them where a quarter of the lines moved them by two.
+    final_rounds : `rounds` of the fit after the second-order terms were formed anew; it begins where the other ended.
     bands_per_octave : bands over which the relative error of a path counts as constant; a third of an octave is what a
         mode's flank takes to change by a factor of two.
     least_error : relative error of every path that nobody can exclude [1], the scale of its prior: cables, threads and
@@ -41,7 +42,7 @@ class FitSettings:
     damping_percent: float = 20.0
     unknown_percent: float = 10.0
     lines: int = 200
-    final_lines: int = 800
+    residual_lines: int = 800
     final_rounds: int = 3
     bands_per_octave: int = 3
     least_error: float = 1e-3

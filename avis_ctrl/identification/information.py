@@ -155,6 +155,12 @@ class Information:
         return Information(tuple(names), self.values[keep], tuple(self.units[k] for k in keep),
                            left / np.outer(scale, scale), scale)
 
+    def along(self, other: Information) -> Information:
+        """Only on the directions that another information of the same parameters determines."""
+        V = other.directions[1][:, other.determined]
+        P = (V @ V.T) * np.outer(other.scale, 1 / other.scale)
+        return replace(self, matrix=P.T @ self.matrix @ P)
+
     def _priors(self, deviations: Mapping[str, float]) -> np.ndarray:
         diagonal = np.zeros(len(self.names))
         for name, sigma in deviations.items():

@@ -26,6 +26,7 @@ from avis_ctrl.identification.maximum_likelihood import (
 from avis_ctrl.identification.priors import Priors, beside, identified
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import SpectralBlock, thinned
+from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.instruments import Tolerances
 
 
@@ -43,9 +44,11 @@ def begin(model: ResponseModel, blocks: Sequence[SpectralBlock], levels: Mapping
 
     Parameters
     ----------
-    model : with these parameters free. levels : [V] by record. stated : (mean, standard deviation) of parameters that have a prior.
+    model : with these parameters free. levels : [V] by record.
+    stated : (mean, standard deviation) of parameters that have a prior.
     """
-    rig = model.rig.with_channels_apart()  # type: ignore[attr-defined]
+    assert isinstance(model.rig, AvisTable)  # each channel at a place of its own
+    rig = model.rig.with_channels_apart()
     rest = beside(replace(model, rig=rig, names=()), model.names, tolerances)
     priors = identified(model, stated, settings).followed_by(rest)
     apart = replace(model, rig=rig, names=priors.names)
@@ -57,8 +60,8 @@ def begin(model: ResponseModel, blocks: Sequence[SpectralBlock], levels: Mapping
 
 def end(begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[str, float],
         settings: FitSettings = SETTINGS) -> ToleranceFit:
-    """The same on more lines, which the precision of the parameters is worth."""
-    one, data = begun.fitted, _data(blocks, levels, settings.final_lines)
+    """On from there, with blocks whose second-order terms are those of the model found."""
+    one, data = begun.fitted, _data(blocks, levels, settings.lines)
     priors = replace(one.priors, mean=np.where(begun.flat, one.priors.values(one.z), one.priors.mean))
     rounds = replace(settings, rounds=settings.final_rounds)
     found = fit(one.model, priors, np.where(begun.flat, 0.0, one.z), data, one.variances, rounds)

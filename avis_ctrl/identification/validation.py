@@ -51,6 +51,7 @@ class HeldOut:
         band; None where the record does not start at rest. nrms_time_whole : (n_y,) without the filter.
     time_note : why there is no prediction in time, or what it covers.
     whiteness : correlations of the residual; None where there are too few lines.
+    nrms_all_exact : nrms_all of the fit that takes the rig file for exact, None where no tolerance was fitted.
     """
 
     name: str
@@ -74,6 +75,7 @@ class HeldOut:
     nrms_time_whole: np.ndarray | None = None
     time_note: str = ""
     whiteness: Whiteness | None = None
+    nrms_all_exact: float | None = None
 
     @property
     def consistent(self) -> bool:
@@ -228,7 +230,11 @@ def _figures(found: CampaignFit, fitted: Campaign | FrequencyResponse, block: Sp
         np.array(of_output), _root(error.error, power), _root(before.error, power), np.sqrt(floor / power),
         _root_all(error), _root_all(before), float(np.sqrt(floor.sum() / power.sum())),
         _floor_interval(error, float(floor.sum() / power.sum()), noise_dof / (2 * block.Y.size)),
-        *_in_time(found, record), white)
+        *_in_time(found, record), white, _exact(found, block))
+
+
+def _exact(found: CampaignFit, block: SpectralBlock) -> float | None:
+    return _root_all(prediction_error(found.first.model, block, derivative=False)) if found.tolerances else None
 
 
 def _floor_interval(error: PredictionError, floor: float, times: float) -> tuple[float, float]:
@@ -353,6 +359,9 @@ def _sentences(figures: list[HeldOut]) -> list[str]:
                         f"{_percent(one.nrms_time.min())} to {_percent(one.nrms_time.max())}, depending on the output "
                         f"(start model: {_percent(one.nrms_time_start.min())} to "
                         f"{_percent(one.nrms_time_start.max())})")
+        if one.nrms_all_exact is not None:
+            said.append(f"record {one.name}: residual {_percent(one.nrms_all_exact)} of the signal, r.m.s., with the "
+                        f"rig file taken for exact, and {_percent(one.nrms_all)} with its tolerances fitted")
         if one.whiteness is not None:
             said += [f"record {one.name}: {sentence}" for sentence in one.whiteness.sentences]
     return said

@@ -49,6 +49,8 @@ from avis_ctrl.study.rig_channels import in_words_of
 Progress = Callable[[str], None]
 CAUTION = ("the standard deviations include only the noise of these records; values that were not fitted (such as "
            "force constants, sensitivities, positions) count as exact")
+TOLERANT = ("the standard deviations include noise, the tolerances of the rig file, and errors of the response that "
+            "nothing in the model explains")
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,13 @@ class Identification:
 
     @property
     def model(self) -> ResponseModel:
-        return self.campaign_fit.fit.model
+        """With the identified parameters free."""
+        return self.campaign_fit.model
+
+    @property
+    def caution(self) -> str:
+        """What the standard deviations include."""
+        return TOLERANT if self.campaign_fit.tolerances else CAUTION
 
     @property
     def information(self) -> Information:
@@ -139,7 +147,7 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
             progress(f"  warning: {sentence}")
         found = replace(found, notes=(*far, *found.notes, *([unplayed] if unplayed else [])))
         floor = any(block.block.kind == "floor measured" for block in found.fit.residuals)
-        report = identifiability_report(found.information, found.model, floor,
+        report = identifiability_report(found.information, found.structure, floor,
                                         {name: sigma for name, (_, sigma) in options.priors.items()})
         progress(f"the data determine {found.information.rank} of {len(model.names)} combinations of parameters")
         advice = _advice(found, fitted, report, progress)
@@ -239,7 +247,7 @@ def _divided_lines(measured: FrequencyResponse) -> tuple[FrequencyResponse, Freq
 def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, report: IdentifiabilityReport,
             progress: Progress) -> tuple[str, ...]:
     """What another record like the fitted ones would bring, or one of another kind."""
-    model = found.model
+    model = found.structure
     if found.information.rank == len(model.names) or not isinstance(fitted, Campaign):
         return ()
     progress("searching for a further record that would determine the rest")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.campaign_fit import SETTINGS, driven_inputs, excited_band
 from avis_ctrl.identification.model_error import measured_response
+from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spread import FrfSpread, frf_spread
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs.avis import AvisTable
@@ -92,13 +94,18 @@ def measured_spread(found: Identification, keep: tuple[str, ...]) -> FrfSpread:
 
     Over the band that the actuators drive: a floor that is shaken below it says nothing of their response.
     """
-    measured, band, model = found.measured, found.campaign_fit.band_Hz, found.model
+    measured, band, model = found.measured, found.campaign_fit.band_Hz, _as_written(found.model)
     if isinstance(measured, FrequencyResponse):
         return frf_spread(measured.between(*band), model, keep)
     driven = measured.only(tuple(record.header.name for record in measured.records if driven_inputs(record)))
     low, high = excited_band(driven)
     band = max(band[0], low), min(band[1], high)
     return frf_spread(measured_response(driven, model, band, SETTINGS.longest_piece), model, keep)
+
+
+def _as_written(model: ResponseModel) -> ResponseModel:
+    """As a rig file has it, in which the filter of a geophone matches its suspension: the spread covers the rest."""
+    return replace(model, sensors=replace(model.sensors, suspensions=model.sensors.assumed))
 
 
 def identification_design(content: UncertaintyFile, template: Design, rig: Rig) -> str:

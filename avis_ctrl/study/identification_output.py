@@ -23,7 +23,7 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig, rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.study.files import as_json
-from avis_ctrl.study.identification import CAUTION, Identification
+from avis_ctrl.study.identification import Identification
 from avis_ctrl.study.identification_files import FILES, RESULT_FILE, RIG_FILE
 
 PIECE = 1 << 17
@@ -69,8 +69,8 @@ def identified_toml(found: Identification) -> str:
               f"from {p['measurement'] or 'a measurement'}, SHA-256 {p['measurement_sha256'][:16]}",
               f"{information.rank} of {len(information.names)} combinations of parameters are determined; standard "
               "deviations (1 sigma) beside the values",
-              "the report and result.json list the combinations", CAUTION]
-    return rig_toml(identified_rig(found.model), comments, "\n".join(header))
+              "the report and result.json list the combinations", found.caution]
+    return rig_toml(identified_rig(found.campaign_fit.fit.model), comments, "\n".join(header))
 
 
 def result_dict(found: Identification) -> dict[str, Any]:

@@ -39,7 +39,7 @@ def found(rehearsal) -> Identification:
 
 def test_the_truth_lies_within_the_standard_deviations(rehearsal, found):
     """Every determined direction, and each parameter that is known by itself."""
-    information = found.campaign_fit.fit.information
+    information = found.campaign_fit.information
     truth = np.array([rehearsal.truth.parameters()[name].value for name in information.names])
     sigma, V = information.directions
     z = (V.T @ ((information.values - truth) / information.scale) / sigma)[information.determined]

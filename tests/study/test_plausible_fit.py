@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.maximum_likelihood import LikelihoodFit
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.plausible_fit import far_from_file
@@ -18,12 +17,11 @@ def start() -> ResponseModel:
                             True)
 
 
-def fitted(model: ResponseModel, factors, sigma: float = 1e-3) -> LikelihoodFit:
-    """A fit that ended at the model's values times `factors`, each known to `sigma` (relative)."""
+def fitted(model: ResponseModel, factors, sigma: float = 1e-3) -> Information:
+    """Of a fit that ended at the model's values times `factors`, each known to `sigma` (relative)."""
     found = model.at(model.values * np.array(factors))
     scale = np.abs(found.values)
-    information = Information(NAMES, found.values, found.units, np.diag((sigma * scale) ** -2.0), scale)
-    return LikelihoodFit(found, information, 1.0, 1, 1, True, (), (), ())
+    return Information(NAMES, found.values, found.units, np.diag((sigma * scale) ** -2.0), scale)
 
 
 def test_common_factor_is_blamed_on_the_gains():

@@ -19,6 +19,15 @@ SOURCES = (
 )
 
 
+_TOLERANCES = (
+    Paragraph("Tolerances. Every value of the rig file that has a tolerance (places, directions, gains, corners and "
+              "damping ratios of geophones, centre of mass, products of inertia) is fitted beside the parameters, with "
+              "its tolerance as the standard deviation of a normal prior. The residual is weighted by noise, by a "
+              "relative error of each path from an input to a sensor that is constant over a third of an octave, and "
+              "by distortion; the variances of the last two are estimated from the residual in turn with the fit. The "
+              "information on the parameters is what remains of H whatever the tolerances are (Schur complement)."),)
+
+
 def method(found: Identification) -> Section:
     """Short account of the method with its formulas."""
     pieces: list[Piece] = [
@@ -44,6 +53,7 @@ def method(found: Identification) -> Section:
         Paragraph("where the second sum is over the parameters with a prior, if any. It is minimised by "
                   "Levenberg-Marquardt steps in relative parameters from several starts, with analytic derivatives. "
                   "The noise covariance is first estimated from the records and then from the residuals."),
+        *(_TOLERANCES if found.campaign_fit.tolerances else ()),
         Paragraph("Information. With J the derivative of the whitened residuals, the Cramér-Rao bound of every "
                   "unbiased estimate is"),
         Formula("H = J^T J, quad op(\"cov\") hat(theta) >= S V_1 Lambda_1^(-1) V_1^T S, quad S H S = V Lambda V^T",
