@@ -82,11 +82,13 @@ def as_likelihood_fit(found: ToleranceFit, blocks: Sequence[SpectralBlock], firs
     information = Information(model.names, model.values, model.units,
                               (H + np.diag(known)) / np.outer(slopes, slopes), model.scales())
     step = np.linalg.solve(H + np.eye(len(g)), g - one.z)
-    numbers, unknown = len(one.white.e), sum(transient_unknowns(block, model) for block in blocks)
-    dof = numbers + int(known.sum()) - unknown - information.rank
+    less = int(known.sum()) - sum(transient_unknowns(block, model) for block in blocks) - information.rank
+    fitted, dof = len(one.white.e) + less, sum(block.numbers for block in blocks) + less
+    # The lines that were fitted stand for all of the residuals.
+    chi2 = (cost + float(known @ one.z ** 2)) * dof / fitted
     residuals = tuple(block_residual(model, block, whitener(block), derivative=False)[2] for block in blocks)
-    return LikelihoodFit(model, information, cost + float(known @ one.z ** 2), dof, first.iterations + one.iterations,
-                         bool(step @ (g - one.z) < settings.converged * numbers), first.history, residuals,
+    return LikelihoodFit(model, information, chi2, dof, first.iterations + one.iterations,
+                         bool(step @ (g - one.z) < settings.converged * len(one.white.e)), first.history, residuals,
                          first.starts, _with_prior(one.priors, ~found.flat))
 
 
