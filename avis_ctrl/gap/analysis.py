@@ -20,7 +20,7 @@ from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplaine
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_second_order
 from avis_ctrl.gap.residual import Left, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
-from avis_ctrl.gap.search import Step, implausible, name_of, search, with_effect, without_effect
+from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, search, with_effect, without_effect
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import left_by, levels, named
 from avis_ctrl.gap.tolerances import of_effect
@@ -165,7 +165,7 @@ def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Dat
         return "the library has no name for it"
     if probability < settings.headline:
         return f"another explanation is as probable ({probability:.2f})"
-    if reason := implausible(replace(best, model=replace(best.model, effects=(one,)))):
+    if reason := forbidden(best, one):
         return reason
     # With the priors: a value beyond its tolerance shows in how far others had to move, and hardly in a residual.
     after, before = (sum(log_likelihoods(one, held, settings).values()) - 0.5 * float(one.z @ one.z)

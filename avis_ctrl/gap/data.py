@@ -22,16 +22,13 @@ from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.prediction_error import prediction_error
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, record_block, thinned
+from avis_ctrl.identification.spectra import SpectralBlock, record_block
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 
 # Bands to the octave in which silent lines are weighted by what is left of them, and how often.
 PER_OCTAVE, WEIGHTINGS = 2, 4
 # Periods of a record from which the first one may be left to the transient.
 SETTLED = 3
-
-
-__all__ = ["Halves", "all_silent", "blocks_of", "divide", "of_one_level", "thinned", "with_noise"]
 
 
 @dataclass(frozen=True, eq=False)

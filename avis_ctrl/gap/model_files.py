@@ -82,9 +82,7 @@ def model_to_dict(model: TableModel) -> dict[str, Any]:
         "sensors": list(base.sensors.names), "sensitivity": [float(one) for one in base.sensors.sensitivity],
         "actuators": list(base.actuators), "period_s": float(base.period_s), "delay_s": float(base.delay_s),
         "amplifier_corner_Hz": None if base.amplifier_corner_Hz is None else float(base.amplifier_corner_Hz),
-        "suspensions": {name: list(own) for name, own, assumed in zip(
-            base.sensors.names, base.sensors.suspensions, base.sensors.assumed, strict=False)
-            if own is not None and own != assumed},
+        "suspensions": {name: list(own) for name, own in base.sensors.detuned.items()},
         "effects": [{"name": one.effect.name, "place": one.place,
                      "values": {name: float(value) for name, value in one.by_name.items()}} for one in model.effects],
         "campaign_s": list(campaign_clock(model))}

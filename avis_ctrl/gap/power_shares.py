@@ -26,9 +26,9 @@ from typing import Literal
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.data import of_one_level
 from avis_ctrl.gap.result import PowerShares
 from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.campaign_fit import of_one_level
 from avis_ctrl.identification.prediction_error import PredictionError
 from avis_ctrl.measurement.campaign import RecordHeader
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.data import Halves, blocks_of, divide, of_one_level, thinned, with_noise
+from avis_ctrl.gap.data import Halves, blocks_of, divide, with_noise
 from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
@@ -24,13 +24,13 @@ from avis_ctrl.gap.signals.hum import HumFinding, find_hum, polluted
 from avis_ctrl.gap.signals.leftover import Leftover
 from avis_ctrl.gap.signals.repair import repair
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.identification.campaign_fit import excited_band
+from avis_ctrl.identification.campaign_fit import excited_band, levels_of
 from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.maximum_likelihood import fit
 from avis_ctrl.identification.noise import relative_noise
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectra import SpectralBlock, thinned
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.rigs.rig import Rig
 
@@ -64,15 +64,7 @@ class Prepared:
 
     def data(self, blocks: Sequence[SpectralBlock], lines: int) -> Data:
         """Some lines of blocks, each with the level of its group of like records."""
-        levels = self.levels
-        return Data(tuple(thinned(block, lines) for block in blocks), tuple(levels[block.name] for block in blocks))
-
-    @property
-    def levels(self) -> dict[str, float]:
-        """Level [V] by block: of the lowest record of a group that counts as one level."""
-        headers = [record.header for record in (*self.halves.fitted.records, *self.halves.held_out.records)]
-        groups = of_one_level(headers, lambda h: ("", h.level_V))
-        return {h.name: group[0].level_V for group in groups for h in group}
+        return Data.of(blocks, levels_of((*self.halves.fitted.records, *self.halves.held_out.records)), lines)
 
 
 def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = None,

@@ -10,13 +10,13 @@ from typing import Protocol, cast
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.data import Halves, all_silent, thinned
+from avis_ctrl.gap.data import Halves, all_silent
 from avis_ctrl.gap.power_shares import power_shares
 from avis_ctrl.gap.result import HeatMap, PowerShares, RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction_error import PredictionError, prediction_error
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectra import SpectralBlock, thinned
 
 # Residual over noise that is shown as a place of the gap: significant at this level over all places together.
 PLACE_ALARM = 0.01

@@ -23,7 +23,7 @@ class NamedEffect:
     name, location : of the contract. title : in words. parameters : with standard deviations.
     probability : of this effect among the candidates that were refitted in its place, given the data, equal beforehand;
     of one that acts on the signals alone, what its finder states. indistinguishable_from : names that this data cannot
-    tell from it. confirmed : by how much the held-out log-likelihood rises with it, beside those named before it.
+    tell from it.
     share : by how much the held-out residual power rises without it, over the baseline's in excess of the noise.
     label : of the active effect in the updated model; empty for one that acts on the signals alone (hum, converter,
     ground motion). confirmation : in words, how it was found.
@@ -35,7 +35,6 @@ class NamedEffect:
     parameters: Mapping[str, Reported]
     probability: float
     indistinguishable_from: tuple[str, ...] = ()
-    confirmed: float = 0.0
     label: str = ""
     confirmation: str = ""
     share: float | None = None
@@ -223,8 +222,7 @@ class Gap:
             "remaining": None if self.left is None else {
                 "nrmse": self.left.nrmse, "over_noise": self.left.over_noise, "share": self.left.share,
                 "where": _places(self.remaining), "grows_with_level": self.left.grows_with_level},
-            "tolerances": [{"parameter": one.parameter, "value": one.value, "std": one.std,
-                            "tolerances_moved": one.moved} for one in self.tolerances],
+            "tolerances": [one.to_json() for one in self.tolerances],
             "next_experiment": self.next_experiment,
             "seconds": self.seconds,
         }

@@ -83,7 +83,7 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: 
         found = []
         for place in effect.places(model):
             if (effect.name, place.partition("/")[0]) not in taken:
-                found += [Candidate(active(effect, model, place, seed.values), seed.chi2, seed.chance(1.0))
+                found += [Candidate(active(effect, model, place, seed.values), seed.chi2, seed.p_value)
                           for seed in effect.seeds(score, place)[:1]]
         return found
     resonant = [one for one in effects if one.resonant]
@@ -112,12 +112,10 @@ def other_laws(found: Sequence[Candidate], best: ActiveEffect) -> list[Candidate
 def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSettings) -> Fitted | None:
     """The fit with one effect more; None where it came to no end."""
     model = fitted.model.with_effect(one)
-    own = of_effect(one, tolerances_of(model.rig), settings).of([name for name in one.names if name in model.names])
-    own = _with_known(own, model.priors)
-    values = dict(zip(one.names, one.values, strict=True))
+    own = _with_known(of_effect(one, tolerances_of(model.rig), settings), model.priors)
     before = fitted.z.copy()
     before[tolerances_behind(one, fitted.priors.names)] = 0  # the effect begins with what these had to make up for
-    z = np.concatenate([before, own.z(np.array([values[name] for name in own.names]))])
+    z = np.concatenate([before, own.z(np.array(one.values))])
     return _try(fitted, model, fitted.priors.followed_by(own), z, data, settings)
 
 
@@ -224,12 +222,14 @@ def _whole(found: Fitted, like: Fitted) -> Fitted:
 
 def implausible(fitted: Fitted) -> str:
     """Why physics forbids the values of some effect; empty where it does not."""
-    for one in fitted.model.effects:
-        std = np.sqrt(np.maximum(np.diag(fitted.covariance_of(one.names)), 0))
-        values = dict(zip((p.name for p in one.parameters), std, strict=True))
-        if reason := one.effect.implausible(one.by_name, values) or at_the_edge(one):
-            return str(reason)
-    return ""
+    return next((reason for one in fitted.model.effects if (reason := forbidden(fitted, one))), "")
+
+
+def forbidden(fitted: Fitted, one: ActiveEffect) -> str:
+    """Why physics forbids the values of an effect; empty where it does not."""
+    std = np.sqrt(np.maximum(np.diag(fitted.covariance_of(one.names)), 0))
+    values = dict(zip((p.name for p in one.parameters), std, strict=True))
+    return str(one.effect.implausible(one.by_name, values) or at_the_edge(one))
 
 
 def at_the_edge(effect: ActiveEffect) -> str:

@@ -184,10 +184,9 @@ class TableModel:
         values[j] = value
         return replace(self, effects=(*self.effects[:k], self.effects[k].at(values), *self.effects[k + 1:]))
 
-    def with_effect(self, effect: ActiveEffect, at: int | None = None) -> TableModel:
-        """The model with one effect more, the last or as number `at`."""
-        at = len(self.effects) if at is None else at
-        return replace(self, effects=(*self.effects[:at], effect, *self.effects[at:]))
+    def with_effect(self, effect: ActiveEffect) -> TableModel:
+        """The model with one effect more, the last."""
+        return replace(self, effects=(*self.effects, effect))
 
     def without(self, label: str) -> TableModel:
         return replace(self, effects=tuple(one for one in self.effects if one.label != label))

@@ -124,6 +124,12 @@ def of_one_level(items: Sequence[Item], told: Callable[[Item], tuple[str, float]
     return groups
 
 
+def levels_of(records: Sequence[RecordSource]) -> dict[str, float]:
+    """Level [V] by record: of the lowest one of a group that counts as one level."""
+    groups = of_one_level([record.header for record in records], lambda header: ("", header.level_V))
+    return {header.name: group[0].level_V for group in groups for header in group}
+
+
 def drive_power(record: RecordSource) -> np.ndarray:
     """(n_u, n_u) sum of u u^T over the first quarter of a million samples."""
     u = record.load(0, min(record.header.samples, SETTINGS.longest_piece)).u
@@ -375,8 +381,7 @@ def _within_tolerances(campaign: Campaign, model: ResponseModel, band_Hz: tuple[
     turning, added = chosen_turning(campaign, blocks, first.model)
     if not known:
         blocks = noise_from_residuals(first.residuals, blocks, model=first.model)
-    levels = {one.name: group[0].level_V for group in of_one_level(
-        [record.header for record in campaign.records], lambda header: ("", header.level_V)) for one in group}
+    levels = levels_of(campaign.records)
     begun = begin(replace(first.model, turning=turning), without(blocks, added), levels, tolerances, priors)
     say(f"with {int(np.sum(~begun.flat))} tolerances of the rig file: {begun.fitted.iterations} iterations")
     linear = without(blocks, [one[0] for one in terms(campaign, blocks, begun.fitted.model)])

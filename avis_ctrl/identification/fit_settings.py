@@ -17,9 +17,9 @@ class FitSettings:
         and Marquardt's damping, as a prior).
     lines : spectral lines of a record that are fitted; with 8 drives and 6 sensors the response needs about 100, and
         twice as many make the estimate of the unexplained part precise.
-    residual_lines : lines of a record whose residuals tell the noise of an identification. They are not all fitted:
-        the path errors do not go together from line to line as what nobody has named does, and with more lines
-        tolerances moved by seven of them where a quarter of the lines moved them by two.
+    residual_lines : lines of a record from whose residuals an identification estimates the noise. Not all of them are
+        fitted: path errors are independent from band to band in the model, unexplained effects are not, and with
+        all lines the fit moved tolerances by seven standard deviations instead of two.
     final_rounds : `rounds` of the fit after the second-order terms were formed anew; it begins where the other ended.
     bands_per_octave : bands over which the relative error of a path counts as constant; a third of an octave is what a
         mode's flank takes to change by a factor of two.

@@ -18,7 +18,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.maximum_likelihood import block_residual, transient_unknowns
 from avis_ctrl.identification.priors import Priors, Tolerance
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectra import SpectralBlock, thinned
 from avis_ctrl.identification.weights import Group, Variances, Weights, bands, estimated, path_contributions, weigh
 
 
@@ -28,6 +28,11 @@ class Data:
 
     blocks: tuple[SpectralBlock, ...]
     levels: tuple[float, ...]
+
+    @staticmethod
+    def of(blocks: Sequence[SpectralBlock], levels: Mapping[str, float], lines: int) -> Data:
+        """Some lines of each block; levels [V] by record."""
+        return Data(tuple(thinned(block, lines) for block in blocks), tuple(levels[block.name] for block in blocks))
 
 
 @dataclass(frozen=True, eq=False)

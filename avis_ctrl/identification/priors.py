@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -86,8 +87,8 @@ def beside(model: ResponseModel, names: Sequence[str], tolerances: Tolerances) -
 
 def identified(model: ResponseModel, stated: Mapping[str, tuple[float, float]], settings: FitSettings = SETTINGS
                ) -> Priors:
-    """The free parameters of a model: as stated (mean, standard deviation), otherwise about their present values, and
-    so broadly that only what the data do not determine feels it."""
+    """The free parameters of a model: as stated (mean, standard deviation), otherwise about their present values.
+    The prior is so wide that it acts only on combinations that the data do not determine."""
     mean, scale = model.values.copy(), model.scales()
     sigma = settings.unknown_percent / 100 * scale
     for name, (value, deviation) in stated.items():
@@ -106,6 +107,10 @@ class Tolerance:
     std: float
     moved: float
     unit: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """As the contract has it."""
+        return {"parameter": self.parameter, "value": self.value, "std": self.std, "tolerances_moved": self.moved}
 
 
 def tolerances_of(rig: Rig) -> Tolerances:

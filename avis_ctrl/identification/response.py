@@ -96,6 +96,12 @@ class SensorModel:
         w0, w = 2 * np.pi * f0, 2 * np.pi * f
         return (s ** 2 + 2 * z0 * w0 * s + w0 ** 2) / (s ** 2 + 2 * z * w * s + w ** 2)
 
+    @property
+    def detuned(self) -> dict[str, tuple[float, float]]:
+        """Corner [Hz] and damping ratio of the geophones that their filters do not match."""
+        known = zip(self.names, self.suspensions, self.assumed, strict=False)
+        return {name: own for name, own, assumed in known if own is not None and own != assumed}
+
     def suspension_slopes(self, s: np.ndarray, k: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """(n, len(k)) each: relative change of the response of some geophones per Hz of the corner, and per unit of the
         damping ratio; s (n, 1)."""

@@ -25,7 +25,7 @@ from avis_ctrl.identification.maximum_likelihood import (
 )
 from avis_ctrl.identification.priors import Priors, beside, identified
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, thinned
+from avis_ctrl.identification.spectra import SpectralBlock
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.instruments import Tolerances
 
@@ -52,7 +52,7 @@ def begin(model: ResponseModel, blocks: Sequence[SpectralBlock], levels: Mapping
     rest = beside(replace(model, rig=rig, names=()), model.names, tolerances)
     priors = identified(model, stated, settings).followed_by(rest)
     apart = replace(model, rig=rig, names=priors.names)
-    data = _data(blocks, levels, settings.lines)
+    data = Data.of(blocks, levels, settings.lines)
     flat = np.array([name in model.names and name not in stated for name in priors.names])
     found = fit(apart, priors, priors.z(apart.values), data, first_variances(data, settings), settings)
     return ToleranceFit(found, flat)
@@ -61,15 +61,11 @@ def begin(model: ResponseModel, blocks: Sequence[SpectralBlock], levels: Mapping
 def end(begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[str, float],
         settings: FitSettings = SETTINGS) -> ToleranceFit:
     """On from there, with blocks whose second-order terms are those of the model found."""
-    one, data = begun.fitted, _data(blocks, levels, settings.lines)
+    one, data = begun.fitted, Data.of(blocks, levels, settings.lines)
     priors = replace(one.priors, mean=np.where(begun.flat, one.priors.values(one.z), one.priors.mean))
     rounds = replace(settings, rounds=settings.final_rounds)
     found = fit(one.model, priors, np.where(begun.flat, 0.0, one.z), data, one.variances, rounds)
     return begun._replace(fitted=found)
-
-
-def _data(blocks: Sequence[SpectralBlock], levels: Mapping[str, float], lines: int) -> Data:
-    return Data(tuple(thinned(block, lines) for block in blocks), tuple(levels[block.name] for block in blocks))
 
 
 def as_likelihood_fit(found: ToleranceFit, blocks: Sequence[SpectralBlock], first: LikelihoodFit,

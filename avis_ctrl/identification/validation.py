@@ -361,7 +361,8 @@ def _sentences(figures: list[HeldOut]) -> list[str]:
                         f"{_percent(one.nrms_time_start.max())})")
         if one.nrms_all_exact is not None:
             said.append(f"record {one.name}: residual {_percent(one.nrms_all_exact)} of the signal, r.m.s., with the "
-                        f"rig file taken for exact, and {_percent(one.nrms_all)} with its tolerances fitted")
+                        f"values of the rig file taken as exact, and {_percent(one.nrms_all)} with them fitted within "
+                        "their tolerances")
         if one.whiteness is not None:
             said += [f"record {one.name}: {sentence}" for sentence in one.whiteness.sentences]
     return said

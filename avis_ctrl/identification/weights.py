@@ -47,9 +47,7 @@ def bands(omega: np.ndarray, per_octave: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class PathError:
-    """Lines of one level and band: rows (m,) of the stacked real residual, and Q (m, r), lambda (r,) of B B^T.
-
-    """
+    """Lines of one level and band: rows (m,) of the stacked real residual, and Q (m, r), lambda (r,) of B B^T."""
 
     group: Group
     rows: np.ndarray
@@ -80,7 +78,6 @@ class Weights:
             part = x[:, one.rows]
             out[:, one.rows] = part - ((part @ one.Q) * (1 - 1 / np.sqrt(1 + one.size))) @ one.Q.T
         return out
-
 
     def normal_equations(self, J: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """J W J^T (n, n), J W e (n,) and e W e of whitened rows, W = inv(I + B B^T), without forming its root."""

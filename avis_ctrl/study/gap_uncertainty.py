@@ -114,8 +114,8 @@ class FitUncertainty:
                 f"Left out of the loops: combinations of parameters that change the response to the drives by at most "
                 f"{_percent(own['left_out_drives'])}{share} and that to the floor by at most "
                 f"{_percent(own['left_out_floor'])}; products of changes, {_percent(own['products'])} in tables drawn; "
-                f"what sensors, effects and locked coordinates add, at most {_percent(own['not_in_equations'])}, those "
-                "parameters not looked at whose effect depends on amplitude.")
+                f"what sensors, effects and locked coordinates add, at most {_percent(own['not_in_equations'])}. "
+                "Parameters of effects that depend on amplitude are in none of these figures.")
 
 
 def _percent(share: float) -> str:
@@ -145,7 +145,7 @@ def fit_uncertainty(design: Design, model: TableModel, covariance: np.ndarray, w
     A[[actuators.index(name) for name in wiring.actuators]] = wiring.allocation
     seen, inside = _seen(model, names, wiring, omega), np.zeros((len(names), len(omega), *base[0].shape), complex)
     inside[held] = relative_changes(base, [slope for _, slope in felt], omega, A)[0]
-    # A sensor that reads more is to the loop a drive that pushes harder: the records told their product only.
+    # The records determine only the product of force constant and sensitivity, and the loop depends on no more.
     drives = [k for k in held if names[k] in {f"actuator.{name}" for name in wiring.actuators}]
     alike = _nearest(inside[drives] / allowed[:, None, None], seen[others] / allowed[:, None, None],
                      settings.alike)

@@ -15,7 +15,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
 from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
 from avis_ctrl.identification.prediction import Predictor, model_inputs
-from avis_ctrl.identification.response import ResponseModel, SensorModel
+from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, ranges
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.rigs.avis import AvisTable
@@ -98,9 +98,8 @@ def result_dict(found: Identification) -> dict[str, Any]:
                    "records": list(f.records)} for f in found.findings],
         "unit_of_y": found.model.sensors.unit, "amplifier_corner_Hz": found.model.amplifier_corner_Hz,
         "turning": found.model.turning._asdict(),
-        "tolerances": [{"parameter": one.parameter, "value": one.value, "std": one.std, "unit": one.unit,
-                        "tolerances_moved": one.moved} for one in found.campaign_fit.tolerances],
-        "suspensions": {name: list(own) for name, own in detuned(found.model.sensors).items()},
+        "tolerances": [{**one.to_json(), "unit": one.unit} for one in found.campaign_fit.tolerances],
+        "suspensions": {name: list(own) for name, own in found.model.sensors.detuned.items()},
         "provenance": dict(found.provenance), "seconds": found.seconds}
 
 
@@ -111,13 +110,6 @@ def write_identification(found: Identification, folder: Path, html: bytes | None
              "report.html": html, "report.pdf": pdf, RESULT_FILE: as_json(result_dict(found))}
     return write_together(folder, {name: content for name, content in texts.items() if content is not None},
                           [folder / name for name in FILES])
-
-
-def detuned(sensors: SensorModel) -> dict[str, tuple[float, float]]:
-    """Corner [Hz] and damping ratio of the geophones that their filters do not match: a rig file has no place for them.
-    """
-    known = zip(sensors.names, sensors.suspensions, sensors.assumed, strict=False)
-    return {name: own for name, own, assumed in known if own is not None and own != assumed}
 
 
 def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:

@@ -26,7 +26,6 @@ from threadpoolctl import threadpool_limits
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs import AvisTable, load_rig
-from avis_ctrl.rigs.instruments import Tolerances
 
 # A traceback is kept from its end, where the reason is.
 LONGEST_TEXT = 4000
@@ -71,9 +70,7 @@ def _work(task: Task, to_parent: Connection) -> None:
     to_parent.send(("simulated", {"simulation_seconds": time.perf_counter() - began,
                                   "relative_change": finite(truth.relative_change(case))}))
     finder = importlib.import_module(task.finder)
-    # A table that is off its rig file a little comes with a file that says so.
-    rig = replace(load_rig("avis"), tolerances=Tolerances()) if task.clutter else load_rig("avis")
-    finding = _ask(finder, campaign, rig, to_parent)
+    finding = _ask(finder, campaign, load_rig("avis"), to_parent)
     if finding is not None and task.unseen:
         try:
             unseen = stripped(truth.simulate_case(case, unseen=True))

@@ -10,6 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from avis_ctrl.rigs.instruments import Tolerances
 from benchmarks.blind.lines import Hidden, Line, Named, Trace
 
 # Effects of the contract with their places; those in PLACED have a place that can be wrong.
@@ -116,10 +117,14 @@ def is_trace(named: Named, line: Line) -> bool:
     return any(one.name == named.name for one in line.traces)
 
 
-# Parameters of a hidden value of the rig file, what the file says, and the contract's default tolerance.
-TOLERANCES = {"sensor_gain": (("gain",), 1.0, 0.01), "actuator_gain": (("gain",), 1.0, 0.01),
-              "sensor_misalignment": (("angle_rad",), 0.0, 0.005), "geophone_corner": (("corner_Hz",), 4.5, 0.045),
-              "com_offset": (("x_m", "y_m", "z_m"), 0.0, 0.001), "product_of_inertia": (("product_kgm2",), 0.0, 0.2)}
+# Parameters of a hidden value of the rig file, what the file says, and its default tolerance.
+_T, _CORNER_Hz = Tolerances(), 4.5
+TOLERANCES = {"sensor_gain": (("gain",), 1.0, _T.sensor_gain_percent / 100),
+              "actuator_gain": (("gain",), 1.0, _T.actuator_gain_percent / 100),
+              "sensor_misalignment": (("angle_rad",), 0.0, _T.direction_rad),
+              "geophone_corner": (("corner_Hz",), _CORNER_Hz, _CORNER_Hz * _T.sensor_corner_percent / 100),
+              "com_offset": (("x_m", "y_m", "z_m"), 0.0, _T.centre_of_mass_m),
+              "product_of_inertia": (("product_kgm2",), 0.0, _T.product_of_inertia_kgm2)}
 # Up to so many of them a departure is within tolerance, and no missing effect.
 WITHIN = 3.0
 

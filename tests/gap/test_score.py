@@ -98,7 +98,7 @@ def test_what_re_identification_absorbs_is_never_significant():
         took = score.reduction(score.of_effect(effect(name, place, None, free)))
         assert took.chi2 < 1e-6 * score.chi2
         assert took.rank == 0
-    assert all(seed.chance(1.0) > CHANCE for seed in library()["sensor_gain"].seeds(score, "Sz2"))
+    assert all(seed.p_value > CHANCE for seed in library()["sensor_gain"].seeds(score, "Sz2"))
 
 
 def test_parameter_errors_alone_are_found_by_no_effect():
@@ -108,7 +108,7 @@ def test_parameter_errors_alone_are_found_by_no_effect():
     blocks = [block(truth, rng, True, name=name) for name in ("00", "01")]
     fitted = fit(MODEL, blocks).model
     score = Score(fitted, blocks)
-    found = [seed.chance(1.0) for one in library().values() if not one.nonlinear for place in one.places(fitted)
+    found = [seed.p_value for one in library().values() if not one.nonlinear for place in one.places(fitted)
              for seed in one.seeds(score, place)]
     assert len(found) > 10
     assert min(found) > CHANCE

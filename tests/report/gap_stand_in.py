@@ -89,7 +89,7 @@ def explained(campaign: Campaign) -> Gap:
     base, updated = models(campaign)
     sizes = {"offset_x_m": Reported(0.0201, 0.0002, "m"), "offset_y_m": Reported(-0.0119, 0.0002, "m"),
              "offset_z_m": Reported(0.0004, 0.003, "m")}
-    named = NamedEffect("com_offset", "payload", library()["com_offset"].title, sizes, 0.9996, (), 5120.0,
+    named = NamedEffect("com_offset", "payload", library()["com_offset"].title, sizes, 0.9996, (),
                         "com_offset@payload", "found by its score, refitted on all lines")
     considered = tuple(Considered(name, place, chi2, p, reason, size) for name, place, chi2, p, reason, size in (
         ("product_of_inertia", "Jxz", 41.3, 3e-9, "leaves a significant residual at the roll mode",

@@ -50,7 +50,7 @@ def test_parameters_lie_within_their_standard_deviations(case, found):
 def test_the_error_on_held_out_records_falls(found):
     held, = found.validation.held_out
     assert held.nrms_all < 0.1 * held.nrms_all_exact
-    assert any("taken for exact" in sentence for sentence in found.validation.sentences)
+    assert any("taken as exact" in sentence for sentence in found.validation.sentences)
 
 
 def test_the_folder_predicts_what_the_fitted_model_does(campaign, found, tmp_path):

@@ -67,10 +67,11 @@ class Seed:
     looks: int = 1
     seen: float | None = None
 
-    def chance(self, stretch: float) -> float:
-        """Probability of as large a fall by noise alone, of which the power is `stretch` times the stated one."""
+    @property
+    def p_value(self) -> float:
+        """Probability of as large a fall by noise alone."""
         fall = self.chi2 if self.seen is None else self.seen
-        return min(1.0, self.looks * float(stats.chi2.sf(fall / stretch, self.directions)))
+        return min(1.0, self.looks * float(stats.chi2.sf(fall, self.directions)))
 
 
 @dataclass(frozen=True)
@@ -108,11 +109,6 @@ class Effect(ABC):
     holds_states: ClassVar[bool] = False
     resonant: ClassVar[bool] = False
     outside: ClassVar[bool] = False
-
-    @property
-    def shipped(self) -> bool:
-        """Whether it comes with the product; not so of a user's own file."""
-        return type(self).__module__.startswith(__package__ or "avis_ctrl")
 
     def places(self, model: TableModel) -> tuple[str, ...]:
         """Where it can act on this table; empty where it cannot."""

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.data import thinned
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register, told_from_none
 from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.mounts import has_mounts
@@ -21,7 +20,7 @@ from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, fit
 from avis_ctrl.identification.noise import relative_noise
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectra import SpectralBlock, thinned
 from avis_ctrl.rigs.rigid_body import point_map
 
 if TYPE_CHECKING:

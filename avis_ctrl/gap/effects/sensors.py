@@ -68,7 +68,7 @@ class GeophoneCorner(_OfSensor):
                 EffectParameter("damping", "1", "damping ratio of the suspension", z, z / 5, 5 * z, z))
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        # Times the corner as it is within its tolerance: to first order both are the same parameter wherever that is.
+        # A factor of the present corner, which the tolerance fit may have moved: both then change the same parameter.
         k, (f, z) = ops.sensor(place), suspensions(ops.base.rig)[place]
         own = ops.base.sensors.suspensions
         f_own, z_own = (own[k] if own else None) or (f, z)

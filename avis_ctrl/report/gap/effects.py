@@ -13,9 +13,7 @@ from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.pieces import Bullets, Fold, Heading, Paragraph, Piece, Section, Table, table
-
-# Tolerances that are shown at once, and from how many standard deviations one counts as far.
-SHOWN, FAR = 10, 3.0
+from avis_ctrl.report.sections.tolerances import tolerances
 
 
 def parameters(found: Found) -> Section:
@@ -32,25 +30,8 @@ def parameters(found: Found) -> Section:
         pieces.append(Fold(f"The rig's own parameters, re-identified{both}",
                            (_rig(gap, groups), *_together(groups), *_always(gap))))
     if gap.tolerances:
-        pieces += [Heading("Tolerances"), *_tolerances(gap)]
+        pieces += [Heading("Tolerances"), *tolerances(gap.tolerances)]
     return Section("Parameters", "parameters", tuple(pieces))
-
-
-def _tolerances(gap: Gap) -> list[Piece]:
-    """How far every value of the rig file with a tolerance had to move; the largest first."""
-    header = ("parameter", "value", "± 1 σ", "unit", "moved by")
-    rows = []
-    for one in gap.tolerances:
-        value, sigma = words.with_deviation(one.value, one.std)
-        rows.append((one.parameter, value, f"± {sigma}", words.unit(one.unit), f"{one.moved:+.1f}".replace("-", "−")))
-    moved = np.array([one.moved for one in gap.tolerances])
-    far = int(np.sum(np.abs(moved) > FAR))
-    told = (f"{len(rows)} values of the rig file have a tolerance. They moved by "
-            f"{words.number(float(np.sqrt(np.mean(moved ** 2))), 2)} of their tolerances, r.m.s., and {far or 'none'} "
-            f"of them by more than {FAR:g}.")
-    many = table("Values of the rig file that moved most, in units of their tolerance.", header, rows[:SHOWN], "lrrlr")
-    rest = Fold(f"{len(rows) - SHOWN} more tolerances", (table("The others.", header, rows[SHOWN:], "lrrlr"),))
-    return [Paragraph(told), many, *([rest] if rows[SHOWN:] else [])]
 
 
 def _sizes(gap: Gap) -> Table:

@@ -7,17 +7,17 @@ import numpy as np
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.sections.tolerances import tolerances
 from avis_ctrl.study.identification import Identification
 
 TOGETHER = "only in combination"
-MOST_TOLERANCES = 10
 
 
 def opening(found: Identification) -> Section:
     """The verdict, and every parameter."""
     pieces: list[Piece] = [_sentence(found), _parameters(found), _changes(found)]
     if found.campaign_fit.tolerances:
-        pieces += _tolerances(found)
+        pieces += [*tolerances(found.campaign_fit.tolerances), Paragraph(_upper(found.caution), "note")]
     pieces += [Paragraph(_upper(note), "note") for note in found.campaign_fit.notes]
     return Section("Result", "result", tuple(pieces))
 
@@ -64,20 +64,6 @@ def _parameters(found: Identification) -> Table:
                  "one nearest to the start and has no meaning by itself; section 5 lists the combinations."
                  f"{prior}", ("parameter", "start", "identified", "± 1 σ", "relative", "change", "unit"), rows,
                  "lrrrrrl")
-
-
-def _tolerances(found: Identification) -> list[Piece]:
-    """The values of the rig file that moved most within their tolerance."""
-    every = found.campaign_fit.tolerances
-    rows = []
-    for one in every[:MOST_TOLERANCES]:
-        value, sigma = words.with_deviation(one.value, one.std)
-        rows.append((one.parameter, value, f"± {sigma}", words.unit(one.unit), f"{one.moved:+.1f}".replace("-", "−")))
-    moved = words.number(float(np.sqrt(np.mean([one.moved ** 2 for one in every]))), 2)
-    return [table(f"Values of the rig file that moved most. {len(every)} of its values were fitted within their "
-                  f"tolerances, and moved by {moved} of these, r.m.s.; result.json lists all of them.",
-                  ("parameter", "value", "± 1 σ", "unit", "moved by"), rows, "lrrlr"),
-            Paragraph(_upper(found.caution), "note")]
 
 
 def _changes(found: Identification) -> Figure:
