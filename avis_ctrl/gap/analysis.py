@@ -261,8 +261,10 @@ def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSetting
             break
         found.append((label, one))
         before = {label for label in one.labels if label != found[-1][0]}
-        one = next((step.fitted for step in fits.steps if set(step.fitted.labels) == before),
-                   without_effect(one, label, data, settings) if before else None)
+        if not before:
+            break
+        known = next((step.fitted for step in fits.steps if set(step.fitted.labels) == before), None)
+        one = known or without_effect(one, label, data, settings)
     return found[::-1]
 
 

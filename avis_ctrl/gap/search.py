@@ -95,12 +95,18 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: 
 
 
 def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candidate]:
-    """Each effect at its best place, of those whose fall is no chance among so many."""
-    chosen: dict[str, Candidate] = {}
+    """Each effect at its best place, by each law that promises a good part of what its best one does, of those whose
+    fall is no chance among so many."""
+    best: dict[str, Candidate] = {}
+    chosen: dict[tuple[str, str], Candidate] = {}
     for one in found:
-        if one.p_value * len(found) < math.exp(-settings.certain):
-            chosen.setdefault(one.effect.effect.name, one)
-    return list(chosen.values())[:settings.refits]
+        first = best.setdefault(one.effect.effect.name, one)
+        law = one.effect.label.partition("/")[2]
+        if (one.p_value * len(found) < math.exp(-settings.certain)
+                and (one is first or one.fall >= settings.not_far_behind * first.fall)):
+            chosen.setdefault((one.effect.effect.name, law), one)
+    names = list(best)[:settings.refits]
+    return [one for (name, _), one in chosen.items() if name in names]
 
 
 def other_laws(found: Sequence[Candidate], best: ActiveEffect) -> list[Candidate]:

@@ -307,9 +307,9 @@ class ContactFriction(Effect):
 
     def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
                        ) -> np.ndarray | None:
-        """As `force`; of a slip the contacts' own forces are kept."""
-        slip = values["slip_m"]
-        return pushed(record.kept(f"{self.name} {slip}", omega, lambda: slipping(record, slip)), record, values)
+        """As `force`, interpolated between slips."""
+        f = record.interpolated(self.name, values["slip_m"], omega, lambda slip: slipping(record, slip))
+        return pushed(f, record, values)
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
