@@ -109,10 +109,10 @@ def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candida
     return [one for (name, _), one in chosen.items() if name in names]
 
 
-def other_laws(found: Sequence[Candidate], best: ActiveEffect) -> list[Candidate]:
-    """The same effect at the same place by its other laws."""
-    return [one for one in found if name_of(one.effect.label) == name_of(best.label)
-            and one.effect.label != best.label]
+def other_laws(found: Sequence[Candidate], best: ActiveEffect, fitted: Sequence[Candidate]) -> list[Candidate]:
+    """The same effect at the same place by its other laws, but for those that were fitted."""
+    done = {one.effect.label for one in fitted}
+    return [one for one in found if name_of(one.effect.label) == name_of(best.label) and one.effect.label not in done]
 
 
 def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSettings) -> Fitted | None:
@@ -178,11 +178,12 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
 def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each) -> Step | None:
     """The effect of the largest evidence; None where none beats the present model."""
     found = candidates(now, data, effects, settings, each)
-    tried = _tried(now, shortlist(found, settings), data, settings, each)
+    first = shortlist(found, settings)
+    tried = _tried(now, first, data, settings, each)
     if not tried:
         return None
     best = max(tried, key=lambda label: tried[label].log_evidence)
-    tried |= _tried(now, other_laws(found, tried[best].model.effects[-1]), data, settings, each)
+    tried |= _tried(now, other_laws(found, tried[best].model.effects[-1], first), data, settings, each)
     best = max(tried, key=lambda label: tried[label].log_evidence)
     start = tried[best]
     if start.log_evidence - now.log_evidence < settings.certain + math.log(len(found)):
