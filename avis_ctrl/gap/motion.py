@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.fft
@@ -97,6 +97,6 @@ class RecordMotion:
         """
         at = np.log(value) / np.log(NODES)
         nodes = np.floor(at) + np.arange(-1, 3)
-        of = [self.kept(f"{key} {node:g}", omega, lambda node=node: samples(NODES ** node)) for node in nodes]
+        of = [self.kept(f"{key} {node:g}", omega, partial(samples, NODES ** node)) for node in nodes]
         weights = [np.prod([(at - other) / (node - other) for other in nodes if other != node]) for node in nodes]
         return np.asarray(sum(weight * one for weight, one in zip(weights, of, strict=True)))

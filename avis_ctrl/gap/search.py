@@ -11,7 +11,7 @@ well goes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,24 +95,30 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: 
 
 
 def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candidate]:
-    """Each effect at its best place, by each law that promises a good part of what its best one does, of those whose
-    fall is no chance among so many."""
-    best: dict[str, Candidate] = {}
-    chosen: dict[tuple[str, str], Candidate] = {}
+    """Each effect at its best place, of those whose fall is no chance among so many."""
+    chosen: dict[str, Candidate] = {}
     for one in found:
-        first = best.setdefault(one.effect.effect.name, one)
-        law = one.effect.label.partition("/")[2]
-        if (one.p_value * len(found) < math.exp(-settings.certain)
-                and (one is first or one.fall >= settings.not_far_behind * first.fall)):
-            chosen.setdefault((one.effect.effect.name, law), one)
-    names = list(best)[:settings.refits]
-    return [one for (name, _), one in chosen.items() if name in names]
+        if one.p_value * len(found) < math.exp(-settings.certain):
+            chosen.setdefault(one.effect.effect.name, one)
+    return list(chosen.values())[:settings.refits]
 
 
-def other_laws(found: Sequence[Candidate], best: ActiveEffect, fitted: Sequence[Candidate]) -> list[Candidate]:
-    """The same effect at the same place by its other laws, but for those that were fitted."""
-    done = {one.effect.label for one in fitted}
-    return [one for one in found if name_of(one.effect.label) == name_of(best.label) and one.effect.label not in done]
+def other_laws(found: Sequence[Candidate], best: str, fitted: Collection[str]) -> list[Candidate]:
+    """The same effect at the same place by its other laws, but for those that were fitted; all by their labels."""
+    return [one for one in found if name_of(one.effect.label) == name_of(best) and one.effect.label not in fitted]
+
+
+def richer_laws(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> list[Candidate]:
+    """Richer laws of the effects that were fitted last, each begun where a simpler one has ended."""
+    found = []
+    for one in fits:
+        effect = one.model.effects[-1]
+        if type(effect.effect).richer is Effect.richer:
+            continue
+        whole = fit(one.model, one.priors, one.z, data, one.variances, replace(settings, rounds=0, iterations=0))
+        for place, values in effect.effect.richer(EvidenceScore(whole, data, settings), effect):
+            found.append(Candidate(active(effect.effect, one.model, place, values), 0.0, 0.0))
+    return found
 
 
 def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSettings) -> Fitted | None:
@@ -178,12 +184,16 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
 def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each) -> Step | None:
     """The effect of the largest evidence; None where none beats the present model."""
     found = candidates(now, data, effects, settings, each)
-    first = shortlist(found, settings)
-    tried = _tried(now, first, data, settings, each)
+    tried = _tried(now, shortlist(found, settings), data, settings, each)
     if not tried:
         return None
+    last = tried
+    while last:
+        last = _tried(now, richer_laws(list(last.values()), data, settings), data, settings, each)
+        tried |= {label: one for label, one in last.items()
+                  if label not in tried or one.log_evidence > tried[label].log_evidence}
     best = max(tried, key=lambda label: tried[label].log_evidence)
-    tried |= _tried(now, other_laws(found, tried[best].model.effects[-1], first), data, settings, each)
+    tried |= _tried(now, other_laws(found, best, tried), data, settings, each)
     best = max(tried, key=lambda label: tried[label].log_evidence)
     start = tried[best]
     if start.log_evidence - now.log_evidence < settings.certain + math.log(len(found)):

@@ -19,11 +19,13 @@ from avis_ctrl.rigs.rigid_body import point_map
 if TYPE_CHECKING:
     from avis_ctrl.gap.operators import Operators
     from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import TableModel
+    from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 
 # Damping ratios at which seeds are looked for, how often the step between frequencies or places is halved about the
 # best, and places from which that begins.
 DAMPINGS, HALVINGS, STARTS = (0.03, 0.15), 3, 6
+# Least damping ratio by which the steps between frequencies are chosen, and the frequency of a mass that is held fast.
+NARROW, STIFF_Hz = 0.02, 150.0
 
 
 @register
@@ -75,6 +77,26 @@ class AttachedOscillator(AtPoint):
         parameters = self.parameters(score.model, place)
         found = _along_three_axes(score, parameters) if place.endswith("axes") else _along_one(score, parameters)
         return sorted(found, key=lambda seed: -seed.chi2)
+
+    def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
+        """Along three axes, from a fit along one direction: the nearest axis keeps its frequency, and along the others
+        a resonance is looked for at each frequency, anywhere on the line of action."""
+        if not one.place.endswith("oblique"):
+            return []
+        values = one.by_name
+        a = np.array([values[f"along_{axis}"] for axis in "xyz"])
+        mass, first = float(a @ a), int(np.argmax(np.abs(a)))
+        parameters = self.parameters(score.model, "payload/axes")
+        # Resonances of a damping ratio zeta are 2 zeta wide: a step of zeta misses none.
+        grid, damping = parameters[1].grid, max(values["damping"], NARROW)
+        frequencies = (*np.geomspace(grid[0], grid[-1], 2 + int(np.log(grid[-1] / grid[0]) / damping)), STIFF_Hz)
+        others = [k for k in range(3) if k != first]
+        points = place_of(values) + np.outer(np.linspace(-REACH_m, REACH_m, 25), a / np.sqrt(mass))
+        pair, point = _along_the_others(score, values["damping"], frequencies, points,
+                                        "".join("xyz"[k] for k in others))
+        along = np.full(3, values["frequency_Hz"])
+        along[others] = pair
+        return [("payload/axes", tuple(map(float, (mass, *along, values["damping"], *point))))]
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         names = [name for name in values if name.startswith("along_")] or ["mass_kg"]
@@ -170,6 +192,26 @@ def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> li
             values = (min(mass, 0.5 * parameters[0].high), *frequencies[triple], zeta, *point)
             found.append(Seed(tuple(map(float, values)), chi2, 8, n ** 3))
     return found
+
+
+def _along_the_others(score: Score, damping: float, frequencies: Sequence[float], points: np.ndarray, axes: str
+                      ) -> tuple[tuple[float, float], np.ndarray]:
+    """Frequencies along two axes, and the point (3,), that take most together. Their masses are left free: what has no
+    name has taken a part of what they do."""
+    kept = np.concatenate([unit_matrices(score, partial(sprung, frequency_Hz=f, damping=damping)) for f in frequencies],
+                          dtype=np.float32)
+    n = len(frequencies)
+    G, b = (kept @ kept.T).reshape(n, 21, n, 21), (kept @ score.e.astype(np.float32)).reshape(n, 21)
+    best = -np.inf, (0, 0), points[0]
+    for rows, point in zip(at_points(points, axes), points, strict=True):
+        H, g = np.einsum("ap,fpgq,bq->afbg", rows, G, rows, optimize=True), rows @ b.T
+        one, other, both = np.diag(H[0, :, 0])[:, None], np.diag(H[1, :, 1]), H[0, :, 1]
+        size = one * other - both ** 2
+        masses = np.array([other * g[0][:, None] - both * g[1], one * g[1] - both * g[0][:, None]]) / size
+        fall = np.where(np.all(masses > 0, axis=0), masses[0] * g[0][:, None] + masses[1] * g[1], 0.0)
+        k, j = np.unravel_index(int(np.argmax(fall)), fall.shape)
+        best = max(best, (float(fall[k, j]), (int(k), int(j)), point), key=lambda found: found[0])
+    return (frequencies[best[1][0]], frequencies[best[1][1]]), best[2]
 
 
 def _best_triple(G: np.ndarray, b: np.ndarray) -> tuple[float, float, list[int]]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from avis_ctrl.gap.motion import RecordMotion
     from avis_ctrl.gap.operators import Operators
     from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import TableModel
+    from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 
 
 @dataclass(frozen=True)
@@ -207,6 +207,11 @@ class Effect(ABC):
             if not wrong:
                 found.append(Seed(tuple(values), took.chi2, took.rank, len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
+
+    def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
+        """Places (with their law) and values from which a richer law of the same effect may begin, where `one` has been
+        fitted; score : of that fit. By default none."""
+        return []
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         """Why physics forbids these values, empty where it does not."""

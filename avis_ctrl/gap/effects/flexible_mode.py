@@ -17,15 +17,12 @@ from avis_ctrl.gap.score_algebra import reduction
 if TYPE_CHECKING:
     from avis_ctrl.gap.operators import Operators
     from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import TableModel
+    from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 
 # Frequencies at which a mode is looked for [Hz].
 FREQUENCIES_Hz = tuple(np.geomspace(7.0, 140.0, 22).tolist())
 # Variants by number of modes.
 COUNTS = {"": 1, "two": 2, "three": 3}
-# A further mode is looked for where it takes this share of what the modes before it leave over the noise, and, of
-# several at one look, more than chance would; beside fitted ones its refit says that.
-FURTHER = 0.25
 # log of the ratio of two modes' frequencies from which on they are looked for apart.
 APART = 0.08
 # 1/sqrt(kg) that a shape is expected to have at least, where nothing is seen of it.
@@ -87,11 +84,16 @@ class PayloadFlexibleMode(Effect):
                                                  at_sensors @ shape))
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Residues over all paths at the frequencies that take most, of which the symmetric part of rank one is each
-        mode's shape."""
-        count = COUNTS[place.partition("/")[2]]
-        return [seed for n, seed in _modes_one_by_one(score)
-                if n == count]
+        """Residues over all paths at the frequencies that take most, of which the symmetric part of rank one is the
+        mode's shape. Further modes begin beside fitted ones (`richer`)."""
+        return _one_mode(score, ()) if COUNTS[place.partition("/")[2]] == 1 else []
+
+    def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
+        """One mode more, where the fitted ones leave most."""
+        more = {count: place for place in self.places(score.model) for count in [COUNTS[place.partition("/")[2]]]}
+        place = more.get(COUNTS[one.place.partition("/")[2]] + 1)
+        found = _one_mode(score, [frequency for frequency, *_ in modes(one.by_name)]) if place else []
+        return [(place, (*one.values, *found[0].values))] if place and found else []
 
     def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
@@ -132,78 +134,42 @@ def _shape_rows(actuators: tuple[tuple[str, float], ...], sensors: tuple[tuple[s
 
 def resonance(score: Score) -> float:
     """Fall of chi-square by one mode whose residues are free on every path."""
-    return max(reduction(G, b).chi2 for G, b in _looks(score)[2])
+    return max(reduction(G, b).chi2 for G, b in _looks(score)[1])
 
 
-Looks = tuple[list[tuple[float, float]], list[np.ndarray], list[tuple[np.ndarray, np.ndarray]]]
-
-
-def _looks(score: Score) -> Looks:
-    """Frequency and damping ratio of every mode that is looked for, its paths (n_y n_u, N), and their Gram matrix and
-    product with the residual."""
+def _looks(score: Score) -> tuple[list[tuple[float, float]], list[tuple[np.ndarray, np.ndarray]]]:
+    """Frequency and damping ratio of every mode that is looked for, and the Gram matrix of its paths with their product
+    with the residual."""
     if "looks" not in score.kept:
         lowest = FREQUENCIES_Hz[0]
         tried = [(f, 0.02) for f in FREQUENCIES_Hz]
         tried += [(f, zeta) for f in peaks(score) if f > lowest for zeta in (0.005, 0.02)]
-        kept = [paths(score, partial(receptance, frequency_Hz=f, damping=zeta)).astype(np.float32) for f, zeta in tried]
-        e = score.e.astype(np.float32)
-        score.kept["looks"] = tried, kept, [((A @ A.T).astype(float), (A @ e).astype(float)) for A in kept]
+        kept = [paths(score, partial(receptance, frequency_Hz=f, damping=zeta)) for f, zeta in tried]
+        score.kept["looks"] = tried, [(A @ A.T, A @ score.e) for A in kept]
     return score.kept["looks"]
 
 
-def _modes_one_by_one(score: Score, most: int = len(COUNTS)) -> list[tuple[int, Seed]]:
-    """(number of modes, seed), the best first: each further mode beside those before it, up to `most`."""
-    key = ("modes", most)
-    if key in score.kept:
-        return score.kept[key]
-    frequencies, kept, own = _looks(score)
-    found: list[tuple[int, Seed]] = []
-    chosen: list[int] = []
-    before = 0.0
-    for count in range(1, most + 1):
-        tries = []
-        for k in range(len(frequencies)):
-            if all(abs(np.log(frequencies[k][0] / frequencies[j][0])) > APART for j in chosen):
-                G, b = _joint([*chosen, k], kept, own)
-                took = reduction(G, b)
-                tries.append((took.chi2, k, took.coefficients))
-        chi2, best, _ = max(tries, key=lambda one: one[0])
-        gain, paths_of_one = chi2 - before, len(kept[0])
-        chance = paths_of_one + 6 * np.sqrt(2 * paths_of_one)
-        if count > 1 and gain < max(FURTHER * (score.chi2 - score.dof - before),
-                                    chance * max(1.0, score.chi2 / score.dof)):
-            break
-        chosen.append(best)
-        for taken, k, residues in sorted(tries, key=lambda one: -one[0])[:4]:
-            if seed := _seed(score.model, [frequencies[j] for j in (*chosen[:-1], k)], residues, taken,
-                                 len(frequencies) ** count):
-                found.append((count, seed))
-        before = chi2
-    score.kept[key] = sorted(found, key=lambda one: (one[0], -one[1].chi2))
-    return score.kept[key]
+def _one_mode(score: Score, beside: Sequence[float]) -> list[Seed]:
+    """A mode away from the frequencies [Hz] of others, the best first."""
+    at, products = _looks(score)
+    found = []
+    for (f, zeta), (G, b) in zip(at, products, strict=True):
+        if all(abs(np.log(f / other)) > APART for other in beside):
+            took = reduction(G, b)
+            if seed := _seed(score.model, f, zeta, took.coefficients, took.chi2, len(at)):
+                found.append(seed)
+    return sorted(found, key=lambda seed: -seed.chi2)
 
 
-def _joint(chosen: Sequence[int], kept: Sequence[np.ndarray], own: Sequence[tuple[np.ndarray, np.ndarray]]
-           ) -> tuple[np.ndarray, np.ndarray]:
-    """Gram matrix and product with the residual of several frequencies' paths together."""
-    G = np.block([[own[i][0] if i == j else (kept[i] @ kept[j].T).astype(float) for j in chosen] for i in chosen])
-    return G, np.concatenate([own[i][1] for i in chosen])
-
-
-def _seed(model: TableModel, at: Sequence[tuple[float, float]], residues: np.ndarray, chi2: float,
-          looks: int) -> Seed | None:
-    """Shapes from residues (modes n_y n_u,); None where some mode's would be negative."""
+def _seed(model: TableModel, f: float, zeta: float, residues: np.ndarray, chi2: float, looks: int) -> Seed | None:
+    """Shape from residues (n_y n_u,); None where it would be negative."""
     at_actuators, at_sensors = shape_rows(model.rig, model.actuators, model.sensors.names)
-    values: list[float] = []
-    share, total = 0.0, 0.0
-    for (f, zeta), own in sorted(zip(at, np.split(residues, len(at)), strict=True), key=lambda one: one[0][0]):
-        # Q = a_s a_u^T with both from one shape: the size by the best of rank one.
-        U, sigma, Vt = np.linalg.svd(own.reshape(len(at_sensors), -1))
-        shape = at_actuators.T @ Vt[0]
-        sign = float(U[:, 0] @ (at_sensors @ shape))
-        size = float(np.sum((at_sensors @ shape) ** 2))
-        if sign <= 0 or size == 0:
-            return None
-        values += [f, zeta, *(shape * np.sqrt(sigma[0] * sign / size))]
-        share, total = share + sigma[0] ** 2, total + float(np.sum(sigma ** 2))
-    return Seed(tuple(float(v) for v in values), chi2 * float(share / total), len(residues), looks)
+    # Q = a_s a_u^T with both from one shape: the size by the best of rank one.
+    U, sigma, Vt = np.linalg.svd(residues.reshape(len(at_sensors), -1))
+    shape = at_actuators.T @ Vt[0]
+    sign, size = float(U[:, 0] @ (at_sensors @ shape)), float(np.sum((at_sensors @ shape) ** 2))
+    if sign <= 0 or size == 0:
+        return None
+    values = f, zeta, *(shape * np.sqrt(sigma[0] * sign / size))
+    share = sigma[0] ** 2 / float(np.sum(sigma ** 2))
+    return Seed(tuple(float(v) for v in values), chi2 * float(share), len(residues), looks)
