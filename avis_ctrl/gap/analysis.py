@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 from avis_ctrl.gap.detectable import detectable
 from avis_ctrl.gap.each import Each, one_by_one
-from avis_ctrl.gap.effects.base import Effect, library
+from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.beyond import beyond
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.evidence_score import EvidenceScore
 from avis_ctrl.gap.in_words import in_words
 from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplained

@@ -22,7 +22,8 @@ from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.prediction_error import prediction_error
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, record_block
+from avis_ctrl.identification.spectra import record_block
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 
 # Bands to the octave in which silent lines are weighted by what is left of them, and how often.

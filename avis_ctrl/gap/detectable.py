@@ -12,7 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, library
+from avis_ctrl.gap.effects.base import Effect
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.result import Detectable
 from avis_ctrl.gap.score import LEFT, Score
 from avis_ctrl.gap.table_model import active

@@ -17,8 +17,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.base import Effect, library
+from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.large_motion import LargeMotion
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.response import ResponseModel, sensor_model
 from avis_ctrl.rigs.avis import INERTIA

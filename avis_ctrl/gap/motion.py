@@ -97,6 +97,8 @@ class RecordMotion:
         """
         at = np.log(value) / np.log(NODES)
         nodes = np.floor(at) + np.arange(-1, 3)
-        of = [self.kept(f"{key} {node:g}", omega, lambda node=node: samples(NODES ** node)) for node in nodes]
+
+        def at_node(node: float) -> np.ndarray:
+            return self.kept(f"{key} {node:g}", omega, lambda: samples(NODES ** node))
         weights = [np.prod([(at - other) / (node - other) for other in nodes if other != node]) for node in nodes]
-        return np.asarray(sum(weight * one for weight, one in zip(weights, of, strict=True)))
+        return np.asarray(sum(weight * at_node(node) for weight, node in zip(weights, nodes, strict=True)))

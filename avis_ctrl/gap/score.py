@@ -20,10 +20,12 @@ import numpy as np
 
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.score_algebra import SYMMETRIC, Reduction, reduction
-from avis_ctrl.gap.table_model import Acting, ActiveEffect, TableModel, _Answer, _Side
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.gap.table_response import Acting, AtMotion, TableResponse
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitened_real, whitener
 from avis_ctrl.identification.response import N_Q, ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns, transient_parts
+from avis_ctrl.identification.spectra import span, transient_columns, transient_parts
+from avis_ctrl.identification.spectral_block import SpectralBlock
 
 # Step of a linear parameter, in units of its size, at which its direction is taken.
 STEP = 1e-3
@@ -45,7 +47,7 @@ class Part:
         self.transient = np.zeros((0, 0))
         self.body: np.ndarray | None = None
         self.inner: np.ndarray | None = None
-        self.answer = _Answer(self.made, self._acting(model))
+        self.answer = TableResponse(self.made, self._acting(model))
         if block.transient:
             columns, norms = transient_columns(block, cast(ResponseModel, model))
             T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
@@ -53,12 +55,12 @@ class Part:
             left = as_real(whitened(self.L, block.Y - self.answer.Y)[None])[0]
             self.body, self.inner = transient_parts(X @ (self.transient.T @ left), norms, block,
                                                     cast(ResponseModel, model))
-            self.answer = _Answer(self.made, self._acting(model))
+            self.answer = TableResponse(self.made, self._acting(model))
 
     def _acting(self, model: TableModel) -> Acting:
         block = self.block
         U = block.U if self.body is None else np.concatenate([block.U, self.body], axis=1)
-        return model._acting(U, block if model.nonlinear else None)
+        return model.acting(U, block if model.nonlinear else None)
 
     @property
     def s(self) -> np.ndarray:
@@ -72,9 +74,9 @@ class Part:
             out -= (self.transient @ (self.transient.T @ out.T)).T
         return out
 
-    def side(self, model: TableModel) -> _Side:
+    def side(self, model: TableModel) -> AtMotion:
         """What a model near by misses of the motion of this one."""
-        return _Side(assemble(model.operators(self.block.omega), invert=False), self._acting(model), self.answer.x)
+        return AtMotion(assemble(model.operators(self.block.omega), invert=False), self._acting(model), self.answer.x)
 
     def by_impedance(self, dynamic: np.ndarray) -> np.ndarray:
         """(21, n, n_y, m): y by each symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""

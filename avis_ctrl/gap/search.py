@@ -22,6 +22,7 @@ from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.flexible_mode import resonance
 from avis_ctrl.gap.evidence_score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
+from avis_ctrl.gap.starting_values import seeds
 from avis_ctrl.gap.table_model import ActiveEffect, active
 from avis_ctrl.gap.tolerances import BEYOND, of_effect, tolerances_behind, within_tolerance
 from avis_ctrl.identification.likelihood import Data, Fitted, fit
@@ -84,7 +85,7 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: 
         for place in effect.places(model):
             if (effect.name, place.partition("/")[0]) not in taken:
                 found += [Candidate(active(effect, model, place, seed.values), seed.chi2, seed.p_value)
-                          for seed in effect.seeds(score, place)[:1]]
+                          for seed in seeds(effect, score, place)[:1]]
         return found
     resonant = [one for one in effects if one.resonant]
     found = [one for own in each(scored, [one for one in effects if not one.resonant]) for one in own]

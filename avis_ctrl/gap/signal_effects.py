@@ -1,6 +1,6 @@
 """Effects that act on the signals alone: recognised in the records themselves, not by refits of the table.
 
-They are no classes of the library (`effects.base.library`) and have no part in a score.
+They are no classes of the library (`effects.library`) and have no part in a score.
 """
 
 from __future__ import annotations

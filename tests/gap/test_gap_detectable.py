@@ -8,7 +8,7 @@ from noise_fit import fitted
 from test_score import MODEL, block, effect
 
 from avis_ctrl.gap.detectable import detectable
-from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.parameter_sets import default_parameters

@@ -14,7 +14,8 @@ from scipy.integrate import solve_ivp
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.additions import LADDER_ERROR, LADDER_Hz, Table, impedance, ladder
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, library
+from avis_ctrl.gap.effects.base import Effect, EffectParameter
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.mounts import REFERENCE_Hz
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.realise import CHECK_Hz, realise, sufficient_order, with_effects

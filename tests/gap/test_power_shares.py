@@ -13,7 +13,7 @@ from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.prediction_error import PredictionError
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import RecordHeader
 from avis_ctrl.rigs import load_rig
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, library
+from avis_ctrl.gap.effects.base import Effect, EffectParameter
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.realise import Realised, notes_on
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register, told_from_none
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, register, told_from_none
 from avis_ctrl.gap.effects.impedance import about, at_points, positions, project
 from avis_ctrl.gap.effects.line_of_action import best_direction, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
+from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.gap.starting_values import Seed
 from avis_ctrl.rigs.rigid_body import point_map
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import TableModel
-
 
 # How often the step between places is halved about the best.
 HALVINGS = 3
@@ -36,10 +32,10 @@ class CableStiffness(AtPoint):
     title = "a cable or hose ties the payload to ground"
     looks_like = "stiffness at a place and height where no mount is: it shifts and couples the lowest resonances"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("payload/axes", "payload/oblique")
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 0.02 * float(np.mean(np.diag(model.base.matrices.K)[:3])) / 4  # of one mount of four, on any rig
         most = 200 * size
         if place.endswith("oblique"):
@@ -75,7 +71,7 @@ class CableStiffness(AtPoint):
         names = [name for name in values if name.startswith(("along_", "k_"))]
         return "" if told_from_none(values, std, names) else "a cable that the data do not tell from none"
 
-    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         """Of one direction: stiffness, direction, and the foot of the line of action; else the largest stiffness before
         all others."""

@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter
+from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.score_algebra import symmetric_coordinates
 from avis_ctrl.rigs.rigid_body import point_map
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.score import Score
 
 # Places looked at along x, y, z [m], from the geometric centre: over and around a table.
 GRID_m = (np.linspace(-0.6, 0.6, 7), np.linspace(-0.5, 0.5, 6), np.linspace(-0.3, 0.4, 4))
