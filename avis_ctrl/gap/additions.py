@@ -31,9 +31,24 @@ from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.rigid_body import COORDINATES, point_map
 
-# Band in which the ladder follows the power of s, and its largest relative error there.
-LADDER_Hz = (0.1, 200.0)
-LADDER_ERROR = 2e-3
+
+@dataclass(frozen=True)
+class RealisationSettings:
+    """Of effects as state-space systems.
+
+    ladder_Hz : band in which the ladder of Maxwell branches follows the power of s [Hz], wider than that of a
+        controller.
+    ladder_error : its largest relative error there [1]: small beside what is known of any loss factor.
+    check_Hz : lowest and highest frequency [Hz], and number of those at which a realisation is compared with the
+        model's response.
+    """
+
+    ladder_Hz: tuple[float, float] = (0.1, 200.0)
+    ladder_error: float = 2e-3
+    check_Hz: tuple[float, float, int] = (0.3, 100.0, 120)
+
+
+SETTINGS = RealisationSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,19 +194,19 @@ def _structural(table: Table, place: str, values: Mapping[str, float]) -> StateS
 def ladder(power: float) -> tuple[float, list[tuple[float, float]]]:
     """(s/w_ref)^power as rest + sum of ratio s/(s + w), all ratios positive: (rest, [(w, ratio)]).
 
-    As few branches, evenly spaced in log w within and beyond the band, as keep the error below LADDER_ERROR in
-    LADDER_Hz. Positive ratios make it passive.
+    As few branches, evenly spaced in log w within and beyond the band, as keep the error below `ladder_error` in
+    `ladder_Hz`. Positive ratios make it passive.
     """
-    f = np.geomspace(*LADDER_Hz, 200)
+    f = np.geomspace(*SETTINGS.ladder_Hz, 200)
     s = 2j * np.pi * f
     wanted = (s / (2 * np.pi * REFERENCE_Hz)) ** power
     if power == 0:
         return 1.0, []
     for count, reach in ((count, reach) for count in range(2, 24) for reach in (3.0, 10.0, 30.0)):
-        w = 2 * np.pi * np.geomspace(LADDER_Hz[0] / reach, LADDER_Hz[1] * reach, count)
+        w = 2 * np.pi * np.geomspace(SETTINGS.ladder_Hz[0] / reach, SETTINGS.ladder_Hz[1] * reach, count)
         basis = np.column_stack([np.ones(len(s)), s[:, None] / (s[:, None] + w)]) / wanted[:, None]
         found, _ = nnls(np.vstack([basis.real, basis.imag]), np.concatenate([np.ones(len(s)), np.zeros(len(s))]))
-        if np.max(np.abs(basis @ found - 1)) < LADDER_ERROR:
+        if np.max(np.abs(basis @ found - 1)) < SETTINGS.ladder_error:
             break
     return float(found[0]), [(float(a), float(b)) for a, b in zip(w, found[1:], strict=True) if b > 0]
 

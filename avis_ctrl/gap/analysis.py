@@ -223,7 +223,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         progress("noise of floor and sensors")
         left = left_by(prepared.campaign, updated.model, each)
         faults = replace(faults, noise=levels(left, updated.model, faults.hum, faults.converter))
-    found += [replace(one, share=_share_of_signal(one.name, raw, before, power)) for one in named(faults)]
+    found += [replace(one, share=_share_of_signal(one.name, raw, before, power)) for one in named(faults, settings)]
     found.sort(key=lambda one: -(one.share or 0.0))
     told = tuple(one for one in found if (one.share or 0.0) >= settings.trace)
     traces = tuple(one for one in found if (one.share or 0.0) < settings.trace)

@@ -22,13 +22,25 @@ from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.identification.response import N_Q
 
-# Length of a window [s]: about a radian of the fastest motion of a mount with friction at rest.
-WINDOW_s = 0.05
-# A window is done when its deflection changes by less than this share of the largest one so far.
-WINDOW_TOLERANCE = 1e-9
-MOST_ITERATIONS = 40
-# Into so many pieces a window is cut where it does not contract; 2^20 for single samples.
-PIECES = (1, 8, 1 << 20)
+
+@dataclass(frozen=True)
+class MarchSettings:
+    """Of marching through windows of time.
+
+    window_s : length of a window [s]: about a radian of the fastest motion of a mount with friction at rest.
+    tolerance : a window is done when its deflection changes by less than this fraction of the largest one so far
+        [1].
+    most_iterations : fixed-point iterations in a window before it is cut into more pieces.
+    pieces : into so many pieces a window is cut where it does not contract; 2^20 for single samples.
+    """
+
+    window_s: float = 0.05
+    tolerance: float = 1e-9
+    most_iterations: int = 40
+    pieces: tuple[int, ...] = (1, 8, 1 << 20)
+
+
+SETTINGS = MarchSettings()
 
 
 class Answer:
@@ -57,7 +69,7 @@ class Answer:
             if k < N_Q:
                 column += self.alias[:, None] * self.by_mass[k]
             impulse[:, k] = scipy.fft.irfft(column, response.padded, axis=0)[:response.samples]
-        window = 1 << max(4, round(np.log2(WINDOW_s * response.sample_rate_Hz)))
+        window = 1 << max(4, round(np.log2(SETTINGS.window_s * response.sample_rate_Hz)))
         self.own = scipy.fft.rfft(impulse[:window], 2 * window, axis=0)
         self.window, self.levels, length = window, [], window
         while length < max(response.samples, 2 * window):
@@ -184,8 +196,8 @@ def march(answer: Answer, free: np.ndarray, effects: Sequence[ActiveEffect], rec
             B = W << level
             end = min(start + B, samples)
             z[start:end] += answer.after(total[start - B:start], level)[:end - start]
-        window = _Window(answer, record, forces, beyond, start, stop, WINDOW_TOLERANCE * largest)
-        for piece in PIECES:
+        window = _Window(answer, record, forces, beyond, start, stop, SETTINGS.tolerance * largest)
+        for piece in SETTINGS.pieces:
             if (done := window.solve(z[start:stop], max(W // piece, 1))) is not None:
                 break
         else:
@@ -218,7 +230,7 @@ class _Window:
             b = min(a + piece, length)
             here = slice(self.start + a, self.start + b)
             before = None
-            for iteration in range(1, MOST_ITERATIONS + 1):
+            for iteration in range(1, SETTINGS.most_iterations + 1):
                 z = free + self.answer.within(push[:b], length)
                 deflection = z[a:b] @ self.answer.shape.T + self.beyond[here]
                 change = np.inf if before is None else float(np.max(np.abs(deflection - before)))
@@ -250,6 +262,7 @@ def _without_bound(effects: Sequence[ActiveEffect], record: RecordMotion, start:
     peak = float(np.max(np.abs(record.deflection[:start]), initial=0.0))
     values = ", ".join(f"{one.label} {one.by_name}" for one in effects)
     return ComputationError(f"the table with {values} finds no motion at {start / record.sample_rate_Hz:.3g} s",
-                            measured=f"up to {peak:.3g} m of deflection before; {MOST_ITERATIONS} iterations a sample",
+                            measured=f"up to {peak:.3g} m of deflection before; {SETTINGS.most_iterations} iterations "
+                                     "a sample",
                             cause="an effect that pushes harder the farther the table moves, or that is far stiffer "
                                   "than a mount", next_step="other values of the effect's parameters, or a lower level")

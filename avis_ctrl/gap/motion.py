@@ -9,11 +9,22 @@ from functools import cached_property
 import numpy as np
 import scipy.fft
 
-# Spectra kept for each record; those that have not been used for longest go first.
-MOST_KEPT = 100
-# Ratio of the values between which spectra are interpolated. Of a contact's friction over its slip, cubic interpolation
-# is then exact to a part in ten thousand, and its derivative to a part in five hundred.
-NODES = 1.2
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """Of spectra of a record's motion.
+
+    most_kept : spectra kept for each record; those that have not been used for longest go first.
+    node_ratio : ratio of the values between which spectra are interpolated [1]. Of a contact's friction over its
+        slip, cubic interpolation is then exact to a part in ten thousand, and its derivative to a part in five
+        hundred.
+    """
+
+    most_kept: int = 100
+    node_ratio: float = 1.2
+
+
+SETTINGS = MotionSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +95,7 @@ class RecordMotion:
         found = self._spectra.pop(where, None)
         if found is None:
             found = self.spectrum(samples(), omega)
-            while len(self._spectra) >= MOST_KEPT:
+            while len(self._spectra) >= SETTINGS.most_kept:
                 self._spectra.pop(next(iter(self._spectra)), None)
         self._spectra[where] = found
         return found
@@ -95,10 +106,10 @@ class RecordMotion:
 
         A fit asks for many values near each other, and for differences between them.
         """
-        at = np.log(value) / np.log(NODES)
+        at = np.log(value) / np.log(SETTINGS.node_ratio)
         nodes = np.floor(at) + np.arange(-1, 3)
 
         def at_node(node: float) -> np.ndarray:
-            return self.kept(f"{key} {node:g}", omega, lambda: samples(NODES ** node))
+            return self.kept(f"{key} {node:g}", omega, lambda: samples(SETTINGS.node_ratio ** node))
         weights = [np.prod([(at - other) / (node - other) for other in nodes if other != node]) for node in nodes]
         return np.asarray(sum(weight * at_node(node) for weight, node in zip(weights, nodes, strict=True)))

@@ -173,15 +173,14 @@ class Operators:
 
 # What a fit asks for again and again on the same lines; the oldest go first.
 _kept: dict[tuple, Any] = {}
-_MOST_KEPT = 64
 
 
 def _of(omega: np.ndarray) -> tuple[int, float, float, float]:
     return len(omega), float(omega[0]), float(omega[-1]), float(omega.sum())
 
 
-def _keep(key: tuple, value: Any) -> Any:
-    while len(_kept) >= _MOST_KEPT:
+def _keep(key: tuple, value: Any, most: int = 64) -> Any:
+    while len(_kept) >= most:
         _kept.pop(next(iter(_kept)), None)
     _kept[key] = value
     return value

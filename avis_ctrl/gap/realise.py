@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.additions import Table, addition, chassis, has_addition
+from avis_ctrl.gap.additions import SETTINGS, Table, addition, chassis, has_addition
 from avis_ctrl.gap.effects.sensors import GRAVITY, suspensions
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.table_model import TableModel
@@ -27,8 +27,6 @@ from avis_ctrl.rigs.geophone import second_order_roots
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.uncertainty.uncertain_rig import edge_name, uncertain_rig
 
-# Grid on which a realisation is compared with the model's response.
-CHECK_Hz = np.geomspace(0.3, 100.0, 120)
 FLOOR = ("vx", "vy", "vz")
 # Effects that act through rig parameters, sensors or drives, and on signals alone.
 _ELSEWHERE = {"com_offset", "product_of_inertia", "geophone_corner", "sensor_gain", "sensor_misalignment",
@@ -223,12 +221,12 @@ def _sensor_filters(model: TableModel, factors: np.ndarray) -> list[StateSpace]:
 
 
 def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: int | None = None, when: float = 0.0,
-            check_Hz: np.ndarray = CHECK_Hz) -> Realised:
+            check_Hz: np.ndarray | None = None) -> Realised:
     """One state space of a model, drives and sensors included; coordinates not kept are locked at rest.
 
     pade_order : of delay and hold (1-10); by default what keeps the delay's error below 1e-3 up to the highest of
-    check_Hz, or 10. The error is measured where all six coordinates are kept, nan otherwise: `TableModel.response`
-    knows no locked ones.
+    check_Hz (by default that of the settings), or 10. The error is measured where all six coordinates are kept, nan
+    otherwise: `TableModel.response` knows no locked ones.
 
     Raises
     ------
@@ -236,7 +234,7 @@ def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: in
     """
     if model.sensors.motion != "velocity":
         raise InputError("expected sensors of velocity", field="sensors", value=model.sensors.motion)
-    omega = 2 * np.pi * np.asarray(check_Hz, float)
+    omega = 2 * np.pi * (np.geomspace(*SETTINGS.check_Hz) if check_Hz is None else np.asarray(check_Hz, float))
     order = pade_order or sufficient_order(loop_lag(model)[0], float(omega.max()), 1e-3, 10)[0]
     effective = model.effective
     rig = uncertain_rig(effective.rig, [], keep).system

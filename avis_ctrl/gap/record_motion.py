@@ -9,7 +9,7 @@ P = D^-1 S: the inverse of the sensors' chain where they see more than noise, no
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
@@ -25,13 +25,30 @@ from avis_ctrl.identification.prediction import model_inputs
 from avis_ctrl.identification.response import N_Q
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 
-# Band [Hz] in which the sensors correct the model, with the edges over which that fades.
-LOW_Hz, HIGH_Hz = (0.4, 0.8), (120.0, 150.0)
-# Part of the band, at its upper end, where only noise is left: its power is that of the sensors.
-NOISE_FROM = 0.6
-# Length [s] to which a record is continued beyond its ends, passes in which that continuation is found, and how far
-# each goes: beyond what it finds, for plain passes come nearer by a fifth only.
-MARGIN_s, PASSES, RELAXATION = 5.0, 6, 1.8
+
+@dataclass(frozen=True)
+class RecordMotionSettings:
+    """Of the motion of the mounts in a measured record.
+
+    low_Hz : lower end of the band in which the sensors correct the model, from nothing to all [Hz]: below, the
+        inverse of the sensors' chain would raise their noise.
+    high_Hz : upper end of that band, from all to nothing [Hz]: above, the mounts deflect little.
+    noise_from : fraction of the band from which on, to its upper end, only noise is left: its power is that of the
+        sensors [1].
+    margin_s : length to which a record is continued beyond its ends [s]: several periods of a table's lowest mode.
+    passes : passes in which that continuation is found.
+    relaxation : how far each pass goes beyond what it finds [1]: plain passes come nearer by a fifth only.
+    """
+
+    low_Hz: tuple[float, float] = (0.4, 0.8)
+    high_Hz: tuple[float, float] = (120.0, 150.0)
+    noise_from: float = 0.6
+    margin_s: float = 5.0
+    passes: int = 6
+    relaxation: float = 1.8
+
+
+SETTINGS = RecordMotionSettings()
 
 
 def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = None, each: Each = one_by_one
@@ -118,7 +135,7 @@ def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.n
     the record a motion that dies out, so that the last seconds are not bent by what never was.
     """
     samples, fs = len(left), lines.sample_rate_Hz
-    margin = min(round(MARGIN_s * fs), (lines.padded - samples) // 2, samples - 1)
+    margin = min(round(SETTINGS.margin_s * fs), (lines.padded - samples) // 2, samples - 1)
     inside = slice(margin, margin + samples)
     frequency = lines.omega / (2 * np.pi)
     fade = _fade(frequency)
@@ -134,14 +151,14 @@ def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.n
         return scipy.fft.irfft(whole, lines.padded, axis=0)
 
     continued = np.pad(left, ((margin, margin), (0, 0)))
-    for k in range(PASSES):
+    for k in range(SETTINGS.passes):
         spectrum = scipy.fft.rfft(continued, lines.padded, axis=0)[:len(frequency)]
         e = _force(spectrum, H, at, frequency) * fade[at, None]
-        if k < PASSES - 1:
+        if k < SETTINGS.passes - 1:
             force = in_time(e)
             force[margin + samples:] = 0
             answer = in_time((H @ scipy.fft.rfft(force, axis=0)[at][:, :, None])[:, :, 0])
-            continued += RELAXATION * (answer[:len(continued)] - continued)
+            continued += SETTINGS.relaxation * (answer[:len(continued)] - continued)
             continued[inside] = left
     x = (lines.compliance[at, :, :N_Q] @ (size * e)[:, :, None])
     d = x[:, :, 0] @ lines.G.T
@@ -152,7 +169,7 @@ def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.n
 
 def _force(spectrum: np.ndarray, H: np.ndarray, at: np.ndarray, frequency: np.ndarray) -> np.ndarray:
     """(n_at, 6) most likely force behind y (n, n_y) on the lines `at`, H (n_at, n_y, 6)."""
-    noise = np.median(np.abs(spectrum[frequency > NOISE_FROM * frequency[-1]]) ** 2, axis=0) / np.log(2)
+    noise = np.median(np.abs(spectrum[frequency > SETTINGS.noise_from * frequency[-1]]) ** 2, axis=0) / np.log(2)
     noise = np.maximum(noise, 1e-8 * np.mean(np.abs(spectrum) ** 2))
     white, H = spectrum[at] / np.sqrt(noise), H / np.sqrt(noise)[:, None]
     strength = _strength(frequency[at], white, H)[:, None, None]
@@ -162,9 +179,9 @@ def _force(spectrum: np.ndarray, H: np.ndarray, at: np.ndarray, frequency: np.nd
 
 
 def _fade(frequency: np.ndarray) -> np.ndarray:
-    """(n,) one between LOW_Hz and HIGH_Hz, zero outside."""
-    up = np.clip((frequency - LOW_Hz[0]) / (LOW_Hz[1] - LOW_Hz[0]), 0, 1)
-    down = np.clip((HIGH_Hz[1] - frequency) / (HIGH_Hz[1] - HIGH_Hz[0]), 0, 1)
+    """(n,) one between `low_Hz` and `high_Hz`, zero outside."""
+    up = np.clip((frequency - SETTINGS.low_Hz[0]) / (SETTINGS.low_Hz[1] - SETTINGS.low_Hz[0]), 0, 1)
+    down = np.clip((SETTINGS.high_Hz[1] - frequency) / (SETTINGS.high_Hz[1] - SETTINGS.high_Hz[0]), 0, 1)
     return np.sin(np.pi / 2 * up) ** 2 * np.sin(np.pi / 2 * down) ** 2
 
 

@@ -13,6 +13,7 @@ there are directions.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import cast
 
@@ -27,10 +28,31 @@ from avis_ctrl.identification.response import N_Q, ResponseModel
 from avis_ctrl.identification.spectra import span, transient_columns, transient_parts
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
-# Step of a linear parameter, in units of its size, at which its direction is taken.
-STEP = 1e-3
-# Share of a direction that must be left when what re-identification absorbs is taken out: below, it is round-off.
-LEFT = 1e-5
+
+@dataclass(frozen=True)
+class ScoreSettings:
+    """Of the score test and of what it can detect.
+
+    step : step of a linear parameter at which its direction is taken, in units of its size [1]: small beside any
+        curvature, large beside round-off.
+    least_left : fraction of a direction that must be left when what re-identification absorbs is taken out [1]:
+        below, it is round-off.
+    least_singular : singular value of the parameters' directions over the largest, below which they determine
+        nothing [1].
+    least_eigenvalue : eigenvalue of a scaled information matrix over the largest, below which there is only
+        round-off, 1e-16 of it [1].
+    detected : standard deviations from which an effect is detected [1]: a parameter gains the evidence that a name
+        needs at between four and five.
+    """
+
+    step: float = 1e-3
+    least_left: float = 1e-5
+    least_singular: float = 1e-6
+    least_eigenvalue: float = 1e-12
+    detected: float = 5.0
+
+
+SETTINGS = ScoreSettings()
 
 
 class Part:
@@ -106,7 +128,7 @@ class Score:
         J = J * model.scales()[:, None]
         size = np.linalg.norm(J, axis=1)
         _, s, Vt = np.linalg.svd(J / np.where(size > 0, size, 1.0)[:, None], full_matrices=False)
-        self.basis = Vt[s > 1e-6 * s[0]]
+        self.basis = Vt[s > SETTINGS.least_singular * s[0]]
         self.e = self.e - self.basis.T @ (self.basis @ self.e)
 
     @property
@@ -125,7 +147,7 @@ class Score:
         """(k, N) of one (k, n, n_y, m) a block, projected."""
         A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
         left = A - (A @ self.basis.T) @ self.basis
-        left[np.linalg.norm(left, axis=1) < LEFT * np.linalg.norm(A, axis=1)] = 0
+        left[np.linalg.norm(left, axis=1) < SETTINGS.least_left * np.linalg.norm(A, axis=1)] = 0
         return left
 
     def of_effect(self, effect: ActiveEffect) -> np.ndarray:
@@ -138,7 +160,7 @@ class Score:
         models = []
         for j in linear:
             values = list(effect.values)
-            step = STEP * effect.parameters[j].size
+            step = SETTINGS.step * effect.parameters[j].size
             values[j] += step
             models.append((self.model.with_effect(effect.at(values)), step))
         columns = []

@@ -15,6 +15,7 @@ from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.record_motion import clock_of
 from avis_ctrl.gap.result import NamedEffect
+from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
 from avis_ctrl.gap.signals.hum import HumFinding, subtract
 from avis_ctrl.gap.signals.leftover import Estimate, Leftover, leftovers
@@ -24,9 +25,6 @@ from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction import model_inputs
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.rigs.rig import Rig
-
-# No probability is reported above this: what the library does not hold, and the noise's own uncertainty, leave so much.
-MOST_SURE = 0.99
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +91,7 @@ def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[Leftover, ...])
     return replace(campaign, records=tuple(records))
 
 
-def named(faults: SignalFaults) -> list[NamedEffect]:
+def named(faults: SignalFaults, settings: GapSettings) -> list[NamedEffect]:
     """Effects of the library that the signals show."""
     found = []
     for one in faults.converter:
@@ -101,15 +99,16 @@ def named(faults: SignalFaults) -> list[NamedEffect]:
                                  f"the converter of {one.channel} is coarser than the rig file says"
                                  if one.kind == "resolution" else
                                  f"the converter of {one.channel} clips below its nominal range",
-                                 _reported(one.parameters), min(one.confidence, MOST_SURE), confirmation=one.sentence))
+                                 _reported(one.parameters), min(one.confidence, settings.most_sure),
+                                 confirmation=one.sentence))
     if faults.hum is not None:
         found.append(NamedEffect("mains_hum", "geophones", f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics "
                                  f"in {', '.join(faults.hum.channels)}", _reported(faults.hum.parameters),
-                                 min(faults.hum.confidence, MOST_SURE), confirmation=faults.hum.sentence))
+                                 min(faults.hum.confidence, settings.most_sure), confirmation=faults.hum.sentence))
     motion = faults.noise.ground_motion if faults.noise is not None else None
     if motion is not None:
         found.append(NamedEffect("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured",
-                                 _reported(motion.parameters), min(motion.confidence, MOST_SURE),
+                                 _reported(motion.parameters), min(motion.confidence, settings.most_sure),
                                  confirmation=motion.sentence))
     return found
 

@@ -5,7 +5,7 @@ found from sample to sample (`marching`) and then act on the same lines. A band 
 kept: a table moves above by its mass alone.
 
 Limits: a record starts at rest, with nothing before it. Volts that an effect changes by the motion see the motion
-without them. Records of more than `line_response.MOST_SAMPLES` samples are refused.
+without them. Records of more than `RecordLineSettings.most_samples` samples are refused.
 """
 
 from __future__ import annotations
@@ -26,9 +26,20 @@ from avis_ctrl.identification.response import N_Q
 
 __all__ = ["Simulated", "motion_of", "simulate"]
 
-# Largest r.m.s. of what the equation of motion leaves, over that of the deflection.
-DEFECT = 1e-5
-MOST_PASSES = 12
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """Of forces that act over a whole record.
+
+    defect : what the equation of motion may leave of the deflection, r.m.s. [1]: far below any sensor's noise.
+    most_passes : passes over the record before it counts as one that does not settle.
+    """
+
+    defect: float = 1e-5
+    most_passes: int = 12
+
+
+SETTINGS = SimulationSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +151,7 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x
     defect, reading = float("nan"), np.zeros((n, len(model.sensors.names)))
     slow, correction, size = np.zeros((n, N_Q)), np.zeros((n, answer.shape.shape[1])), 0.0
     linear = lines.deflection(x, floor)
-    for passes in range(1, MOST_PASSES + 1):
+    for passes in range(1, SETTINGS.most_passes + 1):
         free = linear + answer.whole(slow) @ answer.shape.T
         in_time = lines.in_time(free)
         z_free = in_time @ to_z.T
@@ -155,7 +166,7 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x
             missing, slow = lines.in_time(answer.whole(more - slow)), more
         size = float(np.sqrt(np.mean(record.deflection ** 2))) or 1.0
         defect = float(np.sqrt(np.mean(((left + missing) @ answer.shape.T) ** 2))) / size
-        if defect <= DEFECT:
+        if defect <= SETTINGS.defect:
             z = answer.whole(push + slow)
             y = lines.sensed(x + z[:, :answer.n_x], record.volts, floor)
             if weak:

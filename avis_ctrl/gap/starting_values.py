@@ -14,6 +14,40 @@ from avis_ctrl.gap.table_model import ActiveEffect
 
 
 @dataclass(frozen=True)
+class StartSettings:
+    """Of the search for starting values.
+
+    places_m : lowest and highest place along x, y, z, from the geometric centre [m], and number of places: over and
+        around a table.
+    halvings : how often the step between places is halved about the best: to some 2 cm.
+    polar, around : rows and columns of a half-sphere of directions, about 16 degrees apart.
+    surge_Hz : lowest and highest frequency of a resonance inside the mounts [Hz], and number of those looked at.
+    least_surge_damping : damping ratio with which the fit of such a resonance begins at least [1]: from a narrow one
+        at the wrong frequency no fit finds the right one.
+    peak_step, peak_reach : steps of the logarithm of frequency in which the residual's power is averaged [1], and steps
+        on either side whose median it is compared with.
+    peak_height : power over that median from which a step is a peak [1].
+    peaks_apart : logarithm of the ratio of two peaks' frequencies, at least [1]: some half widths.
+    most_peaks : peaks that are looked at, the highest first.
+    """
+
+    places_m: tuple[tuple[float, float, int], ...] = ((-0.6, 0.6, 7), (-0.5, 0.5, 6), (-0.3, 0.4, 4))
+    halvings: int = 3
+    polar: int = 6
+    around: int = 18
+    surge_Hz: tuple[float, float, int] = (8.0, 150.0, 28)
+    least_surge_damping: float = 0.05
+    peak_step: float = 0.02
+    peak_reach: int = 10
+    peak_height: float = 1.5
+    peaks_apart: float = 0.06
+    most_peaks: int = 5
+
+
+SETTINGS = StartSettings()
+
+
+@dataclass(frozen=True)
 class Seed:
     """Where a refit may begin: values of all parameters, and by how much chi2 falls there to first order.
 

@@ -18,10 +18,23 @@ from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, S
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rig import Parameter, Rig
 
-# Relative step of differences by an effect's parameters, in units of their size.
-STEP = 1e-4
-# A sensor's chain is another one where its ratio to the rig's varies over these frequencies by more than this share.
-PROBED, UNCHANGED = 2 * np.pi * np.geomspace(0.5, 100.0, 5), 1e-6
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """Of a model's derivatives and of its sensors' transients.
+
+    step : step of differences by an effect's parameters, in units of their size [1].
+    probed_Hz : frequencies at which the chains of sensors are compared with the rig's [Hz].
+    unchanged : a sensor's chain is another one where its ratio to the rig's varies over these by more than this
+        [1]: round-off.
+    """
+
+    step: float = 1e-4
+    probed_Hz: tuple[float, ...] = tuple(np.geomspace(0.5, 100.0, 5).tolist())
+    unchanged: float = 1e-6
+
+
+SETTINGS = ModelSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,9 +257,9 @@ class TableModel:
     @cached_property
     def _changed_sensors(self) -> np.ndarray:
         """Indices of the sensors whose chain effects change by more than a factor, whatever lines are asked for."""
-        r = self._chain_ratio(PROBED)
+        r = self._chain_ratio(2 * np.pi * np.array(SETTINGS.probed_Hz))
         level = np.mean(r, axis=0)
-        return np.flatnonzero(np.max(np.abs(r - level), axis=0) > UNCHANGED * np.abs(level))
+        return np.flatnonzero(np.max(np.abs(r - level), axis=0) > SETTINGS.unchanged * np.abs(level))
 
     def _chain_ratio(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y) chain of each sensor over that of the rig."""
@@ -306,7 +319,7 @@ class TableModel:
         n, theta, (low, high) = len(self.base.names), self.values, self.bounds()
         scale = self.scales()
         for row in range(n, len(theta)):
-            step = STEP * scale[row]
+            step = SETTINGS.step * scale[row]
             # A bound that goes with the payload's mass may have moved past the value.
             lowest, highest = min(low[row], theta[row]), max(high[row], theta[row])
             ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]

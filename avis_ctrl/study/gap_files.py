@@ -12,7 +12,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
-from avis_ctrl.gap.line_response import MOST_SAMPLES
+from avis_ctrl.gap import line_response
 from avis_ctrl.gap.model_files import model_to_dict, read_model
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.signals.converter import nominal_converter
@@ -196,7 +196,7 @@ def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
 
 def _predicted(model: TableModel, record: Record, clock: tuple[float, float]) -> np.ndarray:
     """(samples, n_y) in the model's order."""
-    if len(record.u) > MOST_SAMPLES and not model.effects:
+    if len(record.u) > line_response.SETTINGS.most_samples and not model.effects:
         limit = model.rig.limits_of(record.header.u_names)
         return predict(model.base, replace(record, u=np.clip(record.u, -limit, limit)), large_motion=False)
     u, floor = model_inputs(model.base, record)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.signal as sg
@@ -42,5 +44,5 @@ def test_noise_of_silent_lines_is_the_noise_in_every_band(slope):
 
 def test_weights_that_are_equal_leave_of_a_red_floor_too_much_where_it_is_low(monkeypatch):
     """Why they are not: the transient's estimate carries the noise of low frequencies over the whole band."""
-    monkeypatch.setattr(data, "WEIGHTINGS", 1)
+    monkeypatch.setattr(data, "SETTINGS", replace(data.SETTINGS, weightings=1))
     assert np.max(estimated_over_true(3.0)[-1]) > 10

@@ -28,6 +28,21 @@ from avis_ctrl.identification.response import ResponseModel, SensorModel
 from avis_ctrl.rigs.rig import Rig
 
 
+@dataclass(frozen=True)
+class LibrarySettings:
+    """Of what the library takes for granted.
+
+    tilted_rad : tilt up to which a sensor counts as lying along an earth axis [rad]: far more than one is mounted by.
+    tried_Hz : frequencies at which an effect of the user's own is tried out [Hz]: below, at and above the suspension.
+    """
+
+    tilted_rad: float = 0.3
+    tried_Hz: tuple[float, ...] = (0.3, 3.0, 30.0)
+
+
+SETTINGS = LibrarySettings()
+
+
 class Table(Protocol):
     """What an effect asks of the table that it acts on: of the model without it (`gap.table_model.TableModel`).
 

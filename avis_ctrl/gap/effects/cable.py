@@ -14,11 +14,8 @@ from avis_ctrl.gap.effects.payload import AtPoint, place_of
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.score_algebra import reduction
-from avis_ctrl.gap.starting_values import Seed
+from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.rigs.rigid_body import point_map
-
-# How often the step between places is halved about the best.
-HALVINGS = 3
 
 
 @register
@@ -62,7 +59,7 @@ class CableStiffness(AtPoint):
         G, b = project(score, lambda s: np.ones_like(s))
         of = _along_one if place.endswith("oblique") else _along_axes
         found = of(G, b, positions(parameters), parameters[0].high)
-        for halving in range(1, HALVINGS + 1) if found else ():
+        for halving in range(1, SETTINGS.halvings + 1) if found else ():
             near = about(np.array(found[0].values[-3:]), 0.5 ** halving)
             found = sorted(found + of(G, b, near, parameters[0].high), key=lambda seed: -seed.chi2)
         return found

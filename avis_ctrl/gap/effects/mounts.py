@@ -11,19 +11,15 @@ from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table,
 from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.operators import Operators, mount_geometry
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.starting_values import Seed
+from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.gap.table_model import ActiveEffect
 
 # Frequency at which the mounts' stiffness is meant where it depends on frequency.
 REFERENCE_Hz = 3.0
-# Where a resonance inside the mounts is looked for.
-SURGE_Hz = tuple(np.geomspace(8.0, 150.0, 28).tolist())
 # Mounts with a leveling valve: a fourth would be one too many to level a plane.
 LEVELED = 3
 # Corners of a leveling valve [Hz]: at the upper end it follows at once, at the lower one hardly ever.
 VALVE_Hz = 0.01, 100.0
-# Damping ratio with which the fit of a resonance inside the mounts begins at least.
-BROAD = 0.05
 
 
 def has_mounts(model: Table) -> bool:
@@ -112,7 +108,7 @@ class MountSurge(_OfMounts):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         count = int(np.sum(vertical(model)))
         return (EffectParameter("frequency_Hz", "Hz", "of the mass inside the mounts", np.inf, 4.0, 400.0, 20.0, False,
-                                SURGE_Hz),
+                                tuple(np.geomspace(*SETTINGS.surge_Hz).tolist())),
                 EffectParameter("payload_share", "1", "of the mount's compliance between mass and payload", 0.5, 0.05,
                                 0.95, 0.2, False, (0.5,), True),
                 EffectParameter("damping_ratio", "1", "of that resonance", 0.0, 0.0, 1.0, 0.05, False,
@@ -130,7 +126,7 @@ class MountSurge(_OfMounts):
             took = score.reduction(score.of_effect(ActiveEffect(self, place, parameters, values)))
             if took.coefficients[0] > 0:
                 # From a narrow resonance at the wrong frequency no fit finds the right one.
-                begin = [max(value, BROAD) if one.name == "damping_ratio" else value
+                begin = [max(value, SETTINGS.least_surge_damping) if one.name == "damping_ratio" else value
                          for one, value in zip(parameters, values, strict=True)]
                 found.append(Seed(tuple(begin), took.chi2, len(parameters), len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)

@@ -12,12 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, restore
+from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, restore
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.table_model import TableModel, active
-
-# Frequencies [Hz] at which an effect is tried.
-TRIED_Hz = (0.3, 3.0, 30.0)
 
 
 @dataclass(frozen=True)
@@ -95,7 +92,7 @@ def _tried(effect: Effect, model: TableModel) -> None:
     for method in ("places", "parameters"):
         if getattr(type(effect), method) is getattr(Effect, method):
             raise InputError("expected the method", field=method)
-    omega = 2 * np.pi * np.array(TRIED_Hz)
+    omega = 2 * np.pi * np.array(SETTINGS.tried_Hz)
     for place in effect.places(model):
         parameters = effect.parameters(model, place)
         for one in parameters:

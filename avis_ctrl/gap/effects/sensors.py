@@ -6,13 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, register
+from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, Table, register
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.rigs.rig import Rig
 
 GRAVITY = 9.80665
-# A sensor counts as lying along an earth axis up to this tilt [rad].
-TILTED_rad = 0.3
 
 
 def second_order(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
@@ -34,7 +32,7 @@ def suspensions(rig: Rig) -> dict[str, tuple[float, float]]:
 def axis_of(model: Table, sensor: str) -> str:
     """x, y or z: the earth axis that a sensor lies along, within what one is tilted; empty where it lies along none."""
     direction = model.rig.sensor_axes()[sensor][1]
-    along = np.flatnonzero(np.abs(direction) > np.cos(TILTED_rad))
+    along = np.flatnonzero(np.abs(direction) > np.cos(SETTINGS.tilted_rad))
     return "xyz"[along[0]] if len(along) else ""
 
 

@@ -20,17 +20,34 @@ from avis_ctrl.gap.signals.leftover import Estimate, Leftover, check_common
 from avis_ctrl.measurement.gates.finding import Limit, Picture, Series, thinned
 
 MAINS_HZ = (50.0, 60.0)
-SEARCH_HZ = 0.3
-# Chance of a false alarm in a whole campaign.
-FALSE_ALARM = 1e-3
-# A line's mean power by that of its neighbours, at least: floors are not quite flat.
-RATIO = 3.0
-# Neighbours on either side, and lines left out next to the tested one.
-REFERENCE, GUARD = 12, 3
-# Half width [lines] of a polluted band in a transform without window, by default.
-POLLUTED_LINES = 3
 # int w^2 t^2 dt / (int w t^2 dt)^2 of a Hann window over the same of none: 28.1 / 12.
 HANN_COST = 2.34
+
+
+@dataclass(frozen=True)
+class HumSettings:
+    """Of the search for mains hum.
+
+    search_Hz : half width of the band about 50 and 60 Hz in which the fundamental is looked for [Hz], within which
+        grids keep their frequency.
+    false_alarm : chance of a false alarm in a whole campaign [1]: one user in a thousand is misled.
+    least_ratio : mean power of a line over that of its neighbours, at least [1]: floors are not quite flat.
+    neighbours : lines on either side with which a line is compared: enough for their mean, few enough for a floor
+        to be flat.
+    guard : lines left out next to the tested one: the main lobe of a Hann window is two lines wide.
+    polluted_lines : half width of a polluted band in a transform without window, whose side lobes fall slowly
+        [lines].
+    """
+
+    search_Hz: float = 0.3
+    false_alarm: float = 1e-3
+    least_ratio: float = 3.0
+    neighbours: int = 12
+    guard: int = 3
+    polluted_lines: int = 3
+
+
+SETTINGS = HumSettings()
 
 
 @dataclass(frozen=True)
@@ -88,12 +105,12 @@ class _Score:
 
     @property
     def p(self) -> np.ndarray:
-        """Of each line by itself; 1 where it is not RATIO times as strong as those next to it."""
-        tested = (self.tests > 0) & (self.ratio > RATIO)
+        """Of each line by itself; 1 where it is not `least_ratio` times as strong as those next to it."""
+        tested = (self.tests > 0) & (self.ratio > SETTINGS.least_ratio)
         return np.where(tested, stats.gamma.sf(self.score, np.maximum(self.tests, 1)), 1.0)
 
 
-def find_hum(left: Sequence[Leftover], false_alarm: float = FALSE_ALARM) -> HumFinding | None:
+def find_hum(left: Sequence[Leftover], false_alarm: float = SETTINGS.false_alarm) -> HumFinding | None:
     """The hum in what a model leaves, None where no line stands out.
 
     Works on the residual at every harmonic below 0.98 of half the sample rate, driven or not; a driven line whose
@@ -126,7 +143,8 @@ def find_hum(left: Sequence[Leftover], false_alarm: float = FALSE_ALARM) -> HumF
     return _finding(left, best.nominal_Hz, frequency, lines, chance, first.y_unit)
 
 
-def polluted(finding: HumFinding, samples: int, sample_rate_Hz: float, half_lines: int = POLLUTED_LINES) -> np.ndarray:
+def polluted(finding: HumFinding, samples: int, sample_rate_Hz: float, half_lines: int = SETTINGS.polluted_lines
+             ) -> np.ndarray:
     """(samples // 2 + 1,) True at lines of a record's transform that hum reaches, to be left out of a fit.
 
     half_lines : on either side of each harmonic that was found in any channel; a transform without window leaks as
@@ -157,13 +175,13 @@ def subtract(finding: HumFinding, e: np.ndarray, y: np.ndarray, sample_rate_Hz: 
 
 
 def _scores(left: Sequence[Leftover], nominal: float, f0: np.ndarray | None = None) -> _Score:
-    """At f0 (n,), by default everywhere within SEARCH_HZ of the nominal frequency."""
+    """At f0 (n,), by default everywhere within `search_Hz` of the nominal frequency."""
     h = left[0].header
     duration = max(one.header.duration_s for one in left)
-    top = int(0.49 * h.sample_rate_Hz / (nominal + SEARCH_HZ))
+    top = int(0.49 * h.sample_rate_Hz / (nominal + SETTINGS.search_Hz))
     if f0 is None:
-        n = int(np.ceil(2 * SEARCH_HZ * 2 * duration * max(top, 1))) + 1
-        f0 = np.linspace(nominal - SEARCH_HZ, nominal + SEARCH_HZ, n)
+        n = int(np.ceil(2 * SETTINGS.search_Hz * 2 * duration * max(top, 1))) + 1
+        f0 = np.linspace(nominal - SETTINGS.search_Hz, nominal + SETTINGS.search_Hz, n)
     shape = (len(f0), top, len(h.y_names))
     score, tests, ratio = np.zeros(shape), np.zeros(shape, int), np.zeros(shape)
     for one in left:
@@ -175,8 +193,8 @@ def _add(one: Leftover, f0: np.ndarray, score: np.ndarray, tests: np.ndarray, ra
     """A record's part, harmonic by harmonic; lines are looked at once however many f0 fall on them."""
     power, df = np.abs(one.E) ** 2, one.frequency_Hz[1]
     stride = 2 * one.periods if one.periods >= 2 else 1
-    first = stride if stride > GUARD else GUARD + 1
-    offsets = first + stride * np.arange(REFERENCE)
+    first = stride if stride > SETTINGS.guard else SETTINGS.guard + 1
+    offsets = first + stride * np.arange(SETTINGS.neighbours)
     for k in range(1, score.shape[1] + 1):
         bins, back = np.unique(np.rint(k * f0 / df).astype(int), return_inverse=True)
         inside = (bins - offsets[-1] >= 1) & (bins + offsets[-1] < len(power) - 1)
@@ -191,7 +209,7 @@ def _add(one: Leftover, f0: np.ndarray, score: np.ndarray, tests: np.ndarray, ra
             # The experiment's own line among silent ones is no hum.
             alike = (one.driven[b[:, None] + offsets].mean(1) + one.driven[b[:, None] - offsets].mean(1)) / 2
             usable &= ~(one.driven[b] & (alike < 0.5))[:, None]
-        s = REFERENCE * np.log1p(z / REFERENCE)
+        s = SETTINGS.neighbours * np.log1p(z / SETTINGS.neighbours)
         score[:, k - 1] += np.where(usable, s, 0.0)[back]
         ratio[:, k - 1] += np.where(usable, z, 0.0)[back]
         tests[:, k - 1] += usable[back]
@@ -211,7 +229,7 @@ def _spread(one: Leftover, f: float) -> np.ndarray:
     """(n_y,) variance of either part of a sine's amplitude: 2 s^2 / N, s^2 of the lines near f that are like it."""
     b = round(f / one.frequency_Hz[1])
     stride = 2 * one.periods if one.periods >= 2 else 1
-    offsets = (stride if stride > GUARD else GUARD + 1) + stride * np.arange(REFERENCE)
+    offsets = (stride if stride > SETTINGS.guard else SETTINGS.guard + 1) + stride * np.arange(SETTINGS.neighbours)
     near = np.clip(np.concatenate([b - offsets, b + offsets]), 1, len(one.E) - 1)
     return 2 * np.mean(np.abs(one.E[near]) ** 2, axis=0) / one.header.samples
 

@@ -13,11 +13,23 @@ import scipy.fft
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordHeader
 
-# Part of its largest line's power above which a line of u counts as driven.
-DRIVEN = 1e-6
 # Variance of a mean of |e|^2 over neighbouring lines of a Hann window, by that of independent lines: the correlation
 # of e is 2/3 one line apart and 1/6 two apart, so 1 + 2 (4/9 + 1/36).
 HANN_SHARED = 1 + 2 * (4 / 9 + 1 / 36)
+
+
+@dataclass(frozen=True)
+class LineSettings:
+    """Of the lines of a record.
+
+    driven : of the power of its largest line, above which a line of u counts as driven [1]: far above round-off,
+        and below what any drive's spectrum leaves out on purpose.
+    """
+
+    driven: float = 1e-6
+
+
+SETTINGS = LineSettings()
 
 
 class Estimate(NamedTuple):
@@ -71,7 +83,7 @@ class Leftover:
     def driven(self) -> np.ndarray:
         """(n,) lines in which u holds more than a millionth of the power of its largest line."""
         power = np.sum(np.abs(self.U) ** 2, axis=1)
-        return power > DRIVEN * power.max() if power.max() > 0 else np.zeros(len(power), bool)
+        return power > SETTINGS.driven * power.max() if power.max() > 0 else np.zeros(len(power), bool)
 
     @property
     def silent(self) -> bool:
