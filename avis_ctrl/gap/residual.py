@@ -10,7 +10,7 @@ from typing import Protocol, cast
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.data import Halves, all_silent
+from avis_ctrl.gap.campaign_spectra import Halves, all_silent
 from avis_ctrl.gap.power_shares import power_shares
 from avis_ctrl.gap.result import HeatMap, PowerShares, RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel

@@ -13,20 +13,25 @@ there are directions.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from avis_ctrl.gap.operators import assemble
-from avis_ctrl.gap.score_algebra import SYMMETRIC, Reduction, reduction
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.gap.table_response import Acting, AtMotion, TableResponse
+from avis_ctrl.identification.fit_settings import SETTINGS as FIT_SETTINGS
+from avis_ctrl.identification.fit_settings import FitSettings
+from avis_ctrl.identification.likelihood import Data, Fitted
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitened_real, whitener
+from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import N_Q, ResponseModel
 from avis_ctrl.identification.spectra import span, transient_columns, transient_parts
 from avis_ctrl.identification.spectral_block import SpectralBlock
+from avis_ctrl.identification.weights import with_distortion
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,34 @@ class ScoreSettings:
 
 
 SETTINGS = ScoreSettings()
+
+
+SYMMETRIC = tuple((i, j) for i in range(N_Q) for j in range(i, N_Q))
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """Of chi2 by a set of directions: how much, how many directions the data determine, and their coefficients."""
+
+    chi2: float
+    rank: int
+    coefficients: np.ndarray
+
+
+def reduction(G: np.ndarray, b: np.ndarray) -> Reduction:
+    """b^T inv(G) b over what G determines."""
+    size = np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(G / np.outer(size, size))
+    known = values > 1e-9 * max(values[-1], 1e-300)
+    along = vectors.T @ (b / size)
+    step = np.where(known, along / np.where(known, values, 1.0), 0.0)
+    return Reduction(float(along @ step), int(known.sum()), vectors @ step / size)
+
+
+def symmetric_coordinates(S: np.ndarray) -> np.ndarray:
+    """(..., 21) of symmetric matrices (..., 6, 6): coefficients of the unit matrices e_i e_j^T + e_j e_i^T."""
+    rows, columns = np.array(SYMMETRIC).T
+    return S[..., rows, columns]
 
 
 class Part:
@@ -176,3 +209,37 @@ class Score:
     def reduction(self, A: np.ndarray) -> Reduction:
         """Of chi2 by directions (k, N)."""
         return reduction(A @ A.T, A @ self.e)
+
+
+class EvidenceScore(Score):
+    """`Score` with path errors integrated out and normal priors on all parameters.
+
+    Priors are rows of their own below the residuals: e = (e, -z), J = (J, I). A direction of an effect has zeros there.
+    """
+
+    def __init__(self, fitted: Fitted, data: Data, settings: FitSettings = FIT_SETTINGS):
+        full = fitted.model
+        # What an effect fits by itself, to find where to begin, leaves the tolerances where they are.
+        rig = tuple(name for name in full.base.names if name in default_parameters(full.rig))
+        nominal = full.nominal and replace(full.nominal, names=rig)
+        self.model, self.kept = replace(full, base=replace(full.base, names=rig), nominal=nominal), {}
+        blocks = [with_distortion(block, level, fitted.variances, settings)
+                  for block, level in zip(data.blocks, data.levels, strict=True)]
+        self.parts = [Part(self.model, block) for block in blocks]
+        self.weights = fitted.weights
+        # Orthonormal rows that span the Jacobian with its priors.
+        root = np.linalg.cholesky(np.linalg.inv(fitted.covariance))
+        self.basis = solve_triangular(root, np.concatenate([fitted.J, np.eye(len(fitted.z))], axis=1), lower=True)
+        self.e = np.concatenate([fitted.e, -fitted.z])
+        self.e = self.e - self.basis.T @ (self.basis @ self.e)
+
+    @cached_property
+    def plain(self) -> Score:
+        """The same against noise and distortion alone, for effects that look for their beginning by fits of their own:
+        there what has no name is not taken out."""
+        return Score(self.model, [part.block for part in self.parts])
+
+    def directions(self, dY):
+        A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
+        A = np.concatenate([self.weights.flatten(A), np.zeros((len(A), len(self.basis)))], axis=1)
+        return A - (A @ self.basis.T) @ self.basis

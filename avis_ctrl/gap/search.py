@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.flexible_mode import resonance
-from avis_ctrl.gap.evidence_score import EvidenceScore
+from avis_ctrl.gap.parallel import Each, one_by_one
+from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.starting_values import seeds
 from avis_ctrl.gap.table_model import ActiveEffect, active

@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Reported
-from avis_ctrl.gap.record_motion import clock_of
+from avis_ctrl.gap.motion_estimate import clock_of
+from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.result import NamedEffect
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
 from avis_ctrl.gap.signals.hum import HumFinding, subtract
-from avis_ctrl.gap.signals.leftover import Estimate, Leftover, leftovers
 from avis_ctrl.gap.signals.noise_level import NoiseLevels, noise_levels
-from avis_ctrl.gap.simulate import simulate
+from avis_ctrl.gap.signals.record_residual import Estimate, RecordResidual, record_residuals
+from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction import model_inputs
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
@@ -65,12 +65,12 @@ def predicted(campaign: Campaign, model: TableModel, each: Each = one_by_one) ->
     return dict(zip((record.header.name for record in campaign.records), each(read, campaign.records), strict=True))
 
 
-def left_by(campaign: Campaign, model: TableModel, each: Each = one_by_one) -> tuple[Leftover, ...]:
+def left_by(campaign: Campaign, model: TableModel, each: Each = one_by_one) -> tuple[RecordResidual, ...]:
     """What the model leaves of every record in time."""
-    return leftovers(campaign, predicted(campaign, model, each))
+    return record_residuals(campaign, predicted(campaign, model, each))
 
 
-def levels(left: tuple[Leftover, ...], model: TableModel, hum: HumFinding | None,
+def levels(left: tuple[RecordResidual, ...], model: TableModel, hum: HumFinding | None,
            converter: tuple[ConverterFinding, ...]) -> NoiseLevels | None:
     """Noise of floor and sensors; None where the records or the rig file do not allow it."""
     n_u, steps = len(model.actuators), SignalFaults(converter).resolution_V
@@ -80,7 +80,7 @@ def levels(left: tuple[Leftover, ...], model: TableModel, hum: HumFinding | None
         return None
 
 
-def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[Leftover, ...]) -> Campaign:
+def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[RecordResidual, ...]) -> Campaign:
     """The campaign with the hum's sines taken out of every record."""
     of, records = {one.header.name: one for one in left}, []
     for source in campaign.records:

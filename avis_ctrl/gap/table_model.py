@@ -11,11 +11,12 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import Effect, EffectParameter
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.operators import Assembled, Operators, assemble
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_response import MOUNT, Acting, AtMotion, TableResponse, gain_of
 from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, SensorModel, kept_lines
 from avis_ctrl.identification.spectral_block import SpectralBlock
+from avis_ctrl.identification.structure import structural_null_space, structure_of
 from avis_ctrl.rigs.rig import Parameter, Rig
 
 
@@ -341,6 +342,16 @@ class TableModel:
                      for other in others]
             # d x = inv(D) (d F - d D x): no second inverse.
             dY[row] = ((sides[0].Y - sides[1].Y) + answer.left @ (sides[0].push - sides[1].push)) / width
+
+
+def inseparable_parameters(model: TableModel) -> tuple[tuple[str, ...], ...]:
+    """Groups of the rig's free parameters that its equations determine as combinations only (two springs in one line):
+    a fit leaves how they share where it was, and their own standard deviations do not tell of that."""
+    base = model.effective
+    if not base.names:
+        return ()
+    found = structure_of(structural_null_space(base), base.values, base.units, base.names)
+    return tuple(tuple(base.names[k] for k in group.members) for group in found.groups)
 
 
 def _added(one: ActiveEffect, record: RecordMotion, omega: np.ndarray) -> tuple[np.ndarray | None, ...]:

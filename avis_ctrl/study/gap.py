@@ -19,11 +19,11 @@ from threadpoolctl import threadpool_limits
 import avis_ctrl
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.gap.analysis import analyse
-from avis_ctrl.gap.effects.own import OwnEffects, try_out
+from avis_ctrl.gap.effects.user_effects import OwnEffects, try_out
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.signal_effects import predicted
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.gap.tuning import tuning_values
+from avis_ctrl.gap.tuning_values import tuning_values
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse

@@ -16,9 +16,8 @@ from avis_ctrl.gap import line_response
 from avis_ctrl.gap.model_files import model_to_dict, read_model
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.signals.converter import nominal_converter
-from avis_ctrl.gap.simulate import simulate
-from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-from avis_ctrl.gap.together import only_together
+from avis_ctrl.gap.simulation import simulate
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel, inseparable_parameters
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.prediction import model_inputs, predict
 from avis_ctrl.measurement.campaign import Campaign, Record
@@ -68,7 +67,7 @@ def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
     names, known = model.base.names, rig.parameters()
     comments = {}
     if covariance is not None and covariance.shape == (len(model.names),) * 2:
-        shared = {name: group for group in only_together(_rig_alone(model)) for name in group}
+        shared = {name: group for group in inseparable_parameters(_rig_alone(model)) for name in group}
         for k, name in enumerate(names):
             if name in shared:
                 others = " and ".join(other for other in shared[name] if other != name)

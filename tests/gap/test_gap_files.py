@@ -16,9 +16,9 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.model_files import campaign_clock, model_from_dict, model_to_dict, read_model
-from avis_ctrl.gap.motion import RecordMotion
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.result import Gap, NamedEffect, Reported, Stage, Where
-from avis_ctrl.gap.simulate import simulate
+from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.prediction import Predictor
 from avis_ctrl.identification.response import ResponseModel

@@ -19,7 +19,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.analysis import analyse
 from avis_ctrl.gap.effects import base
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.effects.own import load_effects, try_out
+from avis_ctrl.gap.effects.user_effects import load_effects, try_out
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record

@@ -12,7 +12,7 @@ from noise_fit import fitted, reported
 from avis_ctrl.gap.effects.impedance import peaks
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.operators import assemble
-from avis_ctrl.gap.realise import realise
+from avis_ctrl.gap.realisation import realise
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.search import at_the_edge
 from avis_ctrl.gap.starting_values import seeds

@@ -9,8 +9,7 @@ import pytest
 from scipy import stats
 
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.gap.score import Score, reduction
 from avis_ctrl.gap.starting_values import seeds
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.maximum_likelihood import fit

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import avis_ctrl.gap
-from avis_ctrl.gap.tuning import tuning_values
+from avis_ctrl.gap.tuning_values import tuning_values
 
 FOLDER = Path(avis_ctrl.gap.__file__).parent
 FILES = sorted(path for path in FOLDER.rglob("*.py") if "single_axis" not in path.parts)

@@ -22,8 +22,8 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.identification.response import ResponseModel, SensorModel
 from avis_ctrl.rigs.rig import Rig
 

@@ -12,8 +12,7 @@ from avis_ctrl.gap.effects.impedance import about, at_points, positions, project
 from avis_ctrl.gap.effects.line_of_action import best_direction, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
 from avis_ctrl.gap.operators import Operators
-from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.gap.score import Score, reduction
 from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.rigs.rigid_body import point_map
 

@@ -15,8 +15,7 @@ from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.mounts import has_mounts
 from avis_ctrl.gap.effects.sensors import receptance
 from avis_ctrl.gap.operators import Operators
-from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.gap.score import Score, reduction
 from avis_ctrl.gap.starting_values import Seed
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, fit

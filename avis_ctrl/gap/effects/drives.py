@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, register
-from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.record_motion import RecordMotion
 
 
 @register

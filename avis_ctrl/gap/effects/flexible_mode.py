@@ -11,8 +11,7 @@ from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table,
 from avis_ctrl.gap.effects.impedance import paths, peaks
 from avis_ctrl.gap.effects.sensors import receptance, second_order
 from avis_ctrl.gap.operators import AddedCoordinate, Operators, mount_geometry
-from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.gap.score import Score, reduction
 from avis_ctrl.gap.starting_values import Seed
 from avis_ctrl.gap.table_model import TableModel
 

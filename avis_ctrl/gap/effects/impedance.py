@@ -13,8 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter
-from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.score_algebra import symmetric_coordinates
+from avis_ctrl.gap.score import Score, symmetric_coordinates
 from avis_ctrl.gap.starting_values import SETTINGS
 from avis_ctrl.rigs.rigid_body import point_map
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table
-from avis_ctrl.gap.motion import RecordMotion
+from avis_ctrl.gap.record_motion import RecordMotion
 
 
 class LargeMotion(Effect):

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, register, told_from_none
-from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.operators import Operators, mount_geometry
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.gap.table_model import ActiveEffect

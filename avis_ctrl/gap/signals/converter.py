@@ -23,7 +23,7 @@ import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.signals.leftover import Estimate
+from avis_ctrl.gap.signals.record_residual import Estimate
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.clipping import repeated_extreme
 from avis_ctrl.measurement.gates.finding import Limit, Picture, Series, thinned

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, stats
 
-from avis_ctrl.gap.signals.leftover import Estimate, Leftover, check_common
+from avis_ctrl.gap.signals.record_residual import Estimate, RecordResidual, check_common
 from avis_ctrl.measurement.gates.finding import Limit, Picture, Series, thinned
 
 MAINS_HZ = (50.0, 60.0)
@@ -110,7 +110,7 @@ class _Score:
         return np.where(tested, stats.gamma.sf(self.score, np.maximum(self.tests, 1)), 1.0)
 
 
-def find_hum(left: Sequence[Leftover], false_alarm: float = SETTINGS.false_alarm) -> HumFinding | None:
+def find_hum(left: Sequence[RecordResidual], false_alarm: float = SETTINGS.false_alarm) -> HumFinding | None:
     """The hum in what a model leaves, None where no line stands out.
 
     Works on the residual at every harmonic below 0.98 of half the sample rate, driven or not; a driven line whose
@@ -174,7 +174,7 @@ def subtract(finding: HumFinding, e: np.ndarray, y: np.ndarray, sample_rate_Hz: 
     return cleaned
 
 
-def _scores(left: Sequence[Leftover], nominal: float, f0: np.ndarray | None = None) -> _Score:
+def _scores(left: Sequence[RecordResidual], nominal: float, f0: np.ndarray | None = None) -> _Score:
     """At f0 (n,), by default everywhere within `search_Hz` of the nominal frequency."""
     h = left[0].header
     duration = max(one.header.duration_s for one in left)
@@ -189,7 +189,7 @@ def _scores(left: Sequence[Leftover], nominal: float, f0: np.ndarray | None = No
     return _Score(nominal, f0, score, ratio / np.maximum(tests, 1), tests)
 
 
-def _add(one: Leftover, f0: np.ndarray, score: np.ndarray, tests: np.ndarray, ratio: np.ndarray) -> None:
+def _add(one: RecordResidual, f0: np.ndarray, score: np.ndarray, tests: np.ndarray, ratio: np.ndarray) -> None:
     """A record's part, harmonic by harmonic; lines are looked at once however many f0 fall on them."""
     power, df = np.abs(one.E) ** 2, one.frequency_Hz[1]
     stride = 2 * one.periods if one.periods >= 2 else 1
@@ -225,7 +225,7 @@ def _fitted(A: np.ndarray, e: np.ndarray) -> np.ndarray:
     return np.linalg.solve(A.T @ A, A.T @ e)
 
 
-def _spread(one: Leftover, f: float) -> np.ndarray:
+def _spread(one: RecordResidual, f: float) -> np.ndarray:
     """(n_y,) variance of either part of a sine's amplitude: 2 s^2 / N, s^2 of the lines near f that are like it."""
     b = round(f / one.frequency_Hz[1])
     stride = 2 * one.periods if one.periods >= 2 else 1
@@ -234,7 +234,7 @@ def _spread(one: Leftover, f: float) -> np.ndarray:
     return 2 * np.mean(np.abs(one.E[near]) ** 2, axis=0) / one.header.samples
 
 
-def _refined(left: Sequence[Leftover], start: float, hits: np.ndarray) -> Estimate:
+def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> Estimate:
     """f0 by least squares of all lines that stand out, amplitudes and phases free in each record.
 
     Its variance is that of a sine in white noise of the local level, var(2 pi f) = 12 v / (A T)^2 with v the variance
@@ -267,7 +267,7 @@ def _refined(left: Sequence[Leftover], start: float, hits: np.ndarray) -> Estima
     return Estimate(start + shift, float(1 / np.sqrt(max(information, 1e-30))), "Hz")
 
 
-def _lines(left: Sequence[Leftover], f0: float, hits: np.ndarray, p: np.ndarray, ratio: np.ndarray
+def _lines(left: Sequence[RecordResidual], f0: float, hits: np.ndarray, p: np.ndarray, ratio: np.ndarray
            ) -> tuple[HumLine, ...]:
     names, unit, rate = left[0].header.y_names, left[0].header.y_unit, left[0].header.sample_rate_Hz
     found = []
@@ -288,8 +288,8 @@ def _lines(left: Sequence[Leftover], f0: float, hits: np.ndarray, p: np.ndarray,
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
 
 
-def _finding(left: Sequence[Leftover], nominal: float, frequency: Estimate, lines: tuple[HumLine, ...], chance: float,
-             unit: str) -> HumFinding:
+def _finding(left: Sequence[RecordResidual], nominal: float, frequency: Estimate, lines: tuple[HumLine, ...],
+             chance: float, unit: str) -> HumFinding:
     largest = lines[0]
     names = left[0].header.y_names
     j = names.index(largest.channel)

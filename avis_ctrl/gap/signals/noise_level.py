@@ -26,8 +26,8 @@ from scipy.stats import norm
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.signals.converter import nominal_converter
 from avis_ctrl.gap.signals.hum import HumFinding, polluted
-from avis_ctrl.gap.signals.leftover import HANN_SHARED, Estimate, Leftover, check_common
 from avis_ctrl.gap.signals.quiet_lines import QuietLines, quiet_lines
+from avis_ctrl.gap.signals.record_residual import HANN_SHARED, Estimate, RecordResidual, check_common
 from avis_ctrl.measurement.gates.finding import Limit, Picture, Series
 from avis_ctrl.rigs.rig import Rig
 
@@ -161,7 +161,7 @@ class NoiseLevels:
     ways: dict[str, str]
 
 
-def noise_levels(left: Sequence[Leftover], floor_response: FloorResponse, rig: Rig, hum: HumFinding | None = None,
+def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, rig: Rig, hum: HumFinding | None = None,
                  steps_V: dict[str, float] | None = None) -> NoiseLevels:
     """Levels of floor and sensor noise, and what is above the rig's [ambient].
 

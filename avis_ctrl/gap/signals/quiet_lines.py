@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avis_ctrl.gap.signals.leftover import Leftover
+from avis_ctrl.gap.signals.record_residual import RecordResidual
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class QuietLines:
         return np.abs(self.e) ** 2 / self.left[:, None]
 
 
-def quiet_lines(left: Sequence[Leftover], band_Hz: tuple[float, float], narrow: bool,
+def quiet_lines(left: Sequence[RecordResidual], band_Hz: tuple[float, float], narrow: bool,
                 polluted: Sequence[np.ndarray] | None = None) -> tuple[QuietLines, ...]:
     """Of each record, in a band.
 
@@ -95,11 +95,11 @@ def quiet_lines(left: Sequence[Leftover], band_Hz: tuple[float, float], narrow: 
     return tuple(found[k] for k in range(len(left)))
 
 
-def _plain(one: Leftover, kind: str, level: float, keep: np.ndarray) -> QuietLines:
+def _plain(one: RecordResidual, kind: str, level: float, keep: np.ndarray) -> QuietLines:
     return QuietLines(one.header.name, kind, level, one.frequency_Hz[keep], one.E[keep], np.ones(int(keep.sum())))
 
 
-def _regression(left: Sequence[Leftover], keep: Sequence[np.ndarray], narrow: bool) -> list[QuietLines]:
+def _regression(left: Sequence[RecordResidual], keep: Sequence[np.ndarray], narrow: bool) -> list[QuietLines]:
     """Residuals of e on u, (1, x, x^2) u over each window of lines common to the records, with what they are left."""
     lines = np.flatnonzero(np.any(keep, axis=0))
     n_u, R = left[0].u.shape[1], len(left)

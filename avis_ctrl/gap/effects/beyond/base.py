@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table
-from avis_ctrl.gap.motion import RecordMotion
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Part, Score
 from avis_ctrl.gap.starting_values import Seed
 

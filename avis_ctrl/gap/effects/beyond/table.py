@@ -9,8 +9,8 @@ import numpy as np
 from avis_ctrl.gap.effects.base import EffectParameter, Table
 from avis_ctrl.gap.effects.beyond.base import Beyond
 from avis_ctrl.gap.effects.mounts import has_mounts, largest_rms
-from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.operators import Operators, mount_geometry
+from avis_ctrl.gap.record_motion import RecordMotion
 
 
 class QuadraticStiffness(Beyond):

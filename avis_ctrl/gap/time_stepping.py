@@ -18,7 +18,7 @@ import scipy.fft
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.gap.effects.mounts import ContactFriction, dahl, pushed
 from avis_ctrl.gap.line_response import LineResponse
-from avis_ctrl.gap.motion import RecordMotion
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.identification.response import N_Q
 
@@ -43,7 +43,7 @@ class MarchSettings:
 SETTINGS = MarchSettings()
 
 
-class Answer:
+class ForceResponse:
     """Motion z (c,) by a force (6,) at the samples; z holds x, and the chassis where it recoils.
 
     shape : (n_g, c) deflection by z.
@@ -172,7 +172,7 @@ class Marched:
     iterations: int
 
 
-def march(answer: Answer, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,
+def march(answer: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,
           beyond: np.ndarray | float = 0.0) -> Marched:
     """Solve z = free + h * f(z) from rest.
 
@@ -213,7 +213,7 @@ def march(answer: Answer, free: np.ndarray, effects: Sequence[ActiveEffect], rec
 class _Window:
     """Samples start .. stop, solved whole or in pieces one after the other."""
 
-    answer: Answer
+    answer: ForceResponse
     record: RecordMotion
     forces: Sequence[WindowForce]
     beyond: np.ndarray

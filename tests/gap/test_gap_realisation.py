@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.additions import SETTINGS, Table, impedance, ladder
 from avis_ctrl.gap.effects.base import Effect, EffectParameter
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.mounts import REFERENCE_Hz
 from avis_ctrl.gap.operators import assemble
-from avis_ctrl.gap.realise import realise, sufficient_order, with_effects
+from avis_ctrl.gap.realisation import realise, sufficient_order, with_effects
+from avis_ctrl.gap.state_space import SETTINGS, ReducedTable, impedance, ladder
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.lti.statespace import gain
@@ -264,7 +264,7 @@ class _Skyhook(Effect):
 
 
 class _WithStates(_Skyhook):
-    def addition(self, table: Table, place, values):
+    def addition(self, table: ReducedTable, place, values):
         g = table.rows(np.eye(6)[2:3])
         return impedance(table, values["damping_Ns_per_m"] * g.T @ g, gain([[1.0]]), "v")
 

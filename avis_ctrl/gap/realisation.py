@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.additions import SETTINGS, Table, addition, chassis, has_addition
 from avis_ctrl.gap.effects.sensors import GRAVITY, suspensions
 from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.state_space import SETTINGS, ReducedTable, addition, chassis, has_addition
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.sampling import hold
 from avis_ctrl.lti.connect import connect
@@ -104,7 +104,7 @@ def with_effects(rig: StateSpace, model: TableModel, keep: Sequence[str], when: 
     ------
     InputError : values that no system has (a chassis without mass).
     """
-    table = Table(model, tuple(keep), when)
+    table = ReducedTable(model, tuple(keep), when)
     names = [edge_name(name) for name in keep]
     sensors, actuators = model.sensors.names, list(model.actuators)
     parts = {"rig": _rig_part(rig, names, actuators), "additions": _additions(table, names)}
@@ -134,7 +134,7 @@ def _rig_part(rig: StateSpace, names: list[str], actuators: list[str]) -> StateS
     return rig.select(outputs, None).renamed(new)
 
 
-def _additions(table: Table, names: list[str]) -> StateSpace:
+def _additions(table: ReducedTable, names: list[str]) -> StateSpace:
     total = gain(np.zeros(table.shape))
     for one in table.model.effects:
         made = addition(table, one)
@@ -162,7 +162,7 @@ def _drives(model: TableModel) -> list[StateSpace]:
     return [lag.scaled(factors[name]) for name in model.actuators]
 
 
-def _sensors(table: Table, names: list[str]) -> StateSpace:
+def _sensors(table: ReducedTable, names: list[str]) -> StateSpace:
     """(velocities, what bends) -> what each sensor sees beyond its nominal row, and its share of gravity's rate."""
     model, n, n_y = table.model, table.n, table.n_y
     ops = Operators(model.effective, np.ones(1))
@@ -193,7 +193,7 @@ def _numbered(system: StateSpace, tag: str) -> StateSpace:
                       tuple(f"{tag}y{k}" for k in range(system.noutputs)))
 
 
-def _tilt_rows(table: Table) -> np.ndarray:
+def _tilt_rows(table: ReducedTable) -> np.ndarray:
     """(n_y, n) what gravity adds to the rate of each sensor's acceleration, by the velocities."""
     model, of_q = table.model, np.zeros((table.n_y, len(COORDINATES)))
     strength = sum(one.by_name["gravity_m_per_s2"] for one in model.effects if one.effect.name == "tilt_coupling")
@@ -239,7 +239,7 @@ def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: in
     effective = model.effective
     rig = uncertain_rig(effective.rig, [], keep).system
     names = [edge_name(name) for name in keep]
-    table = Table(model, tuple(keep), when)
+    table = ReducedTable(model, tuple(keep), when)
     inner = with_effects(rig, model, keep, when)
     parts = {"table": inner, "chains": _chains(table, names), "loop": _loop(model, order)}
     floor = [f"floor_{a}_dot" for a in names]
@@ -304,7 +304,7 @@ def _loop(model: TableModel, order: int) -> StateSpace:
     return append(*(one.renamed([f"{name}_command"], [name]) for name in model.actuators))
 
 
-def _chains(table: Table, names: list[str]) -> StateSpace:
+def _chains(table: ReducedTable, names: list[str]) -> StateSpace:
     """Velocities, deviations and gravity's share to the sensors' own unit; the two zeros at rest cancel s^-2."""
     model, n_y = table.model, table.n_y
     nominal, chain = table.rows(table.matrices.R), model.sensors.chain

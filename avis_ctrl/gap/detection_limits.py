@@ -19,7 +19,7 @@ from avis_ctrl.gap.score import SETTINGS, Score
 from avis_ctrl.gap.table_model import active
 
 
-def detectable(score: Score, effects: Sequence[Effect] | None = None) -> tuple[Detectable, ...]:
+def detection_limits(score: Score, effects: Sequence[Effect] | None = None) -> tuple[Detectable, ...]:
     """For every effect, place and parameter the departure from none of five standard deviations.
 
     Of effects whose parameters are all linear, each parameter with the others of its effect free; of two laws of one

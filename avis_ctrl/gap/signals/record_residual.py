@@ -41,7 +41,7 @@ class Estimate(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Leftover:
+class RecordResidual:
     """y minus a model's prediction in one record.
 
     header : of the record. u : (samples, n_u) commanded volts. e : (samples, n_y), unit of y.
@@ -103,7 +103,7 @@ class Leftover:
         return scipy.fft.rfft((x - x.mean(0)) * window[:, None], axis=0) / np.sqrt(n * 3 / 8)
 
 
-def leftovers(campaign: Campaign, predicted: Mapping[str, np.ndarray]) -> tuple[Leftover, ...]:
+def record_residuals(campaign: Campaign, predicted: Mapping[str, np.ndarray]) -> tuple[RecordResidual, ...]:
     """Of the records that a prediction (samples, n_y) is given for, by record name; memory holds all of them.
 
     Raises
@@ -117,11 +117,11 @@ def leftovers(campaign: Campaign, predicted: Mapping[str, np.ndarray]) -> tuple[
         record = campaign.named(name).load()
         if np.shape(y) != record.y.shape:
             raise InputError(f"expected shape {record.y.shape}", field=f"record {name}: prediction", value=np.shape(y))
-        found.append(Leftover(record.header, record.u, record.y - y))
+        found.append(RecordResidual(record.header, record.u, record.y - y))
     return tuple(found)
 
 
-def check_common(left: Sequence[Leftover]) -> RecordHeader:
+def check_common(left: Sequence[RecordResidual]) -> RecordHeader:
     """The first header; InputError where there is none or channels or rates differ."""
     if not left:
         raise InputError("expected the residual of one record at least", field="residuals")

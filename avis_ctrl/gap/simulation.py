@@ -18,10 +18,10 @@ import numpy as np
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
-from avis_ctrl.gap.marching import Answer, march
-from avis_ctrl.gap.motion import RecordMotion
-from avis_ctrl.gap.record_motion import motion_of, mount_rows, with_large_motion
+from avis_ctrl.gap.motion_estimate import motion_of, mount_rows, with_large_motion
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.gap.time_stepping import ForceResponse, march
 from avis_ctrl.identification.response import N_Q
 
 __all__ = ["Simulated", "motion_of", "simulate"]
@@ -126,17 +126,17 @@ def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tupl
     return np.clip(u, -limit, limit), floor
 
 
-_answers: list[tuple[LineResponse, Answer]] = []
+_responses: list[tuple[LineResponse, ForceResponse]] = []
 
 
-def _answer(lines: LineResponse, mass: np.ndarray) -> Answer:
-    """`Answer`, the last one kept: records of one length share it."""
-    for known, found in _answers:
+def _force_response(lines: LineResponse, mass: np.ndarray) -> ForceResponse:
+    """`ForceResponse`, the last one kept: records of one length share it."""
+    for known, found in _responses:
         if known is lines:
             return found
-    _answers.clear()
-    _answers.append((lines, Answer(lines, mass)))
-    return _answers[0][1]
+    _responses.clear()
+    _responses.append((lines, ForceResponse(lines, mass)))
+    return _responses[0][1]
 
 
 def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x: np.ndarray,
@@ -145,7 +145,7 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x
     leaves (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
     marching = [one for one in effects if not isinstance(one.effect, LargeMotion)]
     weak = [one for one in effects if isinstance(one.effect, LargeMotion)]
-    answer = _answer(lines, model.matrices.M)
+    answer = _force_response(lines, model.matrices.M)
     # Free motion in coordinates of the answer: any that give the deflection.
     to_z, n = np.linalg.pinv(answer.shape), len(record.volts)
     defect, reading = float("nan"), np.zeros((n, len(model.sensors.names)))
