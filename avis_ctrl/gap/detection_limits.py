@@ -20,7 +20,8 @@ from avis_ctrl.gap.table_model import active
 
 
 def detection_limits(score: Score, effects: Sequence[Effect] | None = None) -> tuple[Detectable, ...]:
-    """For every effect, place and parameter the departure from none of five standard deviations.
+    """For every effect, place and parameter the departure from its value without the effect, of five standard
+    deviations.
 
     Of effects whose parameters are all linear, each parameter with the others of its effect free; of two laws of one
     effect the larger value. One effect at a time. Infinite where re-identification absorbs a parameter.

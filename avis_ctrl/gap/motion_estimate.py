@@ -2,7 +2,7 @@
 
     d = d_model + G q_e,    q_e = K (y - y_model)
 
-y - y_model is taken for the answer to a force e that the model lacks, white within a third of an octave, and to white
+y - y_model is taken for the response to a force e that the model lacks, white within a third of an octave, and to white
 noise of the sensors. The most likely q_e is then K = P H^H S (H S H^H + N)^-1 (Wiener), with H = (y by force) and
 P = D^-1 S: the inverse of the sensors' chain where they see more than noise, nothing where they do not.
 """
@@ -157,8 +157,8 @@ def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.n
         if k < SETTINGS.passes - 1:
             force = in_time(e)
             force[margin + samples:] = 0
-            answer = in_time((H @ scipy.fft.rfft(force, axis=0)[at][:, :, None])[:, :, 0])
-            continued += SETTINGS.relaxation * (answer[:len(continued)] - continued)
+            response = in_time((H @ scipy.fft.rfft(force, axis=0)[at][:, :, None])[:, :, 0])
+            continued += SETTINGS.relaxation * (response[:len(continued)] - continued)
             continued[inside] = left
     x = (lines.compliance[at, :, :N_Q] @ (size * e)[:, :, None])
     d = x[:, :, 0] @ lines.G.T

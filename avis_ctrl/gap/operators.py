@@ -217,7 +217,7 @@ def mount_geometry(rig: Rig) -> MountGeometry:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """The table as `Operators` left it, ready to answer.
+    """The table as `Operators` left it, ready for its response.
 
     D (n, n_q, n_q) and its inverse, empty where it was not asked for; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp,
     slope_pf (n, n_g): the slopes are derivatives by the mount's stiffness k; by its c both are s damping_factor.

@@ -1,4 +1,4 @@
-"""How independent questions are answered: one after the other, or several at a time where a caller knows how."""
+"""Independent calculations: one after the other, or several at a time where a caller knows how."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar
 
 Item = TypeVar("Item")
-Answer = TypeVar("Answer")
+Result = TypeVar("Result")
 
 
 class Each(Protocol):
-    """Answers to independent questions, in their order; where there are processors, several at a time."""
+    """Results of independent calculations, in their order; where there are processors, several at a time."""
 
-    def __call__(self, function: Callable[[Item], Answer], items: Sequence[Item]) -> list[Answer]: ...
+    def __call__(self, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]: ...
 
 
-def one_by_one(function: Callable[[Item], Answer], items: Sequence[Item]) -> list[Answer]:
+def one_by_one(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """The same, one after the other."""
     return [function(item) for item in items]

@@ -339,7 +339,7 @@ def _without_aliases(model: TableModel, omega: np.ndarray) -> np.ndarray:
 
 
 def _distance(found: np.ndarray, asked: np.ndarray, n_u: int) -> float:
-    """Largest relative difference over frequency, of the answers to the actuators and to the floor."""
+    """Largest relative difference over frequency, of the responses to the actuators and to the floor."""
     worst = 0.0
     for part in (slice(0, n_u), slice(n_u, None)):
         size = np.linalg.norm(asked[:, :, part], axis=(1, 2))

@@ -102,15 +102,15 @@ class Part:
         self.transient = np.zeros((0, 0))
         self.body: np.ndarray | None = None
         self.inner: np.ndarray | None = None
-        self.answer = TableResponse(self.made, self._acting(model))
+        self.response = TableResponse(self.made, self._acting(model))
         if block.transient:
             columns, norms = transient_columns(block, cast(ResponseModel, model))
             T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
             self.transient, X = span(T.T)
-            left = as_real(whitened(self.L, block.Y - self.answer.Y)[None])[0]
+            left = as_real(whitened(self.L, block.Y - self.response.Y)[None])[0]
             self.body, self.inner = transient_parts(X @ (self.transient.T @ left), norms, block,
                                                     cast(ResponseModel, model))
-            self.answer = TableResponse(self.made, self._acting(model))
+            self.response = TableResponse(self.made, self._acting(model))
 
     def _acting(self, model: TableModel) -> Acting:
         block = self.block
@@ -120,7 +120,7 @@ class Part:
     @property
     def s(self) -> np.ndarray:
         """(n, 1, 1) j omega."""
-        return self.answer.s
+        return self.response.s
 
     def real(self, dY: np.ndarray) -> np.ndarray:
         """(k, n, n_y, m) of y to (k, N), whitened, free of the transient."""
@@ -131,11 +131,11 @@ class Part:
 
     def side(self, model: TableModel) -> AtMotion:
         """What a model near by misses of the motion of this one."""
-        return AtMotion(assemble(model.operators(self.block.omega), invert=False), self._acting(model), self.answer.x)
+        return AtMotion(assemble(model.operators(self.block.omega), invert=False), self._acting(model), self.response.x)
 
     def by_impedance(self, dynamic: np.ndarray) -> np.ndarray:
         """(21, n, n_y, m): y by each symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""
-        q, left = self.answer.x[:, :N_Q], self.answer.left[:, :, :N_Q]
+        q, left = self.response.x[:, :N_Q], self.response.left[:, :, :N_Q]
         out = []
         for i, j in SYMMETRIC:
             push = left[:, :, i, None] * q[:, None, j]
@@ -155,7 +155,7 @@ class Score:
         self.model = model
         self.kept: dict = {}
         self.parts = [Part(model, block) for block in blocks]
-        self.e = np.concatenate([part.real((part.block.Y - part.answer.Y)[None])[0] for part in self.parts])
+        self.e = np.concatenate([part.real((part.block.Y - part.response.Y)[None])[0] for part in self.parts])
         J = np.concatenate([part.real(model.answer(part.block, part.body, inner=part.inner).dY)
                             for part in self.parts], axis=1)
         J = J * model.scales()[:, None]
@@ -188,7 +188,7 @@ class Score:
         linear = [j for j, one in enumerate(effect.parameters) if one.linear]
         if not linear:
             added = self.model.with_effect(effect)
-            return self.directions([(added.answer(part.block, part.body, False).Y - part.answer.Y)[None]
+            return self.directions([(added.answer(part.block, part.body, False).Y - part.response.Y)[None]
                                     for part in self.parts])
         models = []
         for j in linear:
@@ -198,11 +198,11 @@ class Score:
             models.append((self.model.with_effect(effect.at(values)), step))
         columns = []
         for part in self.parts:
-            rest = part.answer.Y
+            rest = part.response.Y
             own = []
             for model, step in models:
                 side = part.side(model)
-                own.append((side.Y - rest + part.answer.left @ side.push) / step)
+                own.append((side.Y - rest + part.response.left @ side.push) / step)
             columns.append(np.array(own))
         return self.directions(columns)
 

@@ -1,8 +1,8 @@
 """Simulation in time of a table with effects: what its sensors read in a record, from u and floor alone.
 
 The linear part acts on the lines of the padded record (`line_response`). Forces that depend on amplitude or time are
-found from sample to sample (`marching`) and then act on the same lines. A band of 500 Hz, or half the sample rate, is
-kept: a table moves above by its mass alone.
+found from sample to sample (`time_stepping`) and then act on the same lines. A band of 500 Hz, or half the sample
+rate, is kept: a table moves above by its mass alone.
 
 Limits: a record starts at rest, with nothing before it. Volts that an effect changes by the motion see the motion
 without them. Records of more than `RecordLineSettings.most_samples` samples are refused.
@@ -69,7 +69,7 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
     Raises
     ------
     InputError : arrays of other shapes, numbers that are not finite, a rate that is not the rig's, a record too long.
-    ComputationError : a motion that grows without bound, or an answer that does not settle.
+    ComputationError : a motion that grows without bound, or a response that does not settle.
     """
     u, floor = _checked(model, u, floor)
     lines = line_response(linear_part(model), len(u), sample_rate_Hz)
@@ -141,37 +141,37 @@ def _force_response(lines: LineResponse, mass: np.ndarray) -> ForceResponse:
 
 def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x: np.ndarray,
                  floor: np.ndarray | None, effects: Sequence[ActiveEffect]) -> Simulated:
-    """March, then let the forces act over the whole record. What enters the next pass: what an answer before its cause
-    leaves (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
+    """March, then let the forces act over the whole record. What enters the next pass: what a response before its
+    cause leaves (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
     marching = [one for one in effects if not isinstance(one.effect, LargeMotion)]
     weak = [one for one in effects if isinstance(one.effect, LargeMotion)]
-    answer = _force_response(lines, model.matrices.M)
-    # Free motion in coordinates of the answer: any that give the deflection.
-    to_z, n = np.linalg.pinv(answer.shape), len(record.volts)
+    by_force = _force_response(lines, model.matrices.M)
+    # Free motion in coordinates of the response: any that give the deflection.
+    to_z, n = np.linalg.pinv(by_force.shape), len(record.volts)
     defect, reading = float("nan"), np.zeros((n, len(model.sensors.names)))
-    slow, correction, size = np.zeros((n, N_Q)), np.zeros((n, answer.shape.shape[1])), 0.0
+    slow, correction, size = np.zeros((n, N_Q)), np.zeros((n, by_force.shape.shape[1])), 0.0
     linear = lines.deflection(x, floor)
     for passes in range(1, SETTINGS.most_passes + 1):
-        free = linear + answer.whole(slow) @ answer.shape.T
+        free = linear + by_force.whole(slow) @ by_force.shape.T
         in_time = lines.in_time(free)
         z_free = in_time @ to_z.T
         record.deflection[:] = in_time
         push, left, missing = np.zeros((n, N_Q)), np.zeros_like(correction), np.zeros_like(correction)
         if marching:
-            marched = march(answer, z_free + correction, marching, record, in_time - z_free @ answer.shape.T)
+            marched = march(by_force, z_free + correction, marching, record, in_time - z_free @ by_force.shape.T)
             push = marched.force
-            left = z_free + lines.in_time(answer.whole(push)) - marched.z
+            left = z_free + lines.in_time(by_force.whole(push)) - marched.z
         if weak:
             more, reading = _large_rotations(weak, record, model)
-            missing, slow = lines.in_time(answer.whole(more - slow)), more
+            missing, slow = lines.in_time(by_force.whole(more - slow)), more
         size = float(np.sqrt(np.mean(record.deflection ** 2))) or 1.0
-        defect = float(np.sqrt(np.mean(((left + missing) @ answer.shape.T) ** 2))) / size
+        defect = float(np.sqrt(np.mean(((left + missing) @ by_force.shape.T) ** 2))) / size
         if defect <= SETTINGS.defect:
-            z = answer.whole(push + slow)
-            y = lines.sensed(x + z[:, :answer.n_x], record.volts, floor)
+            z = by_force.whole(push + slow)
+            y = lines.sensed(x + z[:, :by_force.n_x], record.volts, floor)
             if weak:
                 y += lines.read_beside(reading)
-            return Simulated(lines.in_time(y), lines.in_time(linear + z @ answer.shape.T), passes, defect)
+            return Simulated(lines.in_time(y), lines.in_time(linear + z @ by_force.shape.T), passes, defect)
         if not np.isfinite(defect):
             break
         correction = correction + left

@@ -292,12 +292,12 @@ class TableModel:
     def _driven(self, omega: np.ndarray, U: np.ndarray, block: SpectralBlock | None, derivative: bool,
                 inner: np.ndarray | None = None) -> Driven:
         made = self.assembled(omega)
-        answer = TableResponse(made, self.acting(U, block, inner))
+        response = TableResponse(made, self.acting(U, block, inner))
         if not derivative:
-            return Driven(answer.Y, np.empty(0))
-        dY = answer.by_rig(self.effective, self.derivative_matrices, len(self._free))
-        self._by_effects(omega, U, block, made, answer, dY)
-        return Driven(answer.Y, dY)
+            return Driven(response.Y, np.empty(0))
+        dY = response.by_rig(self.effective, self.derivative_matrices, len(self._free))
+        self._by_effects(omega, U, block, made, response, dY)
+        return Driven(response.Y, dY)
 
     def acting(self, U: np.ndarray, block: SpectralBlock | None, inner: np.ndarray | None = None) -> Acting:
         """Inputs with the volts that act, and what effects that depend on the record add."""
@@ -314,7 +314,7 @@ class TableModel:
             U[:, :len(self.actuators)] += volts
         return Acting(U, force, reading, output, inner)
 
-    def _by_effects(self, omega, U, block, made: Assembled, answer: TableResponse, dY: np.ndarray) -> None:
+    def _by_effects(self, omega, U, block, made: Assembled, response: TableResponse, dY: np.ndarray) -> None:
         """Central differences by the effects' parameters: of what an effect adds to a record, which the response is
         linear in; of the whole response where it changes the table."""
         n, theta, (low, high) = len(self.base.names), self.values, self.bounds()
@@ -335,13 +335,13 @@ class TableModel:
                 change = np.zeros((len(omega), len(self.inputs), 1), complex)
                 if volts is not None:
                     change[:, :len(self.actuators)] = volts
-                side = AtMotion(made, Acting(change, *rest), np.zeros_like(answer.x))
-                dY[row] = side.Y + answer.left @ side.push
+                side = AtMotion(made, Acting(change, *rest), np.zeros_like(response.x))
+                dY[row] = side.Y + response.left @ side.push
                 continue
-            sides = [AtMotion(assemble(other.operators(omega), invert=False), answer.acting, answer.x)
+            sides = [AtMotion(assemble(other.operators(omega), invert=False), response.acting, response.x)
                      for other in others]
             # d x = inv(D) (d F - d D x): no second inverse.
-            dY[row] = ((sides[0].Y - sides[1].Y) + answer.left @ (sides[0].push - sides[1].push)) / width
+            dY[row] = ((sides[0].Y - sides[1].Y) + response.left @ (sides[0].push - sides[1].push)) / width
 
 
 def inseparable_parameters(model: TableModel) -> tuple[tuple[str, ...], ...]:

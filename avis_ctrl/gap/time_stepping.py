@@ -1,10 +1,10 @@
 """Forces that depend on the motion that they make: d = d_0 + h * f(d), solved from sample to sample.
 
-d_0 is the deflection without the forces, h the answer of the linear part to a force that runs straight between samples.
-A fixed point over a whole record diverges wherever f is not small beside a lightly damped mount. Here time is cut into
-windows so short that within one the fixed point contracts, whatever f; what earlier windows leave for later ones is
-added in blocks that double in length (fast convolution of a sequence that is only known up to now: Hairer, Lubich and
-Schlichte, SIAM J. Sci. Stat. Comput. 6, 1985).
+d_0 is the deflection without the forces, h the response of the linear part to a force that runs straight between
+samples. A fixed point over a whole record diverges wherever f is not small beside a lightly damped mount. Here time is
+cut into windows so short that within one the fixed point contracts, whatever f; what earlier windows leave for later
+ones is added in blocks that double in length (fast convolution of a sequence that is only known up to now: Hairer,
+Lubich and Schlichte, SIAM J. Sci. Stat. Comput. 6, 1985).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class ForceResponse:
     """Motion z (c,) by a force (6,) at the samples; z holds x, and the chassis where it recoils.
 
     shape : (n_g, c) deflection by z.
-    The force is a straight line between samples: sinc^2 of the continuous answer, and what sampling folds, known in
+    The force is a straight line between samples: sinc^2 of the continuous response, and what sampling folds, known in
     closed form for the mass alone: T^2/6 (z + 4 + 1/z)/(z - 2 + 1/z) in the place of 1/s^2.
     """
 
@@ -172,7 +172,7 @@ class Marched:
     iterations: int
 
 
-def march(answer: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,
+def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,
           beyond: np.ndarray | float = 0.0) -> Marched:
     """Solve z = free + h * f(z) from rest.
 
@@ -186,8 +186,8 @@ def march(answer: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffec
     ComputationError : a motion that grows without bound.
     """
     forces = [(FrictionForce if type(one.effect) is ContactFriction else WindowForce)(one, record) for one in effects]
-    beyond = np.broadcast_to(beyond, (len(free), len(answer.shape)))
-    z, W, samples = free.copy(), answer.window, len(free)
+    beyond = np.broadcast_to(beyond, (len(free), len(by_force.shape)))
+    z, W, samples = free.copy(), by_force.window, len(free)
     total, most, largest = np.zeros((samples, N_Q)), 0, float(np.max(np.abs(record.deflection), initial=0.0))
     for start in range(0, samples, W):
         stop = min(start + W, samples)
@@ -195,8 +195,8 @@ def march(answer: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffec
             level = (start // W & -(start // W)).bit_length() - 1
             B = W << level
             end = min(start + B, samples)
-            z[start:end] += answer.after(total[start - B:start], level)[:end - start]
-        window = _Window(answer, record, forces, beyond, start, stop, SETTINGS.tolerance * largest)
+            z[start:end] += by_force.after(total[start - B:start], level)[:end - start]
+        window = _Window(by_force, record, forces, beyond, start, stop, SETTINGS.tolerance * largest)
         for piece in SETTINGS.pieces:
             if (done := window.solve(z[start:stop], max(W // piece, 1))) is not None:
                 break
@@ -213,7 +213,7 @@ def march(answer: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffec
 class _Window:
     """Samples start .. stop, solved whole or in pieces one after the other."""
 
-    answer: ForceResponse
+    by_force: ForceResponse
     record: RecordMotion
     forces: Sequence[WindowForce]
     beyond: np.ndarray
@@ -231,8 +231,8 @@ class _Window:
             here = slice(self.start + a, self.start + b)
             before = None
             for iteration in range(1, SETTINGS.most_iterations + 1):
-                z = free + self.answer.within(push[:b], length)
-                deflection = z[a:b] @ self.answer.shape.T + self.beyond[here]
+                z = free + self.by_force.within(push[:b], length)
+                deflection = z[a:b] @ self.by_force.shape.T + self.beyond[here]
                 change = np.inf if before is None else float(np.max(np.abs(deflection - before)))
                 self.record.deflection[here] = before = deflection
                 if change <= self.tolerance:

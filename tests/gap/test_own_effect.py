@@ -90,7 +90,7 @@ def test_every_attribute_that_the_guide_names_exists():
     for name in set(re.findall(r"\bops\.(\w+)", GUIDE.read_text(encoding="utf-8"))):
         assert hasattr(ops, name), name
     for name in set(re.findall(r"^- `(\w+)\(", GUIDE.read_text(encoding="utf-8"), re.MULTILINE)):
-        assert hasattr(base.Effect, name) or name == "addition", name  # which `additions.has_addition` asks for
+        assert hasattr(base.Effect, name) or name == "addition", name  # which `state_space.has_addition` asks for
 
 
 @pytest.mark.slow

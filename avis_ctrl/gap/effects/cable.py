@@ -65,7 +65,8 @@ class CableStiffness(AtPoint):
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         names = [name for name in values if name.startswith(("along_", "k_"))]
-        return "" if told_from_none(values, std, names) else "a cable that the data do not tell from none"
+        return "" if told_from_none(values, std, names) else (
+            "a cable whose stiffness the data do not distinguish from zero")
 
     def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:

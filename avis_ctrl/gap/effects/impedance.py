@@ -111,10 +111,10 @@ def recoils(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.
     """(6, N): by each way in which a chassis can recoil, receptance (n,) [1/mass times displacement per force]."""
     columns = []
     for part in score.parts:
-        made, answer = part.made, part.answer
+        made, response = part.made, part.response
         through = np.swapaxes(made.G, 0, 1)[:6] @ (made.z_pf[:, :, None] * made.ops.mounts.chassis)
-        amount = part.s ** 2 * (made.M @ answer.x[:, :6]) * receptance(part.s[:, 0, 0])[:, None, None]
-        seen = answer.left[:, :, :6] @ through
+        amount = part.s ** 2 * (made.M @ response.x[:, :6]) * receptance(part.s[:, 0, 0])[:, None, None]
+        seen = response.left[:, :, :6] @ through
         columns.append(-np.moveaxis(seen[:, :, :, None] * amount[:, None], 2, 0))
     return score.directions(columns)
 
@@ -123,12 +123,12 @@ def paths(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.nd
     """(n_y n_u, N): by the residue of each path, displacement per newton."""
     columns = []
     for part in score.parts:
-        ops, answer = part.made.ops, part.answer
-        force = np.linalg.norm(ops.base.matrices.T[:3], axis=0)[:, None] * answer.volts
+        ops, response = part.made.ops, part.response
+        force = np.linalg.norm(ops.base.matrices.T[:3], axis=0)[:, None] * response.volts
         n_y, n_u = len(ops.base.sensors.names), force.shape[1]
-        seen = (answer.gain * answer.sense)[:, :, 0] * receptance(part.s[:, 0, 0])[:, None]
-        out = np.zeros((n_y, n_u, *answer.Y.shape), complex)
+        seen = (response.gain * response.sense)[:, :, 0] * receptance(part.s[:, 0, 0])[:, None]
+        out = np.zeros((n_y, n_u, *response.Y.shape), complex)
         for i in range(n_y):
             out[i, :, :, i] = seen[:, i, None] * np.moveaxis(force, 1, 0)
-        columns.append(out.reshape(n_y * n_u, *answer.Y.shape))
+        columns.append(out.reshape(n_y * n_u, *response.Y.shape))
     return score.directions(columns)

@@ -110,7 +110,7 @@ class _Score:
         return np.where(tested, stats.gamma.sf(self.score, np.maximum(self.tests, 1)), 1.0)
 
 
-def find_hum(left: Sequence[RecordResidual], false_alarm: float = SETTINGS.false_alarm) -> HumFinding | None:
+def find_hum(left: Sequence[RecordResidual]) -> HumFinding | None:
     """The hum in what a model leaves, None where no line stands out.
 
     Works on the residual at every harmonic below 0.98 of half the sample rate, driven or not; a driven line whose
@@ -125,11 +125,11 @@ def find_hum(left: Sequence[RecordResidual], false_alarm: float = SETTINGS.false
     trials = sum(int(np.count_nonzero(one.tests)) for one in scores)
     each = [one.p for one in scores]
     chance = min(1.0, min(float(p.min()) for p in each) * trials)
-    if chance > false_alarm:
+    if chance > SETTINGS.false_alarm:
         return None
     # p underflows where lines are strong, so that the sum of the scores tells where they are strongest: at 300 Hz
     # stands a harmonic of either of the mains, elsewhere of one of them.
-    surest = [p * trials <= false_alarm for p in each]
+    surest = [p * trials <= SETTINGS.false_alarm for p in each]
     strength = [np.sum(np.where(sure, one.score, 0.0), axis=(1, 2)) for one, sure in zip(scores, surest, strict=True)]
     which = int(np.argmax([sums.max() for sums in strength]))
     best, sure, at = scores[which], surest[which], int(np.argmax(strength[which]))
@@ -137,7 +137,7 @@ def find_hum(left: Sequence[RecordResidual], false_alarm: float = SETTINGS.false
     # With the frequency known, what else stands out is judged among the lines there.
     there = _scores(left, best.nominal_Hz, np.array([frequency.value]))
     own = there.p[0]
-    hits = np.argwhere((own < false_alarm / own.size) | sure[at])
+    hits = np.argwhere((own < SETTINGS.false_alarm / own.size) | sure[at])
     frequency = _refined(left, frequency.value, hits)
     lines = _lines(left, frequency.value, hits, own, there.ratio[0])
     return _finding(left, best.nominal_Hz, frequency, lines, chance, first.y_unit)

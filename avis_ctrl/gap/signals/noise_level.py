@@ -87,7 +87,7 @@ class FloorLevel:
     rms : of each direction in 0.5-60 Hz, a power law beyond `seen_to_Hz`. seen : in 0.5 Hz to seen_to_Hz only.
     ambient : of the rig file [m/s].
     foreign : part of the excess over sensor noise that no floor motion makes, 0 to 1.
-    frequency_Hz (n,), density (n, 3), density_std : one-sided [m^2/s^2/Hz] in bands of a third of an octave.
+    frequency_Hz (n,), density (n, 3) : one-sided [m^2/s^2/Hz] in bands of a third of an octave.
     clear, significant : whether the floor is above ambient clearly, and beyond doubt of statistics.
     """
 
@@ -100,7 +100,6 @@ class FloorLevel:
     foreign: float
     frequency_Hz: np.ndarray
     density: np.ndarray
-    density_std: np.ndarray
     significant: bool
     clear: bool
 
@@ -155,7 +154,6 @@ class NoiseLevels:
     floor: FloorLevel | None
     sensors: dict[str, Estimate]
     by_record: dict[str, dict[str, Estimate]]
-    expected_sensor: dict[str, float]
     ground_motion: GroundMotionFinding | None
     raised: tuple[NoiseFinding, ...]
     ways: dict[str, str]
@@ -201,7 +199,7 @@ def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, 
         D = np.array([sensors[name].value ** 2 for name in first.y_names])
         floor = _floor(low, floor_response, D, ambient.floor_velocity_rms_m_per_s, rate)
     made = None if floor is None or not floor.ground_motion else _ground_motion(floor, first.y_names)
-    return NoiseLevels(floor, sensors, by_record, expected, made, raised, {one.record: one.kind for one in high})
+    return NoiseLevels(floor, sensors, by_record, made, raised, {one.record: one.kind for one in high})
 
 
 def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str
@@ -349,7 +347,7 @@ def _level(S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarra
     significant = _excess(ambient, mean, mean_seen, seen) > SETTINGS.significant
     clear = (any(above(one, SETTINGS.seen_factor) for one in (mean_seen, *seen.values()))
              or any(above(one, SETTINGS.total_factor) for one in (mean, *rms.values())))
-    return FloorLevel(rms, seen, ends, mean, mean_seen, ambient, foreign, centre, S, std, significant, clear)
+    return FloorLevel(rms, seen, ends, mean, mean_seen, ambient, foreign, centre, S, significant, clear)
 
 
 def _excess(ambient: float, mean: Estimate, mean_seen: Estimate, seen: dict[str, Estimate]) -> float:

@@ -1,7 +1,7 @@
 """Lines of a record that hold noise alone, whatever the drives do and whatever the model lacks.
 
 Periodic records: lines at least two away from every harmonic of the period, which a Hann window keeps free of all that
-answers u periodically, nonlinear or not. Records at rest: all lines. Others: what a local linear regression of the
+responds to u periodically, nonlinear or not. Records at rest: all lines. Others: what a local linear regression of the
 residual on u leaves, jointly over the records, with a response that is a parabola in frequency over each window
 (Pintelon and Schoukens 2012, section 7.2), so that dynamics that the model lacks are not taken for noise.
 """

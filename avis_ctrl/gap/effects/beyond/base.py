@@ -59,7 +59,7 @@ def by_volts(part: Part) -> np.ndarray:
     """(n, n_y, n_u) y by the volts of each motor."""
     kept = part.__dict__.get("by_volts")
     if kept is None:
-        kept = part.answer.left @ (part.made.T * part.made.volts[:, None, :])
+        kept = part.response.left @ (part.made.T * part.made.volts[:, None, :])
         part.__dict__["by_volts"] = kept
     return kept
 

@@ -44,7 +44,7 @@ class SensorCrosstalk(FirstOrder):
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
         names = part.model.sensors.names
         j, i = (names.index(name) for name in place.split("/"))
-        return only(part.answer.Y, j, part.answer.Y[:, i])
+        return only(part.response.Y, j, part.response.Y[:, i])
 
     def said(self, place: str, values: Mapping[str, float]) -> str:
         j, i = place.split("/")
@@ -68,7 +68,7 @@ class SensorCrosstalkOfAll(FirstOrder):
         mix(ops, place, {name.removeprefix("share_of_"): share for name, share in values.items()})
 
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
-        names, Y = part.model.sensors.names, part.answer.Y
+        names, Y = part.model.sensors.names, part.response.Y
         j = names.index(place)
         return np.concatenate([only(Y, j, Y[:, i]) for i in range(len(names)) if i != j])
 
@@ -93,7 +93,7 @@ class SensorLate(Late):
 
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
         j = part.model.sensors.names.index(place)
-        return np.repeat(only(part.answer.Y, j, -part.s[:, 0] * part.answer.Y[:, j]), 2, axis=0)
+        return np.repeat(only(part.response.Y, j, -part.s[:, 0] * part.response.Y[:, j]), 2, axis=0)
 
     def said(self, place: str, values: Mapping[str, float]) -> str:
         return f"a low pass or a delay of {place} alone"
@@ -125,7 +125,7 @@ class SensorResonance(FirstOrder):
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
         j = part.model.sensors.names.index(place)
         shape = self._shape(part.s[:, 0], float(point[1]), float(point[2]))
-        return only(part.answer.Y, j, shape * part.answer.Y[:, j])
+        return only(part.response.Y, j, shape * part.response.Y[:, j])
 
     def said(self, place: str, values: Mapping[str, float]) -> str:
         return f"a resonance of {place} alone at {values['frequency_Hz']:.3g} Hz"
