@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from avis_ctrl.identification.maximum_likelihood import fit
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs import load_rig
 
 LINES, SEED = 1000, 1

@@ -1,4 +1,4 @@
-"""The layers of the package: imports point downward only."""
+"""The layers of the package: imports point downward only, and run in no circle."""
 
 from __future__ import annotations
 
@@ -63,6 +63,55 @@ def test_the_walk_sees_an_upward_import(tmp_path, monkeypatch):
     path.write_text("from ..study import runner\ndef f():\n    import avis_ctrl.cli\n    from . import norms\n")
     assert list(imports(path)) == [("avis_ctrl.study.runner", True), ("avis_ctrl.cli", False),
                                    ("avis_ctrl.lti.norms", False)]
+
+
+def modules_imported_by(path: Path, known: set[str]) -> set[str]:
+    """Modules of the package that a file imports anywhere: under TYPE_CHECKING and inside functions too."""
+    found = set()
+    for name, _ in imports(path):
+        module = name if name in known else name.rpartition(".")[0]
+        found |= {module} & known
+    return found - {module_name(path)}
+
+
+def module_name(path: Path) -> str:
+    parts = [PACKAGE.name, *path.relative_to(PACKAGE).with_suffix("").parts]
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def import_circles() -> list[list[str]]:
+    """Groups of modules each of which reaches every other by imports."""
+    files = {module_name(path): path for path in PACKAGE.rglob("*.py")}
+    after = {name: modules_imported_by(path, set(files)) for name, path in files.items()}
+
+    def reached(start: str) -> set[str]:
+        found: set[str] = set()
+        waiting = [start]
+        while waiting:
+            new = after[waiting.pop()] - found
+            found |= new
+            waiting += new
+        return found
+    reach = {name: reached(name) for name in after}
+    groups = {frozenset(other for other in reach[name] if name in reach[other])
+              for name in after if name in reach[name]}
+    return sorted(sorted(group) for group in groups)
+
+
+def test_no_import_circles():
+    assert import_circles() == []
+
+
+@pytest.mark.parametrize("back", ["from .a import x\n", "if TYPE_CHECKING:\n    from avis_ctrl.lti.a import x\n",
+                                  "def f():\n    from avis_ctrl.lti import a\n"])
+def test_a_circle_is_found_however_it_is_hidden(tmp_path, monkeypatch, back):
+    monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path / "avis_ctrl")
+    folder = tmp_path / "avis_ctrl" / "lti"
+    folder.mkdir(parents=True)
+    (folder / "a.py").write_text("from avis_ctrl.lti.b import y\n")
+    (folder / "b.py").write_text(back)
+    (folder / "c.py").write_text("from avis_ctrl.lti import a\n")
+    assert import_circles() == [["avis_ctrl.lti.a", "avis_ctrl.lti.b"]]
 
 
 def users(library: str, at_once: bool = False) -> list[str]:

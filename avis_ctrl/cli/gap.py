@@ -54,7 +54,7 @@ def gap(
     console = Console(highlight=False)
     own = None
     if effects is not None:
-        from avis_ctrl.gap.effects.own import load_effects
+        from avis_ctrl.gap.effects.user_effects import load_effects
 
         own = load_effects(effects)
         console.print(f"[dim]effects of your own: {', '.join(own.names)}[/]")

@@ -124,7 +124,7 @@ def predict(
     if not isinstance(measured, Campaign):
         raise InputError("expected records, found frequency responses", file=campaign)
     if effects is not None:
-        from avis_ctrl.gap.effects.own import load_effects
+        from avis_ctrl.gap.effects.user_effects import load_effects
 
         load_effects(effects)
     if (folder / GAP_FILE).exists():

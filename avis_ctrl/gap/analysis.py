@@ -10,16 +10,16 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from avis_ctrl.gap.detectable import detectable
-from avis_ctrl.gap.each import Each, one_by_one
-from avis_ctrl.gap.effects.base import Effect, library
+from avis_ctrl.gap.detection_limits import detection_limits
+from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.beyond import beyond
-from avis_ctrl.gap.evidence_score import EvidenceScore
-from avis_ctrl.gap.in_words import in_words
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplained
+from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_second_order
 from avis_ctrl.gap.residual import Left, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
+from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, search, with_effect, without_effect
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import left_by, levels, named
@@ -222,7 +222,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         progress("noise of floor and sensors")
         left = left_by(prepared.campaign, updated.model, each)
         faults = replace(faults, noise=levels(left, updated.model, faults.hum, faults.converter))
-    found += [replace(one, share=_share_of_signal(one.name, raw, before, power)) for one in named(faults)]
+    found += [replace(one, share=_share_of_signal(one.name, raw, before, power)) for one in named(faults, settings)]
     found.sort(key=lambda one: -(one.share or 0.0))
     told = tuple(one for one in found if (one.share or 0.0) >= settings.trace)
     traces = tuple(one for one in found if (one.share or 0.0) < settings.trace)
@@ -242,7 +242,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     if verdict == "none":
         progress("how large an effect would have had to be to be seen")
         data = prepared.data(prepared.fitted, settings.lines)
-        limits = detectable(EvidenceScore(fits.tolerant, data, settings), effects)
+        limits = detection_limits(EvidenceScore(fits.tolerant, data, settings), effects)
     sentences = (_opening(verdict, told, traces, stages, remainder, after), *names.refused,
                  _remains(remainder, remaining), prepared.noise)
     return Gap(verdict, told, tuple(stages), where if verdict != "none" else (), remaining, after.noise_nrmse, onward,
@@ -347,8 +347,9 @@ def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[Nam
     if verdict == "unexplained":
         return (f"Something is missing that the library has no name for{beside}: with all tolerances the model leaves "
                 f"{_percent(left.nrmse)} of the held-out records, {rest}.")
-    return (f"Missing from the model: {' and '.join(map(in_words, told))}{beside}; with that and all tolerances the "
-            f"gap falls from {_percent(before)} to {_percent(left.nrmse)}, {rest}.")
+    names = " and ".join(one.in_words() for one in told)
+    return (f"Missing from the model: {names}{beside}; with that and all tolerances the gap falls from "
+            f"{_percent(before)} to {_percent(left.nrmse)}, {rest}.")
 
 
 def _remains(left: Remainder, remaining: Sequence[Where]) -> str:

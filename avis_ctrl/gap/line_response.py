@@ -1,9 +1,9 @@
 """A table on the lines of a whole record: the linear part of a simulation in time.
 
-A record from rest is put before silence of at least its own length and QUIET_s, so that what the discrete Fourier
+A record from rest is put before silence of at least its own length and `quiet_s`, so that what the discrete Fourier
 transform wraps around has died out. The responses are those of `TableModel`: hold, delay and aliases included, the
 floor's velocity band-limited between its samples. At frequency zero, where displacement by velocity of the floor and
-an integrating loop are infinite while what is read is not, the line is taken at LOWEST_LINE of the line spacing.
+an integrating loop are infinite while what is read is not, the line is taken at `lowest_line` of the line spacing.
 """
 
 from __future__ import annotations
@@ -18,15 +18,27 @@ from avis_ctrl.gap.operators import Assembled, assemble
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.response import N_Q
 
-# Silence behind a record [s]: with 1 % of damping at 1.5 Hz, motion falls to 0.4 % of itself.
-QUIET_s = 60.0
-# Lines above this [Hz] are taken as zero: a table moves there by its mass alone, and little.
-HIGHEST_Hz = 500.0
-LOWEST_LINE = 0.01
-# Lines of which the dynamic stiffness is formed at once.
-CHUNK = 8192
-# Samples of a record beyond which it does not fit into memory in one piece (padded: some 1.5 kB a sample).
-MOST_SAMPLES = 1_000_000
+
+@dataclass(frozen=True)
+class RecordLineSettings:
+    """Of a whole record on the lines of its transform.
+
+    quiet_s : silence behind a record [s]: with 1 % of damping at 1.5 Hz, motion falls to 0.4 % of itself.
+    highest_Hz : lines above this are taken as zero [Hz]: a table moves there by its mass alone, and little.
+    lowest_line : where the line at frequency zero is taken [line spacings].
+    chunk : lines of which the dynamic stiffness is formed at once: memory.
+    most_samples : samples of a record beyond which it does not fit into memory in one piece (padded: some 1.5 kB a
+        sample).
+    """
+
+    quiet_s: float = 60.0
+    highest_Hz: float = 500.0
+    lowest_line: float = 0.01
+    chunk: int = 8192
+    most_samples: int = 1_000_000
+
+
+SETTINGS = RecordLineSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,13 +133,13 @@ def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> Lin
     for known, length, rate, found in _kept:
         if _same(known, model) and (length, rate) == (samples, sample_rate_Hz):
             return found
-    if samples > MOST_SAMPLES:
-        raise InputError(f"expected a record of at most {MOST_SAMPLES} samples, which is simulated in one piece",
-                         field="samples", value=samples)
+    if samples > SETTINGS.most_samples:
+        raise InputError(f"expected a record of at most {SETTINGS.most_samples} samples, which is simulated in one "
+                         "piece", field="samples", value=samples)
     if model.period_s and abs(sample_rate_Hz * model.period_s - 1) > 1e-6:
         raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", field="sample_rate_Hz",
                          value=sample_rate_Hz)
-    padded = scipy.fft.next_fast_len(max(2 * samples, samples + int(np.ceil(QUIET_s * sample_rate_Hz))), True)
+    padded = scipy.fft.next_fast_len(max(2 * samples, samples + int(np.ceil(SETTINGS.quiet_s * sample_rate_Hz))), True)
     _kept.clear()  # first, so that two never lie in memory
     found = _formed(model, samples, padded, sample_rate_Hz)
     _kept.append((model, samples, sample_rate_Hz, found))
@@ -142,15 +154,15 @@ def _same(one: TableModel, other: TableModel) -> bool:
 
 def _formed(model: TableModel, samples: int, padded: int, sample_rate_Hz: float) -> LineResponse:
     spacing = 2 * np.pi * sample_rate_Hz / padded
-    n = min(padded // 2 + 1, int(HIGHEST_Hz * padded / sample_rate_Hz) + 1)
+    n = min(padded // 2 + 1, int(SETTINGS.highest_Hz * padded / sample_rate_Hz) + 1)
     omega = spacing * np.arange(n)
-    omega[0] = LOWEST_LINE * spacing
+    omega[0] = SETTINGS.lowest_line * spacing
     made: dict[str, np.ndarray] = {}
-    for k in range(0, n, CHUNK):
-        for name, part in _lines(assemble(model.operators(omega[k:k + CHUNK]))).items():
+    for k in range(0, n, SETTINGS.chunk):
+        for name, part in _lines(assemble(model.operators(omega[k:k + SETTINGS.chunk]))).items():
             if name not in made:
                 made[name] = np.empty((n if len(part) > 1 else 1, *part.shape[1:]), part.dtype)
-            made[name][k:k + CHUNK] = part
+            made[name][k:k + SETTINGS.chunk] = part
     mat = model.matrices
     first = assemble(model.operators(omega[:1]), invert=False)
     gain = (first.ops.base.sensors.sensitivity * first.ops.sensor_gain)[:, None]

@@ -17,8 +17,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.base import Effect, library
+from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.large_motion import LargeMotion
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.response import ResponseModel, sensor_model
 from avis_ctrl.rigs.avis import INERTIA
@@ -111,15 +112,17 @@ def campaign_clock(model: TableModel) -> tuple[float, float]:
     return 0.0, 1.0
 
 
-def model_from_dict(content: Mapping[str, Any]) -> TableModel:
-    """The model that `model_to_dict` wrote.
+def model_from_dict(content: Mapping[str, Any]) -> tuple[TableModel, tuple[float, float]]:
+    """The model that `model_to_dict` wrote, and the first and last time of the campaign that it was found from.
 
     Raises
     ------
     InputError : a field that is missing, unknown or wrong, an effect that the library does not have, a rig that no
         table has.
     """
-    return _made(_checked(content))
+    checked = _checked(content)
+    begin, end = checked.campaign_s
+    return _made(checked), (begin, end)
 
 
 def read_model(path: str | Path) -> tuple[TableModel, tuple[float, float]]:
@@ -134,9 +137,7 @@ def read_model(path: str | Path) -> tuple[TableModel, tuple[float, float]]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"expected JSON; {error}", file=path) from None
     try:
-        checked = _checked(content)
-        begin, end = checked.campaign_s
-        return _made(checked), (begin, end)
+        return model_from_dict(content)
     except InputError as error:
         raise error.in_file(path) from None
 

@@ -3,21 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from avis_ctrl.gap.result import RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel
 
-# Residual power over that of the noise from which a record tells how the residual grows; levels are two by this ratio.
-TELLING, ANOTHER_LEVEL = 2.0, 1.2
-# Power of the level with which a linear residual grows, and within which deviation that is told; standard deviation
-# from which a power is not told: two of them reach from what grows with the drives to what does not.
-LINEAR, WITHIN, UNSURE = 1.0, 0.2, 0.5
-# Points at which predictions are compared, all over the band and again about where they differ most.
-POINTS = 300
-# Share of the largest difference of two predictions, and of the gap, that belongs to the band to look at.
-NEAR, PART = 0.5, 0.1
+# Power of the level with which a linear residual grows.
+LINEAR = 1.0
+
+
+@dataclass(frozen=True)
+class NextMeasurementSettings:
+    """Of what to measure next.
+
+    telling : residual power over that of the noise from which a record tells how the residual grows [1].
+    another_level : ratio from which levels are two [1].
+    within : how far a power of the level may be from none, or from the linear one, to count as it [1].
+    unsure : standard deviation from which a power is not told [1]: two of them reach from what grows with the
+        drives to what does not.
+    points : points at which predictions are compared, all over the band and again about where they differ most.
+    near : fraction of the largest difference of two predictions, above which a frequency belongs to the band to look
+        at [1].
+    part : fraction of what remains at a sensor, above which a band is named [1].
+    """
+
+    telling: float = 2.0
+    another_level: float = 1.2
+    within: float = 0.2
+    unsure: float = 0.5
+    points: int = 300
+    near: float = 0.5
+    part: float = 0.1
+
+
+SETTINGS = NextMeasurementSettings()
 
 
 def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
@@ -27,12 +48,12 @@ def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
         why = ("only one of them depends on amplitude" if bent == {True, False} else
                "they depend on amplitude in different ways")
         return f"To tell {name} from {other}, record the same signals at half and at twice the level: {why}."
-    frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), POINTS)
+    frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), SETTINGS.points)
     difference = _difference(a, b, frequency)
     k, i, j = np.unravel_index(int(np.argmax(difference)), difference.shape)
     low, high = _about(difference[:, i, j], int(k))
     # A lightly damped peak is narrower than the first points are apart.
-    frequency = np.geomspace(frequency[low], frequency[high], POINTS)
+    frequency = np.geomspace(frequency[low], frequency[high], SETTINGS.points)
     finer = _difference(a, b, frequency)[:, i, j]
     low, high = _about(finer, int(np.argmax(finer)))
     band = f"{frequency[low]:.3g} to {frequency[high]:.3g} Hz"
@@ -53,8 +74,8 @@ def _difference(a: TableModel, b: TableModel, frequency: np.ndarray) -> np.ndarr
 
 
 def _about(size: np.ndarray, k: int) -> tuple[int, int]:
-    """First points on either side of k, or the last there are, that are no larger than NEAR of what is at k."""
-    far = np.flatnonzero(size <= NEAR * size[k])
+    """First points on either side of k, or the last there are, that are no larger than `near` of what is at k."""
+    far = np.flatnonzero(size <= SETTINGS.near * size[k])
     return int(far[far < k].max(initial=0)), int(far[far > k].min(initial=len(size) - 1))
 
 
@@ -69,10 +90,10 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
     power, std = growth
     told = (f"What remains{where and f', to {where},'} grows as the level of the drive to the power {power:.2f} +- "
             f"{std:.2g}")
-    if abs(power) <= max(WITHIN, 2 * std) and abs(power) < abs(power - LINEAR):
+    if abs(power) <= max(SETTINGS.within, 2 * std) and abs(power) < abs(power - LINEAR):
         return (f"{told}: it hardly depends on the drives. Take a record at rest with the floor measured, and look for "
                 "other sources.")
-    if abs(power - LINEAR) <= max(WITHIN, 2 * std):
+    if abs(power - LINEAR) <= max(SETTINGS.within, 2 * std):
         return (f"{told}: it is linear. Drive one actuator at a time: by which drives and at which sensors it appears "
                 "shows where it acts.")
     law = ("more slowly than the drive, as friction, play or a limit would have it" if power < LINEAR else
@@ -86,21 +107,21 @@ def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
 
     Least squares of log residual on log level over the records, noise taken off in power. The residual is told over the
     noise, which is another one where the floor is measured, and other signals meet another part of the gap: records of
-    each kind have a size of their own, all the same power. None, too, where its deviation is UNSURE or more.
+    each kind have a size of their own, all the same power. None, too, where its standard deviation is `unsure` or more.
     """
-    telling = [r for r in records if r.level_V > 0 and r.after ** 2 > TELLING]
+    telling = [r for r in records if r.level_V > 0 and r.after ** 2 > SETTINGS.telling]
     kinds = sorted({r.kind for r in telling})
     if len(telling) < len(kinds) + 2:
         return None
     own = np.array([[r.kind == kind for kind in kinds] for r in telling], float)
     level, left = np.log([r.level_V for r in telling]), np.log([np.sqrt(r.after ** 2 - 1) for r in telling])
-    if max(np.ptp(level[of > 0]) for of in own.T) < np.log(ANOTHER_LEVEL):
+    if max(np.ptp(level[of > 0]) for of in own.T) < np.log(SETTINGS.another_level):
         return None
     A = np.column_stack([own, level])
     x = np.linalg.lstsq(A, left, rcond=None)[0]
     scatter = np.sum((left - A @ x) ** 2) / (len(left) - A.shape[1])
     std = float(np.sqrt(scatter * np.linalg.inv(A.T @ A)[-1, -1]))
-    return (float(x[-1]), std) if std < UNSURE else None
+    return (float(x[-1]), std) if std < SETTINGS.unsure else None
 
 
 def _where(places: Sequence[Where]) -> str:
@@ -111,6 +132,6 @@ def _where(places: Sequence[Where]) -> str:
     most = max(outputs, key=lambda name: sum(one.share for one in places if one.output == name))
     band = [one for one in places if one.output == most]
     held = sum(one.share for one in band)
-    band = [one for one in band if one.share > PART * held]
+    band = [one for one in band if one.share > SETTINGS.part * held]
     return (f"{sum(one.share for one in band):.0%} at {most} from {min(one.from_Hz for one in band):.3g} to "
             f"{max(one.to_Hz for one in band):.3g} Hz")

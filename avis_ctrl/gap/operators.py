@@ -173,15 +173,14 @@ class Operators:
 
 # What a fit asks for again and again on the same lines; the oldest go first.
 _kept: dict[tuple, Any] = {}
-_MOST_KEPT = 64
 
 
 def _of(omega: np.ndarray) -> tuple[int, float, float, float]:
     return len(omega), float(omega[0]), float(omega[-1]), float(omega.sum())
 
 
-def _keep(key: tuple, value: Any) -> Any:
-    while len(_kept) >= _MOST_KEPT:
+def _keep(key: tuple, value: Any, most: int = 64) -> Any:
+    while len(_kept) >= most:
         _kept.pop(next(iter(_kept)), None)
     _kept[key] = value
     return value
@@ -218,7 +217,7 @@ def mount_geometry(rig: Rig) -> MountGeometry:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """The table as `Operators` left it, ready to answer.
+    """The table as `Operators` left it, ready for its response.
 
     D (n, n_q, n_q) and its inverse, empty where it was not asked for; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp,
     slope_pf (n, n_g): the slopes are derivatives by the mount's stiffness k; by its c both are s damping_factor.

@@ -32,18 +32,39 @@ from avis_ctrl.identification.campaign_fit import of_one_level
 from avis_ctrl.identification.prediction_error import PredictionError
 from avis_ctrl.measurement.campaign import RecordHeader
 
-BANDS_PER_OCTAVE = 3
-# Lines of a window by unknowns of its regression, and by unknowns where the error may be linear over it.
-LEAST_LINES, LINEAR_LINES = 3, 8
-# Part of the strongest line's power below which the drives leave a line alone.
-DRIVEN = 1e-6
-# Leverage from which on a line says nothing of the noise.
-MOST_LEVERAGE = 0.9
-# Chance that an error of the model is seen in a window of noise, and nonlinearity in a band of it.
-ALARM, SCATTER = 1e-3, 0.05
-# Times the noise from which on an error may be one of a pole, the part of it that must go, rounds of that fit, and the
-# least value of its denominator, which is one in the middle of the window.
-EXCESS, GAINED, POLE_ROUNDS, NEAREST_POLE = 1.5, 0.8, 4, 0.01
+
+@dataclass(frozen=True)
+class PowerSettings:
+    """Of the split of each output's power.
+
+    bands_per_octave : windows to the octave.
+    least_lines : lines of a window for each unknown of its regression: with fewer, leverage leaves no residual.
+    linear_lines : the same from which the error may be linear over the window.
+    driven : of the strongest line's power, below which the drives leave a line alone [1].
+    most_leverage : leverage from which on a line says nothing of the noise [1].
+    alarm : chance that an error of the model is seen in a window of noise [1].
+    scatter : chance that nonlinearity is seen in a band of noise [1].
+    excess : times the noise from which on an error may be one of a pole [1].
+    gained : fraction to which that error must fall for a pole to be taken [1].
+    pole_rounds : rounds of the fit of a pole, linearised in each.
+    nearest_pole : least value of its denominator, which is one in the middle of the window [1]: nearer, it fits a
+        single line.
+    """
+
+    bands_per_octave: int = 3
+    least_lines: int = 3
+    linear_lines: int = 8
+    driven: float = 1e-6
+    most_leverage: float = 0.9
+    alarm: float = 1e-3
+    scatter: float = 0.05
+    excess: float = 1.5
+    gained: float = 0.8
+    pole_rounds: int = 4
+    nearest_pole: float = 0.01
+
+
+SETTINGS = PowerSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +144,7 @@ def attributed(one: Split, noise: np.ndarray, sensors: np.ndarray | None) -> dic
     incoherent = np.minimum(one.incoherent, one.whole)
     missing = np.minimum(one.missing, one.whole - incoherent)
     # Within its own scatter the incoherent part is noise; as many lines count as share its power.
-    scatter = incoherent < stats.f.isf(SCATTER, 2 * one.effective, 2 * one.effective) * noise
+    scatter = incoherent < stats.f.isf(SETTINGS.scatter, 2 * one.effective, 2 * one.effective) * noise
     noise = np.where(scatter, incoherent, np.minimum(noise, incoherent))
     own = np.zeros_like(noise) if sensors is None else np.minimum(noise, sensors)
     parts = {"model": one.whole - missing - incoherent, "missing": missing, "nonlinear": incoherent - noise,
@@ -158,17 +179,17 @@ def lines_of(errors: Sequence[PredictionError], model: TableModel) -> Lines:
         noise = np.real(np.einsum("nkk->nk", block.noise[:, 0]))
         every = Lines(block.omega / (2 * np.pi), answered + left, left, answered + left - columns.sum(axis=2), columns,
                       noise)
-        made.append(every.some(power > DRIVEN * power.max(initial=0.0)))
+        made.append(every.some(power > SETTINGS.driven * power.max(initial=0.0)))
     joined = Lines(*(np.concatenate([getattr(one, field) for one in made]) for field in Lines.__dataclass_fields__))
     return joined.some(np.argsort(joined.frequency_Hz, kind="stable"))
 
 
 def bands(groups: Sequence[Lines]) -> np.ndarray:
-    """Edges in Hz: BANDS_PER_OCTAVE to the octave, but none with fewer lines of any level than its unknowns ask for."""
+    """Edges in Hz: `bands_per_octave`, but none with fewer lines of any level than its unknowns ask for."""
     low = min(float(one.frequency_Hz[0]) for one in groups if len(one.frequency_Hz))
     high = max(float(one.frequency_Hz[-1]) for one in groups if len(one.frequency_Hz)) * (1 + 1e-9)
-    grid = np.geomspace(low, high, max(int(np.ceil(BANDS_PER_OCTAVE * np.log2(high / low))), 1) + 1)
-    least = [LEAST_LINES * _unknowns(one.columns) for one in groups]
+    grid = np.geomspace(low, high, max(int(np.ceil(SETTINGS.bands_per_octave * np.log2(high / low))), 1) + 1)
+    least = [SETTINGS.least_lines * _unknowns(one.columns) for one in groups]
 
     def enough(a: float, b: float) -> bool:
         return all(np.searchsorted(one.frequency_Hz, b) - np.searchsorted(one.frequency_Hz, a) >= n
@@ -193,7 +214,7 @@ def split(lines: Lines, edges: np.ndarray) -> Split:
     count, alike = np.zeros(len(edges) - 1), np.ones((len(edges) - 1, n_y))
     for b, (low, high) in enumerate(pairwise(np.searchsorted(lines.frequency_Hz, edges))):
         count[b] = high - low
-        least = LINEAR_LINES * _unknowns(lines.columns[low:high])
+        least = SETTINGS.linear_lines * _unknowns(lines.columns[low:high])
         for at in np.array_split(np.arange(low, high), max((high - low) // max(least, 1), 1)):
             found[:, b] += _window(lines, at)
         found[:, b] /= max(count[b], 1)
@@ -215,7 +236,7 @@ def _window(lines: Lines, at: np.ndarray) -> np.ndarray:
         sums[4, k] = np.sum(sigma ** 2)
         for row, e in ((1, lines.beyond[at, k]), (2, lines.left[at, k])):
             error, leverage = _smooth(A, e, x, sigma)
-            if np.sum(np.abs(error / sigma) ** 2 / (1 - leverage)) > EXCESS * len(at):
+            if np.sum(np.abs(error / sigma) ** 2 / (1 - leverage)) > SETTINGS.excess * len(at):
                 error, leverage = _with_poles(A, model + e, x, sigma, (error, leverage))
             apart = np.abs(error) ** 2 / (1 - leverage)
             sums[row, k] = np.sum(apart)
@@ -227,14 +248,14 @@ def _window(lines: Lines, at: np.ndarray) -> np.ndarray:
 def _smooth(A: np.ndarray, e: np.ndarray, x: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Residual (n,) of e after a smooth relative error of each column of A, and leverage (n,) of each line; e itself
     where that error is not significant."""
-    if len(e) >= LINEAR_LINES * A.shape[1]:
+    if len(e) >= SETTINGS.linear_lines * A.shape[1]:
         A = np.hstack([A, A * x[:, None]])
     Q = _basis(A / sigma[:, None])
     white, p = e / sigma, Q.shape[1]
     inside = Q.conj().T @ white
     power, whole = float(np.sum(np.abs(inside) ** 2)), float(np.sum(np.abs(white) ** 2))
     rest = len(e) - p
-    if p == 0 or rest <= 0 or power / p < stats.f.isf(ALARM, 2 * p, 2 * rest) * (whole - power) / rest:
+    if p == 0 or rest <= 0 or power / p < stats.f.isf(SETTINGS.alarm, 2 * p, 2 * rest) * (whole - power) / rest:
         return e, np.zeros(len(e))
     return e - sigma * (Q @ inside), _leverage(Q)
 
@@ -252,14 +273,14 @@ def _with_poles(A: np.ndarray, y: np.ndarray, x: np.ndarray, sigma: np.ndarray, 
     numerator = np.hstack([A, A * x[:, None]])
     powers = np.stack([x, x ** 2], axis=1)
     a = np.ones(len(x), complex)
-    best, least = plain, GAINED * np.sum(np.abs(plain[0] / sigma) ** 2 / (1 - plain[1]))
-    for _ in range(POLE_ROUNDS):
+    best, least = plain, SETTINGS.gained * np.sum(np.abs(plain[0] / sigma) ** 2 / (1 - plain[1]))
+    for _ in range(SETTINGS.pole_rounds):
         weight = 1 / (sigma * np.abs(a))
         K = np.hstack([numerator, -powers * y[:, None]]) * weight[:, None]
         size = np.linalg.norm(K, axis=0)
         found = np.linalg.lstsq(K / size, y * weight, rcond=1e-10)[0] / size
         a = 1 + powers @ found[-2:]
-        if np.min(np.abs(a)) < NEAREST_POLE:
+        if np.min(np.abs(a)) < SETTINGS.nearest_pole:
             break
         error = y - (numerator @ found[:-2]) / a
         leverage = _leverage(_basis(K))
@@ -270,7 +291,7 @@ def _with_poles(A: np.ndarray, y: np.ndarray, x: np.ndarray, sigma: np.ndarray, 
 
 
 def _leverage(Q: np.ndarray) -> np.ndarray:
-    return np.minimum(np.sum(np.abs(Q) ** 2, axis=1), MOST_LEVERAGE)
+    return np.minimum(np.sum(np.abs(Q) ** 2, axis=1), SETTINGS.most_leverage)
 
 
 def _basis(A: np.ndarray) -> np.ndarray:

@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.data import Halves, blocks_of, divide, with_noise
-from avis_ctrl.gap.each import Each, one_by_one
+from avis_ctrl.gap.campaign_spectra import Halves, blocks_of, divide, with_noise
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.record_motion import motion_of, origin, with_large_motion
+from avis_ctrl.gap.motion_estimate import motion_of, origin, with_large_motion
+from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, converter_faults, left_by, predicted, without_hum
 from avis_ctrl.gap.signals.converter import ConverterFinding
 from avis_ctrl.gap.signals.hum import HumFinding, find_hum, polluted
-from avis_ctrl.gap.signals.leftover import Leftover
+from avis_ctrl.gap.signals.record_residual import RecordResidual
 from avis_ctrl.gap.signals.repair import repair
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.campaign_fit import excited_band, levels_of
@@ -30,7 +30,8 @@ from avis_ctrl.identification.maximum_likelihood import fit
 from avis_ctrl.identification.noise import relative_noise
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, thinned
+from avis_ctrl.identification.spectra import thinned
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.rigs.rig import Rig
 
@@ -59,7 +60,7 @@ class Prepared:
     nominal: TableModel
     rough: TableModel
     faults: SignalFaults
-    left: tuple[Leftover, ...]
+    left: tuple[RecordResidual, ...]
     clipped: Campaign | None = None
 
     def data(self, blocks: Sequence[SpectralBlock], lines: int) -> Data:
@@ -156,7 +157,7 @@ def with_second_order(model: TableModel) -> TableModel:
     return model.with_effect(active(LargeMotion(), model, "payload", BY_PHYSICS))
 
 
-def _noise(groups: Sequence[list[SpectralBlock]], halves: Halves, left: tuple[Leftover, ...], model: TableModel,
+def _noise(groups: Sequence[list[SpectralBlock]], halves: Halves, left: tuple[RecordResidual, ...], model: TableModel,
            band: tuple[float, float]) -> tuple[list[list[SpectralBlock]], str]:
     """Groups of blocks with the noise of the fitted records, from what a model leaves of them in time; in words."""
     of, records = {one.header.name: one for one in left}, []

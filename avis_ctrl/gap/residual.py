@@ -10,20 +10,34 @@ from typing import Protocol, cast
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.data import Halves, all_silent
+from avis_ctrl.gap.campaign_spectra import Halves, all_silent
 from avis_ctrl.gap.power_shares import power_shares
 from avis_ctrl.gap.result import HeatMap, PowerShares, RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction_error import PredictionError, prediction_error
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, thinned
+from avis_ctrl.identification.spectra import thinned
+from avis_ctrl.identification.spectral_block import SpectralBlock
 
-# Residual over noise that is shown as a place of the gap: significant at this level over all places together.
-PLACE_ALARM = 0.01
-MOST_PLACES = 10
-BANDS_PER_OCTAVE = 2
-# Lines of each record from which its place in level and time, and the shares of power, are told.
-SHOWN_LINES = 1200
+
+@dataclass(frozen=True)
+class ResidualSettings:
+    """Of where and how much a model leaves.
+
+    place_alarm : significance of a place of the gap over all places together [1].
+    most_places : places that are reported, the largest first.
+    bands_per_octave : bands to the octave of these places.
+    shown_lines : lines of each record from which its place in level and time, and the fractions of power, are told:
+        for a figure, not for a fit.
+    """
+
+    place_alarm: float = 0.01
+    most_places: int = 10
+    bands_per_octave: int = 2
+    shown_lines: int = 1200
+
+
+SETTINGS = ResidualSettings()
 
 
 class Spectra(Protocol):
@@ -74,10 +88,10 @@ def _relative(power: np.ndarray, errors: Sequence[PredictionError]) -> float:
 
 
 def edges_of(errors: Sequence[PredictionError]) -> np.ndarray:
-    """Bands in Hz, BANDS_PER_OCTAVE to the octave."""
+    """Bands in Hz, `bands_per_octave` of them."""
     low = min(float(e.block.omega[0]) for e in errors) / (2 * np.pi)
     high = max(float(e.block.omega[-1]) for e in errors) / (2 * np.pi)
-    count = max(int(np.ceil(BANDS_PER_OCTAVE * np.log2(high / low))), 1)
+    count = max(int(np.ceil(SETTINGS.bands_per_octave * np.log2(high / low))), 1)
     return np.geomspace(low, high * (1 + 1e-9), count + 1)
 
 
@@ -113,11 +127,11 @@ def places(left: Left) -> tuple[Where, ...]:
         known = min(dof * max(lines / 60, 1), max(dof, 2 * lines))
         p = float(stats.f.sf(ratio, 2 * lines, 2 * known) if np.isfinite(dof)
                   else stats.chi2.sf(2 * power, 2 * lines))
-        if min(p * count, 1.0) < PLACE_ALARM:
+        if min(p * count, 1.0) < SETTINGS.place_alarm:
             best = int(np.argmax(found))
             made.append(Where(float(low), float(high), left.inputs[best] if found[best] > 0.1 * power else "", output,
                               max(power - lines, 0.0) / excess_all, ratio, min(p * count, 1.0)))
-    return tuple(sorted(made, key=lambda w: -w.share)[:MOST_PLACES])
+    return tuple(sorted(made, key=lambda w: -w.share)[:SETTINGS.most_places])
 
 
 def _own_noise(e: PredictionError, k: int) -> np.ndarray:
@@ -149,10 +163,10 @@ def _ratios(left: Left, edges: np.ndarray) -> np.ndarray:
 
 def every_record(prepared: Spectra, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
            ) -> tuple[tuple[RecordGap, ...], tuple[PowerShares, ...]]:
-    """What the models leave of each record, fitted ones too, and what accounts for the outputs' power; on SHOWN_LINES
-    lines of each record."""
+    """What the models leave of each record, fitted ones too, and what accounts for the outputs' power;
+    on `shown_lines` of each record."""
     held = {block.name for block in prepared.held_out}
-    blocks = [thinned(block, SHOWN_LINES) for block in (*prepared.fitted, *prepared.held_out)]
+    blocks = [thinned(block, SETTINGS.shown_lines) for block in (*prepared.fitted, *prepared.held_out)]
     headers = {r.header.name: r.header for r in (*prepared.halves.fitted.records, *prepared.halves.held_out.records)}
     last = Left.of(after, blocks).errors
     first = last if after is before else Left.of(before, blocks).errors

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -13,7 +13,24 @@ from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.priors import Tolerance
 
 Verdict = Literal["none", "explained", "partly explained", "unexplained"]
-VERDICTS: tuple[str, ...] = ("none", "explained", "partly explained", "unexplained")
+VERDICTS: tuple[str, ...] = get_args(Verdict)
+
+
+def spoken(name: str, unit: str) -> str:
+    """A parameter's name without its unit, which stands behind the number."""
+    tail = "".join(sign for sign in unit if sign not in " ^()").replace("/", "_per_").removeprefix("1").lstrip("_")
+    return (name.removesuffix(f"_{tail}") if tail else name).replace("_", " ")
+
+
+def sized(p: Reported) -> str:
+    """value +- standard deviation unit, both to the second digit of the latter."""
+    unit = "" if p.unit == "1" else f" {p.unit}"
+    if not (np.isfinite(p.std) and p.std > 0 and np.isfinite(p.value)):
+        return f"{p.value:.5g}{unit}"
+    places = 1 - int(np.floor(np.log10(float(f"{p.std:.1e}"))))
+    power = int(np.floor(np.log10(max(abs(p.value), p.std)))) if not -4 <= places <= 6 else 0
+    value, std = (f"{v / 10.0 ** power:.{max(places + power, 0)}f}" for v in (p.value, p.std))
+    return f"({value} +- {std})e{power}{unit}" if power else f"{value} +- {std}{unit}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +63,13 @@ class NamedEffect:
                                for key, p in self.parameters.items()},
                 "probability": self.probability, "indistinguishable_from": list(self.indistinguishable_from),
                 **({} if self.share is None else {"share": self.share})}
+
+    def in_words(self) -> str:
+        """With its place, first parameters and probability."""
+        sizes = ", ".join(f"{spoken(name, p.unit)} {sized(p)}" for name, p in list(self.parameters.items())[:3])
+        ties = (f", or {' or '.join(self.indistinguishable_from)}, which this data cannot tell from it"
+                if self.indistinguishable_from else "")
+        return f"{self.title} ({self.name}, {self.location}: {sizes}; probability {self.probability:.2f}{ties})"
 
 
 @dataclass(frozen=True)

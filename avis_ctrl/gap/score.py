@@ -13,22 +13,79 @@ there are directions.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from avis_ctrl.gap.operators import assemble
-from avis_ctrl.gap.score_algebra import SYMMETRIC, Reduction, reduction
-from avis_ctrl.gap.table_model import Acting, ActiveEffect, TableModel, _Answer, _Side
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.gap.table_response import Acting, AtMotion, TableResponse
+from avis_ctrl.identification.fit_settings import SETTINGS as FIT_SETTINGS
+from avis_ctrl.identification.fit_settings import FitSettings
+from avis_ctrl.identification.likelihood import Data, Fitted
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitened_real, whitener
+from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import N_Q, ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns, transient_parts
+from avis_ctrl.identification.spectra import span, transient_columns, transient_parts
+from avis_ctrl.identification.spectral_block import SpectralBlock
+from avis_ctrl.identification.weights import with_distortion
 
-# Step of a linear parameter, in units of its size, at which its direction is taken.
-STEP = 1e-3
-# Share of a direction that must be left when what re-identification absorbs is taken out: below, it is round-off.
-LEFT = 1e-5
+
+@dataclass(frozen=True)
+class ScoreSettings:
+    """Of the score test and of what it can detect.
+
+    step : step of a linear parameter at which its direction is taken, in units of its size [1]: small beside any
+        curvature, large beside round-off.
+    least_left : fraction of a direction that must be left when what re-identification absorbs is taken out [1]:
+        below, it is round-off.
+    least_singular : singular value of the parameters' directions over the largest, below which they determine
+        nothing [1].
+    least_eigenvalue : eigenvalue of a scaled information matrix over the largest, below which there is only
+        round-off, 1e-16 of it [1].
+    detected : standard deviations from which an effect is detected [1]: a parameter gains the evidence that a name
+        needs at between four and five.
+    """
+
+    step: float = 1e-3
+    least_left: float = 1e-5
+    least_singular: float = 1e-6
+    least_eigenvalue: float = 1e-12
+    detected: float = 5.0
+
+
+SETTINGS = ScoreSettings()
+
+
+SYMMETRIC = tuple((i, j) for i in range(N_Q) for j in range(i, N_Q))
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """Of chi2 by a set of directions: how much, how many directions the data determine, and their coefficients."""
+
+    chi2: float
+    rank: int
+    coefficients: np.ndarray
+
+
+def reduction(G: np.ndarray, b: np.ndarray) -> Reduction:
+    """b^T inv(G) b over what G determines."""
+    size = np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(G / np.outer(size, size))
+    known = values > 1e-9 * max(values[-1], 1e-300)
+    along = vectors.T @ (b / size)
+    step = np.where(known, along / np.where(known, values, 1.0), 0.0)
+    return Reduction(float(along @ step), int(known.sum()), vectors @ step / size)
+
+
+def symmetric_coordinates(S: np.ndarray) -> np.ndarray:
+    """(..., 21) of symmetric matrices (..., 6, 6): coefficients of the unit matrices e_i e_j^T + e_j e_i^T."""
+    rows, columns = np.array(SYMMETRIC).T
+    return S[..., rows, columns]
 
 
 class Part:
@@ -45,25 +102,25 @@ class Part:
         self.transient = np.zeros((0, 0))
         self.body: np.ndarray | None = None
         self.inner: np.ndarray | None = None
-        self.answer = _Answer(self.made, self._acting(model))
+        self.response = TableResponse(self.made, self._acting(model))
         if block.transient:
             columns, norms = transient_columns(block, cast(ResponseModel, model))
             T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
             self.transient, X = span(T.T)
-            left = as_real(whitened(self.L, block.Y - self.answer.Y)[None])[0]
+            left = as_real(whitened(self.L, block.Y - self.response.Y)[None])[0]
             self.body, self.inner = transient_parts(X @ (self.transient.T @ left), norms, block,
                                                     cast(ResponseModel, model))
-            self.answer = _Answer(self.made, self._acting(model))
+            self.response = TableResponse(self.made, self._acting(model))
 
     def _acting(self, model: TableModel) -> Acting:
         block = self.block
         U = block.U if self.body is None else np.concatenate([block.U, self.body], axis=1)
-        return model._acting(U, block if model.nonlinear else None)
+        return model.acting(U, block if model.nonlinear else None)
 
     @property
     def s(self) -> np.ndarray:
         """(n, 1, 1) j omega."""
-        return self.answer.s
+        return self.response.s
 
     def real(self, dY: np.ndarray) -> np.ndarray:
         """(k, n, n_y, m) of y to (k, N), whitened, free of the transient."""
@@ -72,13 +129,13 @@ class Part:
             out -= (self.transient @ (self.transient.T @ out.T)).T
         return out
 
-    def side(self, model: TableModel) -> _Side:
+    def side(self, model: TableModel) -> AtMotion:
         """What a model near by misses of the motion of this one."""
-        return _Side(assemble(model.operators(self.block.omega), invert=False), self._acting(model), self.answer.x)
+        return AtMotion(assemble(model.operators(self.block.omega), invert=False), self._acting(model), self.response.x)
 
     def by_impedance(self, dynamic: np.ndarray) -> np.ndarray:
         """(21, n, n_y, m): y by each symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""
-        q, left = self.answer.x[:, :N_Q], self.answer.left[:, :, :N_Q]
+        q, left = self.response.x[:, :N_Q], self.response.left[:, :, :N_Q]
         out = []
         for i, j in SYMMETRIC:
             push = left[:, :, i, None] * q[:, None, j]
@@ -98,13 +155,13 @@ class Score:
         self.model = model
         self.kept: dict = {}
         self.parts = [Part(model, block) for block in blocks]
-        self.e = np.concatenate([part.real((part.block.Y - part.answer.Y)[None])[0] for part in self.parts])
+        self.e = np.concatenate([part.real((part.block.Y - part.response.Y)[None])[0] for part in self.parts])
         J = np.concatenate([part.real(model.answer(part.block, part.body, inner=part.inner).dY)
                             for part in self.parts], axis=1)
         J = J * model.scales()[:, None]
         size = np.linalg.norm(J, axis=1)
         _, s, Vt = np.linalg.svd(J / np.where(size > 0, size, 1.0)[:, None], full_matrices=False)
-        self.basis = Vt[s > 1e-6 * s[0]]
+        self.basis = Vt[s > SETTINGS.least_singular * s[0]]
         self.e = self.e - self.basis.T @ (self.basis @ self.e)
 
     @property
@@ -123,7 +180,7 @@ class Score:
         """(k, N) of one (k, n, n_y, m) a block, projected."""
         A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
         left = A - (A @ self.basis.T) @ self.basis
-        left[np.linalg.norm(left, axis=1) < LEFT * np.linalg.norm(A, axis=1)] = 0
+        left[np.linalg.norm(left, axis=1) < SETTINGS.least_left * np.linalg.norm(A, axis=1)] = 0
         return left
 
     def of_effect(self, effect: ActiveEffect) -> np.ndarray:
@@ -131,24 +188,58 @@ class Score:
         linear = [j for j, one in enumerate(effect.parameters) if one.linear]
         if not linear:
             added = self.model.with_effect(effect)
-            return self.directions([(added.answer(part.block, part.body, False).Y - part.answer.Y)[None]
+            return self.directions([(added.answer(part.block, part.body, False).Y - part.response.Y)[None]
                                     for part in self.parts])
         models = []
         for j in linear:
             values = list(effect.values)
-            step = STEP * effect.parameters[j].size
+            step = SETTINGS.step * effect.parameters[j].size
             values[j] += step
             models.append((self.model.with_effect(effect.at(values)), step))
         columns = []
         for part in self.parts:
-            rest = part.answer.Y
+            rest = part.response.Y
             own = []
             for model, step in models:
                 side = part.side(model)
-                own.append((side.Y - rest + part.answer.left @ side.push) / step)
+                own.append((side.Y - rest + part.response.left @ side.push) / step)
             columns.append(np.array(own))
         return self.directions(columns)
 
     def reduction(self, A: np.ndarray) -> Reduction:
         """Of chi2 by directions (k, N)."""
         return reduction(A @ A.T, A @ self.e)
+
+
+class EvidenceScore(Score):
+    """`Score` with path errors integrated out and normal priors on all parameters.
+
+    Priors are rows of their own below the residuals: e = (e, -z), J = (J, I). A direction of an effect has zeros there.
+    """
+
+    def __init__(self, fitted: Fitted, data: Data, settings: FitSettings = FIT_SETTINGS):
+        full = fitted.model
+        # What an effect fits by itself, to find where to begin, leaves the tolerances where they are.
+        rig = tuple(name for name in full.base.names if name in default_parameters(full.rig))
+        nominal = full.nominal and replace(full.nominal, names=rig)
+        self.model, self.kept = replace(full, base=replace(full.base, names=rig), nominal=nominal), {}
+        blocks = [with_distortion(block, level, fitted.variances, settings)
+                  for block, level in zip(data.blocks, data.levels, strict=True)]
+        self.parts = [Part(self.model, block) for block in blocks]
+        self.weights = fitted.weights
+        # Orthonormal rows that span the Jacobian with its priors.
+        root = np.linalg.cholesky(np.linalg.inv(fitted.covariance))
+        self.basis = solve_triangular(root, np.concatenate([fitted.J, np.eye(len(fitted.z))], axis=1), lower=True)
+        self.e = np.concatenate([fitted.e, -fitted.z])
+        self.e = self.e - self.basis.T @ (self.basis @ self.e)
+
+    @cached_property
+    def plain(self) -> Score:
+        """The same against noise and distortion alone, for effects that look for their beginning by fits of their own:
+        there what has no name is not taken out."""
+        return Score(self.model, [part.block for part in self.parts])
+
+    def directions(self, dY):
+        A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
+        A = np.concatenate([self.weights.flatten(A), np.zeros((len(A), len(self.basis)))], axis=1)
+        return A - (A @ self.basis.T) @ self.basis

@@ -17,11 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.flexible_mode import resonance
-from avis_ctrl.gap.evidence_score import EvidenceScore
+from avis_ctrl.gap.parallel import Each, one_by_one
+from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
+from avis_ctrl.gap.starting_values import HasRicherLaws, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, active
 from avis_ctrl.gap.tolerances import BEYOND, of_effect, tolerances_behind, within_tolerance
 from avis_ctrl.identification.likelihood import Data, Fitted, fit
@@ -84,7 +85,7 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: 
         for place in effect.places(model):
             if (effect.name, place.partition("/")[0]) not in taken:
                 found += [Candidate(active(effect, model, place, seed.values), seed.chi2, seed.p_value)
-                          for seed in effect.seeds(score, place)[:1]]
+                          for seed in seeds(effect, score, place)[:1]]
         return found
     resonant = [one for one in effects if one.resonant]
     found = [one for own in each(scored, [one for one in effects if not one.resonant]) for one in own]
@@ -112,12 +113,12 @@ def richer_laws(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> li
     """Richer laws of the effects that were fitted last, each begun where a simpler one has ended."""
     found = []
     for one in fits:
-        effect = one.model.effects[-1]
-        if type(effect.effect).richer is Effect.richer:
-            continue
-        whole = fit(one.model, one.priors, one.z, data, one.variances, replace(settings, rounds=0, iterations=0))
-        for place, values in effect.effect.richer(EvidenceScore(whole, data, settings), effect):
-            found.append(Candidate(active(effect.effect, one.model, place, values), 0.0, 0.0))
+        last = one.model.effects[-1]
+        law = last.effect
+        if isinstance(law, HasRicherLaws):
+            whole = fit(one.model, one.priors, one.z, data, one.variances, replace(settings, rounds=0, iterations=0))
+            found += [Candidate(active(last.effect, one.model, place, values), 0.0, 0.0)
+                      for place, values in law.richer(EvidenceScore(whole, data, settings), last)]
     return found
 
 

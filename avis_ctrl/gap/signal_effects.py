@@ -1,6 +1,6 @@
 """Effects that act on the signals alone: recognised in the records themselves, not by refits of the table.
 
-They are no classes of the library (`effects.base.library`) and have no part in a score.
+They are no classes of the library (`effects.library`) and have no part in a score.
 """
 
 from __future__ import annotations
@@ -11,22 +11,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.each import Each, one_by_one
 from avis_ctrl.gap.effects.base import Reported
-from avis_ctrl.gap.record_motion import clock_of
+from avis_ctrl.gap.motion_estimate import clock_of
+from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.result import NamedEffect
+from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
 from avis_ctrl.gap.signals.hum import HumFinding, subtract
-from avis_ctrl.gap.signals.leftover import Estimate, Leftover, leftovers
 from avis_ctrl.gap.signals.noise_level import NoiseLevels, noise_levels
-from avis_ctrl.gap.simulate import simulate
+from avis_ctrl.gap.signals.record_residual import Estimate, RecordResidual, record_residuals
+from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction import model_inputs
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.rigs.rig import Rig
-
-# No probability is reported above this: what the library does not hold, and the noise's own uncertainty, leave so much.
-MOST_SURE = 0.99
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +65,12 @@ def predicted(campaign: Campaign, model: TableModel, each: Each = one_by_one) ->
     return dict(zip((record.header.name for record in campaign.records), each(read, campaign.records), strict=True))
 
 
-def left_by(campaign: Campaign, model: TableModel, each: Each = one_by_one) -> tuple[Leftover, ...]:
+def left_by(campaign: Campaign, model: TableModel, each: Each = one_by_one) -> tuple[RecordResidual, ...]:
     """What the model leaves of every record in time."""
-    return leftovers(campaign, predicted(campaign, model, each))
+    return record_residuals(campaign, predicted(campaign, model, each))
 
 
-def levels(left: tuple[Leftover, ...], model: TableModel, hum: HumFinding | None,
+def levels(left: tuple[RecordResidual, ...], model: TableModel, hum: HumFinding | None,
            converter: tuple[ConverterFinding, ...]) -> NoiseLevels | None:
     """Noise of floor and sensors; None where the records or the rig file do not allow it."""
     n_u, steps = len(model.actuators), SignalFaults(converter).resolution_V
@@ -82,7 +80,7 @@ def levels(left: tuple[Leftover, ...], model: TableModel, hum: HumFinding | None
         return None
 
 
-def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[Leftover, ...]) -> Campaign:
+def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[RecordResidual, ...]) -> Campaign:
     """The campaign with the hum's sines taken out of every record."""
     of, records = {one.header.name: one for one in left}, []
     for source in campaign.records:
@@ -93,7 +91,7 @@ def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[Leftover, ...])
     return replace(campaign, records=tuple(records))
 
 
-def named(faults: SignalFaults) -> list[NamedEffect]:
+def named(faults: SignalFaults, settings: GapSettings) -> list[NamedEffect]:
     """Effects of the library that the signals show."""
     found = []
     for one in faults.converter:
@@ -101,15 +99,16 @@ def named(faults: SignalFaults) -> list[NamedEffect]:
                                  f"the converter of {one.channel} is coarser than the rig file says"
                                  if one.kind == "resolution" else
                                  f"the converter of {one.channel} clips below its nominal range",
-                                 _reported(one.parameters), min(one.confidence, MOST_SURE), confirmation=one.sentence))
+                                 _reported(one.parameters), min(one.confidence, settings.most_sure),
+                                 confirmation=one.sentence))
     if faults.hum is not None:
         found.append(NamedEffect("mains_hum", "geophones", f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics "
                                  f"in {', '.join(faults.hum.channels)}", _reported(faults.hum.parameters),
-                                 min(faults.hum.confidence, MOST_SURE), confirmation=faults.hum.sentence))
+                                 min(faults.hum.confidence, settings.most_sure), confirmation=faults.hum.sentence))
     motion = faults.noise.ground_motion if faults.noise is not None else None
     if motion is not None:
         found.append(NamedEffect("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured",
-                                 _reported(motion.parameters), min(motion.confidence, MOST_SURE),
+                                 _reported(motion.parameters), min(motion.confidence, settings.most_sure),
                                  confirmation=motion.sentence))
     return found
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -12,17 +11,31 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import Effect, EffectParameter
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.motion import RecordMotion
 from avis_ctrl.gap.operators import Assembled, Operators, assemble
-from avis_ctrl.identification.response import N_Q, Driven, Matrices, Operands, ResponseModel, SensorModel, kept_lines
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.gap.table_response import MOUNT, Acting, AtMotion, TableResponse, gain_of
+from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, SensorModel, kept_lines
+from avis_ctrl.identification.spectral_block import SpectralBlock
+from avis_ctrl.identification.structure import structural_null_space, structure_of
 from avis_ctrl.rigs.rig import Parameter, Rig
 
-_MOUNT = re.compile(r"isolator(\d+)\.([kc])_([xyz])")
-# Relative step of differences by an effect's parameters, in units of their size.
-STEP = 1e-4
-# A sensor's chain is another one where its ratio to the rig's varies over these frequencies by more than this share.
-PROBED, UNCHANGED = 2 * np.pi * np.geomspace(0.5, 100.0, 5), 1e-6
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """Of a model's derivatives and of its sensors' transients.
+
+    step : step of differences by an effect's parameters, in units of their size [1].
+    probed_Hz : frequencies at which the chains of sensors are compared with the rig's [Hz].
+    unchanged : a sensor's chain is another one where its ratio to the rig's varies over these by more than this
+        [1]: round-off.
+    """
+
+    step: float = 1e-4
+    probed_Hz: tuple[float, ...] = tuple(np.geomspace(0.5, 100.0, 5).tolist())
+    unchanged: float = 1e-6
+
+
+SETTINGS = ModelSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,19 +61,6 @@ class ActiveEffect:
 
     def at(self, values: Sequence[float]) -> ActiveEffect:
         return replace(self, values=tuple(float(v) for v in values))
-
-
-@dataclass(frozen=True, eq=False)
-class Acting:
-    """What acts on the table: U (n, n_u + 3 [+ 12], m), internal force (n, 6, m), displacement (n, n_y, m) that the
-    sensors read beside the payload's own, what their outputs hold in addition (n, n_y, m), and what the states inside
-    start with (`TableModel.inner_transients`)."""
-
-    U: np.ndarray
-    force: np.ndarray | None = None
-    reading: np.ndarray | None = None
-    output: np.ndarray | None = None
-    inner: np.ndarray | None = None
 
 
 def active(effect: Effect, model: TableModel, place: str, values: Sequence[float] | None = None) -> ActiveEffect:
@@ -206,7 +206,7 @@ class TableModel:
     @cached_property
     def derivative_matrices(self) -> Matrices:
         """Of the rig's free parameters; zero for stiffness and damping of mounts, which effects may change."""
-        others = np.array([not _MOUNT.fullmatch(name) for name in self.base.names], bool)
+        others = np.array([not MOUNT.fullmatch(name) for name in self.base.names], bool)
         return Matrices(*(slopes * others[:, None, None] for slopes in self.effective.derivative_matrices))
 
     @property
@@ -258,9 +258,9 @@ class TableModel:
     @cached_property
     def _changed_sensors(self) -> np.ndarray:
         """Indices of the sensors whose chain effects change by more than a factor, whatever lines are asked for."""
-        r = self._chain_ratio(PROBED)
+        r = self._chain_ratio(2 * np.pi * np.array(SETTINGS.probed_Hz))
         level = np.mean(r, axis=0)
-        return np.flatnonzero(np.max(np.abs(r - level), axis=0) > UNCHANGED * np.abs(level))
+        return np.flatnonzero(np.max(np.abs(r - level), axis=0) > SETTINGS.unchanged * np.abs(level))
 
     def _chain_ratio(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y) chain of each sensor over that of the rig."""
@@ -275,7 +275,7 @@ class TableModel:
         if not any(one.effect.holds_states for one in self.effects):
             return np.zeros((len(omega), n_y, 0), complex)
         made = self.assembled(omega)
-        seen = (_gain(made) * made.ops.sense[:, :, None]) * (made.rows @ made.inverse)
+        seen = (gain_of(made) * made.ops.sense[:, :, None]) * (made.rows @ made.inverse)
         return seen @ made.forces_of_states
 
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
@@ -292,14 +292,14 @@ class TableModel:
     def _driven(self, omega: np.ndarray, U: np.ndarray, block: SpectralBlock | None, derivative: bool,
                 inner: np.ndarray | None = None) -> Driven:
         made = self.assembled(omega)
-        answer = _Answer(made, self._acting(U, block, inner))
+        response = TableResponse(made, self.acting(U, block, inner))
         if not derivative:
-            return Driven(answer.Y, np.empty(0))
-        dY = answer.by_rig(self.effective, self.derivative_matrices, len(self._free))
-        self._by_effects(omega, U, block, made, answer, dY)
-        return Driven(answer.Y, dY)
+            return Driven(response.Y, np.empty(0))
+        dY = response.by_rig(self.effective, self.derivative_matrices, len(self._free))
+        self._by_effects(omega, U, block, made, response, dY)
+        return Driven(response.Y, dY)
 
-    def _acting(self, U: np.ndarray, block: SpectralBlock | None, inner: np.ndarray | None = None) -> Acting:
+    def acting(self, U: np.ndarray, block: SpectralBlock | None, inner: np.ndarray | None = None) -> Acting:
         """Inputs with the volts that act, and what effects that depend on the record add."""
         if block is None:
             return Acting(U, inner=inner)
@@ -314,13 +314,13 @@ class TableModel:
             U[:, :len(self.actuators)] += volts
         return Acting(U, force, reading, output, inner)
 
-    def _by_effects(self, omega, U, block, made: Assembled, answer: _Answer, dY: np.ndarray) -> None:
+    def _by_effects(self, omega, U, block, made: Assembled, response: TableResponse, dY: np.ndarray) -> None:
         """Central differences by the effects' parameters: of what an effect adds to a record, which the response is
         linear in; of the whole response where it changes the table."""
         n, theta, (low, high) = len(self.base.names), self.values, self.bounds()
         scale = self.scales()
         for row in range(n, len(theta)):
-            step = STEP * scale[row]
+            step = SETTINGS.step * scale[row]
             # A bound that goes with the payload's mass may have moved past the value.
             lowest, highest = min(low[row], theta[row]), max(high[row], theta[row])
             ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]
@@ -335,13 +335,23 @@ class TableModel:
                 change = np.zeros((len(omega), len(self.inputs), 1), complex)
                 if volts is not None:
                     change[:, :len(self.actuators)] = volts
-                side = _Side(made, Acting(change, *rest), np.zeros_like(answer.x))
-                dY[row] = side.Y + answer.left @ side.push
+                side = AtMotion(made, Acting(change, *rest), np.zeros_like(response.x))
+                dY[row] = side.Y + response.left @ side.push
                 continue
-            sides = [_Side(assemble(other.operators(omega), invert=False), answer.acting, answer.x)
+            sides = [AtMotion(assemble(other.operators(omega), invert=False), response.acting, response.x)
                      for other in others]
             # d x = inv(D) (d F - d D x): no second inverse.
-            dY[row] = ((sides[0].Y - sides[1].Y) + answer.left @ (sides[0].push - sides[1].push)) / width
+            dY[row] = ((sides[0].Y - sides[1].Y) + response.left @ (sides[0].push - sides[1].push)) / width
+
+
+def inseparable_parameters(model: TableModel) -> tuple[tuple[str, ...], ...]:
+    """Groups of the rig's free parameters that its equations determine as combinations only (two springs in one line):
+    a fit leaves how they share where it was, and their own standard deviations do not tell of that."""
+    base = model.effective
+    if not base.names:
+        return ()
+    found = structure_of(structural_null_space(base), base.values, base.units, base.names)
+    return tuple(tuple(base.names[k] for k in group.members) for group in found.groups)
 
 
 def _added(one: ActiveEffect, record: RecordMotion, omega: np.ndarray) -> tuple[np.ndarray | None, ...]:
@@ -364,103 +374,3 @@ def _added(one: ActiveEffect, record: RecordMotion, omega: np.ndarray) -> tuple[
 def _sum(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
     given = [part for part in parts if part is not None]
     return sum(given[1:], given[0]) if given else None
-
-
-class _Side:
-    """Y that an assembled table would read of a motion x, and the force that is missing for that motion."""
-
-    def __init__(self, made: Assembled, acting: Acting, x: np.ndarray):
-        drive = _Drive(made, acting)
-        self.push = drive.total - made.D @ x
-        self.Y = _read(made, x, drive)
-
-
-class _Drive:
-    """Forces (n, n_q, m) on an assembled table."""
-
-    def __init__(self, made: Assembled, acting: Acting):
-        U, force = acting.U, acting.force
-        ops, n_u = made.ops, len(made.ops.base.actuators)
-        s = ops.s[:, None, None]
-        commanded = U[:, :n_u]
-        self.volts = made.volts[:, :, None] * commanded
-        self.w = U[:, n_u:n_u + 3] / s
-        self.folded, self.alias = commanded * ops.drive[:, :, None], made.folded[:, :, None]
-        self.driven = bool(np.any(self.folded))
-        total = made.T @ self.volts if self.driven else np.zeros((len(s), made.n_q, U.shape[2]), complex)
-        if np.any(self.w):
-            total = total + made.floor_force(self.w)
-        if U.shape[1] > n_u + 3:
-            total[:, :N_Q] += U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
-        if force is not None:
-            total[:, :N_Q] += force
-        if acting.inner is not None and acting.inner.size:
-            total += (made.forces_of_states @ acting.inner)[:, :, None]
-        self.total, self.reading, self.output = total, acting.reading, acting.output
-
-
-def _gain(made: Assembled) -> np.ndarray:
-    return (made.ops.base.sensors.sensitivity * made.ops.sensor_gain)[:, None]
-
-
-def _read(made: Assembled, x: np.ndarray, drive: _Drive) -> np.ndarray:
-    """(n, n_y, m) of a motion x; aliases pass the chain far above its corners."""
-    mat = made.ops.base.matrices
-    moved = made.rows @ x
-    if np.any(against := made.ops.base.sensors.relative):
-        moved = moved - (against[:, None] * mat.R) @ made.chassis(x, drive.w)
-    if drive.reading is not None:
-        moved = moved + drive.reading
-    seen = made.ops.sense[:, :, None] * moved
-    if drive.driven:
-        seen += drive.alias * ((mat.R @ np.linalg.inv(mat.M) @ mat.T) @ drive.folded)
-    Y = _gain(made) * seen
-    return Y if drive.output is None else Y + drive.output
-
-
-class _Answer:
-    """Response of an assembled table."""
-
-    def __init__(self, made: Assembled, acting: Acting):
-        ops, drive = made.ops, _Drive(made, acting)
-        self.made, self.acting, self.s, self.inner = made, acting, ops.s[:, None, None], acting.inner
-        self.volts, self.w, self.folded, self.alias = drive.volts, drive.w, drive.folded, drive.alias
-        self.x = made.inverse @ drive.total
-        self.sense, self.gain = ops.sense[:, :, None], _gain(made)
-        self.Y = _read(made, self.x, drive)
-
-    @cached_property
-    def left(self) -> np.ndarray:
-        """(n, n_y, n_q) y by a force on the coordinates."""
-        return self.gain * self.sense * (self.made.rows @ self.made.inverse)
-
-    def by_rig(self, model: ResponseModel, d: Matrices, more: int) -> np.ndarray:
-        """(n_p + more, n, n_y, m) by the rig's free parameters, and zeros; d of all of them, zero for stiffness and
-        damping of mounts."""
-        if "loop_delay_s" in model.names:
-            raise InputError("expected the effect loop_delay in the place of this parameter", field="parameters",
-                             value="loop_delay_s")
-        made, ops, s, left = self.made, self.made.ops, self.s, self.left
-        own = made.G @ self.x
-        through = left @ made.G.T
-        inertial = left[:, :, :N_Q]
-        if ops.recoil is not None:
-            inertial = inertial + through @ (made.z_pf[:, :, None] * (ops.mounts.chassis @ ops.recoil))
-        operands = Operands(ops.base.sensors, model.matrices, s, left[:, :, :N_Q], inertial, self.gain * self.sense,
-                            self.gain * self.alias, made.hold[:, None, None], self.folded, self.x[:, :N_Q],
-                            made.follow(self.w), made.chassis(self.x, self.w), self.Y)
-        dY = operands.derivative(model.names, d, more)
-        moved = ops.mounts.chassis @ made.chassis(self.x, self.w, self.inner)
-        rows = {name: k for k, name in enumerate(ops.mounts.names)}
-        for kind in "kc":
-            found = [(j, rows[f"isolator{match[1]}.{match[3]}"]) for j, name in enumerate(model.names)
-                     if (match := _MOUNT.fullmatch(name)) and match[2] == kind]
-            if not found:
-                continue
-            j, k = np.array(found).T
-            if kind == "k":
-                push = made.slope_pf[:, k, None] * moved[:, k] - made.slope_pp[:, k, None] * own[:, k]
-            else:
-                push = s * ops.damping_factor[:, k, None] * (moved[:, k] - own[:, k])
-            dY.transpose(1, 3, 2, 0)[..., j] = through[:, None, :, k] * push.swapaxes(1, 2)[:, :, None]
-        return dY

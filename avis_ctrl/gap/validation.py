@@ -12,7 +12,7 @@ from avis_ctrl.gap.residual import Left
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.likelihood import Fitted
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.weights import Group
 
 

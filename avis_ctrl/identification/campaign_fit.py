@@ -19,7 +19,8 @@ from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.priors import Tolerance
 from avis_ctrl.identification.response import MOMENTS, ResponseModel
 from avis_ctrl.identification.second_order import chosen_turning, terms, without
-from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block, thinned
+from avis_ctrl.identification.spectra import record_block, response_block, thinned
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.tolerance_fit import as_likelihood_fit, begin, end
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse

@@ -22,7 +22,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import FLOOR, Matrices, ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.structure import size_of
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import point_map

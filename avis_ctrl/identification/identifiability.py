@@ -21,36 +21,13 @@ from avis_ctrl.identification.identifiability_words import (
     weak_direction_sentence,
     weak_sentence,
 )
-from avis_ctrl.identification.information import UNDETERMINED, Information
+from avis_ctrl.identification.information import UNDETERMINED, Combination, Information
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.sequential_problem import Problem
 from avis_ctrl.identification.structure import Group, Structure, size_of, structural_null_space, structure_of
 
 # A combination known to worse than this share of its value is called weak.
 WEAK = 0.05
-
-
-@dataclass(frozen=True)
-class Combination:
-    """A combination of parameters.
-
-    weights : derivative of its value by each parameter. value : of the expression, with its standard deviation
-    (infinite where it is not determined). words : the expression, such as "isolator1.k_x + isolator2.k_x".
-    """
-
-    weights: Mapping[str, float]
-    value: float
-    standard_deviation: float
-    unit: str
-    words: str
-
-    @property
-    def relative(self) -> float:
-        return self.standard_deviation / abs(self.value) if self.value else np.inf
-
-    @property
-    def determined(self) -> bool:
-        return bool(np.isfinite(self.standard_deviation))
 
 
 @dataclass(frozen=True)

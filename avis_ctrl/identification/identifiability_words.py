@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.identification.information import Information
+from avis_ctrl.identification.information import Combination, Information
 from avis_ctrl.identification.structure import Scaling
-
-if TYPE_CHECKING:
-    from avis_ctrl.identification.identifiability import Combination
 
 _KINDS = {"kg": ("mass", "masses"), "kg m^2": ("inertia", "inertias"), "N/m": ("stiffness", "stiffnesses"),
           "N m/rad": ("rotational stiffness", "rotational stiffnesses"), "N s/m": ("damping", "dampings"),

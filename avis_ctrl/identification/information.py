@@ -16,6 +16,29 @@ UNDETERMINED = 1.0
 ROUNDED = 1e-3
 
 
+@dataclass(frozen=True)
+class Combination:
+    """A combination of parameters.
+
+    weights : derivative of its value by each parameter. value : of the expression, with its standard deviation
+    (infinite where it is not determined). words : the expression, such as "isolator1.k_x + isolator2.k_x".
+    """
+
+    weights: Mapping[str, float]
+    value: float
+    standard_deviation: float
+    unit: str
+    words: str
+
+    @property
+    def relative(self) -> float:
+        return self.standard_deviation / abs(self.value) if self.value else np.inf
+
+    @property
+    def determined(self) -> bool:
+        return bool(np.isfinite(self.standard_deviation))
+
+
 @dataclass(frozen=True, eq=False)
 class Information:
     """Fisher information of parameters.

@@ -18,7 +18,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.maximum_likelihood import block_residual, transient_unknowns
 from avis_ctrl.identification.priors import Priors, Tolerance
-from avis_ctrl.identification.spectra import SpectralBlock, thinned
+from avis_ctrl.identification.spectra import thinned
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.weights import Group, Variances, Weights, bands, estimated, path_contributions, weigh
 
 

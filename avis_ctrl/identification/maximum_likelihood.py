@@ -31,7 +31,8 @@ from scipy.linalg import null_space
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import ResponseModel, moment_rows, positive
-from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns, transient_parts
+from avis_ctrl.identification.spectra import span, transient_columns, transient_parts
+from avis_ctrl.identification.spectral_block import SpectralBlock
 
 Prior = tuple[float, float]
 

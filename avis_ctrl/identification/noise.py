@@ -22,7 +22,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 
 # Half the band [Hz] over which S and d count as constant, lines in it at least, and rounds of their fit.
 SHAPE_HALF_Hz, SHAPE_LINES, ROUNDS = 0.25, 40, 30

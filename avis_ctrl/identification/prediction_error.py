@@ -15,7 +15,8 @@ from scipy import stats
 
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, span, transient_columns
+from avis_ctrl.identification.spectra import span, transient_columns
+from avis_ctrl.identification.spectral_block import SpectralBlock
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,20 +19,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, wraps
 from itertools import zip_longest
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
 from avis_ctrl.identification.sampling import Motion, aliases, hold
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.geophone import second_order_roots
 from avis_ctrl.rigs.rig import Parameter, Rig
-
-if TYPE_CHECKING:
-    from avis_ctrl.identification.spectra import SpectralBlock
 
 FLOOR = ("vx", "vy", "vz")
 MOTION_OF_UNIT: dict[str, Motion] = {"m": "displacement", "m/s": "velocity", "m/s^2": "acceleration"}

@@ -17,7 +17,7 @@ from avis_ctrl.identification.maximum_likelihood import added_terms
 from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign, RecordSource, ranges
 
 # Samples that are worked on at once.

@@ -25,7 +25,7 @@ from avis_ctrl.identification.maximum_likelihood import (
 )
 from avis_ctrl.identification.priors import Priors, beside, identified
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.instruments import Tolerances
 

@@ -23,7 +23,8 @@ from avis_ctrl.identification.prediction import predict
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.second_order import terms, without
-from avis_ctrl.identification.spectra import SpectralBlock, record_block, response_block
+from avis_ctrl.identification.spectra import record_block, response_block
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.whiteness import Whiteness, whiteness
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse

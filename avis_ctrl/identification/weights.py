@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.identification.fit_settings import FitSettings
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 
 Group = tuple[float, int]
 

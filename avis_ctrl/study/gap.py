@@ -7,7 +7,7 @@ import hashlib
 import platform
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -19,11 +19,11 @@ from threadpoolctl import threadpool_limits
 import avis_ctrl
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.gap.analysis import analyse
-from avis_ctrl.gap.effects.own import OwnEffects, try_out
+from avis_ctrl.gap.effects.user_effects import OwnEffects, try_out
 from avis_ctrl.gap.result import Gap
-from avis_ctrl.gap.settings import SETTINGS
 from avis_ctrl.gap.signal_effects import predicted
 from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.gap.tuning_values import tuning_values
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -164,7 +164,7 @@ def provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float
             told["design_sha256"] = hashlib.sha256(options.design_file.read_bytes()).hexdigest()
     return {"avis_ctrl": avis_ctrl.__version__, "measurement": measured.source, **told,
             "measurement_sha256": data, "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
-            "settings": asdict(SETTINGS), "seed": options.seed,
+            "settings": tuning_values(), "seed": options.seed,
             "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
             "python": platform.python_version(),
             **{name: metadata.version(name) for name in ("numpy", "scipy", "numba", "h5py")}}

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.realise import Realised, not_realised, realise
+from avis_ctrl.gap.realisation import Realised, not_realised, realise
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.lti.norms import hinf_norm

@@ -12,13 +12,12 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
-from avis_ctrl.gap.line_response import MOST_SAMPLES
+from avis_ctrl.gap import line_response
 from avis_ctrl.gap.model_files import model_to_dict, read_model
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.signals.converter import nominal_converter
-from avis_ctrl.gap.simulate import simulate
-from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-from avis_ctrl.gap.together import only_together
+from avis_ctrl.gap.simulation import simulate
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel, inseparable_parameters
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.prediction import model_inputs, predict
 from avis_ctrl.measurement.campaign import Campaign, Record
@@ -68,7 +67,7 @@ def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
     names, known = model.base.names, rig.parameters()
     comments = {}
     if covariance is not None and covariance.shape == (len(model.names),) * 2:
-        shared = {name: group for group in only_together(_rig_alone(model)) for name in group}
+        shared = {name: group for group in inseparable_parameters(_rig_alone(model)) for name in group}
         for k, name in enumerate(names):
             if name in shared:
                 others = " and ".join(other for other in shared[name] if other != name)
@@ -196,7 +195,7 @@ def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
 
 def _predicted(model: TableModel, record: Record, clock: tuple[float, float]) -> np.ndarray:
     """(samples, n_y) in the model's order."""
-    if len(record.u) > MOST_SAMPLES and not model.effects:
+    if len(record.u) > line_response.SETTINGS.most_samples and not model.effects:
         limit = model.rig.limits_of(record.header.u_names)
         return predict(model.base, replace(record, u=np.clip(record.u, -limit, limit)), large_motion=False)
     u, floor = model_inputs(model.base, record)

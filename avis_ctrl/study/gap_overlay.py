@@ -12,8 +12,8 @@ from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.record_motion import clock_of
-from avis_ctrl.gap.simulate import simulate
+from avis_ctrl.gap.motion_estimate import clock_of
+from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.campaign_fit import SAME_LEVEL, driven_inputs, excited_band
 from avis_ctrl.identification.model_error import HALF_WIDTHS

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl.gap.additions import drift_at
 from avis_ctrl.gap.effects.mounts import contacts
-from avis_ctrl.gap.realise import loop_lag, realise, sufficient_order, with_effects
+from avis_ctrl.gap.realisation import loop_lag, realise, sufficient_order, with_effects
+from avis_ctrl.gap.state_space import drift_at
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.lti.connect import connect, lft_lower
 from avis_ctrl.lti.rational import cascade

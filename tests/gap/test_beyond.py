@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.effects.beyond import beyond
 from avis_ctrl.gap.effects.beyond.base import FirstOrder
-from avis_ctrl.gap.motion import RecordMotion
-from avis_ctrl.gap.record_motion import mount_rows
+from avis_ctrl.gap.effects.library import library
+from avis_ctrl.gap.motion_estimate import mount_rows
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.search import search
 from avis_ctrl.gap.settings import GapSettings
@@ -20,7 +20,7 @@ from avis_ctrl.identification.likelihood import Data, first_variances, fit
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.priors import re_identified
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs import load_rig
 
 RIG = load_rig("avis")

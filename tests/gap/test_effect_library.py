@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from assembled_table import Assembly, chain, mount_map
 
-from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.mounts import drifted
-from avis_ctrl.gap.motion import RecordMotion
-from avis_ctrl.gap.record_motion import mount_rows
+from avis_ctrl.gap.motion_estimate import mount_rows
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.maximum_likelihood import block_residual, whitener
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, record_block
+from avis_ctrl.identification.spectra import record_block
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Record, RecordHeader
 from avis_ctrl.rigs import load_rig
 

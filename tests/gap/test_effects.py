@@ -9,11 +9,11 @@ import pytest
 from assembled_table import Assembly, mount_map
 from noise_fit import fitted, reported
 
-from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.instruments import PositionSensorAt
 

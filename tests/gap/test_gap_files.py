@@ -13,12 +13,12 @@ import pytest
 
 from avis_ctrl.cli.identify import predict as predict_command
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.effects.large_motion import LargeMotion
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.model_files import campaign_clock, model_from_dict, model_to_dict, read_model
-from avis_ctrl.gap.motion import RecordMotion
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.result import Gap, NamedEffect, Reported, Stage, Where
-from avis_ctrl.gap.simulate import simulate
+from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.prediction import Predictor
 from avis_ctrl.identification.response import ResponseModel
@@ -61,7 +61,7 @@ def test_every_effect_comes_back(name, place):
     effect = library()[name]
     model = BASE.with_effect(active(effect, BASE, place, some_values(effect, place)))
     written = json.loads(json.dumps(model_to_dict(model), allow_nan=False))
-    again = model_from_dict(written)
+    again, _ = model_from_dict(written)
     assert model_to_dict(again) == written
     assert again.names == model.names
     np.testing.assert_array_equal(again.values, model.values)
@@ -78,7 +78,7 @@ def test_several_effects_clock_and_drives():
                                                             np.zeros(12), np.zeros(12, bool), np.zeros(8, int)))
     model = replace(model, motion={"00": record})
     written = json.loads(json.dumps(model_to_dict(model)))
-    again = model_from_dict(written)
+    again, _ = model_from_dict(written)
     assert campaign_clock(model) == (12.5, 390.25)
     assert written["campaign_s"] == [12.5, 390.25]
     assert [one.label for one in again.effects] == [one.label for one in model.effects]
@@ -91,13 +91,13 @@ def test_an_inertia_that_no_body_has_comes_back():
     model = TableModel(ResponseModel.of(RIG.with_parameters({"J3": 500.0}), ()))
     written = model_to_dict(model)
     assert written["rig_values"]["J3"] == 500.0
-    assert model_from_dict(written).rig == model.rig
+    assert model_from_dict(written)[0].rig == model.rig
 
 
 def test_halcyonics_comes_back():
     model = TableModel(ResponseModel.of(load_rig("halcyonics_loaded"), ("mass",)))
     model = model.with_effect(active(library()["actuator_gain"], model, model.actuators[0], [1.07]))
-    again = model_from_dict(json.loads(json.dumps(model_to_dict(model))))
+    again, _ = model_from_dict(json.loads(json.dumps(model_to_dict(model))))
     np.testing.assert_allclose(again.response(OMEGA), model.response(OMEGA), rtol=1e-12)
 
 

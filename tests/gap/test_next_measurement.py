@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.next_measurement import between, grows, of_unexplained
 from avis_ctrl.gap.result import RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel, active

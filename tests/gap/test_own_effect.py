@@ -18,7 +18,8 @@ from truth.cases import draw_case, rig, simulate_case
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.analysis import analyse
 from avis_ctrl.gap.effects import base
-from avis_ctrl.gap.effects.own import load_effects, try_out
+from avis_ctrl.gap.effects.library import library
+from avis_ctrl.gap.effects.user_effects import load_effects, try_out
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record
@@ -33,7 +34,7 @@ TAU, PLACE = 2e-3, "Sz2"
 
 @pytest.fixture(autouse=True)
 def _library_as_it_was():
-    before = base.library()
+    before = library()
     yield
     base.restore(before)
 
@@ -71,7 +72,7 @@ def test_the_example_loads_and_acts(example):
     assert own.names == ("sensor_lowpass",)
     assert own.sha256 == hashlib.sha256(example.read_bytes()).hexdigest()
     try_out(own, BARE)
-    effect = base.library()["sensor_lowpass"]
+    effect = library()["sensor_lowpass"]
     assert effect.places(BARE) == BARE.sensors.names
     omega = 2 * np.pi * np.array([1.0, 80.0])
     analogue = TableModel(ResponseModel.of(load_rig("avis"), (), sampled=False))
@@ -89,7 +90,7 @@ def test_every_attribute_that_the_guide_names_exists():
     for name in set(re.findall(r"\bops\.(\w+)", GUIDE.read_text(encoding="utf-8"))):
         assert hasattr(ops, name), name
     for name in set(re.findall(r"^- `(\w+)\(", GUIDE.read_text(encoding="utf-8"), re.MULTILINE)):
-        assert hasattr(base.Effect, name) or name == "addition", name  # which `additions.has_addition` asks for
+        assert hasattr(base.Effect, name) or name == "addition", name  # which `state_space.has_addition` asks for
 
 
 @pytest.mark.slow
@@ -110,7 +111,7 @@ def test_the_example_is_found_and_named(example):
 def test_candidates_can_be_given_as_objects(example):
     """In Python a class is enough; nothing has to be registered in a file."""
     own = load_effects(example).names[0]
-    gap = analyse(hidden(), rig(), effects=[base.library()[name] for name in (own, "geophone_corner")])
+    gap = analyse(hidden(), rig(), effects=[library()[name] for name in (own, "geophone_corner")])
     assert [(one.name, one.location) for one in gap.effects] == [("sensor_lowpass", PLACE)]
 
 
@@ -138,13 +139,13 @@ class Own(Effect):
 def test_files_that_cannot_be_loaded_are_one_line(tmp_path, text, said):
     path = tmp_path / "bad.py"
     path.write_text(text, encoding="utf-8")
-    before = base.library()
+    before = library()
     with pytest.raises(InputError) as error:
         load_effects(path)
     assert str(error.value).startswith(str(path))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
-    assert base.library() == before
+    assert library() == before
 
 
 @pytest.mark.parametrize("path", ["missing.py", "."])

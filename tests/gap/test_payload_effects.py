@@ -9,16 +9,17 @@ import pytest
 from assembled_table import Assembly, mount_map
 from noise_fit import fitted, reported
 
-from avis_ctrl.gap.effects.base import library
 from avis_ctrl.gap.effects.impedance import peaks
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.operators import assemble
-from avis_ctrl.gap.realise import realise
+from avis_ctrl.gap.realisation import realise
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.search import at_the_edge
+from avis_ctrl.gap.starting_values import seeds
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs import load_rig
 
 RIG = load_rig("avis")
@@ -278,7 +279,7 @@ def block_of(truth, noise=1e-4):
 def seeds_of(truth, name, place, noise=1e-4):
     """What the score makes of a weak effect."""
     score = Score(FREE, [block_of(truth, noise)])
-    return score, library()[name].seeds(score, place)
+    return score, seeds(library()[name], score, place)
 
 
 def test_seed_of_a_sprung_mass_along_any_direction():

@@ -13,7 +13,7 @@ from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.prediction_error import PredictionError
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import RecordHeader
 from avis_ctrl.rigs import load_rig
 
@@ -142,7 +142,7 @@ def test_bands_hold_lines_enough_for_the_poorest_level():
               for g in (f, few)]
     edges = bands(groups)
     assert edges[0] == 1.0 and edges[-1] == pytest.approx(64.0) and len(edges) > 3
-    assert np.all(np.histogram(few, edges)[0] >= shares.LEAST_LINES * 4)
+    assert np.all(np.histogram(few, edges)[0] >= shares.SETTINGS.least_lines * 4)
     assert len(bands([groups[0]])) > len(edges)
     assert len(bands([groups[1].some(np.arange(5))])) < 2
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from avis_ctrl.gap.effects.base import library
-from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.gap.effects.library import library
+from avis_ctrl.gap.score import Score, reduction
+from avis_ctrl.gap.starting_values import seeds
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.maximum_likelihood import fit
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs import load_rig
 
 RIG = load_rig("avis")
@@ -98,7 +98,7 @@ def test_what_re_identification_absorbs_is_never_significant():
         took = score.reduction(score.of_effect(effect(name, place, None, free)))
         assert took.chi2 < 1e-6 * score.chi2
         assert took.rank == 0
-    assert all(seed.p_value > CHANCE for seed in library()["sensor_gain"].seeds(score, "Sz2"))
+    assert all(seed.p_value > CHANCE for seed in seeds(library()["sensor_gain"], score, "Sz2"))
 
 
 def test_parameter_errors_alone_are_found_by_no_effect():
@@ -109,7 +109,7 @@ def test_parameter_errors_alone_are_found_by_no_effect():
     fitted = fit(MODEL, blocks).model
     score = Score(fitted, blocks)
     found = [seed.p_value for one in library().values() if not one.nonlinear for place in one.places(fitted)
-             for seed in one.seeds(score, place)]
+             for seed in seeds(one, score, place)]
     assert len(found) > 10
     assert min(found) > CHANCE
 

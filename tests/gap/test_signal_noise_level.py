@@ -11,9 +11,9 @@ from signal_campaigns import LSB, draw, hum, rig
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.signals.hum import find_hum
-from avis_ctrl.gap.signals.leftover import leftovers
 from avis_ctrl.gap.signals.noise_level import NoiseLevels, noise_levels
 from avis_ctrl.gap.signals.quiet_lines import quiet_lines
+from avis_ctrl.gap.signals.record_residual import record_residuals
 from avis_ctrl.identification.response import ResponseModel
 
 KINDS = ("rest", "multisine", "noise")
@@ -29,7 +29,7 @@ def floor_response(omega: np.ndarray) -> np.ndarray:
 
 
 def levels(campaign, predicted, **given) -> NoiseLevels:
-    return noise_levels(leftovers(campaign, predicted), floor_response, rig(), **given)
+    return noise_levels(record_residuals(campaign, predicted), floor_response, rig(), **given)
 
 
 def drawn(seed: int, kind: str, **given):
@@ -96,7 +96,7 @@ def test_lines_in_the_sensors_are_no_ground_motion(kind):
     """5 mV at 50.01 Hz and at 29 Hz in every channel, with the hum found and without."""
     both = {(j, k): 5e-3 for j in range(6) for k in (1,)}
     campaign, predicted = drawn(9, kind, added=lambda n, rng: hum(n, 50.01, both, rng) + hum(n, 29.0, both, rng))
-    left = leftovers(campaign, predicted)
+    left = record_residuals(campaign, predicted)
     found = find_hum(left)
     assert found is not None
     for given in (None, found):
@@ -123,7 +123,7 @@ def test_quiet_lines_are_unbiased(kind):
     """White noise of unit variance beside a response that the prediction lacks altogether."""
     campaign, predicted = drawn(8, kind)
     rng = np.random.default_rng(8)
-    left = leftovers(campaign, predicted)
+    left = record_residuals(campaign, predicted)
     only = [replace(one, e=rng.normal(size=one.e.shape)) for one in left]
     for band, narrow in (((1.0, 30.0), True), ((100.0, 400.0), False)):
         for one in quiet_lines(only, band, narrow):
@@ -134,6 +134,6 @@ def test_quiet_lines_are_unbiased(kind):
 def test_what_cannot_be_judged_is_refused():
     campaign, predicted = drawn(1, "rest")
     with pytest.raises(InputError, match="ambient"):
-        noise_levels(leftovers(campaign, predicted), floor_response, replace(rig(), ambient=None))
+        noise_levels(record_residuals(campaign, predicted), floor_response, replace(rig(), ambient=None))
     with pytest.raises(InputError, match="residual"):
         noise_levels([], floor_response, rig())

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.signal as sg
 from signal_campaigns import FS, draw, rig
 
-from avis_ctrl.gap import data
-from avis_ctrl.gap.data import all_silent, blocks_of, with_noise
+from avis_ctrl.gap import campaign_spectra
+from avis_ctrl.gap.campaign_spectra import all_silent, blocks_of, with_noise
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.response import ResponseModel
 
@@ -42,5 +44,5 @@ def test_noise_of_silent_lines_is_the_noise_in_every_band(slope):
 
 def test_weights_that_are_equal_leave_of_a_red_floor_too_much_where_it_is_low(monkeypatch):
     """Why they are not: the transient's estimate carries the noise of low frequencies over the whole band."""
-    monkeypatch.setattr(data, "WEIGHTINGS", 1)
+    monkeypatch.setattr(campaign_spectra, "SETTINGS", replace(campaign_spectra.SETTINGS, weightings=1))
     assert np.max(estimated_over_true(3.0)[-1]) > 10

@@ -11,13 +11,14 @@ from test_score import MODEL, gaussian
 from truth.cases import draw_case, rig, simulate_case
 
 from avis_ctrl.gap.analysis import analyse
-from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.score import Score
+from avis_ctrl.gap.starting_values import seeds
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rigid_body import point_map
 
 OMEGA = 2 * np.pi * np.geomspace(0.5, 80.0, 40)
@@ -118,7 +119,7 @@ def test_six_sharp_resonances_are_found_from_a_model_without(values):
         blocks.append(replace(made, Y=Y).with_noise(noise ** 2 * np.tile(np.eye(6, dtype=complex), (len(omega), 1, 1))))
     base = fitted(MODEL, blocks)
     assert base.chi2_per_dof > 5
-    seed, = library()["base_compliance"].seeds(Score(base.model, blocks), "chassis/rocking")
+    seed, = seeds(library()["base_compliance"], Score(base.model, blocks), "chassis/rocking")
     np.testing.assert_allclose(seed.values[2:8], values[2:8], rtol=0.03)
     assert seed.values[0] == pytest.approx(values[0], rel=0.1)
 

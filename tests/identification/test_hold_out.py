@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avis_ctrl.gap.data import divide
+from avis_ctrl.gap.campaign_spectra import divide
 from avis_ctrl.identification.campaign_fit import split_campaign
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 

@@ -13,7 +13,8 @@ from avis_ctrl.identification import campaign_fit
 from avis_ctrl.identification.maximum_likelihood import SETTINGS, fit, whitened_real
 from avis_ctrl.identification.noise import relative_noise, residual_noise
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import DEPENDENT, SpectralBlock, record_block, response_block, span
+from avis_ctrl.identification.spectra import DEPENDENT, record_block, response_block, span
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig

@@ -21,7 +21,8 @@ from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, record_block
+from avis_ctrl.identification.spectra import record_block
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.validation import _floor_interval, _verdict, validate
 from avis_ctrl.identification.whiteness import whiteness
 from avis_ctrl.measurement.campaign import Campaign

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Reported, library
+from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.result import Considered, Gap, HeatMap, NamedEffect, PowerShares, RecordGap, Remainder, Stage, Where
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.parameter_sets import default_parameters

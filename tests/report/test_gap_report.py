@@ -11,10 +11,10 @@ import pytest
 from gap_stand_in import Finds
 from test_report import HOSTILE, Reader, pdf_text
 
-from avis_ctrl.gap.effects.base import Reported, library
+from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.in_words import spoken
-from avis_ctrl.gap.result import VERDICTS, Detectable, HeatMap, Stage, Where
+from avis_ctrl.gap.effects.library import library
+from avis_ctrl.gap.result import VERDICTS, Detectable, HeatMap, Stage, Where, spoken
 from avis_ctrl.gap.table_model import active
 from avis_ctrl.measurement.gates.finding import Finding
 from avis_ctrl.report import gap_html, gap_pdf

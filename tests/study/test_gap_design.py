@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, library
-from avis_ctrl.gap.realise import Realised, notes_on
+from avis_ctrl.gap.effects.base import Effect, EffectParameter
+from avis_ctrl.gap.effects.library import library
+from avis_ctrl.gap.realisation import Realised, notes_on
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.lti.connect import lft_lower, lft_upper

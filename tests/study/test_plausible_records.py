@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader

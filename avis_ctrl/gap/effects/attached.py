@@ -5,21 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register, told_from_none
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, register, told_from_none
 from avis_ctrl.gap.effects.impedance import about, at_points, peaks, positions, project, unit_matrices
 from avis_ctrl.gap.effects.line_of_action import best_direction, foot, told
 from avis_ctrl.gap.effects.payload import AtPoint, REACH_m, place_of
 from avis_ctrl.gap.effects.sensors import second_order
+from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.score import Score
+from avis_ctrl.gap.starting_values import Seed
+from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.rigs.rigid_body import point_map
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 
 # Damping ratios at which seeds are looked for, how often the step between frequencies or places is halved about the
 # best, and places from which that begins.
@@ -42,10 +40,10 @@ class AttachedOscillator(AtPoint):
     holds_states = True
     resonant = True
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("payload/oblique", "payload/axes")
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         mass = model.rig.mounted_body().mass
         frequency = EffectParameter("frequency_Hz", "Hz", "of the mass on its spring", 0.0, 0.3, 300.0, 10.0, False,
                                     tuple(np.geomspace(1.2, 90.0, 28)))
@@ -106,7 +104,7 @@ class AttachedOscillator(AtPoint):
             return f"a line of action that passes {REACH_m:g} m from the table"
         return ""
 
-    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         """Of one direction: mass, direction, and the point nearest to the geometric centre on the line of action, for
         along that line a place makes no difference."""

@@ -17,18 +17,59 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar, Protocol
 
 import numpy as np
-from scipy import stats
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.identification.response import ResponseModel, SensorModel
+from avis_ctrl.rigs.rig import Rig
 
-if TYPE_CHECKING:
-    from avis_ctrl.gap.motion import RecordMotion
-    from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+
+@dataclass(frozen=True)
+class LibrarySettings:
+    """Of what the library takes for granted.
+
+    tilted_rad : tilt up to which a sensor counts as lying along an earth axis [rad]: far more than one is mounted by.
+    tried_Hz : frequencies at which an effect of the user's own is tried out [Hz]: below, at and above the suspension.
+    """
+
+    tilted_rad: float = 0.3
+    tried_Hz: tuple[float, ...] = (0.3, 3.0, 30.0)
+
+
+SETTINGS = LibrarySettings()
+
+
+class Table(Protocol):
+    """What an effect asks of the table that it acts on: of the model without it (`gap.table_model.TableModel`).
+
+    base : the rig and its free parameters. effective : the same with what other effects set of the rig's parameters.
+    motion : records in time, by name.
+    """
+
+    @property
+    def base(self) -> ResponseModel: ...
+
+    @property
+    def effective(self) -> ResponseModel: ...
+
+    @property
+    def motion(self) -> Mapping[str, RecordMotion]: ...
+
+    @property
+    def rig(self) -> Rig: ...
+
+    @property
+    def sensors(self) -> SensorModel: ...
+
+    @property
+    def actuators(self) -> tuple[str, ...]: ...
+
+    @property
+    def delay_s(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -50,28 +91,6 @@ class EffectParameter:
     linear: bool = True
     grid: tuple[float, ...] = ()
     optional: bool = False
-
-
-@dataclass(frozen=True)
-class Seed:
-    """Where a refit may begin: values of all parameters, and by how much chi2 falls there to first order.
-
-    directions : along how many the data could have made it fall. looks : at how many frequencies, or other values of
-    what shapes the effect, the best was sought. seen : the fall by which its significance is judged, where that is not
-    chi2 (on fewer data).
-    """
-
-    values: tuple[float, ...]
-    chi2: float
-    directions: int
-    looks: int = 1
-    seen: float | None = None
-
-    @property
-    def p_value(self) -> float:
-        """Probability of as large a fall by noise alone."""
-        fall = self.chi2 if self.seen is None else self.seen
-        return min(1.0, self.looks * float(stats.chi2.sf(fall, self.directions)))
 
 
 @dataclass(frozen=True)
@@ -110,15 +129,15 @@ class Effect(ABC):
     resonant: ClassVar[bool] = False
     outside: ClassVar[bool] = False
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         """Where it can act on this table; empty where it cannot."""
         raise NotImplementedError
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         """Its parameters there."""
         raise NotImplementedError
 
-    def rig_changes(self, model: TableModel, place: str, values: Mapping[str, float]) -> dict[str, float]:
+    def rig_changes(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, float]:
         """Parameters of the rig that it sets."""
         return {}
 
@@ -169,7 +188,7 @@ class Effect(ABC):
         reading = self.reading(record, place, values)
         return None if reading is None else record.spectrum(reading, omega)
 
-    def starts(self, model: TableModel, place: str) -> Sequence[np.ndarray]:
+    def starts(self, model: Table, place: str) -> Sequence[np.ndarray]:
         """Where to look: (n_parameters,) each, shape parameters on their grid and the linear ones at none."""
         parameters = self.parameters(model, place)
         points = [np.array([])]
@@ -178,50 +197,15 @@ class Effect(ABC):
             points = [np.append(point, value) for point in points for value in values]
         return points
 
-    def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Where refits may begin, the most promising first.
-
-        By default the score test at every point of `starts`; the linear parameters are as large as it says, within
-        what physics allows.
-        """
-        from avis_ctrl.gap.table_model import ActiveEffect
-
-        parameters, found = self.parameters(score.model, place), []
-        linear = [j for j, one in enumerate(parameters) if one.linear]
-        starts = self.starts(score.model, place)
-        for point in starts:
-            effect = ActiveEffect(self, place, parameters, tuple(float(v) for v in point))
-            A = score.of_effect(effect)
-            if not linear:
-                # It acts at full strength or not at all.
-                fall = float(2 * A[0] @ score.e - A[0] @ A[0])
-                if fall > 0:
-                    found.append(Seed(effect.values, fall, len(parameters), len(starts)))
-                continue
-            took = score.reduction(A)
-            values = list(effect.values)
-            for c, j in zip(took.coefficients, linear, strict=False):
-                one = parameters[j]
-                values[j] = float(np.clip(one.none + c, one.low, one.high))
-            wrong = any(values[j] == parameters[j].none for j in linear) and len(linear) == 1
-            if not wrong:
-                found.append(Seed(tuple(values), took.chi2, took.rank, len(starts)))
-        return sorted(found, key=lambda seed: -seed.chi2)
-
-    def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
-        """Places (with their law) and values from which a richer law of the same effect may begin, where `one` has been
-        fitted; score : of that fit. By default none."""
-        return []
-
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         """Why physics forbids these values, empty where it does not."""
         return ""
 
-    def priors(self, model: TableModel, place: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    def priors(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """(mean, standard deviation) by name of parameters that records need not determine, from values near by."""
         return {}
 
-    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         """Parameters as a person reads them; by default as they are."""
         return {one.name: Reported(values[one.name], float(np.sqrt(max(covariance[k, k], 0.0))), one.unit)
@@ -249,14 +233,12 @@ def register(effect: type[Effect]) -> type[Effect]:
     return effect
 
 
-def library() -> dict[str, Effect]:
-    """Every registered effect by name."""
-    import avis_ctrl.gap.effects.shipped  # noqa: F401  (registers them)
-
+def registered() -> dict[str, Effect]:
+    """What has been registered so far, by name."""
     return dict(_registry)
 
 
 def restore(known: dict[str, Effect]) -> None:
-    """Make the library what it was, as `library` gave it."""
+    """Make the library what it was, as `registered` gave it."""
     _registry.clear()
     _registry.update(known)

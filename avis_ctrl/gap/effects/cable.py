@@ -4,25 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Seed, register, told_from_none
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, register, told_from_none
 from avis_ctrl.gap.effects.impedance import about, at_points, positions, project
 from avis_ctrl.gap.effects.line_of_action import best_direction, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
-from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.score import Score, reduction
+from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.rigs.rigid_body import point_map
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import TableModel
-
-
-# How often the step between places is halved about the best.
-HALVINGS = 3
 
 
 @register
@@ -36,10 +28,10 @@ class CableStiffness(AtPoint):
     title = "a cable or hose ties the payload to ground"
     looks_like = "stiffness at a place and height where no mount is: it shifts and couples the lowest resonances"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("payload/axes", "payload/oblique")
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 0.02 * float(np.mean(np.diag(model.base.matrices.K)[:3])) / 4  # of one mount of four, on any rig
         most = 200 * size
         if place.endswith("oblique"):
@@ -66,16 +58,17 @@ class CableStiffness(AtPoint):
         G, b = project(score, lambda s: np.ones_like(s))
         of = _along_one if place.endswith("oblique") else _along_axes
         found = of(G, b, positions(parameters), parameters[0].high)
-        for halving in range(1, HALVINGS + 1) if found else ():
+        for halving in range(1, SETTINGS.halvings + 1) if found else ():
             near = about(np.array(found[0].values[-3:]), 0.5 ** halving)
             found = sorted(found + of(G, b, near, parameters[0].high), key=lambda seed: -seed.chi2)
         return found
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         names = [name for name in values if name.startswith(("along_", "k_"))]
-        return "" if told_from_none(values, std, names) else "a cable that the data do not tell from none"
+        return "" if told_from_none(values, std, names) else (
+            "a cable whose stiffness the data do not distinguish from zero")
 
-    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         """Of one direction: stiffness, direction, and the foot of the line of action; else the largest stiffness before
         all others."""

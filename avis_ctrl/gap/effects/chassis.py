@@ -5,26 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed, register, told_from_none
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, register, told_from_none
 from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.mounts import has_mounts
 from avis_ctrl.gap.effects.sensors import receptance
-from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.score_algebra import reduction
+from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.score import Score, reduction
+from avis_ctrl.gap.starting_values import Seed
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, fit
 from avis_ctrl.identification.noise import relative_noise
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, thinned
+from avis_ctrl.identification.spectra import thinned
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rigid_body import point_map
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.operators import Operators
 
 WAYS = ("x", "y", "z", "rx", "ry", "rz")
 # Below this the suspension's own modes are in the way of the first look.
@@ -72,10 +71,10 @@ class BaseCompliance(Effect):
     holds_states = True
     resonant = True
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("chassis/translation", "chassis/rocking") if has_mounts(model) else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         m = model.rig.mounted_body().mass
 
         def frequency(way: str) -> EffectParameter:

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, register
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.motion import RecordMotion
-    from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, register
+from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.record_motion import RecordMotion
 
 
 @register
@@ -23,10 +19,10 @@ class ActuatorGain(Effect):
     title = "an actuator's force constant is not the one of the rig file"
     looks_like = "the response to one input is off by the same real factor at every frequency and output"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return model.actuators
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("gain", "1", "force constant over that of the rig file", 1.0, 0.05, 10.0, 1.0),)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -43,10 +39,10 @@ class ActuatorLag(Effect):
     title = "the current amplifiers lag, first order"
     looks_like = "phase lag that grows with frequency, the same in every channel, with a loss of gain"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("actuators",)
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("time_constant_s", "s", "time constant of the amplifiers", 0.0, 0.0, 0.3, 1e-3),)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -56,7 +52,7 @@ class ActuatorLag(Effect):
         elif tau > 1e-9:  # behind the lag that the model has already
             ops.drive = ops.drive / (1 + ops.s * tau)[:, None]
 
-    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         tau, std = values["time_constant_s"], float(np.sqrt(max(covariance[0, 0], 0.0)))
         found = {"time_constant_s": Reported(tau, std, "s")}
@@ -73,16 +69,16 @@ class LoopDelay(Effect):
     title = "a delay of transport or computing beyond the nominal one"
     looks_like = "phase lag in proportion to frequency, the same in every channel, without loss of gain"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("loop",)
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("extra_delay_s", "s", "delay beyond that of the rig file", 0.0, 0.0, 0.2, 1e-3),)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         ops.delay_s = ops.delay_s + values["extra_delay_s"]
 
-    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         extra, std = values["extra_delay_s"], float(np.sqrt(max(covariance[0, 0], 0.0)))
         return {"extra_delay_s": Reported(extra, std, "s"), "delay_s": Reported(model.delay_s + extra, std, "s")}
@@ -97,10 +93,10 @@ class ActuatorSaturation(Effect):
     looks_like = "less response than expected in records at high level only, and harmonics of the input"
     nonlinear = True
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("actuators",)
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         peaks = [float(np.max(np.abs(one.volts))) for one in model.motion.values()] or [model.rig.drive_limit_V]
         peak = min(max(peaks), model.rig.drive_limit_V) or model.rig.drive_limit_V
         grid = tuple(peak * share for share in (0.9, 0.7, 0.5, 0.35, 0.2))

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Seed, register
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, register
 from avis_ctrl.gap.effects.impedance import paths, peaks
 from avis_ctrl.gap.effects.sensors import receptance, second_order
-from avis_ctrl.gap.operators import AddedCoordinate, mount_geometry
-from avis_ctrl.gap.score_algebra import reduction
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.gap.operators import AddedCoordinate, Operators, mount_geometry
+from avis_ctrl.gap.score import Score, reduction
+from avis_ctrl.gap.starting_values import Seed
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 
 # Frequencies at which a mode is looked for [Hz].
 FREQUENCIES_Hz = tuple(np.geomspace(7.0, 140.0, 22).tolist())
@@ -42,10 +38,10 @@ class PayloadFlexibleMode(Effect):
     looks_like = "a resonance above the suspension's, in rows and columns that share one shape"
     holds_states = True
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("payload", "payload/two", "payload/three") if shape_points(model) else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         names = mount_geometry(model.rig).names
         driven = np.any(shape_rows(model.rig, model.actuators, model.sensors.names)[0], axis=0)
         found: list[EffectParameter] = []
@@ -61,7 +57,7 @@ class PayloadFlexibleMode(Effect):
                   for name, own in zip(names, driven, strict=True))]
         return tuple(found)
 
-    def priors(self, model: TableModel, place: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    def priors(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Where no motor pushes, a shape is of the size that it has elsewhere.
 
         A mode is held by the mounts' stiffness at these points, too: what they add to w^2 and 2 z w cannot be told
@@ -95,7 +91,7 @@ class PayloadFlexibleMode(Effect):
         found = _one_mode(score, [frequency for frequency, *_ in modes(one.by_name)]) if place else []
         return [(place, (*one.values, *found[0].values))] if place and found else []
 
-    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         """The modes in the order of their frequencies."""
         found = list(super().reported(model, place, values, covariance).items())
@@ -110,7 +106,7 @@ def modes(values: Mapping[str, float]) -> list[tuple[float, float, np.ndarray]]:
     return [(float(own[0]), float(own[1]), own[2:]) for own in np.split(numbers, count)]
 
 
-def shape_points(model: TableModel) -> bool:
+def shape_points(model: Table) -> bool:
     """Whether every motor and sensor sits in a mount, along an earth axis."""
     find = getattr(model.rig, "mount_of", None)
     return find is not None and all(find(name) for name in (*model.actuators, *model.sensors.names))

@@ -9,33 +9,33 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter
-from avis_ctrl.gap.score_algebra import symmetric_coordinates
+from avis_ctrl.gap.score import Score, symmetric_coordinates
+from avis_ctrl.gap.starting_values import SETTINGS
 from avis_ctrl.rigs.rigid_body import point_map
 
-if TYPE_CHECKING:
-    from avis_ctrl.gap.score import Score
 
-# Places looked at along x, y, z [m], from the geometric centre: over and around a table.
-GRID_m = (np.linspace(-0.6, 0.6, 7), np.linspace(-0.5, 0.5, 6), np.linspace(-0.3, 0.4, 4))
+def place_grid() -> tuple[np.ndarray, ...]:
+    """Places looked at along x, y, z [m]."""
+    return tuple(np.linspace(*one) for one in SETTINGS.places_m)
 
 
 def positions(parameters: Sequence[EffectParameter]) -> np.ndarray:
     """(n, 3) m; a coordinate that is no parameter stays zero."""
     free = {one.name for one in parameters}
-    axes = [grid if f"{axis}_m" in free else np.zeros(1) for axis, grid in zip("xyz", GRID_m, strict=True)]
+    axes = [grid if f"{axis}_m" in free else np.zeros(1) for axis, grid in zip("xyz", place_grid(), strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
 def about(point: np.ndarray, share: float) -> np.ndarray:
     """(27, 3) m: places about one, that share of the grid's step away along each axis, within the grid."""
-    steps = [share * (grid[1] - grid[0]) * np.array([-1.0, 0.0, 1.0]) for grid in GRID_m]
+    grids = place_grid()
+    steps = [share * (grid[1] - grid[0]) * np.array([-1.0, 0.0, 1.0]) for grid in grids]
     near = point + np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(-1, 3)
-    return np.clip(near, [grid[0] for grid in GRID_m], [grid[-1] for grid in GRID_m])
+    return np.clip(near, [grid[0] for grid in grids], [grid[-1] for grid in grids])
 
 
 def at_points(points: np.ndarray, axes: str, oblique: bool = False) -> np.ndarray:
@@ -74,7 +74,7 @@ def unit_matrices(score: Score, dynamic: Callable[[np.ndarray], np.ndarray]) -> 
     return score.directions([part.by_impedance(dynamic(part.s[:, 0, 0])) for part in score.parts])
 
 
-def peaks(score: Score, most: int = 5) -> tuple[float, ...]:
+def peaks(score: Score) -> tuple[float, ...]:
     """Frequencies [Hz] at which the residual's power stands out most of its neighbourhood, strongest first.
 
     A lightly damped resonance that the model lacks leaves its peak there, narrower than any grid.
@@ -89,19 +89,21 @@ def peaks(score: Score, most: int = 5) -> tuple[float, ...]:
         omega.append(part.block.omega)
         power.append(np.mean(e ** 2, axis=(0, 2)))
     f, P = np.concatenate(omega) / (2 * np.pi), np.concatenate(power)
-    # Mean power in steps of 2 %, against the median about it.
-    step = np.floor(np.log(f) / 0.02).astype(int)
+    # Mean power in steps of frequency, against the median about it.
+    reach = SETTINGS.peak_reach
+    step = np.floor(np.log(f) / SETTINGS.peak_step).astype(int)
     step -= step.min()
     count = np.bincount(step)
     seen = count > 0
     mean = np.bincount(step, P)[seen] / count[seen]
     centre = np.exp(np.bincount(step, P * np.log(f))[seen] / np.maximum(np.bincount(step, P)[seen], 1e-300))
-    about = np.array([np.median(mean[max(k - 10, 0):k + 11]) for k in range(len(mean))])
+    about = np.array([np.median(mean[max(k - reach, 0):k + reach + 1]) for k in range(len(mean))])
     found: list[float] = []
     for k in np.argsort(-mean / about):
-        if len(found) < most and mean[k] > 1.5 * about[k] and all(abs(np.log(centre[k] / one)) > 0.06 for one in found):
+        apart = all(abs(np.log(centre[k] / one)) > SETTINGS.peaks_apart for one in found)
+        if apart and mean[k] > SETTINGS.peak_height * about[k]:
             found.append(float(centre[k]))
-    score.kept["peaks"] = tuple(found)
+    score.kept["peaks"] = tuple(found[:SETTINGS.most_peaks])
     return score.kept["peaks"]
 
 
@@ -109,10 +111,10 @@ def recoils(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.
     """(6, N): by each way in which a chassis can recoil, receptance (n,) [1/mass times displacement per force]."""
     columns = []
     for part in score.parts:
-        made, answer = part.made, part.answer
+        made, response = part.made, part.response
         through = np.swapaxes(made.G, 0, 1)[:6] @ (made.z_pf[:, :, None] * made.ops.mounts.chassis)
-        amount = part.s ** 2 * (made.M @ answer.x[:, :6]) * receptance(part.s[:, 0, 0])[:, None, None]
-        seen = answer.left[:, :, :6] @ through
+        amount = part.s ** 2 * (made.M @ response.x[:, :6]) * receptance(part.s[:, 0, 0])[:, None, None]
+        seen = response.left[:, :, :6] @ through
         columns.append(-np.moveaxis(seen[:, :, :, None] * amount[:, None], 2, 0))
     return score.directions(columns)
 
@@ -121,12 +123,12 @@ def paths(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.nd
     """(n_y n_u, N): by the residue of each path, displacement per newton."""
     columns = []
     for part in score.parts:
-        ops, answer = part.made.ops, part.answer
-        force = np.linalg.norm(ops.base.matrices.T[:3], axis=0)[:, None] * answer.volts
+        ops, response = part.made.ops, part.response
+        force = np.linalg.norm(ops.base.matrices.T[:3], axis=0)[:, None] * response.volts
         n_y, n_u = len(ops.base.sensors.names), force.shape[1]
-        seen = (answer.gain * answer.sense)[:, :, 0] * receptance(part.s[:, 0, 0])[:, None]
-        out = np.zeros((n_y, n_u, *answer.Y.shape), complex)
+        seen = (response.gain * response.sense)[:, :, 0] * receptance(part.s[:, 0, 0])[:, None]
+        out = np.zeros((n_y, n_u, *response.Y.shape), complex)
         for i in range(n_y):
             out[i, :, :, i] = seen[:, i, None] * np.moveaxis(force, 1, 0)
-        columns.append(out.reshape(n_y * n_u, *answer.Y.shape))
+        columns.append(out.reshape(n_y * n_u, *response.Y.shape))
     return score.directions(columns)

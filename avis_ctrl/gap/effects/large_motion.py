@@ -6,15 +6,11 @@ As `identification.large_motion`; motors and sensors, and the whole of it, enter
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.motion import RecordMotion
-    from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table
+from avis_ctrl.gap.record_motion import RecordMotion
 
 
 class LargeMotion(Effect):
@@ -25,10 +21,10 @@ class LargeMotion(Effect):
     looks_like = "a residual that grows with the square of the level, at low frequency first"
     nonlinear = True
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("payload",)
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         # Little room beyond 0 and 1, and a size above it: a gap of another origin must not lead a fit astray here.
         return tuple(EffectParameter(name, "1", text, 0.0, -0.5, 1.5, 4.0) for name, text in (
             ("mounts", "second-order terms of mounts and inertia, 1 by Newton and Euler"),

@@ -8,17 +8,22 @@ geometric centre.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.effects.impedance import at_points
+from avis_ctrl.gap.starting_values import SETTINGS
 
-# Half-sphere of directions, about 16 degrees apart.
-_POLAR, _AROUND = np.meshgrid(np.linspace(0, np.pi / 2, 6), np.linspace(0, 2 * np.pi, 18, endpoint=False),
-                              indexing="ij")
-DIRECTIONS = np.unique(np.round(np.stack([np.sin(_POLAR) * np.cos(_AROUND), np.sin(_POLAR) * np.sin(_AROUND),
-                                          np.cos(_POLAR)], -1).reshape(-1, 3), 12), axis=0)
+
+@cache
+def directions() -> np.ndarray:
+    """(n, 3) over a half-sphere."""
+    polar, around = np.meshgrid(np.linspace(0, np.pi / 2, SETTINGS.polar),
+                                np.linspace(0, 2 * np.pi, SETTINGS.around, endpoint=False), indexing="ij")
+    every = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1)
+    return np.unique(np.round(every.reshape(-1, 3), 12), axis=0)
 
 
 def best_direction(G: np.ndarray, b: np.ndarray, points: np.ndarray) -> tuple[float, int, np.ndarray, float]:
@@ -26,13 +31,14 @@ def best_direction(G: np.ndarray, b: np.ndarray, points: np.ndarray) -> tuple[fl
     basis = at_points(points, "xyz", oblique=True)
     d = basis @ b
     A = basis @ G @ np.swapaxes(basis, 1, 2)
-    V = np.column_stack([DIRECTIONS ** 2, *(DIRECTIONS[:, i] * DIRECTIONS[:, j] for i, j in ((0, 1), (0, 2), (1, 2)))])
+    every = directions()
+    V = np.column_stack([every ** 2, *(every[:, i] * every[:, j] for i, j in ((0, 1), (0, 2), (1, 2)))])
     along = d @ V.T
     size = A.reshape(len(A), -1) @ (V[:, :, None] * V[:, None, :]).reshape(len(V), -1).T
     mass = np.where(size > 0, along / np.where(size > 0, size, 1.0), 0.0)
     chi2 = np.where(mass > 0, mass * along, 0.0)
     k, v = np.unravel_index(int(np.argmax(chi2)), chi2.shape)
-    return float(chi2[k, v]), int(k), DIRECTIONS[v], float(mass[k, v])
+    return float(chi2[k, v]), int(k), every[v], float(mass[k, v])
 
 
 def told(values: Mapping[str, float], covariance: np.ndarray, size: str, unit: str) -> dict[str, Reported]:

@@ -3,34 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Seed, register, told_from_none
-from avis_ctrl.gap.operators import mount_geometry
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, register, told_from_none
+from avis_ctrl.gap.operators import Operators, mount_geometry
+from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.gap.score import Score
+from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.gap.table_model import ActiveEffect
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.motion import RecordMotion
-    from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.score import Score
-    from avis_ctrl.gap.table_model import TableModel
 
 # Frequency at which the mounts' stiffness is meant where it depends on frequency.
 REFERENCE_Hz = 3.0
-# Where a resonance inside the mounts is looked for.
-SURGE_Hz = tuple(np.geomspace(8.0, 150.0, 28).tolist())
 # Mounts with a leveling valve: a fourth would be one too many to level a plane.
 LEVELED = 3
 # Corners of a leveling valve [Hz]: at the upper end it follows at once, at the lower one hardly ever.
 VALVE_Hz = 0.01, 100.0
-# Damping ratio with which the fit of a resonance inside the mounts begins at least.
-BROAD = 0.05
 
 
-def has_mounts(model: TableModel) -> bool:
+def has_mounts(model: Table) -> bool:
     """Whether the rig's mounts have stiffness and damping of their own by name."""
     return "isolator1.k_z" in model.rig.parameters()
 
@@ -44,7 +36,7 @@ def vertical(model_or_ops) -> np.ndarray:
 class _OfMounts(Effect):
     where = "isolators z"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return (self.where,) if has_mounts(model) else ()
 
 
@@ -57,7 +49,7 @@ class MountRelaxation(_OfMounts):
     looks_like = "vertical resonances higher and more damped than low frequencies say"
     holds_states = True
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("stiffness_ratio", "1", "stiffness of the branch over that at rest", 0.0, 0.0, 20.0,
                                 0.1),
                 EffectParameter("corner_Hz", "Hz", "above which the branch acts", 0.0, 0.02, 300.0, 1.0, False,
@@ -84,10 +76,10 @@ class StructuralDamping(_OfMounts):
     looks_like = "damping at low resonances larger, at high ones smaller than one dashpot gives"
     where = "isolators"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("isolators/causal", "isolators/complex") if has_mounts(model) else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("loss_factor", "1", "loss factor of the mounts", 0.0, 0.0, 1.0, 0.05),)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -113,10 +105,10 @@ class MountSurge(_OfMounts):
     holds_states = True
     resonant = True
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         count = int(np.sum(vertical(model)))
         return (EffectParameter("frequency_Hz", "Hz", "of the mass inside the mounts", np.inf, 4.0, 400.0, 20.0, False,
-                                SURGE_Hz),
+                                tuple(np.geomspace(*SETTINGS.surge_Hz).tolist())),
                 EffectParameter("payload_share", "1", "of the mount's compliance between mass and payload", 0.5, 0.05,
                                 0.95, 0.2, False, (0.5,), True),
                 EffectParameter("damping_ratio", "1", "of that resonance", 0.0, 0.0, 1.0, 0.05, False,
@@ -134,7 +126,7 @@ class MountSurge(_OfMounts):
             took = score.reduction(score.of_effect(ActiveEffect(self, place, parameters, values)))
             if took.coefficients[0] > 0:
                 # From a narrow resonance at the wrong frequency no fit finds the right one.
-                begin = [max(value, BROAD) if one.name == "damping_ratio" else value
+                begin = [max(value, SETTINGS.least_surge_damping) if one.name == "damping_ratio" else value
                          for one, value in zip(parameters, values, strict=True)]
                 found.append(Seed(tuple(begin), took.chi2, len(parameters), len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
@@ -149,7 +141,7 @@ class MountSurge(_OfMounts):
         ops.payload_share = np.where(up, values["payload_share"], ops.payload_share)
         ops.internal_damping = np.where(up, values["damping_ratio"], ops.internal_damping)
 
-    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         """Means over the mounts; how these scatter goes into their standard deviations, for it is what one number for
         all mounts leaves open. Of the mass that is of frequency, share and scatter; the mean stiffness is taken as it
@@ -196,10 +188,10 @@ class LevelingLoop(_OfMounts):
     looks_like = "phase and gain change at the lowest frequencies, vertical and tilting channels only"
     holds_states = True
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("isolators 1-3 z/plain", "isolators 1-3 z/lag") if has_mounts(model) else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         # Faster than the best damped mode dies away, the loop is unstable: no table that was measured has it.
         fastest = max(2 * fastest_decay(model) / (2 * np.pi), 0.1)
         rate = EffectParameter("rate_Hz", "Hz", "of the integrator, over 2 pi", 0.0, 0.0, fastest, 0.02)
@@ -224,7 +216,7 @@ class LevelingLoop(_OfMounts):
         if "valve_corner_Hz" in values:
             ops.decays.append(rows / (ops.s + 2 * np.pi * values["valve_corner_Hz"])[:, None, None])
 
-    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         """With the mean force by displacement and second over the leveled mounts, at their stiffness as fitted."""
         found = super().reported(model, place, values, covariance)
@@ -251,7 +243,7 @@ class CubicStiffness(_OfMounts):
     nonlinear = True
     strength = "k3_N_per_m3"
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model) ** 2
         return (EffectParameter("k3_N_per_m3", "N/m^3", "cubic stiffness of each mount", 0.0, -1e4 * size, 1e4 * size,
                                 size),)
@@ -264,13 +256,13 @@ class CubicStiffness(_OfMounts):
         return "mounts that soften with amplitude" if values["k3_N_per_m3"] < 0 else ""
 
 
-def largest_rms(model: TableModel) -> float:
+def largest_rms(model: Table) -> float:
     """Largest r.m.s. deflection of a mount [m] in any record; 10 micrometres where none is known."""
     found = [float(one.rms_deflections.max()) for one in model.motion.values()]
     return max(found, default=1e-5) or 1e-5
 
 
-def median_rms(model: TableModel) -> float:
+def median_rms(model: Table) -> float:
     found = [float(np.median(one.rms_deflections)) for one in model.motion.values()]
     return float(np.median(found)) if found else 1e-5
 
@@ -289,11 +281,11 @@ class ContactFriction(Effect):
     nonlinear = True
     strength = "stiffness_N_per_m"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         find = getattr(model.rig, "mount_of", None)
         return ("actuators",) if find and has_mounts(model) and all(map(find, model.actuators)) else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         rms, k = median_rms(model), float(np.mean(mount_geometry(model.rig).stiffness))
         return (EffectParameter("stiffness_N_per_m", "N/m", "of a contact before it slips", 0.0, 0.0, 20 * k, 0.05 * k),
                 EffectParameter("slip_m", "m", "displacement at which a contact slips", 0.0, 1e-3 * rms, 1e3 * rms, rms,
@@ -311,7 +303,7 @@ class ContactFriction(Effect):
         f = record.interpolated(self.name, values["slip_m"], omega, lambda slip: slipping(record, slip))
         return pushed(f, record, values)
 
-    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         k, slip = values["stiffness_N_per_m"], values["slip_m"]
         slope = np.array([slip, k])
@@ -367,10 +359,10 @@ class StiffnessDrift(Effect):
     nonlinear = True
     strength = "relative_change"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("isolators/linear", "isolators/settling") if has_mounts(model) else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         change = EffectParameter("relative_change", "1", "of every stiffness over the campaign", 0.0, -0.9, 0.9, 0.02)
         if not place.endswith("settling"):
             return (change,)
@@ -384,7 +376,7 @@ class StiffnessDrift(Effect):
         push = record.deflection * record.stiffness * through[:, None]
         return -values["relative_change"] * (push @ record.rows)
 
-    def reported(self, model: TableModel, place: str, values: Mapping[str, float], covariance: np.ndarray
+    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
         found = super().reported(model, place, values, covariance)
         # The model's change is of the stiffness that the record's motion was found with; a person's is of what the
@@ -400,7 +392,7 @@ class StiffnessDrift(Effect):
         return found
 
 
-def drift_over_stiffness(model: TableModel) -> float:
+def drift_over_stiffness(model: Table) -> float:
     """Stiffness of the record's motion, whose share a drift's change is, over that of the model's rig."""
     known = float(np.sum(mount_geometry(model.effective.rig).stiffness))
     return next((float(np.sum(one.stiffness)) / known for one in model.motion.values()), 1.0)
@@ -413,7 +405,7 @@ def drifted(when: np.ndarray, time_constant: float) -> np.ndarray:
     return np.expm1(-when / time_constant) / np.expm1(-1 / time_constant) - 0.5
 
 
-def fastest_decay(model: TableModel) -> float:
+def fastest_decay(model: Table) -> float:
     """Largest zeta omega [1/s] of the table's own modes."""
     mat = model.base.matrices
     inverse = np.linalg.inv(mat.M)

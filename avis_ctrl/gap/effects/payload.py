@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, register
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, register
 
 PRODUCTS = {"Jxy": "J12", "Jxz": "J13", "Jyz": "J23"}
 REACH_m = 2.0  # how far from the geometric centre something can be fixed to a payload
@@ -24,14 +20,14 @@ class ComOffset(Effect):
     title = "the centre of mass is not where the model has it"
     looks_like = "coupling between translations and rotations, at every frequency above the resonances too"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("payload",) if "com_x" in model.rig.parameters() else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return tuple(EffectParameter(f"offset_{axis}_m", "m", f"centre of mass beyond the model's along {axis}", 0.0,
                                      -0.5, 0.5, 0.05) for axis in "xyz")
 
-    def rig_changes(self, model: TableModel, place: str, values: Mapping[str, float]) -> dict[str, float]:
+    def rig_changes(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, float]:
         known = model.rig.parameters()
         return {f"com_{axis}": known[f"com_{axis}"].value + values[f"offset_{axis}_m"] for axis in "xyz"}
 
@@ -44,16 +40,16 @@ class ProductOfInertia(Effect):
     title = "a product of inertia of the payload"
     looks_like = "coupling between two rotations"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return tuple(PRODUCTS) if "J12" in model.rig.parameters() else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         known = model.rig.parameters()
         largest = 0.9 * min(known[name].value for name in ("J1", "J2", "J3"))
         return (EffectParameter(f"{place}_kgm2", "kg m^2", "entry of the inertia tensor beyond the model's", 0.0,
                                 -largest, largest, 0.1 * largest),)
 
-    def rig_changes(self, model: TableModel, place: str, values: Mapping[str, float]) -> dict[str, float]:
+    def rig_changes(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, float]:
         name = PRODUCTS[place]
         return {name: model.rig.parameters()[name].value + values[f"{place}_kgm2"]}
 

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, register
+from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, Table, register
+from avis_ctrl.gap.operators import Operators
 from avis_ctrl.rigs.rig import Rig
 
-if TYPE_CHECKING:
-    from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.table_model import TableModel
-
 GRAVITY = 9.80665
-# A sensor counts as lying along an earth axis up to this tilt [rad].
-TILTED_rad = 0.3
 
 
 def second_order(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
@@ -35,15 +29,15 @@ def suspensions(rig: Rig) -> dict[str, tuple[float, float]]:
     return {one.name: one.suspension for one in rig.sensors() if one.suspension is not None}
 
 
-def axis_of(model: TableModel, sensor: str) -> str:
+def axis_of(model: Table, sensor: str) -> str:
     """x, y or z: the earth axis that a sensor lies along, within what one is tilted; empty where it lies along none."""
     direction = model.rig.sensor_axes()[sensor][1]
-    along = np.flatnonzero(np.abs(direction) > np.cos(TILTED_rad))
+    along = np.flatnonzero(np.abs(direction) > np.cos(SETTINGS.tilted_rad))
     return "xyz"[along[0]] if len(along) else ""
 
 
 class _OfSensor(Effect):
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return model.sensors.names
 
 
@@ -58,11 +52,11 @@ class GeophoneCorner(_OfSensor):
     title = "a geophone's suspension frequency is not the one that its compensation filter assumes"
     looks_like = "one output is off around and below the suspension frequency, by the same factor from every input"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         known = suspensions(model.rig)
         return tuple(name for name in model.sensors.names if name in known) if model.sensors.unit == "V" else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         f, z = suspensions(model.rig)[place]
         return (EffectParameter("corner_Hz", "Hz", "suspension frequency", f, f / 5, 5 * f, f),
                 EffectParameter("damping", "1", "damping ratio of the suspension", z, z / 5, 5 * z, z))
@@ -84,7 +78,7 @@ class SensorGain(_OfSensor):
     title = "a sensor's sensitivity is not the one of the rig file"
     looks_like = "one output is off by the same real factor at every frequency and from every input"
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("gain", "1", "sensitivity over that of the rig file", 1.0, 0.1, 10.0, 1.0),)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -99,10 +93,10 @@ class SensorMisalignment(_OfSensor):
     title = "a sensor's axis is tilted, so that it sees another axis too"
     looks_like = "one output holds a share of the motion along another axis at its place, at every frequency"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return tuple(name for name in model.sensors.names if axis_of(model, name))
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         own = axis_of(model, place)
         return tuple(EffectParameter(f"towards_{axis}_deg", "deg", f"tilt of the axis towards {axis}", 0.0, -60.0, 60.0,
                                      5.0) for axis in "xyz" if axis != own)
@@ -131,11 +125,11 @@ class TiltCoupling(Effect):
     title = "gravity: the horizontal sensors read g times the tilt as an acceleration"
     looks_like = "horizontal outputs rise towards low frequency where the payload tilts, as g over frequency squared"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         horizontal = [name for name in model.sensors.names if axis_of(model, name) in ("x", "y")]
         return ("horizontal geophones",) if horizontal and model.sensors.unit in ("V", "m/s^2") else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("gravity_m_per_s2", "m/s^2", "acceleration read for a tilt of 1 rad", 0.0, -30.0, 30.0,
                                 GRAVITY),)
 

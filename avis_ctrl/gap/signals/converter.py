@@ -23,29 +23,49 @@ import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.signals.leftover import Estimate
+from avis_ctrl.gap.signals.record_residual import Estimate
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.clipping import repeated_extreme
 from avis_ctrl.measurement.gates.finding import Limit, Picture, Series, thinned
 from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.rig import Rig
 
-# False alarms of a clean campaign, over all channels, ends and records.
-FALSE_ALARM = 1e-3
-# Smallest step that counts [nominal lsb], and |phi| that a comb of such a step reaches: sinc(1/2) = 0.64 at two.
-LEAST_STEP, LEAST_PHI = 1.9, 0.5
-# phi of a smooth signal has died out from this many cycles per standard deviation on (a sine's Bessel function last).
-FREE_OF_SIGNAL = 2.0
-# Part of the codes in use that lie within one of the comb.
-ON_THE_COMB = 0.9
-# Codes used up to which a signal counts as one of few steps; samples that must lie off its most frequent code.
-FEW_CODES, OFF_THE_MODE = 40, 20
-# Probability of the code next to the most frequent one, at least, for noise of 0.3 lsb and more and any offset.
-NEIGHBOUR = 0.02
-# Distance of a clip level from the nominal limit [lsb] below which it is the nominal one.
-NOMINAL_MARGIN = 4.0
-# Samples of a record that are looked at.
-LONGEST = 1 << 20
+
+@dataclass(frozen=True)
+class ConverterSettings:
+    """Of the check of converters.
+
+    false_alarm : chance of a false alarm in a clean campaign, over all channels, ends and records [1].
+    least_step : smallest step that counts [nominal lsb]: two, less what an estimate may miss.
+    least_phi : modulus of the characteristic function that a comb of such a step reaches [1]: sinc(1/2) = 0.64 at
+        two.
+    free_of_signal : cycles per standard deviation from which the characteristic function of a smooth signal has
+        died out (a sine's Bessel function last).
+    on_the_comb : fraction of the codes in use that lie within one of the comb, at least [1]: the rest is noise
+        behind the step.
+    few_codes : codes in use up to which a signal counts as one of few steps: below, it has no characteristic
+        function to speak of.
+    off_the_mode : samples that must lie off the most frequent code: with fewer, the signal never left its code.
+    neighbour : probability of the code next to the most frequent one, at least [1]: of noise of 0.3 lsb and more,
+        at any offset.
+    nominal_margin : distance of a clip level from the nominal limit below which it is the nominal one [lsb]:
+        offsets of converters.
+    longest : samples of a record that are looked at: more tell nothing new and take memory.
+    """
+
+    false_alarm: float = 1e-3
+    least_step: float = 1.9
+    least_phi: float = 0.5
+    free_of_signal: float = 2.0
+    on_the_comb: float = 0.9
+    few_codes: int = 40
+    off_the_mode: int = 20
+    neighbour: float = 0.02
+    nominal_margin: float = 4.0
+    longest: int = 1 << 20
+
+
+SETTINGS = ConverterSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +136,7 @@ def inspect_converter(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, .
     of_channel: dict[str, list[_Samples]] = {name: [] for name in campaign.y_names}
     for source in campaign.records:
         h = source.header
-        record = source.load(0, min(h.samples, LONGEST))
+        record = source.load(0, min(h.samples, SETTINGS.longest))
         for k, name in enumerate(h.y_names):
             y = record.y[:, k]
             inside = (y > nominal.limits_V[0] + nominal.lsb_V) & (y < nominal.limits_V[1] - nominal.lsb_V)
@@ -125,9 +145,9 @@ def inspect_converter(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, .
     tests = len(of_channel)
     found: list[ConverterFinding | None] = []
     for name, of in of_channel.items():
-        step = _resolution(name, of, nominal, FALSE_ALARM / (2 * tests))
+        step = _resolution(name, of, nominal, SETTINGS.false_alarm / (2 * tests))
         lsb = step.parameters["resolution_V"].value if step else nominal.lsb_V
-        found += [step, _clipping(name, of, nominal, lsb, FALSE_ALARM / (4 * tests))]
+        found += [step, _clipping(name, of, nominal, lsb, SETTINGS.false_alarm / (4 * tests))]
     return tuple(one for one in found if one is not None)
 
 
@@ -168,21 +188,21 @@ def _comb(of: Sequence[_Samples]) -> _Step | None:
     total, weight, travelled = np.zeros(len(nu)), np.zeros(len(nu)), np.zeros(len(nu))
     for one in of:
         spread = float(one.codes.std())
-        if spread * nu[-1] < FREE_OF_SIGNAL:
+        if spread * nu[-1] < SETTINGS.free_of_signal:
             continue
         counts = np.bincount(one.codes - low, minlength=1).astype(float)
         phi = np.abs(scipy.fft.rfft(counts, size)) / len(one.codes)
-        free = nu >= FREE_OF_SIGNAL / spread
+        free = nu >= SETTINGS.free_of_signal / spread
         n = float(len(one.codes))
         total[free] += n * phi[free]
         weight[free] += n
         # Each step that is passed is one look at where the values lie within a step.
         travelled += free * np.minimum(n, np.abs(np.diff(one.codes)).sum() * nu)
-    usable = (weight > 0) & (nu <= 1 / LEAST_STEP)
+    usable = (weight > 0) & (nu <= 1 / SETTINGS.least_step)
     if not usable.any():
         return None
     mean = np.where(usable, total / np.maximum(weight, 1), 0.0)
-    high = np.flatnonzero(mean >= max(LEAST_PHI, 0.85 * mean.max()))
+    high = np.flatnonzero(mean >= max(SETTINGS.least_phi, 0.85 * mean.max()))
     if not high.size:
         return None
     # The lowest frequency of the comb is its step's; beside it phi has the width of the transform.
@@ -212,7 +232,7 @@ def _fitted(of: Sequence[_Samples], q: float) -> tuple[float, float] | None:
             continue
         q, b = (float(c) for c in np.polyfit(k, x[near], 1))
     k = np.rint((x - b) / q)
-    if np.mean(np.abs(x - b - q * k) <= 1.0) < ON_THE_COMB:
+    if np.mean(np.abs(x - b - q * k) <= 1.0) < SETTINGS.on_the_comb:
         return None
     # Rounding to the nominal lsb is the error, at least where the comb happens to be exact.
     rest = max(float(np.std(x - b - q * k)), 1 / np.sqrt(12.0))
@@ -223,7 +243,7 @@ def _gaps(of: Sequence[_Samples]) -> _Step | None:
     """The step of a signal that shows a few values only, from the codes between them that nothing reaches."""
     codes, counts = np.unique(np.concatenate([one.codes for one in of]), return_counts=True)
     off = int(counts.sum() - counts.max())
-    if not 2 <= len(codes) <= FEW_CODES or off < OFF_THE_MODE:
+    if not 2 <= len(codes) <= SETTINGS.few_codes or off < SETTINGS.off_the_mode:
         return None
     steps = np.diff(codes)
     smallest = int(steps.min())
@@ -234,7 +254,7 @@ def _gaps(of: Sequence[_Samples]) -> _Step | None:
     q = float(np.polyfit(k, codes, 1)[0])
     std = 1 / np.sqrt(6.0) / max(float(k[-1]), 1.0)
     # Both neighbours of the most frequent code empty, in so many changes of value.
-    return _Step(q, std, float((1 - NEIGHBOUR) ** min(counts.sum(), 1e5)))
+    return _Step(q, std, float((1 - SETTINGS.neighbour) ** min(counts.sum(), 1e5)))
 
 
 def _clipping(name: str, of: Sequence[_Samples], nominal: Converter, lsb: float, level: float
@@ -274,7 +294,7 @@ def _plateau(of: Sequence[_Samples], sign: float, bound: float, nominal_lsb: flo
              ) -> tuple[float, float, float, dict[str, int]] | None:
     """Level, width, chance and samples by record of a flat end that no record goes beyond."""
     top = max(float(np.max(sign * one.y)) for one in of)
-    if top <= 0 or top > bound - max(NOMINAL_MARGIN * nominal_lsb, lsb):
+    if top <= 0 or top > bound - max(SETTINGS.nominal_margin * nominal_lsb, lsb):
         return None
     best, widest = 1.0, 0.0
     near = [one for one in of if float(np.max(sign * one.y)) >= top - max(2 * lsb, top / 256)]

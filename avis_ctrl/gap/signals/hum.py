@@ -16,21 +16,38 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, stats
 
-from avis_ctrl.gap.signals.leftover import Estimate, Leftover, check_common
+from avis_ctrl.gap.signals.record_residual import Estimate, RecordResidual, check_common
 from avis_ctrl.measurement.gates.finding import Limit, Picture, Series, thinned
 
 MAINS_HZ = (50.0, 60.0)
-SEARCH_HZ = 0.3
-# Chance of a false alarm in a whole campaign.
-FALSE_ALARM = 1e-3
-# A line's mean power by that of its neighbours, at least: floors are not quite flat.
-RATIO = 3.0
-# Neighbours on either side, and lines left out next to the tested one.
-REFERENCE, GUARD = 12, 3
-# Half width [lines] of a polluted band in a transform without window, by default.
-POLLUTED_LINES = 3
 # int w^2 t^2 dt / (int w t^2 dt)^2 of a Hann window over the same of none: 28.1 / 12.
 HANN_COST = 2.34
+
+
+@dataclass(frozen=True)
+class HumSettings:
+    """Of the search for mains hum.
+
+    search_Hz : half width of the band about 50 and 60 Hz in which the fundamental is looked for [Hz], within which
+        grids keep their frequency.
+    false_alarm : chance of a false alarm in a whole campaign [1]: one user in a thousand is misled.
+    least_ratio : mean power of a line over that of its neighbours, at least [1]: floors are not quite flat.
+    neighbours : lines on either side with which a line is compared: enough for their mean, few enough for a floor
+        to be flat.
+    guard : lines left out next to the tested one: the main lobe of a Hann window is two lines wide.
+    polluted_lines : half width of a polluted band in a transform without window, whose side lobes fall slowly
+        [lines].
+    """
+
+    search_Hz: float = 0.3
+    false_alarm: float = 1e-3
+    least_ratio: float = 3.0
+    neighbours: int = 12
+    guard: int = 3
+    polluted_lines: int = 3
+
+
+SETTINGS = HumSettings()
 
 
 @dataclass(frozen=True)
@@ -88,12 +105,12 @@ class _Score:
 
     @property
     def p(self) -> np.ndarray:
-        """Of each line by itself; 1 where it is not RATIO times as strong as those next to it."""
-        tested = (self.tests > 0) & (self.ratio > RATIO)
+        """Of each line by itself; 1 where it is not `least_ratio` times as strong as those next to it."""
+        tested = (self.tests > 0) & (self.ratio > SETTINGS.least_ratio)
         return np.where(tested, stats.gamma.sf(self.score, np.maximum(self.tests, 1)), 1.0)
 
 
-def find_hum(left: Sequence[Leftover], false_alarm: float = FALSE_ALARM) -> HumFinding | None:
+def find_hum(left: Sequence[RecordResidual]) -> HumFinding | None:
     """The hum in what a model leaves, None where no line stands out.
 
     Works on the residual at every harmonic below 0.98 of half the sample rate, driven or not; a driven line whose
@@ -108,11 +125,11 @@ def find_hum(left: Sequence[Leftover], false_alarm: float = FALSE_ALARM) -> HumF
     trials = sum(int(np.count_nonzero(one.tests)) for one in scores)
     each = [one.p for one in scores]
     chance = min(1.0, min(float(p.min()) for p in each) * trials)
-    if chance > false_alarm:
+    if chance > SETTINGS.false_alarm:
         return None
     # p underflows where lines are strong, so that the sum of the scores tells where they are strongest: at 300 Hz
     # stands a harmonic of either of the mains, elsewhere of one of them.
-    surest = [p * trials <= false_alarm for p in each]
+    surest = [p * trials <= SETTINGS.false_alarm for p in each]
     strength = [np.sum(np.where(sure, one.score, 0.0), axis=(1, 2)) for one, sure in zip(scores, surest, strict=True)]
     which = int(np.argmax([sums.max() for sums in strength]))
     best, sure, at = scores[which], surest[which], int(np.argmax(strength[which]))
@@ -120,13 +137,14 @@ def find_hum(left: Sequence[Leftover], false_alarm: float = FALSE_ALARM) -> HumF
     # With the frequency known, what else stands out is judged among the lines there.
     there = _scores(left, best.nominal_Hz, np.array([frequency.value]))
     own = there.p[0]
-    hits = np.argwhere((own < false_alarm / own.size) | sure[at])
+    hits = np.argwhere((own < SETTINGS.false_alarm / own.size) | sure[at])
     frequency = _refined(left, frequency.value, hits)
     lines = _lines(left, frequency.value, hits, own, there.ratio[0])
     return _finding(left, best.nominal_Hz, frequency, lines, chance, first.y_unit)
 
 
-def polluted(finding: HumFinding, samples: int, sample_rate_Hz: float, half_lines: int = POLLUTED_LINES) -> np.ndarray:
+def polluted(finding: HumFinding, samples: int, sample_rate_Hz: float, half_lines: int = SETTINGS.polluted_lines
+             ) -> np.ndarray:
     """(samples // 2 + 1,) True at lines of a record's transform that hum reaches, to be left out of a fit.
 
     half_lines : on either side of each harmonic that was found in any channel; a transform without window leaks as
@@ -156,14 +174,14 @@ def subtract(finding: HumFinding, e: np.ndarray, y: np.ndarray, sample_rate_Hz: 
     return cleaned
 
 
-def _scores(left: Sequence[Leftover], nominal: float, f0: np.ndarray | None = None) -> _Score:
-    """At f0 (n,), by default everywhere within SEARCH_HZ of the nominal frequency."""
+def _scores(left: Sequence[RecordResidual], nominal: float, f0: np.ndarray | None = None) -> _Score:
+    """At f0 (n,), by default everywhere within `search_Hz` of the nominal frequency."""
     h = left[0].header
     duration = max(one.header.duration_s for one in left)
-    top = int(0.49 * h.sample_rate_Hz / (nominal + SEARCH_HZ))
+    top = int(0.49 * h.sample_rate_Hz / (nominal + SETTINGS.search_Hz))
     if f0 is None:
-        n = int(np.ceil(2 * SEARCH_HZ * 2 * duration * max(top, 1))) + 1
-        f0 = np.linspace(nominal - SEARCH_HZ, nominal + SEARCH_HZ, n)
+        n = int(np.ceil(2 * SETTINGS.search_Hz * 2 * duration * max(top, 1))) + 1
+        f0 = np.linspace(nominal - SETTINGS.search_Hz, nominal + SETTINGS.search_Hz, n)
     shape = (len(f0), top, len(h.y_names))
     score, tests, ratio = np.zeros(shape), np.zeros(shape, int), np.zeros(shape)
     for one in left:
@@ -171,12 +189,12 @@ def _scores(left: Sequence[Leftover], nominal: float, f0: np.ndarray | None = No
     return _Score(nominal, f0, score, ratio / np.maximum(tests, 1), tests)
 
 
-def _add(one: Leftover, f0: np.ndarray, score: np.ndarray, tests: np.ndarray, ratio: np.ndarray) -> None:
+def _add(one: RecordResidual, f0: np.ndarray, score: np.ndarray, tests: np.ndarray, ratio: np.ndarray) -> None:
     """A record's part, harmonic by harmonic; lines are looked at once however many f0 fall on them."""
     power, df = np.abs(one.E) ** 2, one.frequency_Hz[1]
     stride = 2 * one.periods if one.periods >= 2 else 1
-    first = stride if stride > GUARD else GUARD + 1
-    offsets = first + stride * np.arange(REFERENCE)
+    first = stride if stride > SETTINGS.guard else SETTINGS.guard + 1
+    offsets = first + stride * np.arange(SETTINGS.neighbours)
     for k in range(1, score.shape[1] + 1):
         bins, back = np.unique(np.rint(k * f0 / df).astype(int), return_inverse=True)
         inside = (bins - offsets[-1] >= 1) & (bins + offsets[-1] < len(power) - 1)
@@ -191,7 +209,7 @@ def _add(one: Leftover, f0: np.ndarray, score: np.ndarray, tests: np.ndarray, ra
             # The experiment's own line among silent ones is no hum.
             alike = (one.driven[b[:, None] + offsets].mean(1) + one.driven[b[:, None] - offsets].mean(1)) / 2
             usable &= ~(one.driven[b] & (alike < 0.5))[:, None]
-        s = REFERENCE * np.log1p(z / REFERENCE)
+        s = SETTINGS.neighbours * np.log1p(z / SETTINGS.neighbours)
         score[:, k - 1] += np.where(usable, s, 0.0)[back]
         ratio[:, k - 1] += np.where(usable, z, 0.0)[back]
         tests[:, k - 1] += usable[back]
@@ -207,16 +225,16 @@ def _fitted(A: np.ndarray, e: np.ndarray) -> np.ndarray:
     return np.linalg.solve(A.T @ A, A.T @ e)
 
 
-def _spread(one: Leftover, f: float) -> np.ndarray:
+def _spread(one: RecordResidual, f: float) -> np.ndarray:
     """(n_y,) variance of either part of a sine's amplitude: 2 s^2 / N, s^2 of the lines near f that are like it."""
     b = round(f / one.frequency_Hz[1])
     stride = 2 * one.periods if one.periods >= 2 else 1
-    offsets = (stride if stride > GUARD else GUARD + 1) + stride * np.arange(REFERENCE)
+    offsets = (stride if stride > SETTINGS.guard else SETTINGS.guard + 1) + stride * np.arange(SETTINGS.neighbours)
     near = np.clip(np.concatenate([b - offsets, b + offsets]), 1, len(one.E) - 1)
     return 2 * np.mean(np.abs(one.E[near]) ** 2, axis=0) / one.header.samples
 
 
-def _refined(left: Sequence[Leftover], start: float, hits: np.ndarray) -> Estimate:
+def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> Estimate:
     """f0 by least squares of all lines that stand out, amplitudes and phases free in each record.
 
     Its variance is that of a sine in white noise of the local level, var(2 pi f) = 12 v / (A T)^2 with v the variance
@@ -249,7 +267,7 @@ def _refined(left: Sequence[Leftover], start: float, hits: np.ndarray) -> Estima
     return Estimate(start + shift, float(1 / np.sqrt(max(information, 1e-30))), "Hz")
 
 
-def _lines(left: Sequence[Leftover], f0: float, hits: np.ndarray, p: np.ndarray, ratio: np.ndarray
+def _lines(left: Sequence[RecordResidual], f0: float, hits: np.ndarray, p: np.ndarray, ratio: np.ndarray
            ) -> tuple[HumLine, ...]:
     names, unit, rate = left[0].header.y_names, left[0].header.y_unit, left[0].header.sample_rate_Hz
     found = []
@@ -270,8 +288,8 @@ def _lines(left: Sequence[Leftover], f0: float, hits: np.ndarray, p: np.ndarray,
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
 
 
-def _finding(left: Sequence[Leftover], nominal: float, frequency: Estimate, lines: tuple[HumLine, ...], chance: float,
-             unit: str) -> HumFinding:
+def _finding(left: Sequence[RecordResidual], nominal: float, frequency: Estimate, lines: tuple[HumLine, ...],
+             chance: float, unit: str) -> HumFinding:
     largest = lines[0]
     names = left[0].header.y_names
     j = names.index(largest.channel)

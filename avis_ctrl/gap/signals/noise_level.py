@@ -26,34 +26,56 @@ from scipy.stats import norm
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.signals.converter import nominal_converter
 from avis_ctrl.gap.signals.hum import HumFinding, polluted
-from avis_ctrl.gap.signals.leftover import HANN_SHARED, Estimate, Leftover, check_common
 from avis_ctrl.gap.signals.quiet_lines import QuietLines, quiet_lines
+from avis_ctrl.gap.signals.record_residual import HANN_SHARED, Estimate, RecordResidual, check_common
 from avis_ctrl.measurement.gates.finding import Limit, Picture, Series
 from avis_ctrl.rigs.rig import Rig
 
-FLOOR_BAND_HZ = (0.5, 60.0)
 DIRECTIONS = ("x", "y", "z")
-# Band of the sensors' own noise, in parts of the sample rate; 100 Hz to 490 Hz at 1 kHz.
-SENSOR_BAND = (0.1, 0.49)
-# Standard errors above ambient that count as significant: 2e-4 one-sided, for three directions and their mean.
-SIGNIFICANT = 3.5
-# The floor counts as clearly above ambient if its r.m.s. in the band where sensors see it is 1.25 times the figure for
-# the whole band, which no shape of an ambient spectrum explains but a model some per cent wrong may; or if the whole
-# band, by a power law, has twice as much: an ambient floor that is flat where it is seen and ends there would be taken
-# for sqrt(59.5 / 14.5) = 2.0 times what it is.
-SEEN_FACTOR, TOTAL_FACTOR = 1.25, 2.0
-# Sensor noise counts as raised from here: a converter that is not dithered, or noise not quite white, makes less.
-SENSOR_FACTOR = 1.15
-# Part of the excess outside the range of G above which it is not the floor; a force anywhere would have a half.
-FOREIGN = 0.25
-# Bands per octave; a direction is seen where the density's error is below half of a white ambient floor's density.
-PER_OCTAVE, SEEN = 3, 0.5
-NARROWEST_HZ = 0.4
-# Power outside the range of G by its median in the band, above which a line is none of the floor; a gamma distribution
-# of shape 3 is above 20 times its median once in 1e20.
-LINE = 20.0
 
 FloorResponse = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class NoiseLevelSettings:
+    """Of the level of floor and sensors.
+
+    floor_band_Hz : band of the floor's level [Hz]: that of the rig file's `[ambient]`.
+    sensor_band : band of the sensors' own noise, in parts of the sample rate [1]: 100 Hz to 490 Hz at 1 kHz, where
+        no table moves.
+    significant : standard errors above ambient that count as significant [1]: 2e-4 one-sided, for three directions
+        and their mean.
+    seen_factor : r.m.s. in the band where sensors see the floor over the figure for the whole band, from which the
+        floor is clearly above ambient [1]: no shape of an ambient spectrum explains that, but a model some per cent
+        wrong may explain less.
+    total_factor : the same of the whole band, by a power law [1]: an ambient floor that is flat where it is seen
+        and ends there would be taken for sqrt(59.5 / 14.5) = 2.0 times what it is.
+    sensor_factor : sensor noise over what is expected, from which it counts as raised [1]: a converter that is not
+        dithered, or noise not quite white, makes less.
+    foreign : fraction of the excess outside the range of G above which it is not the floor [1]; a force anywhere
+        would have a half.
+    bands_per_octave : bands to the octave.
+    seen : a direction is seen where the density's error is below this fraction of a white ambient floor's density
+        [1].
+    narrowest_Hz : narrowest band [Hz]: a few lines of a record of 20 s.
+    line : power outside the range of G over its median in the band, above which a line is none of the floor [1]; a
+        gamma distribution of shape 3 is above 20 times its median once in 1e20.
+    """
+
+    floor_band_Hz: tuple[float, float] = (0.5, 60.0)
+    sensor_band: tuple[float, float] = (0.1, 0.49)
+    significant: float = 3.5
+    seen_factor: float = 1.25
+    total_factor: float = 2.0
+    sensor_factor: float = 1.15
+    foreign: float = 0.25
+    bands_per_octave: int = 3
+    seen: float = 0.5
+    narrowest_Hz: float = 0.4
+    line: float = 20.0
+
+
+SETTINGS = NoiseLevelSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +87,7 @@ class FloorLevel:
     rms : of each direction in 0.5-60 Hz, a power law beyond `seen_to_Hz`. seen : in 0.5 Hz to seen_to_Hz only.
     ambient : of the rig file [m/s].
     foreign : part of the excess over sensor noise that no floor motion makes, 0 to 1.
-    frequency_Hz (n,), density (n, 3), density_std : one-sided [m^2/s^2/Hz] in bands of a third of an octave.
+    frequency_Hz (n,), density (n, 3) : one-sided [m^2/s^2/Hz] in bands of a third of an octave.
     clear, significant : whether the floor is above ambient clearly, and beyond doubt of statistics.
     """
 
@@ -78,14 +100,13 @@ class FloorLevel:
     foreign: float
     frequency_Hz: np.ndarray
     density: np.ndarray
-    density_std: np.ndarray
     significant: bool
     clear: bool
 
     @property
     def ground_motion(self) -> bool:
         """The floor moves clearly more than the rig file says, and it is the floor."""
-        return self.significant and self.clear and self.foreign <= FOREIGN
+        return self.significant and self.clear and self.foreign <= SETTINGS.foreign
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,13 +154,12 @@ class NoiseLevels:
     floor: FloorLevel | None
     sensors: dict[str, Estimate]
     by_record: dict[str, dict[str, Estimate]]
-    expected_sensor: dict[str, float]
     ground_motion: GroundMotionFinding | None
     raised: tuple[NoiseFinding, ...]
     ways: dict[str, str]
 
 
-def noise_levels(left: Sequence[Leftover], floor_response: FloorResponse, rig: Rig, hum: HumFinding | None = None,
+def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, rig: Rig, hum: HumFinding | None = None,
                  steps_V: dict[str, float] | None = None) -> NoiseLevels:
     """Levels of floor and sensor noise, and what is above the rig's [ambient].
 
@@ -160,7 +180,7 @@ def noise_levels(left: Sequence[Leftover], floor_response: FloorResponse, rig: R
         raise InputError("the rig file does not say what is normal on site", field="ambient")
     masks = None if hum is None else [polluted(hum, one.header.samples, one.header.sample_rate_Hz, 4) for one in left]
     rate = first.sample_rate_Hz
-    high = quiet_lines(left, (SENSOR_BAND[0] * rate, SENSOR_BAND[1] * rate), False, masks)
+    high = quiet_lines(left, (SETTINGS.sensor_band[0] * rate, SETTINGS.sensor_band[1] * rate), False, masks)
     if not any(len(one.left) for one in high):
         raise InputError("expected lines that hold noise alone, above a tenth of the sample rate; records are too short"
                          " to tell the noise from what u drives", field="residuals")
@@ -169,17 +189,17 @@ def noise_levels(left: Sequence[Leftover], floor_response: FloorResponse, rig: R
     expected = {name: float(np.hypot(ambient.sensor_noise_rms_V, lsb[name] / np.sqrt(12))) for name in first.y_names}
     raised = tuple(_raised(name, sensors[name], expected[name], by_record)
                    for name in first.y_names
-                   if sensors[name].value > SENSOR_FACTOR * expected[name]
-                   and sensors[name].value - SIGNIFICANT * sensors[name].std > expected[name])
+                   if sensors[name].value > SETTINGS.sensor_factor * expected[name]
+                   and sensors[name].value - SETTINGS.significant * sensors[name].std > expected[name])
     unknown = [k for k, one in enumerate(left) if not one.header.floor_names]
     floor = None
     if unknown:
-        low = quiet_lines([left[k] for k in unknown], FLOOR_BAND_HZ, True,
+        low = quiet_lines([left[k] for k in unknown], SETTINGS.floor_band_Hz, True,
                           None if masks is None else [masks[k] for k in unknown])
         D = np.array([sensors[name].value ** 2 for name in first.y_names])
         floor = _floor(low, floor_response, D, ambient.floor_velocity_rms_m_per_s, rate)
     made = None if floor is None or not floor.ground_motion else _ground_motion(floor, first.y_names)
-    return NoiseLevels(floor, sensors, by_record, expected, made, raised, {one.record: one.kind for one in high})
+    return NoiseLevels(floor, sensors, by_record, made, raised, {one.record: one.kind for one in high})
 
 
 def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str
@@ -205,7 +225,7 @@ def _floor(low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarr
     estimated = [_floor_lines(one, floor_response, D) for one in low if len(one.left)]
     if not estimated:
         return None
-    white = ambient ** 2 / (FLOOR_BAND_HZ[1] - FLOOR_BAND_HZ[0]) * rate / 2
+    white = ambient ** 2 / (SETTINGS.floor_band_Hz[1] - SETTINGS.floor_band_Hz[0]) * rate / 2
     S, std = np.full((count, 3), np.nan), np.full((count, 3), np.inf)
     louder, foreign = _foreign(estimated, edges, len(D) - 3)
     for b in range(count):
@@ -214,7 +234,7 @@ def _floor(low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarr
             S[b], std[b] = _at_zero_level(rows)
     # Variance per line to one-sided density.
     S, std = S * 2 / rate, std * 2 / rate
-    visible = std < SEEN * white * 2 / rate + 0.5 * np.maximum(np.nan_to_num(S), 0.0)
+    visible = std < SETTINGS.seen * white * 2 / rate + 0.5 * np.maximum(np.nan_to_num(S), 0.0)
     return _level(S, std, visible, edges, ambient, foreign)
 
 
@@ -239,11 +259,11 @@ def _foreign(estimated: Sequence[tuple], edges: np.ndarray, n_out: int) -> tuple
 
 
 def _edges() -> np.ndarray:
-    """Thirds of an octave, but no band narrower than NARROWEST_HZ."""
-    edges = [FLOOR_BAND_HZ[0]]
-    while edges[-1] < FLOOR_BAND_HZ[1] * 0.9:
-        edges.append(max(edges[-1] * 2 ** (1 / PER_OCTAVE), edges[-1] + NARROWEST_HZ))
-    return np.array([*edges[:-1], FLOOR_BAND_HZ[1]])
+    """Thirds of an octave, but no band narrower than `narrowest_Hz`."""
+    edges = [SETTINGS.floor_band_Hz[0]]
+    while edges[-1] < SETTINGS.floor_band_Hz[1] * 0.9:
+        edges.append(max(edges[-1] * 2 ** (1 / SETTINGS.bands_per_octave), edges[-1] + SETTINGS.narrowest_Hz))
+    return np.array([*edges[:-1], SETTINGS.floor_band_Hz[1]])
 
 
 def _floor_lines(one: QuietLines, floor_response: FloorResponse, D: np.ndarray) -> tuple:
@@ -268,7 +288,7 @@ def _band(one: tuple, low: float, high: float, white: float, louder: float
     if np.count_nonzero(inside) < 4:
         return None
     # Lines of machines or mains in the sensors' signals stand out where no floor motion is seen.
-    inside &= outside <= LINE * np.median(outside[inside])
+    inside &= outside <= SETTINGS.line * np.median(outside[inside])
     # Noise that is no floor's is as loud in the range of G as outside it, seen from the sensors.
     P, N, h = power[inside], louder * noise[inside], left[inside][:, None]
     S = np.full(3, white)
@@ -323,11 +343,11 @@ def _level(S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarra
     mean, mean_seen = root(all2.mean(), all_v.sum() / 9), root(seen2.mean(), seen_v.sum() / 9)
 
     def above(one: Estimate, factor: float) -> bool:
-        return one.value > factor * ambient and one.value - SIGNIFICANT * one.std > ambient
-    significant = _excess(ambient, mean, mean_seen, seen) > SIGNIFICANT
-    clear = (any(above(one, SEEN_FACTOR) for one in (mean_seen, *seen.values()))
-             or any(above(one, TOTAL_FACTOR) for one in (mean, *rms.values())))
-    return FloorLevel(rms, seen, ends, mean, mean_seen, ambient, foreign, centre, S, std, significant, clear)
+        return one.value > factor * ambient and one.value - SETTINGS.significant * one.std > ambient
+    significant = _excess(ambient, mean, mean_seen, seen) > SETTINGS.significant
+    clear = (any(above(one, SETTINGS.seen_factor) for one in (mean_seen, *seen.values()))
+             or any(above(one, SETTINGS.total_factor) for one in (mean, *rms.values())))
+    return FloorLevel(rms, seen, ends, mean, mean_seen, ambient, foreign, centre, S, significant, clear)
 
 
 def _excess(ambient: float, mean: Estimate, mean_seen: Estimate, seen: dict[str, Estimate]) -> float:
@@ -337,11 +357,11 @@ def _excess(ambient: float, mean: Estimate, mean_seen: Estimate, seen: dict[str,
 
 def _tail(f: np.ndarray, S: np.ndarray, std: np.ndarray, end: float) -> tuple[float, float]:
     """Power above `end` of a power law a f^-s fitted below, and its standard error over slopes that fit."""
-    if end >= FLOOR_BAND_HZ[1] * (1 - 1e-9):
+    if end >= SETTINGS.floor_band_Hz[1] * (1 - 1e-9):
         return 0.0, 0.0
     slopes = np.linspace(0.0, 6.0, 61)
     shape = f[None, :] ** -slopes[:, None]
-    x = np.geomspace(end, FLOOR_BAND_HZ[1], 200)
+    x = np.geomspace(end, SETTINGS.floor_band_Hz[1], 200)
     integral = np.trapezoid(x[None, :] ** -slopes[:, None], x, axis=1)
     w = 1 / std ** 2
     a_var = 1 / (shape ** 2 @ w)
@@ -369,7 +389,7 @@ def _raised(name: str, found: Estimate, expected: float, by_record: dict[str, di
 
 
 def _ground_motion(floor: FloorLevel, names: tuple[str, ...]) -> GroundMotionFinding:
-    flat = floor.ambient ** 2 / (FLOOR_BAND_HZ[1] - FLOOR_BAND_HZ[0])
+    flat = floor.ambient ** 2 / (SETTINGS.floor_band_Hz[1] - SETTINGS.floor_band_Hz[0])
     density = np.sqrt(np.maximum(np.nan_to_num(floor.density), 1e-30))
     series = tuple(Series(f"floor {axis}", floor.frequency_Hz, density[:, j]) for j, axis in enumerate(DIRECTIONS))
     picture = Picture("Floor velocity that explains what u and sensor noise do not", "frequency [Hz]",

@@ -1,7 +1,7 @@
 """Lines of a record that hold noise alone, whatever the drives do and whatever the model lacks.
 
 Periodic records: lines at least two away from every harmonic of the period, which a Hann window keeps free of all that
-answers u periodically, nonlinear or not. Records at rest: all lines. Others: what a local linear regression of the
+responds to u periodically, nonlinear or not. Records at rest: all lines. Others: what a local linear regression of the
 residual on u leaves, jointly over the records, with a response that is a parabola in frequency over each window
 (Pintelon and Schoukens 2012, section 7.2), so that dynamics that the model lacks are not taken for noise.
 """
@@ -13,18 +13,37 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avis_ctrl.gap.signals.leftover import Leftover
+from avis_ctrl.gap.signals.record_residual import RecordResidual
 
-# Periods from which lines between the harmonics are used.
-LEAST_PERIODS = 4
-# Windows [lines], and order of the response over them: narrow where modes are, wide far above.
-NARROW, WIDE, ORDER = 15, 120, 2
-# A line counts if the regression leaves this part of its noise at least.
-LEAST_LEFT = 0.2
-# Rounds of weighting records by their noise, and windows over which that is averaged.
-ROUNDS, SMOOTHED = 2, 9
-# Power of a line by the median of its window above which it is no noise: exponential noise is once in 1e12.
-OUTLIER = 40.0
+
+@dataclass(frozen=True)
+class QuietLineSettings:
+    """Of the lines that hold noise alone.
+
+    least_periods : periods from which lines between the harmonics are used: with fewer, none is two lines away from
+        every harmonic.
+    narrow : window of the local regression where modes are [lines]: their response is a parabola over it.
+    wide : window far above the modes [lines]: many data for each parameter.
+    order : order of the response over a narrow window [1].
+    least_left : a line counts if the regression leaves this fraction of its noise at least [1]: below, its level
+        hangs on the model of the window.
+    rounds : rounds of weighting records by their noise: louder ones must not spoil the others.
+    smoothed : windows over which that weight is averaged.
+    outlier : power of a line over the median of its window above which it is no noise [1]: exponential noise is
+        once in 1e12.
+    """
+
+    least_periods: int = 4
+    narrow: int = 15
+    wide: int = 120
+    order: int = 2
+    least_left: float = 0.2
+    rounds: int = 2
+    smoothed: int = 9
+    outlier: float = 40.0
+
+
+SETTINGS = QuietLineSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +66,7 @@ class QuietLines:
         return np.abs(self.e) ** 2 / self.left[:, None]
 
 
-def quiet_lines(left: Sequence[Leftover], band_Hz: tuple[float, float], narrow: bool,
+def quiet_lines(left: Sequence[RecordResidual], band_Hz: tuple[float, float], narrow: bool,
                 polluted: Sequence[np.ndarray] | None = None) -> tuple[QuietLines, ...]:
     """Of each record, in a band.
 
@@ -65,7 +84,7 @@ def quiet_lines(left: Sequence[Leftover], band_Hz: tuple[float, float], narrow: 
         level = float(np.sqrt(np.mean(one.u ** 2)))
         if one.silent:
             found[k] = _plain(one, "rest", level, keep)
-        elif one.periods >= LEAST_PERIODS:
+        elif one.periods >= SETTINGS.least_periods:
             away = np.arange(len(keep)) % one.periods
             found[k] = _plain(one, "between harmonics", level, keep & (away >= 2) & (away <= one.periods - 2))
         else:
@@ -76,16 +95,16 @@ def quiet_lines(left: Sequence[Leftover], band_Hz: tuple[float, float], narrow: 
     return tuple(found[k] for k in range(len(left)))
 
 
-def _plain(one: Leftover, kind: str, level: float, keep: np.ndarray) -> QuietLines:
+def _plain(one: RecordResidual, kind: str, level: float, keep: np.ndarray) -> QuietLines:
     return QuietLines(one.header.name, kind, level, one.frequency_Hz[keep], one.E[keep], np.ones(int(keep.sum())))
 
 
-def _regression(left: Sequence[Leftover], keep: Sequence[np.ndarray], narrow: bool) -> list[QuietLines]:
+def _regression(left: Sequence[RecordResidual], keep: Sequence[np.ndarray], narrow: bool) -> list[QuietLines]:
     """Residuals of e on u, (1, x, x^2) u over each window of lines common to the records, with what they are left."""
     lines = np.flatnonzero(np.any(keep, axis=0))
     n_u, R = left[0].u.shape[1], len(left)
-    order = ORDER if narrow else 1
-    width = NARROW if narrow else WIDE
+    order = SETTINGS.order if narrow else 1
+    width = SETTINGS.narrow if narrow else SETTINGS.wide
     # One parameter in two data at most, so that noise is left.
     width = max(width, int(np.ceil(2 * (order + 1) * n_u / R)))
     blocks = len(lines) // width
@@ -102,17 +121,17 @@ def _regression(left: Sequence[Leftover], keep: Sequence[np.ndarray], narrow: bo
     E = np.stack([one.E[at] for one in left], axis=1).reshape(blocks, R * width, -1)
     size, lines_of_noise = np.ones((blocks, R)), np.ones((blocks, R, width), bool)
     # Records that clip or distort are louder: weighted by what they leave, they do not spoil the others.
-    for _ in range(ROUNDS):
+    for _ in range(SETTINGS.rounds):
         weight = np.where(lines_of_noise, 1 / size[:, :, None], 1e-4 / size[:, :, None]).reshape(blocks, -1)
         rest, share = _residual(A, E, weight, R)
         line = np.sum(np.abs(rest) ** 2, axis=3)
         # Lines of machines or mains would be spread over their window.
-        lines_of_noise &= line <= OUTLIER * np.median(line, axis=2, keepdims=True)
+        lines_of_noise &= line <= SETTINGS.outlier * np.median(line, axis=2, keepdims=True)
         power = np.sum(line * lines_of_noise, axis=2) / np.maximum(np.sum(share * lines_of_noise, axis=2), 1e-3 * width)
-        size = np.sqrt(_running_mean(power, SMOOTHED)) + 1e-300
+        size = np.sqrt(_running_mean(power, SETTINGS.smoothed)) + 1e-300
     made = []
     for k, one in enumerate(left):
-        good = (share[:, k] > LEAST_LEFT) & keep[k][at] & lines_of_noise[:, k]
+        good = (share[:, k] > SETTINGS.least_left) & keep[k][at] & lines_of_noise[:, k]
         made.append(QuietLines(one.header.name, "regression on u", empty[k].level, one.frequency_Hz[at[good]],
                                rest[:, k][good], share[:, k][good]))
     return made

@@ -3,7 +3,7 @@
 A clipped sample says only that the true value lies beyond the limit. Its expectation given the model is the prediction
 where that lies beyond the limit too, and close to the limit otherwise: the E step of expectation maximisation for
 censored data (Dempster, Laird and Rubin 1977, section 4.2), with noise small against the excess. Refit, predict and
-repair again until the share and the parameters stand still.
+repair again until the parameters stand still.
 """
 
 from __future__ import annotations
@@ -23,14 +23,11 @@ from avis_ctrl.rigs.rig import Rig
 class Repaired:
     """A campaign in memory.
 
-    clipped, replaced : shares of the samples of y of each channel, over all records, that lie at its limits, and that
-    the model puts beyond them. drive_clipped : share of the samples of u beyond the drive's limit.
+    clipped : fraction of the samples of y of each channel, over all records, that lie at its limits.
     """
 
     campaign: Campaign
     clipped: dict[str, float]
-    replaced: dict[str, float]
-    drive_clipped: float
 
 
 def channel_limits(rig: Rig, names: tuple[str, ...], findings: tuple[ConverterFinding, ...] = ()
@@ -65,7 +62,7 @@ def repair(campaign: Campaign, rig: Rig, predicted: Mapping[str, np.ndarray] | N
     limits = channel_limits(rig, names, findings)
     low, high = (np.array([limits[name][k] for name in names]) for k in (0, 1))
     margin = nominal_converter(rig).lsb_V / 2
-    at, beyond, samples, drive, driven = np.zeros(len(names)), np.zeros(len(names)), 0, 0, 0
+    at, samples = np.zeros(len(names)), 0
     records = []
     for source in campaign.records:
         record = source.load()
@@ -75,15 +72,9 @@ def repair(campaign: Campaign, rig: Rig, predicted: Mapping[str, np.ndarray] | N
         samples += len(y)
         if predicted is not None and record.header.name in predicted:
             model = _checked(record, predicted[record.header.name])
-            swap = (top & (model > y)) | (bottom & (model < y))
-            beyond += np.count_nonzero(swap, axis=0)
-            y = np.where(swap, model, y)
-        u = drive_limited(record.u, rig.limits_of(record.header.u_names))
-        drive += int(np.count_nonzero(u != record.u))
-        driven += u.size
-        records.append(replace(record, u=u, y=y))
-    return Repaired(replace(campaign, records=tuple(records)), dict(zip(names, (at / samples).tolist(), strict=True)),
-                    dict(zip(names, (beyond / samples).tolist(), strict=True)), drive / max(driven, 1))
+            y = np.where((top & (model > y)) | (bottom & (model < y)), model, y)
+        records.append(replace(record, u=drive_limited(record.u, rig.limits_of(record.header.u_names)), y=y))
+    return Repaired(replace(campaign, records=tuple(records)), dict(zip(names, (at / samples).tolist(), strict=True)))
 
 
 def drive_limited(u: np.ndarray, limits_V: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.result import Gap, NamedEffect
-from avis_ctrl.gap.together import only_together
+from avis_ctrl.gap.table_model import inseparable_parameters
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.finding import Found
@@ -26,7 +26,7 @@ def parameters(found: Found) -> Section:
         pieces.append(Paragraph("No effect is named: the updated model is the rig within its tolerances."))
     if len(gap.baseline.values):
         both = " and updated" if gap.effects else ""
-        groups = only_together(gap.baseline)
+        groups = inseparable_parameters(gap.baseline)
         pieces.append(Fold(f"The rig's own parameters, re-identified{both}",
                            (_rig(gap, groups), *_together(groups), *_always(gap))))
     if gap.tolerances:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from avis_ctrl.gap.in_words import spoken
-from avis_ctrl.gap.result import Detectable, Gap
+from avis_ctrl.gap.result import Detectable, Gap, spoken
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.finding import Found

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, Reported, library
-from avis_ctrl.gap.in_words import spoken
-from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Where
+from avis_ctrl.gap.effects.base import Effect, Reported
+from avis_ctrl.gap.effects.library import library
+from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Where, spoken
 from avis_ctrl.report import words
 
 # What each verdict claims, and what it does not.

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Seed
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.motion import RecordMotion
-    from avis_ctrl.gap.score import Part, Score
-    from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table
+from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.gap.score import Part, Score
+from avis_ctrl.gap.starting_values import Seed
 
 
 class Beyond(Effect):
@@ -39,7 +36,7 @@ class FirstOrder(Beyond):
             found.append(Seed(tuple(float(v) for v in values), took.chi2, took.rank, len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
 
-    def _begin(self, model: TableModel, place: str, point: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    def _begin(self, model: Table, place: str, point: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
         parameters, values = self.parameters(model, place), np.array(point, float)
         linear = [j for j, one in enumerate(parameters) if one.linear]
         for j, c in zip(linear, coefficients, strict=True):
@@ -62,7 +59,7 @@ def by_volts(part: Part) -> np.ndarray:
     """(n, n_y, n_u) y by the volts of each motor."""
     kept = part.__dict__.get("by_volts")
     if kept is None:
-        kept = part.answer.left @ (part.made.T * part.made.volts[:, None, :])
+        kept = part.response.left @ (part.made.T * part.made.volts[:, None, :])
         part.__dict__["by_volts"] = kept
     return kept
 
@@ -91,5 +88,5 @@ class Late(FirstOrder):
     def seeds(self, score: Score, place: str) -> list[Seed]:
         return [seed for seed in super().seeds(score, place) if any(seed.values)]
 
-    def _begin(self, model: TableModel, place: str, point: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    def _begin(self, model: Table, place: str, point: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
         return np.full(2, max(float(np.sum(coefficients)), 0.0) / 2)

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter
+from avis_ctrl.gap.effects.base import EffectParameter, Table
 from avis_ctrl.gap.effects.beyond.base import FirstOrder, Late, at, by_volts, late, motion, pairs, timing
 from avis_ctrl.gap.effects.mounts import largest_rms
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.motion import RecordMotion
-    from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.score import Part
-    from avis_ctrl.gap.table_model import TableModel
-
+from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.gap.score import Part
 
 ALL = "all motors"
 
@@ -28,10 +23,10 @@ class MotorLate(Late):
     name = "motor_late"
     title = "one motor is later than the others (a lag or a delay of its own)"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return model.actuators
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return timing("motor")
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -54,13 +49,13 @@ class _Drive(FirstOrder):
     nonlinear = True
 
     @abstractmethod
-    def strength_of(self, model: TableModel, place: str) -> EffectParameter: ...
+    def strength_of(self, model: Table, place: str) -> EffectParameter: ...
 
     def added(self, record: RecordMotion) -> np.ndarray:
         """(samples, n_u) V on all motors for a strength of one."""
         raise NotImplementedError
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (self.strength_of(model, place),)
 
     def volts_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
@@ -84,10 +79,10 @@ class DriveCrosstalk(_Drive):
     name = "drive_crosstalk"
     title = "a share of one motor's voltage on another"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return pairs(model.actuators)
 
-    def strength_of(self, model: TableModel, place: str) -> EffectParameter:
+    def strength_of(self, model: Table, place: str) -> EffectParameter:
         return EffectParameter("share", "1", "share of the other's voltage", 0.0, -2.0, 2.0, 0.01)
 
     def _unit(self, record: RecordMotion, place: str, omega: np.ndarray) -> np.ndarray:
@@ -112,7 +107,7 @@ class _DriveLaw(_Drive):
     unit = ""
     power = 0
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return (ALL, *model.actuators)
 
     def law(self, u: np.ndarray) -> np.ndarray:
@@ -121,7 +116,7 @@ class _DriveLaw(_Drive):
     def added(self, record: RecordMotion) -> np.ndarray:
         return self.law(record.volts)
 
-    def strength_of(self, model: TableModel, place: str) -> EffectParameter:
+    def strength_of(self, model: Table, place: str) -> EffectParameter:
         size = 0.01 / largest_volts(model) ** self.power
         return EffectParameter("strength", self.unit, self.words, 0.0, -1e3 * size, 1e3 * size, size)
 
@@ -129,7 +124,7 @@ class _DriveLaw(_Drive):
         return f"the force of {place} not in proportion to voltage, with a term in {self.words}"
 
 
-def largest_volts(model: TableModel) -> float:
+def largest_volts(model: Table) -> float:
     """Largest r.m.s. of a voltage in any record; one where none is known."""
     return max((one.largest_volts for one in model.motion.values()), default=1.0) or 1.0
 
@@ -168,7 +163,7 @@ class DeadZone(_DriveLaw):
     name = "dead_zone"
     title = "a dead zone of the drives"
 
-    def strength_of(self, model: TableModel, place: str) -> EffectParameter:
+    def strength_of(self, model: Table, place: str) -> EffectParameter:
         size = 0.01 * largest_volts(model)
         return EffectParameter("half_width_V", "V", "half width of the dead zone", 0.0, 0.0, 300 * size, size)
 
@@ -190,11 +185,11 @@ class DeadZone(_DriveLaw):
 class _OfDeflection(_Drive):
     power = 1
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         known = [one for one in model.motion.values() if len(one.driven_rows) == one.volts.shape[1]]
         return (ALL,) if known else ()
 
-    def strength_of(self, model: TableModel, place: str) -> EffectParameter:
+    def strength_of(self, model: Table, place: str) -> EffectParameter:
         size = 0.01 / largest_rms(model) ** self.power
         return EffectParameter("strength", "1/m" if self.power == 1 else "1/m^2", "of the force constant by deflection",
                                0.0, -1e3 * size, 1e3 * size, size)
@@ -224,10 +219,10 @@ class ForceDrift(_Drive):
     name = "force_drift"
     title = "force constants that drift over the campaign"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return (ALL,)
 
-    def strength_of(self, model: TableModel, place: str) -> EffectParameter:
+    def strength_of(self, model: Table, place: str) -> EffectParameter:
         return EffectParameter("relative_change", "1", "of every force constant over the campaign", 0.0, -0.9, 0.9,
                                0.01)
 

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter
+from avis_ctrl.gap.effects.base import EffectParameter, Table
 from avis_ctrl.gap.effects.beyond.base import FirstOrder, Late, at, late, motion, only, pairs, timing
 from avis_ctrl.gap.effects.sensors import receptance
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.motion import RecordMotion
-    from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.score import Part
-    from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.gap.score import Part
 
 
 def mix(ops: Operators, into: str, shares: Mapping[str, float]) -> None:
@@ -35,10 +31,10 @@ class SensorCrosstalk(FirstOrder):
     name = "sensor_crosstalk"
     title = "a share of one sensor's signal in another's"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return pairs(model.sensors.names)
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("share", "1", "share of the other's signal", 0.0, -2.0, 2.0, 0.01),)
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -48,7 +44,7 @@ class SensorCrosstalk(FirstOrder):
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
         names = part.model.sensors.names
         j, i = (names.index(name) for name in place.split("/"))
-        return only(part.answer.Y, j, part.answer.Y[:, i])
+        return only(part.response.Y, j, part.response.Y[:, i])
 
     def said(self, place: str, values: Mapping[str, float]) -> str:
         j, i = place.split("/")
@@ -61,10 +57,10 @@ class SensorCrosstalkOfAll(FirstOrder):
     name = "sensor_crosstalk_of_all"
     title = "shares of all sensors' signals in one"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return model.sensors.names if len(model.sensors.names) > 2 else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return tuple(EffectParameter(f"share_of_{name}", "1", f"share of {name}'s signal", 0.0, -2.0, 2.0, 0.01)
                      for name in model.sensors.names if name != place)
 
@@ -72,7 +68,7 @@ class SensorCrosstalkOfAll(FirstOrder):
         mix(ops, place, {name.removeprefix("share_of_"): share for name, share in values.items()})
 
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
-        names, Y = part.model.sensors.names, part.answer.Y
+        names, Y = part.model.sensors.names, part.response.Y
         j = names.index(place)
         return np.concatenate([only(Y, j, Y[:, i]) for i in range(len(names)) if i != j])
 
@@ -86,10 +82,10 @@ class SensorLate(Late):
     name = "sensor_late"
     title = "one sensor is later than the others (a low pass or a delay of its own)"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return model.sensors.names
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return timing("sensor")
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -97,7 +93,7 @@ class SensorLate(Late):
 
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
         j = part.model.sensors.names.index(place)
-        return np.repeat(only(part.answer.Y, j, -part.s[:, 0] * part.answer.Y[:, j]), 2, axis=0)
+        return np.repeat(only(part.response.Y, j, -part.s[:, 0] * part.response.Y[:, j]), 2, axis=0)
 
     def said(self, place: str, values: Mapping[str, float]) -> str:
         return f"a low pass or a delay of {place} alone"
@@ -109,10 +105,10 @@ class SensorResonance(FirstOrder):
     name = "sensor_resonance"
     title = "a resonance of one sensor (a spurious mode, its holder)"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return model.sensors.names
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("share", "1", "of the resonance in the output", 0.0, -5.0, 5.0, 0.01),
                 EffectParameter("frequency_Hz", "Hz", "of the resonance", 0.0, 0.5, 400.0, 1.0, False,
                                 tuple(np.geomspace(8.0, 90.0, 10))),
@@ -129,7 +125,7 @@ class SensorResonance(FirstOrder):
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
         j = part.model.sensors.names.index(place)
         shape = self._shape(part.s[:, 0], float(point[1]), float(point[2]))
-        return only(part.answer.Y, j, shape * part.answer.Y[:, j])
+        return only(part.response.Y, j, shape * part.response.Y[:, j])
 
     def said(self, place: str, values: Mapping[str, float]) -> str:
         return f"a resonance of {place} alone at {values['frequency_Hz']:.3g} Hz"
@@ -141,7 +137,7 @@ class _Output(FirstOrder):
     nonlinear = True
     parameter: EffectParameter
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (self.parameter,)
 
     @abstractmethod
@@ -166,7 +162,7 @@ class _OfOneOutput(_Output):
     law: Callable[[np.ndarray], np.ndarray]
     words: str
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         known = [one for one in model.motion.values() if one.y.size]
         return model.sensors.names if known else ()
 
@@ -204,7 +200,7 @@ class ClockRate(_Output):
     title = "outputs and inputs run on clocks of different rate"
     parameter = EffectParameter("relative", "1", "rate of one clock over the other's, less one", 0.0, -0.01, 0.01, 1e-6)
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("loop",) if any(one.y.size for one in model.motion.values()) else ()
 
     def signals(self, record: RecordMotion) -> np.ndarray:

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter
+from avis_ctrl.gap.effects.base import EffectParameter, Table
 from avis_ctrl.gap.effects.beyond.base import Beyond
 from avis_ctrl.gap.effects.mounts import has_mounts, largest_rms
-from avis_ctrl.gap.operators import mount_geometry
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.motion import RecordMotion
-    from avis_ctrl.gap.operators import Operators
-    from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.gap.operators import Operators, mount_geometry
+from avis_ctrl.gap.record_motion import RecordMotion
 
 
 class QuadraticStiffness(Beyond):
@@ -26,10 +21,10 @@ class QuadraticStiffness(Beyond):
     nonlinear = True
     strength = "k2_N_per_m2"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("isolators z",) if has_mounts(model) else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model)
         return (EffectParameter("k2_N_per_m2", "N/m^2", "quadratic stiffness of each mount", 0.0, -1e4 * size,
                                 1e4 * size, size),)
@@ -50,10 +45,10 @@ class QuadraticDrag(Beyond):
     nonlinear = True
     strength = "drag_Ns2_per_m2"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("payload",) if has_mounts(model) else ()
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 10.0 / max(largest_rms(model) * 10.0, 1e-9)
         return (EffectParameter("drag_Ns2_per_m2", "N s^2/m^2", "of the payload", 0.0, -1e4 * size, 1e4 * size, size),)
 
@@ -73,10 +68,10 @@ class Gyroscope(Beyond):
     name = "gyroscope"
     title = "a rotor on the payload"
 
-    def places(self, model: TableModel) -> tuple[str, ...]:
+    def places(self, model: Table) -> tuple[str, ...]:
         return ("payload",)
 
-    def parameters(self, model: TableModel, place: str) -> tuple[EffectParameter, ...]:
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return tuple(EffectParameter(f"h{axis}_Nms", "N m s", f"angular momentum about {axis}", 0.0, -1e6, 1e6, 1.0)
                      for axis in "xyz")
 

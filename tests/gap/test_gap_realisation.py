@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.additions import LADDER_ERROR, LADDER_Hz, Table, impedance, ladder
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, library
+from avis_ctrl.gap.effects.base import Effect, EffectParameter
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.mounts import REFERENCE_Hz
 from avis_ctrl.gap.operators import assemble
-from avis_ctrl.gap.realise import CHECK_Hz, realise, sufficient_order, with_effects
+from avis_ctrl.gap.realisation import realise, sufficient_order, with_effects
+from avis_ctrl.gap.state_space import SETTINGS, ReducedTable, impedance, ladder
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.lti.statespace import gain
@@ -196,9 +197,9 @@ def test_constant_complex_stiffness_is_not_claimed(plain):
 def test_the_ladder_is_passive_and_follows_the_power(power):
     rest, branches = ladder(power)
     assert rest >= 0 and all(w > 0 and ratio > 0 for w, ratio in branches)
-    s = 2j * np.pi * np.geomspace(*LADDER_Hz, 333)
+    s = 2j * np.pi * np.geomspace(*SETTINGS.ladder_Hz, 333)
     made = rest + sum(ratio * s / (s + w) for w, ratio in branches)
-    assert np.max(np.abs(made / (s / (2 * np.pi * REFERENCE_Hz)) ** power - 1)) < 1.1 * LADDER_ERROR
+    assert np.max(np.abs(made / (s / (2 * np.pi * REFERENCE_Hz)) ** power - 1)) < 1.1 * SETTINGS.ladder_error
     assert np.all(made.imag > 0)
 
 
@@ -263,7 +264,7 @@ class _Skyhook(Effect):
 
 
 class _WithStates(_Skyhook):
-    def addition(self, table: Table, place, values):
+    def addition(self, table: ReducedTable, place, values):
         g = table.rows(np.eye(6)[2:3])
         return impedance(table, values["damping_Ns_per_m"] * g.T @ g, gain([[1.0]]), "v")
 
@@ -274,4 +275,4 @@ def test_effects_of_the_users_own(plain):
     assert "left out" in left_out.notes[0] and left_out.error > 0.1
     held = realise(replace(plain, effects=(active(_WithStates(), plain, "payload", (2e4,)),)))
     assert held.notes == () and held.error < 1e-9
-    assert held.omega == pytest.approx(2 * np.pi * CHECK_Hz)
+    assert held.omega == pytest.approx(2 * np.pi * np.geomspace(*SETTINGS.check_Hz))

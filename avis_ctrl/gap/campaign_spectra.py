@@ -22,13 +22,26 @@ from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.prediction_error import prediction_error
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import SpectralBlock, record_block
+from avis_ctrl.identification.spectra import record_block
+from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 
-# Bands to the octave in which silent lines are weighted by what is left of them, and how often.
-PER_OCTAVE, WEIGHTINGS = 2, 4
-# Periods of a record from which the first one may be left to the transient.
-SETTLED = 3
+
+@dataclass(frozen=True)
+class SilentLineSettings:
+    """Of lines on which the drives are silent.
+
+    bands_per_octave : bands to the octave in which these lines are weighted by what is left of them.
+    weightings : how often these weights are formed anew, from equal ones on.
+    settled : periods of a record from which the first one may be left to the transient.
+    """
+
+    bands_per_octave: int = 2
+    weightings: int = 4
+    settled: int = 3
+
+
+SETTINGS = SilentLineSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +130,7 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campai
 def all_silent(campaign: Campaign, blocks: Sequence[SpectralBlock]) -> bool:
     """Whether `with_noise` finds lines on which the drives are silent for every kind of block."""
     kinds = {"floor measured" if r.header.floor_names else "floor not measured" for r in campaign.records
-             if (r.header.period_samples and r.header.periods >= SETTLED) or not driven_inputs(r)}
+             if (r.header.period_samples and r.header.periods >= SETTINGS.settled) or not driven_inputs(r)}
     return {block.kind for block in blocks} <= kinds
 
 
@@ -144,7 +157,7 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
     """What the model leaves on lines without drive: of a record at rest all, of a periodic one those between its
     harmonics, once the first period has carried the transient of the start away. None where there are none."""
     h = record.header
-    if h.period_samples and h.periods >= SETTLED:
+    if h.period_samples and h.periods >= SETTINGS.settled:
         segment = record.load(h.period_samples, h.periods * h.period_samples)
         block = record_block(segment, model.base, band_Hz)
         lines = np.rint(block.omega * segment.header.samples / (2 * np.pi * h.sample_rate_Hz)).astype(int)
@@ -157,9 +170,9 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
     # What the ends of the record leave is found by weighted least squares: where the noise falls with frequency, equal
     # weights would leave of it, everywhere, as much as the noise where it is largest.
     power = np.broadcast_to(np.mean(np.abs(block.Y) ** 2, axis=(0, 2)), block.Y.shape[:2])
-    octave = np.floor(PER_OCTAVE * np.log2(block.omega / block.omega[0])).astype(int)
+    octave = np.floor(SETTINGS.bands_per_octave * np.log2(block.omega / block.omega[0])).astype(int)
     lines = np.maximum(np.bincount(octave), 1)
-    for _ in range(WEIGHTINGS):
+    for _ in range(SETTINGS.weightings):
         weights = power[:, :, None] * np.eye(power.shape[1])
         left = prediction_error(cast(ResponseModel, model), block.with_noise(weights.astype(complex)), derivative=False)
         found = np.mean(np.abs(left.error) ** 2, axis=2)

@@ -1,10 +1,10 @@
 """Forces that depend on the motion that they make: d = d_0 + h * f(d), solved from sample to sample.
 
-d_0 is the deflection without the forces, h the answer of the linear part to a force that runs straight between samples.
-A fixed point over a whole record diverges wherever f is not small beside a lightly damped mount. Here time is cut into
-windows so short that within one the fixed point contracts, whatever f; what earlier windows leave for later ones is
-added in blocks that double in length (fast convolution of a sequence that is only known up to now: Hairer, Lubich and
-Schlichte, SIAM J. Sci. Stat. Comput. 6, 1985).
+d_0 is the deflection without the forces, h the response of the linear part to a force that runs straight between
+samples. A fixed point over a whole record diverges wherever f is not small beside a lightly damped mount. Here time is
+cut into windows so short that within one the fixed point contracts, whatever f; what earlier windows leave for later
+ones is added in blocks that double in length (fast convolution of a sequence that is only known up to now: Hairer,
+Lubich and Schlichte, SIAM J. Sci. Stat. Comput. 6, 1985).
 """
 
 from __future__ import annotations
@@ -18,24 +18,36 @@ import scipy.fft
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.gap.effects.mounts import ContactFriction, dahl, pushed
 from avis_ctrl.gap.line_response import LineResponse
-from avis_ctrl.gap.motion import RecordMotion
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.identification.response import N_Q
 
-# Length of a window [s]: about a radian of the fastest motion of a mount with friction at rest.
-WINDOW_s = 0.05
-# A window is done when its deflection changes by less than this share of the largest one so far.
-WINDOW_TOLERANCE = 1e-9
-MOST_ITERATIONS = 40
-# Into so many pieces a window is cut where it does not contract; 2^20 for single samples.
-PIECES = (1, 8, 1 << 20)
+
+@dataclass(frozen=True)
+class MarchSettings:
+    """Of marching through windows of time.
+
+    window_s : length of a window [s]: about a radian of the fastest motion of a mount with friction at rest.
+    tolerance : a window is done when its deflection changes by less than this fraction of the largest one so far
+        [1].
+    most_iterations : fixed-point iterations in a window before it is cut into more pieces.
+    pieces : into so many pieces a window is cut where it does not contract; 2^20 for single samples.
+    """
+
+    window_s: float = 0.05
+    tolerance: float = 1e-9
+    most_iterations: int = 40
+    pieces: tuple[int, ...] = (1, 8, 1 << 20)
 
 
-class Answer:
+SETTINGS = MarchSettings()
+
+
+class ForceResponse:
     """Motion z (c,) by a force (6,) at the samples; z holds x, and the chassis where it recoils.
 
     shape : (n_g, c) deflection by z.
-    The force is a straight line between samples: sinc^2 of the continuous answer, and what sampling folds, known in
+    The force is a straight line between samples: sinc^2 of the continuous response, and what sampling folds, known in
     closed form for the mass alone: T^2/6 (z + 4 + 1/z)/(z - 2 + 1/z) in the place of 1/s^2.
     """
 
@@ -57,7 +69,7 @@ class Answer:
             if k < N_Q:
                 column += self.alias[:, None] * self.by_mass[k]
             impulse[:, k] = scipy.fft.irfft(column, response.padded, axis=0)[:response.samples]
-        window = 1 << max(4, round(np.log2(WINDOW_s * response.sample_rate_Hz)))
+        window = 1 << max(4, round(np.log2(SETTINGS.window_s * response.sample_rate_Hz)))
         self.own = scipy.fft.rfft(impulse[:window], 2 * window, axis=0)
         self.window, self.levels, length = window, [], window
         while length < max(response.samples, 2 * window):
@@ -160,7 +172,7 @@ class Marched:
     iterations: int
 
 
-def march(answer: Answer, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,
+def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,
           beyond: np.ndarray | float = 0.0) -> Marched:
     """Solve z = free + h * f(z) from rest.
 
@@ -174,8 +186,8 @@ def march(answer: Answer, free: np.ndarray, effects: Sequence[ActiveEffect], rec
     ComputationError : a motion that grows without bound.
     """
     forces = [(FrictionForce if type(one.effect) is ContactFriction else WindowForce)(one, record) for one in effects]
-    beyond = np.broadcast_to(beyond, (len(free), len(answer.shape)))
-    z, W, samples = free.copy(), answer.window, len(free)
+    beyond = np.broadcast_to(beyond, (len(free), len(by_force.shape)))
+    z, W, samples = free.copy(), by_force.window, len(free)
     total, most, largest = np.zeros((samples, N_Q)), 0, float(np.max(np.abs(record.deflection), initial=0.0))
     for start in range(0, samples, W):
         stop = min(start + W, samples)
@@ -183,9 +195,9 @@ def march(answer: Answer, free: np.ndarray, effects: Sequence[ActiveEffect], rec
             level = (start // W & -(start // W)).bit_length() - 1
             B = W << level
             end = min(start + B, samples)
-            z[start:end] += answer.after(total[start - B:start], level)[:end - start]
-        window = _Window(answer, record, forces, beyond, start, stop, WINDOW_TOLERANCE * largest)
-        for piece in PIECES:
+            z[start:end] += by_force.after(total[start - B:start], level)[:end - start]
+        window = _Window(by_force, record, forces, beyond, start, stop, SETTINGS.tolerance * largest)
+        for piece in SETTINGS.pieces:
             if (done := window.solve(z[start:stop], max(W // piece, 1))) is not None:
                 break
         else:
@@ -201,7 +213,7 @@ def march(answer: Answer, free: np.ndarray, effects: Sequence[ActiveEffect], rec
 class _Window:
     """Samples start .. stop, solved whole or in pieces one after the other."""
 
-    answer: Answer
+    by_force: ForceResponse
     record: RecordMotion
     forces: Sequence[WindowForce]
     beyond: np.ndarray
@@ -218,9 +230,9 @@ class _Window:
             b = min(a + piece, length)
             here = slice(self.start + a, self.start + b)
             before = None
-            for iteration in range(1, MOST_ITERATIONS + 1):
-                z = free + self.answer.within(push[:b], length)
-                deflection = z[a:b] @ self.answer.shape.T + self.beyond[here]
+            for iteration in range(1, SETTINGS.most_iterations + 1):
+                z = free + self.by_force.within(push[:b], length)
+                deflection = z[a:b] @ self.by_force.shape.T + self.beyond[here]
                 change = np.inf if before is None else float(np.max(np.abs(deflection - before)))
                 self.record.deflection[here] = before = deflection
                 if change <= self.tolerance:
@@ -250,6 +262,7 @@ def _without_bound(effects: Sequence[ActiveEffect], record: RecordMotion, start:
     peak = float(np.max(np.abs(record.deflection[:start]), initial=0.0))
     values = ", ".join(f"{one.label} {one.by_name}" for one in effects)
     return ComputationError(f"the table with {values} finds no motion at {start / record.sample_rate_Hz:.3g} s",
-                            measured=f"up to {peak:.3g} m of deflection before; {MOST_ITERATIONS} iterations a sample",
+                            measured=f"up to {peak:.3g} m of deflection before; {SETTINGS.most_iterations} iterations "
+                                     "a sample",
                             cause="an effect that pushes harder the farther the table moves, or that is far stiffer "
                                   "than a mount", next_step="other values of the effect's parameters, or a lower level")

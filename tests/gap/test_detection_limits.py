@@ -7,8 +7,8 @@ import pytest
 from noise_fit import fitted
 from test_score import MODEL, block, effect
 
-from avis_ctrl.gap.detectable import detectable
-from avis_ctrl.gap.effects.base import library
+from avis_ctrl.gap.detection_limits import detection_limits
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.parameter_sets import default_parameters
@@ -19,7 +19,7 @@ OWN = library()
 
 def limits(model, blocks, effects):
     """Of five standard deviations by noise."""
-    return detectable(Score(model, blocks), effects)
+    return detection_limits(Score(model, blocks), effects)
 
 
 def nothing_missing(seed=1):

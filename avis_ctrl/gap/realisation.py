@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.additions import Table, addition, chassis, has_addition
 from avis_ctrl.gap.effects.sensors import GRAVITY, suspensions
 from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.state_space import SETTINGS, ReducedTable, addition, chassis, has_addition
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.sampling import hold
 from avis_ctrl.lti.connect import connect
@@ -27,8 +27,6 @@ from avis_ctrl.rigs.geophone import second_order_roots
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.uncertainty.uncertain_rig import edge_name, uncertain_rig
 
-# Grid on which a realisation is compared with the model's response.
-CHECK_Hz = np.geomspace(0.3, 100.0, 120)
 FLOOR = ("vx", "vy", "vz")
 # Effects that act through rig parameters, sensors or drives, and on signals alone.
 _ELSEWHERE = {"com_offset", "product_of_inertia", "geophone_corner", "sensor_gain", "sensor_misalignment",
@@ -106,7 +104,7 @@ def with_effects(rig: StateSpace, model: TableModel, keep: Sequence[str], when: 
     ------
     InputError : values that no system has (a chassis without mass).
     """
-    table = Table(model, tuple(keep), when)
+    table = ReducedTable(model, tuple(keep), when)
     names = [edge_name(name) for name in keep]
     sensors, actuators = model.sensors.names, list(model.actuators)
     parts = {"rig": _rig_part(rig, names, actuators), "additions": _additions(table, names)}
@@ -136,7 +134,7 @@ def _rig_part(rig: StateSpace, names: list[str], actuators: list[str]) -> StateS
     return rig.select(outputs, None).renamed(new)
 
 
-def _additions(table: Table, names: list[str]) -> StateSpace:
+def _additions(table: ReducedTable, names: list[str]) -> StateSpace:
     total = gain(np.zeros(table.shape))
     for one in table.model.effects:
         made = addition(table, one)
@@ -164,7 +162,7 @@ def _drives(model: TableModel) -> list[StateSpace]:
     return [lag.scaled(factors[name]) for name in model.actuators]
 
 
-def _sensors(table: Table, names: list[str]) -> StateSpace:
+def _sensors(table: ReducedTable, names: list[str]) -> StateSpace:
     """(velocities, what bends) -> what each sensor sees beyond its nominal row, and its share of gravity's rate."""
     model, n, n_y = table.model, table.n, table.n_y
     ops = Operators(model.effective, np.ones(1))
@@ -195,7 +193,7 @@ def _numbered(system: StateSpace, tag: str) -> StateSpace:
                       tuple(f"{tag}y{k}" for k in range(system.noutputs)))
 
 
-def _tilt_rows(table: Table) -> np.ndarray:
+def _tilt_rows(table: ReducedTable) -> np.ndarray:
     """(n_y, n) what gravity adds to the rate of each sensor's acceleration, by the velocities."""
     model, of_q = table.model, np.zeros((table.n_y, len(COORDINATES)))
     strength = sum(one.by_name["gravity_m_per_s2"] for one in model.effects if one.effect.name == "tilt_coupling")
@@ -223,12 +221,12 @@ def _sensor_filters(model: TableModel, factors: np.ndarray) -> list[StateSpace]:
 
 
 def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: int | None = None, when: float = 0.0,
-            check_Hz: np.ndarray = CHECK_Hz) -> Realised:
+            check_Hz: np.ndarray | None = None) -> Realised:
     """One state space of a model, drives and sensors included; coordinates not kept are locked at rest.
 
     pade_order : of delay and hold (1-10); by default what keeps the delay's error below 1e-3 up to the highest of
-    check_Hz, or 10. The error is measured where all six coordinates are kept, nan otherwise: `TableModel.response`
-    knows no locked ones.
+    check_Hz (by default that of the settings), or 10. The error is measured where all six coordinates are kept, nan
+    otherwise: `TableModel.response` knows no locked ones.
 
     Raises
     ------
@@ -236,12 +234,12 @@ def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: in
     """
     if model.sensors.motion != "velocity":
         raise InputError("expected sensors of velocity", field="sensors", value=model.sensors.motion)
-    omega = 2 * np.pi * np.asarray(check_Hz, float)
+    omega = 2 * np.pi * (np.geomspace(*SETTINGS.check_Hz) if check_Hz is None else np.asarray(check_Hz, float))
     order = pade_order or sufficient_order(loop_lag(model)[0], float(omega.max()), 1e-3, 10)[0]
     effective = model.effective
     rig = uncertain_rig(effective.rig, [], keep).system
     names = [edge_name(name) for name in keep]
-    table = Table(model, tuple(keep), when)
+    table = ReducedTable(model, tuple(keep), when)
     inner = with_effects(rig, model, keep, when)
     parts = {"table": inner, "chains": _chains(table, names), "loop": _loop(model, order)}
     floor = [f"floor_{a}_dot" for a in names]
@@ -306,7 +304,7 @@ def _loop(model: TableModel, order: int) -> StateSpace:
     return append(*(one.renamed([f"{name}_command"], [name]) for name in model.actuators))
 
 
-def _chains(table: Table, names: list[str]) -> StateSpace:
+def _chains(table: ReducedTable, names: list[str]) -> StateSpace:
     """Velocities, deviations and gravity's share to the sensors' own unit; the two zeros at rest cancel s^-2."""
     model, n_y = table.model, table.n_y
     nominal, chain = table.rows(table.matrices.R), model.sensors.chain
@@ -341,7 +339,7 @@ def _without_aliases(model: TableModel, omega: np.ndarray) -> np.ndarray:
 
 
 def _distance(found: np.ndarray, asked: np.ndarray, n_u: int) -> float:
-    """Largest relative difference over frequency, of the answers to the actuators and to the floor."""
+    """Largest relative difference over frequency, of the responses to the actuators and to the floor."""
     worst = 0.0
     for part in (slice(0, n_u), slice(n_u, None)):
         size = np.linalg.norm(asked[:, :, part], axis=(1, 2))

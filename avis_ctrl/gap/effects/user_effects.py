@@ -8,19 +8,13 @@ import traceback
 import types
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
-from avis_ctrl.gap.effects import base
-from avis_ctrl.gap.effects.base import Effect, EffectParameter
-
-if TYPE_CHECKING:
-    from avis_ctrl.gap.table_model import TableModel
-
-# Frequencies [Hz] at which an effect is tried.
-TRIED_Hz = (0.3, 3.0, 30.0)
+from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, restore
+from avis_ctrl.gap.effects.library import library
+from avis_ctrl.gap.table_model import TableModel, active
 
 
 @dataclass(frozen=True)
@@ -44,18 +38,18 @@ def load_effects(path: str | Path) -> OwnEffects:
         source = path.read_bytes()
     except OSError as error:
         raise InputError(f"expected a Python file ({error.strerror or error})", file=path) from None
-    before = base.library()
+    before = library()
     module = types.ModuleType(f"avis_effects_{path.stem}")
     module.__file__ = str(path)
     sys.modules[module.__name__] = module  # dataclasses and pickle look there
     try:
         exec(compile(source, str(path), "exec"), module.__dict__)
     except (Exception, SystemExit) as error:
-        base.restore(before)
+        restore(before)
         if isinstance(error, InputError):
             raise error.in_file(path) from None
         raise InputError(f"expected a Python file that runs: {said(error, path)}", file=path) from None
-    names = tuple(name for name, effect in base.library().items() if before.get(name) is not effect)
+    names = tuple(name for name, effect in library().items() if before.get(name) is not effect)
     if not names:
         raise InputError("expected a class with @register; it registers no effect", file=path)
     return OwnEffects(path, names, hashlib.sha256(source).hexdigest())
@@ -78,7 +72,7 @@ def try_out(own: OwnEffects, model: TableModel) -> None:
     ------
     InputError : an effect that fails, says nothing of itself, or leaves no finite response.
     """
-    known = base.library()
+    known = library()
     for name in own.names:
         try:
             _tried(known[name], model)
@@ -90,8 +84,6 @@ def try_out(own: OwnEffects, model: TableModel) -> None:
 
 
 def _tried(effect: Effect, model: TableModel) -> None:
-    from avis_ctrl.gap.table_model import active
-
     if not effect.name.isidentifier():
         raise InputError("expected letters, digits and _", field="name", value=effect.name)
     for field in ("title", "looks_like"):
@@ -100,7 +92,7 @@ def _tried(effect: Effect, model: TableModel) -> None:
     for method in ("places", "parameters"):
         if getattr(type(effect), method) is getattr(Effect, method):
             raise InputError("expected the method", field=method)
-    omega = 2 * np.pi * np.array(TRIED_Hz)
+    omega = 2 * np.pi * np.array(SETTINGS.tried_Hz)
     for place in effect.places(model):
         parameters = effect.parameters(model, place)
         for one in parameters:

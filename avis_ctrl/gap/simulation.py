@@ -1,11 +1,11 @@
 """Simulation in time of a table with effects: what its sensors read in a record, from u and floor alone.
 
 The linear part acts on the lines of the padded record (`line_response`). Forces that depend on amplitude or time are
-found from sample to sample (`marching`) and then act on the same lines. A band of 500 Hz, or half the sample rate, is
-kept: a table moves above by its mass alone.
+found from sample to sample (`time_stepping`) and then act on the same lines. A band of 500 Hz, or half the sample
+rate, is kept: a table moves above by its mass alone.
 
 Limits: a record starts at rest, with nothing before it. Volts that an effect changes by the motion see the motion
-without them. Records of more than `line_response.MOST_SAMPLES` samples are refused.
+without them. Records of more than `RecordLineSettings.most_samples` samples are refused.
 """
 
 from __future__ import annotations
@@ -18,17 +18,28 @@ import numpy as np
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
-from avis_ctrl.gap.marching import Answer, march
-from avis_ctrl.gap.motion import RecordMotion
-from avis_ctrl.gap.record_motion import motion_of, mount_rows, with_large_motion
+from avis_ctrl.gap.motion_estimate import motion_of, mount_rows, with_large_motion
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.gap.time_stepping import ForceResponse, march
 from avis_ctrl.identification.response import N_Q
 
 __all__ = ["Simulated", "motion_of", "simulate"]
 
-# Largest r.m.s. of what the equation of motion leaves, over that of the deflection.
-DEFECT = 1e-5
-MOST_PASSES = 12
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """Of forces that act over a whole record.
+
+    defect : what the equation of motion may leave of the deflection, r.m.s. [1]: far below any sensor's noise.
+    most_passes : passes over the record before it counts as one that does not settle.
+    """
+
+    defect: float = 1e-5
+    most_passes: int = 12
+
+
+SETTINGS = SimulationSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +69,7 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
     Raises
     ------
     InputError : arrays of other shapes, numbers that are not finite, a rate that is not the rig's, a record too long.
-    ComputationError : a motion that grows without bound, or an answer that does not settle.
+    ComputationError : a motion that grows without bound, or a response that does not settle.
     """
     u, floor = _checked(model, u, floor)
     lines = line_response(linear_part(model), len(u), sample_rate_Hz)
@@ -115,52 +126,52 @@ def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tupl
     return np.clip(u, -limit, limit), floor
 
 
-_answers: list[tuple[LineResponse, Answer]] = []
+_responses: list[tuple[LineResponse, ForceResponse]] = []
 
 
-def _answer(lines: LineResponse, mass: np.ndarray) -> Answer:
-    """`Answer`, the last one kept: records of one length share it."""
-    for known, found in _answers:
+def _force_response(lines: LineResponse, mass: np.ndarray) -> ForceResponse:
+    """`ForceResponse`, the last one kept: records of one length share it."""
+    for known, found in _responses:
         if known is lines:
             return found
-    _answers.clear()
-    _answers.append((lines, Answer(lines, mass)))
-    return _answers[0][1]
+    _responses.clear()
+    _responses.append((lines, ForceResponse(lines, mass)))
+    return _responses[0][1]
 
 
 def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x: np.ndarray,
                  floor: np.ndarray | None, effects: Sequence[ActiveEffect]) -> Simulated:
-    """March, then let the forces act over the whole record. What enters the next pass: what an answer before its cause
-    leaves (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
+    """March, then let the forces act over the whole record. What enters the next pass: what a response before its
+    cause leaves (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
     marching = [one for one in effects if not isinstance(one.effect, LargeMotion)]
     weak = [one for one in effects if isinstance(one.effect, LargeMotion)]
-    answer = _answer(lines, model.matrices.M)
-    # Free motion in coordinates of the answer: any that give the deflection.
-    to_z, n = np.linalg.pinv(answer.shape), len(record.volts)
+    by_force = _force_response(lines, model.matrices.M)
+    # Free motion in coordinates of the response: any that give the deflection.
+    to_z, n = np.linalg.pinv(by_force.shape), len(record.volts)
     defect, reading = float("nan"), np.zeros((n, len(model.sensors.names)))
-    slow, correction, size = np.zeros((n, N_Q)), np.zeros((n, answer.shape.shape[1])), 0.0
+    slow, correction, size = np.zeros((n, N_Q)), np.zeros((n, by_force.shape.shape[1])), 0.0
     linear = lines.deflection(x, floor)
-    for passes in range(1, MOST_PASSES + 1):
-        free = linear + answer.whole(slow) @ answer.shape.T
+    for passes in range(1, SETTINGS.most_passes + 1):
+        free = linear + by_force.whole(slow) @ by_force.shape.T
         in_time = lines.in_time(free)
         z_free = in_time @ to_z.T
         record.deflection[:] = in_time
         push, left, missing = np.zeros((n, N_Q)), np.zeros_like(correction), np.zeros_like(correction)
         if marching:
-            marched = march(answer, z_free + correction, marching, record, in_time - z_free @ answer.shape.T)
+            marched = march(by_force, z_free + correction, marching, record, in_time - z_free @ by_force.shape.T)
             push = marched.force
-            left = z_free + lines.in_time(answer.whole(push)) - marched.z
+            left = z_free + lines.in_time(by_force.whole(push)) - marched.z
         if weak:
             more, reading = _large_rotations(weak, record, model)
-            missing, slow = lines.in_time(answer.whole(more - slow)), more
+            missing, slow = lines.in_time(by_force.whole(more - slow)), more
         size = float(np.sqrt(np.mean(record.deflection ** 2))) or 1.0
-        defect = float(np.sqrt(np.mean(((left + missing) @ answer.shape.T) ** 2))) / size
-        if defect <= DEFECT:
-            z = answer.whole(push + slow)
-            y = lines.sensed(x + z[:, :answer.n_x], record.volts, floor)
+        defect = float(np.sqrt(np.mean(((left + missing) @ by_force.shape.T) ** 2))) / size
+        if defect <= SETTINGS.defect:
+            z = by_force.whole(push + slow)
+            y = lines.sensed(x + z[:, :by_force.n_x], record.volts, floor)
             if weak:
                 y += lines.read_beside(reading)
-            return Simulated(lines.in_time(y), lines.in_time(linear + z @ answer.shape.T), passes, defect)
+            return Simulated(lines.in_time(y), lines.in_time(linear + z @ by_force.shape.T), passes, defect)
         if not np.isfinite(defect):
             break
         correction = correction + left

@@ -13,11 +13,23 @@ import scipy.fft
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordHeader
 
-# Part of its largest line's power above which a line of u counts as driven.
-DRIVEN = 1e-6
 # Variance of a mean of |e|^2 over neighbouring lines of a Hann window, by that of independent lines: the correlation
 # of e is 2/3 one line apart and 1/6 two apart, so 1 + 2 (4/9 + 1/36).
 HANN_SHARED = 1 + 2 * (4 / 9 + 1 / 36)
+
+
+@dataclass(frozen=True)
+class LineSettings:
+    """Of the lines of a record.
+
+    driven : of the power of its largest line, above which a line of u counts as driven [1]: far above round-off,
+        and below what any drive's spectrum leaves out on purpose.
+    """
+
+    driven: float = 1e-6
+
+
+SETTINGS = LineSettings()
 
 
 class Estimate(NamedTuple):
@@ -29,7 +41,7 @@ class Estimate(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Leftover:
+class RecordResidual:
     """y minus a model's prediction in one record.
 
     header : of the record. u : (samples, n_u) commanded volts. e : (samples, n_y), unit of y.
@@ -71,7 +83,7 @@ class Leftover:
     def driven(self) -> np.ndarray:
         """(n,) lines in which u holds more than a millionth of the power of its largest line."""
         power = np.sum(np.abs(self.U) ** 2, axis=1)
-        return power > DRIVEN * power.max() if power.max() > 0 else np.zeros(len(power), bool)
+        return power > SETTINGS.driven * power.max() if power.max() > 0 else np.zeros(len(power), bool)
 
     @property
     def silent(self) -> bool:
@@ -91,7 +103,7 @@ class Leftover:
         return scipy.fft.rfft((x - x.mean(0)) * window[:, None], axis=0) / np.sqrt(n * 3 / 8)
 
 
-def leftovers(campaign: Campaign, predicted: Mapping[str, np.ndarray]) -> tuple[Leftover, ...]:
+def record_residuals(campaign: Campaign, predicted: Mapping[str, np.ndarray]) -> tuple[RecordResidual, ...]:
     """Of the records that a prediction (samples, n_y) is given for, by record name; memory holds all of them.
 
     Raises
@@ -105,11 +117,11 @@ def leftovers(campaign: Campaign, predicted: Mapping[str, np.ndarray]) -> tuple[
         record = campaign.named(name).load()
         if np.shape(y) != record.y.shape:
             raise InputError(f"expected shape {record.y.shape}", field=f"record {name}: prediction", value=np.shape(y))
-        found.append(Leftover(record.header, record.u, record.y - y))
+        found.append(RecordResidual(record.header, record.u, record.y - y))
     return tuple(found)
 
 
-def check_common(left: Sequence[Leftover]) -> RecordHeader:
+def check_common(left: Sequence[RecordResidual]) -> RecordHeader:
     """The first header; InputError where there is none or channels or rates differ."""
     if not left:
         raise InputError("expected the residual of one record at least", field="residuals")

@@ -12,18 +12,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, library
+from avis_ctrl.gap.effects.base import Effect
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.result import Detectable
-from avis_ctrl.gap.score import LEFT, Score
+from avis_ctrl.gap.score import SETTINGS, Score
 from avis_ctrl.gap.table_model import active
 
-DEVIATIONS = 5.0
-# Share of the largest eigenvalue of a scaled information matrix below which there is only round-off, 1e-16 of it.
-ROUND_OFF = 1e-12
 
-
-def detectable(score: Score, effects: Sequence[Effect] | None = None) -> tuple[Detectable, ...]:
-    """For every effect, place and parameter the departure from none of five standard deviations.
+def detection_limits(score: Score, effects: Sequence[Effect] | None = None) -> tuple[Detectable, ...]:
+    """For every effect, place and parameter the departure from its value without the effect, of five standard
+    deviations.
 
     Of effects whose parameters are all linear, each parameter with the others of its effect free; of two laws of one
     effect the larger value. One effect at a time. Infinite where re-identification absorbs a parameter.
@@ -41,22 +39,23 @@ def detectable(score: Score, effects: Sequence[Effect] | None = None) -> tuple[D
             parameters = effect.parameters(model, place)
             if not parameters or not all(one.linear for one in parameters):
                 continue
-            std = _deviations(score.of_effect(active(effect, model, place, [one.none for one in parameters])))
+            std = _standard_deviations(score.of_effect(active(effect, model, place, [one.none for one in parameters])))
             for one, own in zip(parameters, std, strict=True):
-                row = Detectable(effect.name, place.partition("/")[0], one.name, float(DEVIATIONS * own), one.unit)
+                row = Detectable(effect.name, place.partition("/")[0], one.name, SETTINGS.detected * float(own),
+                                 one.unit)
                 key = (row.name, row.location, row.parameter)
                 if key not in rows or rows[key].value < row.value:
                     rows[key] = row
     return tuple(rows.values())
 
 
-def _deviations(A: np.ndarray) -> np.ndarray:
+def _standard_deviations(A: np.ndarray) -> np.ndarray:
     """(k,) standard deviations of the parameters behind directions A (k, N); infinite where they are not determined."""
     size = np.linalg.norm(A, axis=1)
     size = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh((A @ A.T) / np.outer(size, size))
-    known = values > ROUND_OFF * max(values[-1], 1e-300)
+    known = values > SETTINGS.least_eigenvalue * max(values[-1], 1e-300)
     variance = np.sum(vectors[:, known] ** 2 / values[known], axis=1) / size ** 2
-    # What moves a parameter and changes nothing: there its deviation has no bound.
-    loose = np.sum(vectors[:, ~known] ** 2, axis=1) > LEFT
+    # What moves a parameter and changes nothing: there its standard deviation has no bound.
+    loose = np.sum(vectors[:, ~known] ** 2, axis=1) > SETTINGS.least_left
     return np.where(loose, np.inf, np.sqrt(variance))

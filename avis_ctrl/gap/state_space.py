@@ -31,13 +31,28 @@ from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.rigid_body import COORDINATES, point_map
 
-# Band in which the ladder follows the power of s, and its largest relative error there.
-LADDER_Hz = (0.1, 200.0)
-LADDER_ERROR = 2e-3
+
+@dataclass(frozen=True)
+class RealisationSettings:
+    """Of effects as state-space systems.
+
+    ladder_Hz : band in which the ladder of Maxwell branches follows the power of s [Hz], wider than that of a
+        controller.
+    ladder_error : its largest relative error there [1]: small beside what is known of any loss factor.
+    check_Hz : lowest and highest frequency [Hz], and number of those at which a realisation is compared with the
+        model's response.
+    """
+
+    ladder_Hz: tuple[float, float] = (0.1, 200.0)
+    ladder_error: float = 2e-3
+    check_Hz: tuple[float, float, int] = (0.3, 100.0, 120)
+
+
+SETTINGS = RealisationSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class ReducedTable:
     """What an addition needs to know of a model in its kept coordinates.
 
     model : with its effects. keep : coordinates that move. when : -0.5 .. 0.5 through the campaign.
@@ -114,10 +129,10 @@ class Table:
         return self.n + self.n_y, 3 * self.n + self.n_u
 
 
-Addition = Callable[[Table, str, Mapping[str, float]], StateSpace]
+Addition = Callable[[ReducedTable, str, Mapping[str, float]], StateSpace]
 
 
-def addition(table: Table, one: ActiveEffect) -> StateSpace | None:
+def addition(table: ReducedTable, one: ActiveEffect) -> StateSpace | None:
     """An effect's part of the motion; None where it has none (it acts on rig parameters, sensors or drives).
 
     An effect of the user's own gives it as a method `addition(table, place, values)`.
@@ -130,7 +145,7 @@ def has_addition(one: ActiveEffect) -> bool:
     return one.effect.name in _MADE or hasattr(one.effect, "addition")
 
 
-def impedance(table: Table, K: np.ndarray, h: StateSpace, of: str = "r") -> StateSpace:
+def impedance(table: ReducedTable, K: np.ndarray, h: StateSpace, of: str = "r") -> StateSpace:
     """Force -K h(s) by displacement ("r") or absolute velocity ("v"), K (n, n) symmetric; states as few as its rank."""
     sizes, V = np.linalg.eigh(K)
     felt = np.abs(sizes) > 1e-12 * max(np.abs(sizes).max(), 1e-300)
@@ -148,7 +163,7 @@ def _plain(system: StateSpace) -> StateSpace:
     return StateSpace(system.A, system.B, system.C, system.D)
 
 
-def _static(table: Table, K: np.ndarray, C: np.ndarray | None = None) -> StateSpace:
+def _static(table: ReducedTable, K: np.ndarray, C: np.ndarray | None = None) -> StateSpace:
     """Force -K r - C (v - v_c)."""
     D = np.zeros(table.shape)
     D[:table.n, table.r] = -K
@@ -157,14 +172,14 @@ def _static(table: Table, K: np.ndarray, C: np.ndarray | None = None) -> StateSp
     return gain(D)
 
 
-def _relaxation(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+def _relaxation(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     up = table.mounts.along("z")
     G, k = table.G[up], table.mounts.stiffness[up]
     h = cascade([0.0], [-2 * np.pi * values["corner_Hz"]], values["stiffness_ratio"])
     return impedance(table, G.T @ (k[:, None] * G), h)
 
 
-def _structural(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+def _structural(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     """The causal law, for the complex constant too: no causal system has that."""
     G, k = table.G, table.mounts.stiffness
     rest, branches = ladder(2 / np.pi * np.arctan(values["loss_factor"]))
@@ -179,24 +194,24 @@ def _structural(table: Table, place: str, values: Mapping[str, float]) -> StateS
 def ladder(power: float) -> tuple[float, list[tuple[float, float]]]:
     """(s/w_ref)^power as rest + sum of ratio s/(s + w), all ratios positive: (rest, [(w, ratio)]).
 
-    As few branches, evenly spaced in log w within and beyond the band, as keep the error below LADDER_ERROR in
-    LADDER_Hz. Positive ratios make it passive.
+    As few branches, evenly spaced in log w within and beyond the band, as keep the error below `ladder_error` in
+    `ladder_Hz`. Positive ratios make it passive.
     """
-    f = np.geomspace(*LADDER_Hz, 200)
+    f = np.geomspace(*SETTINGS.ladder_Hz, 200)
     s = 2j * np.pi * f
     wanted = (s / (2 * np.pi * REFERENCE_Hz)) ** power
     if power == 0:
         return 1.0, []
     for count, reach in ((count, reach) for count in range(2, 24) for reach in (3.0, 10.0, 30.0)):
-        w = 2 * np.pi * np.geomspace(LADDER_Hz[0] / reach, LADDER_Hz[1] * reach, count)
+        w = 2 * np.pi * np.geomspace(SETTINGS.ladder_Hz[0] / reach, SETTINGS.ladder_Hz[1] * reach, count)
         basis = np.column_stack([np.ones(len(s)), s[:, None] / (s[:, None] + w)]) / wanted[:, None]
         found, _ = nnls(np.vstack([basis.real, basis.imag]), np.concatenate([np.ones(len(s)), np.zeros(len(s))]))
-        if np.max(np.abs(basis @ found - 1)) < LADDER_ERROR:
+        if np.max(np.abs(basis @ found - 1)) < SETTINGS.ladder_error:
             break
     return float(found[0]), [(float(a), float(b)) for a, b in zip(w, found[1:], strict=True) if b > 0]
 
 
-def _surge(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+def _surge(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     """A mass in every vertical mount: r_m = its displacement against the chassis, v_m its velocity.
 
     r_m' = v_m - v_c,  m v_m' = a k (r - r_m) + a c (v - v_m) - b k r_m - b c (v_m - v_c), and beside the mount itself
@@ -222,7 +237,7 @@ def _surge(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
     return _plain(total)
 
 
-def _leveling(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+def _leveling(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     """Payload against chassis, as the valves feel it."""
     own = np.flatnonzero(table.mounts.along("z"))[:LEVELED]
     G, k = table.G[own], table.mounts.stiffness[own]
@@ -233,14 +248,14 @@ def _leveling(table: Table, place: str, values: Mapping[str, float]) -> StateSpa
     return impedance(table, G.T @ (k[:, None] * G), cascade([], poles, size))
 
 
-def _friction(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+def _friction(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     """Far below the slip: a spring at every motor."""
     at_actuators, _ = shape_rows(table.model.rig, table.model.actuators, table.model.sensors.names)
     G = at_actuators @ table.G
     return _static(table, G.T @ (contacts(values)[:, None] * G))
 
 
-def _drift(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+def _drift(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     G, k = table.G, table.mounts.stiffness
     return _static(table, drift_at(table.model, values, table.when) * G.T @ (k[:, None] * G))
 
@@ -252,13 +267,13 @@ def drift_at(model: TableModel, values: Mapping[str, float], when: float) -> flo
     return values["relative_change"] * drift_over_stiffness(model) * through
 
 
-def _cable(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+def _cable(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     K = tie(values)
     G = table.rows(point_map(place_of(values)))
     return _static(table, G.T @ K @ G, values["damping_s"] * G.T @ K @ G)
 
 
-def _oscillator(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+def _oscillator(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     """m s (2 z w s + w^2)/(s^2 + 2 z w s + w^2) on the velocity of its place, along each of its directions."""
     total, zeta = gain(np.zeros(table.shape)), values["damping"]
     for row, mass, frequency in elements(place, values):
@@ -269,7 +284,7 @@ def _oscillator(table: Table, place: str, values: Mapping[str, float]) -> StateS
     return _plain(total)
 
 
-def _flexible(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+def _flexible(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     """Coordinates e of the modes and their velocities; the mounts and motors push them, and they deflect the mounts."""
     own = [mode for mode in modes(values) if np.any(mode[2])]
     if not own:
@@ -289,7 +304,7 @@ def _flexible(table: Table, place: str, values: Mapping[str, float]) -> StateSpa
     return StateSpace(A, B, C, np.zeros(table.shape))
 
 
-def _nothing(table: Table, place: str, values: Mapping[str, float]) -> StateSpace:
+def _nothing(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     """Vanishes as the amplitude does."""
     return gain(np.zeros(table.shape))
 
@@ -301,8 +316,8 @@ _MADE: dict[str, Addition] = {
     "actuator_saturation": _nothing}
 
 
-def chassis(table: Table, values: Mapping[str, float], floor: list[str], accelerations: list[str], moves: list[str]
-            ) -> StateSpace:
+def chassis(table: ReducedTable, values: Mapping[str, float], floor: list[str], accelerations: list[str],
+            moves: list[str]) -> StateSpace:
     """Velocity of a chassis on a soft base, from that of the floor and the acceleration of the payload.
 
     M_c v_c' = -K_b x - C_b (v_c - v_f) - M a,  x' = v_c - v_f, with M the payload's: of the coordinates that are kept

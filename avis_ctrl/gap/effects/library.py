@@ -1,0 +1,14 @@
+"""The library of effects: those that come with the product, and those that a user has registered beside them."""
+
+from __future__ import annotations
+
+from avis_ctrl.gap.effects import attached, cable, chassis, drives, flexible_mode, mounts, payload, sensors
+from avis_ctrl.gap.effects.base import Effect, registered
+
+# Importing one of these files registers its effects.
+FILES = (attached, cable, chassis, drives, flexible_mode, mounts, payload, sensors)
+
+
+def library() -> dict[str, Effect]:
+    """Every effect by name."""
+    return registered()

@@ -1,0 +1,211 @@
+"""The motion of the mounts in a measured record: simulated by a model, corrected by what the sensors say.
+
+    d = d_model + G q_e,    q_e = K (y - y_model)
+
+y - y_model is taken for the response to a force e that the model lacks, white within a third of an octave, and to white
+noise of the sensors. The most likely q_e is then K = P H^H S (H S H^H + N)^-1 (Wiener), with H = (y by force) and
+P = D^-1 S: the inverse of the sensors' chain where they see more than noise, nothing where they do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.fft
+
+from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
+from avis_ctrl.gap.operators import mount_geometry
+from avis_ctrl.gap.parallel import Each, one_by_one
+from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.large_motion import second_order
+from avis_ctrl.identification.portion import Portion
+from avis_ctrl.identification.prediction import model_inputs
+from avis_ctrl.identification.response import N_Q
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
+
+
+@dataclass(frozen=True)
+class RecordMotionSettings:
+    """Of the motion of the mounts in a measured record.
+
+    low_Hz : lower end of the band in which the sensors correct the model, from nothing to all [Hz]: below, the
+        inverse of the sensors' chain would raise their noise.
+    high_Hz : upper end of that band, from all to nothing [Hz]: above, the mounts deflect little.
+    noise_from : fraction of the band from which on, to its upper end, only noise is left: its power is that of the
+        sensors [1].
+    margin_s : length to which a record is continued beyond its ends [s]: several periods of a table's lowest mode.
+    passes : passes in which that continuation is found.
+    relaxation : how far each pass goes beyond what it finds [1]: plain passes come nearer by a fifth only.
+    """
+
+    low_Hz: tuple[float, float] = (0.4, 0.8)
+    high_Hz: tuple[float, float] = (120.0, 150.0)
+    noise_from: float = 0.6
+    margin_s: float = 5.0
+    passes: int = 6
+    relaxation: float = 1.8
+
+
+SETTINGS = RecordMotionSettings()
+
+
+def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = None, each: Each = one_by_one
+              ) -> dict[str, RecordMotion]:
+    """Motion of every record of a campaign by its name, from its measured y.
+
+    Parameters
+    ----------
+    campaign : its records may be portions of others: these are taken whole, so that the portion starts in motion.
+    model : effects that depend on amplitude or time do not act in the simulation; the sensors say what they did.
+    whole : the campaign that sets the clock, where `campaign` is a part of it. each : how records are worked through.
+
+    Raises
+    ------
+    InputError : channels or rates that are not the model's, a record too long for one piece.
+    """
+    campaign_s = clock_of(whole or campaign)
+    linear = linear_part(model)
+    sources = list({id(source): source for source, _, _ in map(origin, campaign.records)}.values())
+    known = dict(zip(map(id, sources), each(lambda source: _in_time(source.load(), linear), sources), strict=True))
+    found = {}
+    for record in campaign.records:
+        source, begin, stop = origin(record)
+        volts, deflection, y = known[id(source)]
+        h = record.header
+        found[h.name] = RecordMotion(h.name, h.sample_rate_Hz, h.start_s, campaign_s, volts[:stop], deflection[:stop],
+                                     *mount_rows(model), h.level_V, begin, actuators=model.actuators,
+                                     sensors=model.sensors.names, y=y[:stop])
+    return found
+
+
+def clock_of(campaign: Campaign) -> tuple[float, float]:
+    """Begin of the first record and end of the last one, s."""
+    headers = [one.header for one in campaign.records]
+    return min(h.start_s for h in headers), max(h.start_s + h.duration_s for h in headers)
+
+
+def origin(record: RecordSource) -> tuple[RecordSource, int, int]:
+    """The whole record, and which samples of it a record is."""
+    begin, stop = 0, record.header.samples
+    while isinstance(record, Portion):
+        begin, stop = begin + record.start, stop + record.start
+        record = record.whole
+    return record, begin, stop
+
+
+def mount_rows(model: TableModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rows from q (n_g, 6), stiffness (n_g,) N/m, which are vertical (n_g,), row of each motor (n_u,)."""
+    mounts = mount_geometry(model.effective.rig)
+    found = map(getattr(model.rig, "mount_of", lambda name: None), model.actuators)
+    rows = [mounts.names.index(one[0]) for one in found if one and one[0] in mounts.names]
+    return mounts.payload, mounts.stiffness, mounts.along("z"), np.array(rows, int)
+
+
+def limited_inputs(model: TableModel, record: Record) -> tuple[np.ndarray, np.ndarray | None]:
+    """u (samples, n_u) within the drives' limit and floor, in the model's order."""
+    u, floor = model_inputs(model.base, record)
+    limit = model.rig.limits_of(model.actuators)
+    return np.clip(u, -limit, limit), floor
+
+
+def _in_time(record: Record, linear: TableModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Volts (samples, n_u), deflection (samples, n_g), and y (samples, n_y) where all of it was measured."""
+    h = record.header
+    u, floor = limited_inputs(linear, record)
+    lines = line_response(linear, h.samples, h.sample_rate_Hz)
+    x = lines.motion(lines.drive(u, floor))
+    deflection = lines.in_time(lines.deflection(x, floor))
+    rows = [h.y_names.index(name) for name in linear.sensors.names if name in h.y_names]
+    if not rows or not deflection.size:  # nothing measured, or a rig without mounts of their own
+        return u, deflection, np.zeros((0, 0))
+    seen = np.array([name in h.y_names for name in linear.sensors.names])
+    left = record.y[:, rows] - lines.in_time(lines.sensed(x, u, floor))[:, seen]
+    left = left - left.mean(0)
+    if np.any(left):
+        deflection = deflection + _unmodelled(left, lines, seen)
+    return u, deflection, record.y[:, rows] if np.all(seen) else np.zeros((0, 0))
+
+
+def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.ndarray:
+    """(samples, n_g) deflection that explains what the sensors read beyond the model.
+
+    Nothing is measured beyond the ends. There stands nothing at first, then what the force found so far leaves: behind
+    the record a motion that dies out, so that the last seconds are not bent by what never was.
+    """
+    samples, fs = len(left), lines.sample_rate_Hz
+    margin = min(round(SETTINGS.margin_s * fs), (lines.padded - samples) // 2, samples - 1)
+    inside = slice(margin, margin + samples)
+    frequency = lines.omega / (2 * np.pi)
+    fade = _fade(frequency)
+    at = np.flatnonzero(fade)
+    rows = (lines.rows if len(lines.rows) == 1 else lines.rows[at])[:, seen]
+    # A force on the payload, as much moment as its size makes of it.
+    size = np.array([1.0, 1.0, 1.0, *np.sqrt(np.mean(lines.G[:, 3:N_Q] ** 2, axis=0))])
+    H = lines.sense[at][:, seen, None] * (rows @ lines.compliance[at, :, :N_Q]) * size
+
+    def in_time(spectrum: np.ndarray) -> np.ndarray:
+        whole = np.zeros((len(frequency), spectrum.shape[1]), complex)
+        whole[at] = spectrum
+        return scipy.fft.irfft(whole, lines.padded, axis=0)
+
+    continued = np.pad(left, ((margin, margin), (0, 0)))
+    for k in range(SETTINGS.passes):
+        spectrum = scipy.fft.rfft(continued, lines.padded, axis=0)[:len(frequency)]
+        e = _force(spectrum, H, at, frequency) * fade[at, None]
+        if k < SETTINGS.passes - 1:
+            force = in_time(e)
+            force[margin + samples:] = 0
+            response = in_time((H @ scipy.fft.rfft(force, axis=0)[at][:, :, None])[:, :, 0])
+            continued += SETTINGS.relaxation * (response[:len(continued)] - continued)
+            continued[inside] = left
+    x = (lines.compliance[at, :, :N_Q] @ (size * e)[:, :, None])
+    d = x[:, :, 0] @ lines.G.T
+    if lines.recoil is not None:
+        d = d + (lines.recoil[at] @ x)[:, :, 0] @ lines.G_c.T
+    return in_time(d)[inside]
+
+
+def _force(spectrum: np.ndarray, H: np.ndarray, at: np.ndarray, frequency: np.ndarray) -> np.ndarray:
+    """(n_at, 6) most likely force behind y (n, n_y) on the lines `at`, H (n_at, n_y, 6)."""
+    noise = np.median(np.abs(spectrum[frequency > SETTINGS.noise_from * frequency[-1]]) ** 2, axis=0) / np.log(2)
+    noise = np.maximum(noise, 1e-8 * np.mean(np.abs(spectrum) ** 2))
+    white, H = spectrum[at] / np.sqrt(noise), H / np.sqrt(noise)[:, None]
+    strength = _strength(frequency[at], white, H)[:, None, None]
+    HH = np.conj(np.swapaxes(H, 1, 2))
+    inner = strength * (H @ HH) + np.eye(white.shape[1])
+    return (strength * (HH @ np.linalg.solve(inner, white[:, :, None])))[:, :, 0]
+
+
+def _fade(frequency: np.ndarray) -> np.ndarray:
+    """(n,) one between `low_Hz` and `high_Hz`, zero outside."""
+    up = np.clip((frequency - SETTINGS.low_Hz[0]) / (SETTINGS.low_Hz[1] - SETTINGS.low_Hz[0]), 0, 1)
+    down = np.clip((SETTINGS.high_Hz[1] - frequency) / (SETTINGS.high_Hz[1] - SETTINGS.high_Hz[0]), 0, 1)
+    return np.sin(np.pi / 2 * up) ** 2 * np.sin(np.pi / 2 * down) ** 2
+
+
+def _strength(frequency: np.ndarray, white: np.ndarray, H: np.ndarray) -> np.ndarray:
+    """(n,) variance of the force, a third of an octave at a time, that makes what exceeds unit noise."""
+    band = np.floor(3 * np.log2(frequency / frequency[0])).astype(int)
+    lines = np.bincount(band) * white.shape[1]
+    excess = np.bincount(band, np.sum(np.abs(white) ** 2, axis=1)) - lines
+    made = np.bincount(band, np.sum(np.abs(H) ** 2, axis=(1, 2)))
+    # What noise alone would leave of the excess: two standard deviations are no force.
+    least = 0.02 * np.sqrt(np.maximum(lines, 1))
+    strength = np.maximum(excess, least) / np.maximum(made, np.finfo(float).tiny)
+    return strength[band]
+
+
+def with_large_motion(motion: dict[str, RecordMotion], model: TableModel) -> dict[str, RecordMotion]:
+    """The records with the second-order terms of large rotations, from their motion."""
+    found = {}
+    for name, one in motion.items():
+        back = np.linalg.pinv(one.rows)
+        q = one.deflection @ back.T
+        q_dot = np.gradient(q, 1 / one.sample_rate_Hz, axis=0)
+        late = round(model.delay_s * one.sample_rate_Hz)
+        u = np.concatenate([np.zeros((late, one.volts.shape[1])), one.volts])[:len(one.volts)]
+        large, turned, reading = second_order(model.effective.rig, q, q_dot, u, model.sensors.names)
+        found[name] = replace(one, large_force=large, turned_force=turned, turned_reading=reading)
+    return found

@@ -1,0 +1,129 @@
+"""Response of an assembled table to what acts on it, and its derivative by the rig's parameters."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.operators import Assembled
+from avis_ctrl.identification.response import N_Q, Matrices, Operands, ResponseModel
+
+# Names of the rig's stiffnesses and dampings of mounts.
+MOUNT = re.compile(r"isolator(\d+)\.([kc])_([xyz])")
+
+
+@dataclass(frozen=True, eq=False)
+class Acting:
+    """What acts on the table: U (n, n_u + 3 [+ 12], m), internal force (n, 6, m), displacement (n, n_y, m) that the
+    sensors read beside the payload's own, what their outputs hold in addition (n, n_y, m), and what the states inside
+    start with (`TableModel.inner_transients`)."""
+
+    U: np.ndarray
+    force: np.ndarray | None = None
+    reading: np.ndarray | None = None
+    output: np.ndarray | None = None
+    inner: np.ndarray | None = None
+
+
+class AtMotion:
+    """Y that an assembled table would read of a motion x, and the force that is missing for that motion."""
+
+    def __init__(self, made: Assembled, acting: Acting, x: np.ndarray):
+        drive = _Forces(made, acting)
+        self.push = drive.total - made.D @ x
+        self.Y = _read(made, x, drive)
+
+
+class _Forces:
+    """Forces (n, n_q, m) on an assembled table."""
+
+    def __init__(self, made: Assembled, acting: Acting):
+        U, force = acting.U, acting.force
+        ops, n_u = made.ops, len(made.ops.base.actuators)
+        s = ops.s[:, None, None]
+        commanded = U[:, :n_u]
+        self.volts = made.volts[:, :, None] * commanded
+        self.w = U[:, n_u:n_u + 3] / s
+        self.folded, self.alias = commanded * ops.drive[:, :, None], made.folded[:, :, None]
+        self.driven = bool(np.any(self.folded))
+        total = made.T @ self.volts if self.driven else np.zeros((len(s), made.n_q, U.shape[2]), complex)
+        if np.any(self.w):
+            total = total + made.floor_force(self.w)
+        if U.shape[1] > n_u + 3:
+            total[:, :N_Q] += U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
+        if force is not None:
+            total[:, :N_Q] += force
+        if acting.inner is not None and acting.inner.size:
+            total += (made.forces_of_states @ acting.inner)[:, :, None]
+        self.total, self.reading, self.output = total, acting.reading, acting.output
+
+
+def gain_of(made: Assembled) -> np.ndarray:
+    return (made.ops.base.sensors.sensitivity * made.ops.sensor_gain)[:, None]
+
+
+def _read(made: Assembled, x: np.ndarray, drive: _Forces) -> np.ndarray:
+    """(n, n_y, m) of a motion x; aliases pass the chain far above its corners."""
+    mat = made.ops.base.matrices
+    moved = made.rows @ x
+    if np.any(against := made.ops.base.sensors.relative):
+        moved = moved - (against[:, None] * mat.R) @ made.chassis(x, drive.w)
+    if drive.reading is not None:
+        moved = moved + drive.reading
+    seen = made.ops.sense[:, :, None] * moved
+    if drive.driven:
+        seen += drive.alias * ((mat.R @ np.linalg.inv(mat.M) @ mat.T) @ drive.folded)
+    Y = gain_of(made) * seen
+    return Y if drive.output is None else Y + drive.output
+
+
+class TableResponse:
+    """Response of an assembled table."""
+
+    def __init__(self, made: Assembled, acting: Acting):
+        ops, drive = made.ops, _Forces(made, acting)
+        self.made, self.acting, self.s, self.inner = made, acting, ops.s[:, None, None], acting.inner
+        self.volts, self.w, self.folded, self.alias = drive.volts, drive.w, drive.folded, drive.alias
+        self.x = made.inverse @ drive.total
+        self.sense, self.gain = ops.sense[:, :, None], gain_of(made)
+        self.Y = _read(made, self.x, drive)
+
+    @cached_property
+    def left(self) -> np.ndarray:
+        """(n, n_y, n_q) y by a force on the coordinates."""
+        return self.gain * self.sense * (self.made.rows @ self.made.inverse)
+
+    def by_rig(self, model: ResponseModel, d: Matrices, more: int) -> np.ndarray:
+        """(n_p + more, n, n_y, m) by the rig's free parameters, and zeros; d of all of them, zero for stiffness and
+        damping of mounts."""
+        if "loop_delay_s" in model.names:
+            raise InputError("expected the effect loop_delay in the place of this parameter", field="parameters",
+                             value="loop_delay_s")
+        made, ops, s, left = self.made, self.made.ops, self.s, self.left
+        own = made.G @ self.x
+        through = left @ made.G.T
+        inertial = left[:, :, :N_Q]
+        if ops.recoil is not None:
+            inertial = inertial + through @ (made.z_pf[:, :, None] * (ops.mounts.chassis @ ops.recoil))
+        operands = Operands(ops.base.sensors, model.matrices, s, left[:, :, :N_Q], inertial, self.gain * self.sense,
+                            self.gain * self.alias, made.hold[:, None, None], self.folded, self.x[:, :N_Q],
+                            made.follow(self.w), made.chassis(self.x, self.w), self.Y)
+        dY = operands.derivative(model.names, d, more)
+        moved = ops.mounts.chassis @ made.chassis(self.x, self.w, self.inner)
+        rows = {name: k for k, name in enumerate(ops.mounts.names)}
+        for kind in "kc":
+            found = [(j, rows[f"isolator{match[1]}.{match[3]}"]) for j, name in enumerate(model.names)
+                     if (match := MOUNT.fullmatch(name)) and match[2] == kind]
+            if not found:
+                continue
+            j, k = np.array(found).T
+            if kind == "k":
+                push = made.slope_pf[:, k, None] * moved[:, k] - made.slope_pp[:, k, None] * own[:, k]
+            else:
+                push = s * ops.damping_factor[:, k, None] * (moved[:, k] - own[:, k])
+            dY.transpose(1, 3, 2, 0)[..., j] = through[:, None, :, k] * push.swapaxes(1, 2)[:, :, None]
+        return dY

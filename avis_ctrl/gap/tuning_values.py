@@ -1,0 +1,39 @@
+"""Every tuning value of the search for missing effects, by the part it belongs to."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from avis_ctrl.gap import (
+    campaign_spectra,
+    line_response,
+    motion_estimate,
+    next_measurement,
+    power_shares,
+    record_motion,
+    residual,
+    score,
+    simulation,
+    starting_values,
+    state_space,
+    table_model,
+    time_stepping,
+)
+from avis_ctrl.gap.effects import base
+from avis_ctrl.gap.settings import SETTINGS, GapSettings
+from avis_ctrl.gap.signals import converter, hum, noise_level, quiet_lines, record_residual
+
+
+def tuning_values(search: GapSettings = SETTINGS) -> dict[str, Any]:
+    """Of the search by name, and of its parts under their own names, as the provenance of a result has them."""
+    parts: dict[str, Any] = {
+        "starting values": starting_values.SETTINGS, "score test": score.SETTINGS, "library": base.SETTINGS,
+        "table model": table_model.SETTINGS, "silent lines": campaign_spectra.SETTINGS, "residual": residual.SETTINGS,
+        "power": power_shares.SETTINGS, "next measurement": next_measurement.SETTINGS,
+        "motion in a record": motion_estimate.SETTINGS, "spectra of motion": record_motion.SETTINGS,
+        "lines of a record": line_response.SETTINGS, "time stepping": time_stepping.SETTINGS,
+        "simulation": simulation.SETTINGS, "realisation": state_space.SETTINGS, "converter": converter.SETTINGS,
+        "hum": hum.SETTINGS, "driven lines": record_residual.SETTINGS, "noise level": noise_level.SETTINGS,
+        "quiet lines": quiet_lines.SETTINGS}
+    return {**asdict(search), "parts": {name: asdict(one) for name, one in parts.items()}}

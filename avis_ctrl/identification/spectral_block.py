@@ -1,0 +1,69 @@
+"""Data for the fit: spectra of records, or frequency responses, in one form.
+
+A block holds Y = G U + noise on lines omega for m experiments, with the covariance of the noise. A record is one
+experiment (its own spectra, with the transient of its ends unknown); a measured frequency response of n_u inputs is
+n_u experiments: any W with W W^H = S, its Gram matrix, makes the columns of Y = G W independent with the noise
+covariance of one experiment (Pintelon and Schoukens, System Identification, 2nd ed., 2012, section 2.7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralBlock:
+    """Y = G U + noise.
+
+    Attributes
+    ----------
+    name : record or response that it comes from.
+    omega : (n,) rad/s, positive.
+    U : (n, n_in, m) inputs in the order of the model's (actuators, floor).
+    Y : (n, n_y, m) outputs in the order of the model's sensors.
+    noise : (n, 1 or m, n_y, n_y) covariance E[e e^H] of the noise of an experiment; None until it is known.
+    dof : complex degrees of freedom that `noise` was estimated with; infinite when it is exact.
+    transient : the ends of a record leave a transient in it, which the fit takes out (m = 1).
+    kind : records of one kind share their noise.
+    shared : lines whose errors go together; the information of so many is that of one.
+    start_s, samples : of the record's part that it is of: its begin on the campaign's clock, and its length.
+    """
+
+    name: str
+    omega: np.ndarray
+    U: np.ndarray
+    Y: np.ndarray
+    noise: np.ndarray | None = None
+    dof: float = np.inf
+    transient: bool = False
+    kind: str = ""
+    shared: float = 1.0
+    start_s: float = 0.0
+    samples: int = 0
+
+    def __post_init__(self) -> None:
+        n, m = len(self.omega), self.U.shape[-1]
+        if self.U.shape[0] != n or self.Y.shape[0] != n or self.Y.shape[2] != m or n == 0:
+            raise InputError(f"expected U (n, n_in, m) and Y (n, n_y, m) on {n} lines",
+                             field=f"block {self.name}", value=(self.U.shape, self.Y.shape))
+        if self.transient and m != 1:
+            raise InputError("expected one experiment where a transient is to be found", field=f"block {self.name}")
+
+    @property
+    def numbers(self) -> int:
+        """Independent real numbers in Y."""
+        return round(2 * self.Y.size / self.shared)
+
+    def with_noise(self, noise: np.ndarray, dof: float = np.inf) -> SpectralBlock:
+        """With the covariance of the noise, (n, n_y, n_y) or (n, m, n_y, n_y)."""
+        n_y = self.Y.shape[1]
+        return replace(self, noise=noise.reshape(len(self.omega), -1, n_y, n_y), dof=dof)
+
+    def lines(self, keep: np.ndarray) -> SpectralBlock:
+        """Some of the lines."""
+        return replace(self, omega=self.omega[keep], U=self.U[keep], Y=self.Y[keep],
+                       noise=None if self.noise is None else self.noise[keep])
