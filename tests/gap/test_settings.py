@@ -19,7 +19,7 @@ FILES = sorted(path for path in FOLDER.rglob("*.py") if "single_axis" not in pat
 # What no tuning can change: physics, mathematics, names, tables.
 NO_TUNING = {"ALL", "BEYOND", "BY_PHYSICS", "DIRECTIONS", "FILES", "FLOOR", "FORMAT", "GRAVITY", "HANN_COST",
              "HANN_SHARED", "LEVELED", "LINEAR", "MAINS_HZ", "MOUNT", "PRODUCTS", "REACH_m", "REFERENCE_Hz",
-             "SETTINGS", "SYMMETRIC", "VALVE_Hz", "VERDICTS", "VERSION", "_AT_REST", "_BEYOND",
+             "SETTINGS", "SYMMETRIC", "VALVE_Hz", "VERDICTS", "VERSION", "_AT_REST", "_FAULTS",
              "_ELSEWHERE", "_MADE", "_NOTES"}
 # The starting values of these are being written anew.
 OPEN = {"attached.py", "chassis.py", "flexible_mode.py"}
