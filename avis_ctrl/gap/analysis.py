@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 from avis_ctrl.gap.detection_limits import detection_limits
 from avis_ctrl.gap.effects.base import Effect
-from avis_ctrl.gap.effects.beyond import beyond
 from avis_ctrl.gap.effects.library import library
+from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
 from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplained
 from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_second_order
-from avis_ctrl.gap.residual import Left, every_record, heat_map, places
+from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, search, with_effect, without_effect
@@ -105,16 +105,16 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
         """What was found takes next to nothing of the gap."""
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
         return rise < settings.trace * ground and rise < settings.minor * before
-    steps = search(tolerant, data, [*effects, *beyond().values()], settings, progress, each, enough)
+    steps = search(tolerant, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough)
     return Fits(base, tolerant, tuple(steps))
 
 
 def _left(model, data: Data) -> float:
-    return Left.of(model, data.blocks).nrmse ** 2
+    return ModelResidual.of(model, data.blocks).nrmse ** 2
 
 
 def _excess(base: Fitted, data: Data) -> float:
-    left = Left.of(base.model, data.blocks)
+    left = ModelResidual.of(base.model, data.blocks)
     return left.nrmse ** 2 - left.noise_nrmse ** 2
 
 
@@ -206,14 +206,14 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
          progress: Progress, each: Each, settings: GapSettings) -> Gap:
     """Figures, maps and sentences, all on held-out records."""
     blocks, updated = prepared.held_out, names.updated
-    before, after = Left.of(fits.base.model, blocks), Left.of(updated.model, blocks)
-    raw = Left.of(fits.base.model, prepared.unmasked)
+    before, after = ModelResidual.of(fits.base.model, blocks), ModelResidual.of(updated.model, blocks)
+    raw = ModelResidual.of(fits.base.model, prepared.unmasked)
     noise = after.noise_nrmse ** 2
     power = Power(noise, before.nrmse ** 2)
-    stages = [Stage("nominal", *_figures(Left.of(with_second_order(prepared.nominal), prepared.unmasked))),
+    stages = [Stage("nominal", *_figures(ModelResidual.of(with_second_order(prepared.nominal), prepared.unmasked))),
               Stage("re-identified", *_figures(raw)),
-              Stage("tolerances", *_figures(Left.of(fits.tolerant.model, blocks)))]
-    stages += [Stage(name_of(label)[0], *_figures(after if one is updated else Left.of(one.model, blocks)))
+              Stage("tolerances", *_figures(ModelResidual.of(fits.tolerant.model, blocks)))]
+    stages += [Stage(name_of(label)[0], *_figures(after if one is updated else ModelResidual.of(one.model, blocks)))
                for label, one in _chain(fits, updated, prepared, settings)]
     found = [_named(one, updated, names, power, after.nrmse ** 2, prepared) for one in updated.model.effects
              if one.label in updated.labels]
@@ -268,7 +268,7 @@ def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSetting
     return found[::-1]
 
 
-def _figures(left: Left) -> tuple[float, float]:
+def _figures(left: ModelResidual) -> tuple[float, float]:
     return left.nrmse, left.chi2_per_dof
 
 
@@ -283,7 +283,7 @@ def _named(one, updated: Fitted, names: Names, power: Power, with_it: float, pre
                        share=share_of(updated.model, one.label, prepared.held_out, power, with_it))
 
 
-def _share_of_signal(name: str, raw: Left, masked: Left, power: Power) -> float:
+def _share_of_signal(name: str, raw: ModelResidual, masked: ModelResidual, power: Power) -> float:
     """Of what acts on the signals alone, over the baseline's excess with it: hum by the lines that it spoils; what is
     in the noise (floor, converter) by the noise itself."""
     own = max(raw.nrmse ** 2 - masked.nrmse ** 2, 0.0) if name == "mains_hum" else power.noise
@@ -326,7 +326,8 @@ def _considered(fits: Fits, names: Names, prepared: Prepared, settings: GapSetti
                 continue
             reason = implausible(one) or (f"step {number}: log evidence {top - one.log_evidence:.3g} behind")
             reported = effect.effect.reported(one.model, effect.place, effect.by_name, one.covariance_of(effect.names))
-            rows.append(Considered(effect.effect.name, name_of(label)[1], Left.of(one.model, thin).chi2_per_dof,
+            chi2 = ModelResidual.of(one.model, thin).chi2_per_dof
+            rows.append(Considered(effect.effect.name, name_of(label)[1], chi2,
                                    min(odds_against_fit(best, one), settings.most_sure), reason, reported))
     return tuple(sorted(rows, key=lambda one: -one.probability)[:settings.shown_runners_up])
 
@@ -336,7 +337,7 @@ def _percent(share: float) -> str:
 
 
 def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[NamedEffect], stages: Sequence[Stage],
-             left: Remainder, after: Left) -> str:
+             left: Remainder, after: ModelResidual) -> str:
     """The one sentence."""
     before = next(one.nrmse for one in stages if one.name == "re-identified")
     rest = f"noise alone {_percent(after.noise_nrmse)}"

@@ -165,19 +165,15 @@ def _drives(model: TableModel) -> list[StateSpace]:
 def _sensors(table: ReducedTable, names: list[str]) -> StateSpace:
     """(velocities, what bends) -> what each sensor sees beyond its nominal row, and its share of gravity's rate."""
     model, n, n_y = table.model, table.n, table.n_y
-    ops = Operators(model.effective, np.ones(1))
-    for one in model.effects:
-        if one.effect.name in ("sensor_gain", "sensor_misalignment"):
-            one.effect.change(ops, one.place, one.by_name)
+    ops = _changed_by(model, "sensor_gain", "sensor_misalignment")
     nominal, seen = table.rows(table.matrices.R), table.rows(ops.rows[0].real)
     tilt = _tilt_rows(table)
-    filters = _sensor_filters(model, ops.sensor_gain)
-    sees = append(*(one.renamed([f"a{k}"], [f"b{k}"]) for k, one in enumerate(filters))).scaled(
-        1.0, np.hstack([seen, np.eye(n_y)]))
+    filters = append(*(one.renamed([f"a{k}"], [f"b{k}"])
+                       for k, one in enumerate(_sensor_filters(model, ops.sensor_gain))))
+    sees = filters.scaled(1.0, np.hstack([seen, np.eye(n_y)]))
     total = sees + gain(np.hstack([-nominal, np.zeros((n_y, n_y))]))
     if np.any(tilt):
-        feels = append(*(one.renamed([f"a{k}"], [f"b{k}"]) for k, one in enumerate(filters))).scaled(
-            1.0, np.hstack([tilt, np.zeros((n_y, n_y))]))
+        feels = filters.scaled(1.0, np.hstack([tilt, np.zeros((n_y, n_y))]))
     else:
         feels = gain(np.zeros((n_y, n + n_y)))
     both = append(_numbered(total, "d"), _numbered(feels, "t")).scaled(1.0, np.vstack([np.eye(n + n_y)] * 2))
@@ -185,6 +181,15 @@ def _sensors(table: ReducedTable, names: list[str]) -> StateSpace:
     return StateSpace(both.A, both.B, both.C, both.D, 0.0,
                       (*(f"{a}_dot" for a in names), *(f"bent_{name}" for name in sensors)),
                       (*(f"deviation_{name}" for name in sensors), *(f"tilt_{name}" for name in sensors)))
+
+
+def _changed_by(model: TableModel, *names: str) -> Operators:
+    """The table at 1 rad/s as some of the model's effects change it; for what does not depend on frequency."""
+    ops = Operators(model.effective, np.ones(1))
+    for one in model.effects:
+        if one.effect.name in names:
+            one.effect.change(ops, one.place, one.by_name)
+    return ops
 
 
 def _numbered(system: StateSpace, tag: str) -> StateSpace:
@@ -286,10 +291,7 @@ def sufficient_order(delay_s: float, omega: float, tolerance: float, largest: in
 
 def loop_lag(model: TableModel) -> tuple[float, float | None]:
     """Delay [s] and first amplifier corner [Hz] of a model, its effects included."""
-    ops = Operators(model.effective, np.ones(1))
-    for one in model.effects:
-        if one.effect.name in ("actuator_lag", "loop_delay"):
-            one.effect.change(ops, one.place, one.by_name)
+    ops = _changed_by(model, "actuator_lag", "loop_delay")
     return ops.delay_s, ops.amplifier_corner_Hz
 
 

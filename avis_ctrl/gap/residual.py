@@ -54,7 +54,7 @@ class Spectra(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Left:
+class ModelResidual:
     """What a model leaves of held-out blocks; names of its outputs and inputs."""
 
     errors: tuple[PredictionError, ...]
@@ -62,10 +62,9 @@ class Left:
     inputs: tuple[str, ...]
 
     @staticmethod
-    def of(model: TableModel, blocks: Sequence[SpectralBlock]) -> Left:
-        return Left(tuple(prediction_error(cast(ResponseModel, model), block, derivative=False) for block in blocks),
-                    model.sensors.names,
-                    model.inputs)
+    def of(model: TableModel, blocks: Sequence[SpectralBlock]) -> ModelResidual:
+        errors = (prediction_error(cast(ResponseModel, model), block, derivative=False) for block in blocks)
+        return ModelResidual(tuple(errors), model.sensors.names, model.inputs)
 
     @property
     def chi2_per_dof(self) -> float:
@@ -95,7 +94,7 @@ def edges_of(errors: Sequence[PredictionError]) -> np.ndarray:
     return np.geomspace(low, high * (1 + 1e-9), count + 1)
 
 
-def places(left: Left) -> tuple[Where, ...]:
+def places(left: ModelResidual) -> tuple[Where, ...]:
     """Bands, outputs and the input that goes with each, where the residual exceeds the noise significantly."""
     edges = edges_of(left.errors)
     model_inputs = left.errors[0].block.U.shape[1]
@@ -139,14 +138,14 @@ def _own_noise(e: PredictionError, k: int) -> np.ndarray:
     return np.real(np.broadcast_to(e.block.noise, (len(e.block.omega), *e.block.noise.shape[1:]))[:, 0, k, k])
 
 
-def heat_map(before: Left, after: Left) -> HeatMap:
+def heat_map(before: ModelResidual, after: ModelResidual) -> HeatMap:
     """Residual power over noise power by band, held-out record and output."""
     edges = edges_of(before.errors)
     columns = tuple(f"{e.block.name}: {output}" for e in before.errors for output in before.outputs)
     return HeatMap(edges, columns, _ratios(before, edges), _ratios(after, edges))
 
 
-def _ratios(left: Left, edges: np.ndarray) -> np.ndarray:
+def _ratios(left: ModelResidual, edges: np.ndarray) -> np.ndarray:
     found = np.full((len(edges) - 1, sum(e.block.Y.shape[1] for e in left.errors)), np.nan)
     column = 0
     for e in left.errors:
@@ -168,8 +167,8 @@ def every_record(prepared: Spectra, before: TableModel, after: TableModel, senso
     held = {block.name for block in prepared.held_out}
     blocks = [thinned(block, SETTINGS.shown_lines) for block in (*prepared.fitted, *prepared.held_out)]
     headers = {r.header.name: r.header for r in (*prepared.halves.fitted.records, *prepared.halves.held_out.records)}
-    last = Left.of(after, blocks).errors
-    first = last if after is before else Left.of(before, blocks).errors
+    last = ModelResidual.of(after, blocks).errors
+    first = last if after is before else ModelResidual.of(before, blocks).errors
 
     def ratio(e: PredictionError) -> float:
         return float(np.sqrt(e.chi2 / e.dof))

@@ -44,6 +44,8 @@ class ScoreSettings:
         below, it is round-off.
     least_singular : singular value of the parameters' directions over the largest, below which they determine
         nothing [1].
+    least_direction : eigenvalue of the scaled Gram matrix of directions over the largest, below which the data do not
+        determine a combination [1]: a step along it would be round-off.
     least_eigenvalue : eigenvalue of a scaled information matrix over the largest, below which there is only
         round-off, 1e-16 of it [1].
     detected : standard deviations from which an effect is detected [1]: a parameter gains the evidence that a name
@@ -53,6 +55,7 @@ class ScoreSettings:
     step: float = 1e-3
     least_left: float = 1e-5
     least_singular: float = 1e-6
+    least_direction: float = 1e-9
     least_eigenvalue: float = 1e-12
     detected: float = 5.0
 
@@ -76,7 +79,7 @@ def reduction(G: np.ndarray, b: np.ndarray) -> Reduction:
     """b^T inv(G) b over what G determines."""
     size = np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(G / np.outer(size, size))
-    known = values > 1e-9 * max(values[-1], 1e-300)
+    known = values > SETTINGS.least_direction * max(values[-1], 1e-300)
     along = vectors.T @ (b / size)
     step = np.where(known, along / np.where(known, values, 1.0), 0.0)
     return Reduction(float(along @ step), int(known.sum()), vectors @ step / size)

@@ -25,13 +25,14 @@ class ModelSettings:
     """Of a model's derivatives and of its sensors' transients.
 
     step : step of differences by an effect's parameters, in units of their size [1].
-    probed_Hz : frequencies at which the chains of sensors are compared with the rig's [Hz].
+    probed_Hz : lowest and highest frequency [Hz], and number of those at which the chains of sensors are compared with
+        the rig's.
     unchanged : a sensor's chain is another one where its ratio to the rig's varies over these by more than this
         [1]: round-off.
     """
 
     step: float = 1e-4
-    probed_Hz: tuple[float, ...] = tuple(np.geomspace(0.5, 100.0, 5).tolist())
+    probed_Hz: tuple[float, float, int] = (0.5, 100.0, 5)
     unchanged: float = 1e-6
 
 
@@ -258,7 +259,7 @@ class TableModel:
     @cached_property
     def _changed_sensors(self) -> np.ndarray:
         """Indices of the sensors whose chain effects change by more than a factor, whatever lines are asked for."""
-        r = self._chain_ratio(2 * np.pi * np.array(SETTINGS.probed_Hz))
+        r = self._chain_ratio(2 * np.pi * np.geomspace(*SETTINGS.probed_Hz))
         level = np.mean(r, axis=0)
         return np.flatnonzero(np.max(np.abs(r - level), axis=0) > SETTINGS.unchanged * np.abs(level))
 

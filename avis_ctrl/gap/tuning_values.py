@@ -14,6 +14,7 @@ from avis_ctrl.gap import (
     record_motion,
     residual,
     score,
+    settings,
     simulation,
     starting_values,
     state_space,
@@ -21,19 +22,18 @@ from avis_ctrl.gap import (
     time_stepping,
 )
 from avis_ctrl.gap.effects import base
-from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signals import converter, hum, noise_level, quiet_lines, record_residual
 
 
-def tuning_values(search: GapSettings = SETTINGS) -> dict[str, Any]:
-    """Of the search by name, and of its parts under their own names, as the provenance of a result has them."""
+def tuning_values() -> dict[str, dict[str, Any]]:
+    """By part and name, as the provenance of a result has them."""
     parts: dict[str, Any] = {
-        "starting values": starting_values.SETTINGS, "score test": score.SETTINGS, "library": base.SETTINGS,
-        "table model": table_model.SETTINGS, "silent lines": campaign_spectra.SETTINGS, "residual": residual.SETTINGS,
-        "power": power_shares.SETTINGS, "next measurement": next_measurement.SETTINGS,
+        "search": settings.SETTINGS, "starting values": starting_values.SETTINGS, "score test": score.SETTINGS,
+        "library": base.SETTINGS, "table model": table_model.SETTINGS, "silent lines": campaign_spectra.SETTINGS,
+        "residual": residual.SETTINGS, "power": power_shares.SETTINGS, "next measurement": next_measurement.SETTINGS,
         "motion in a record": motion_estimate.SETTINGS, "spectra of motion": record_motion.SETTINGS,
         "lines of a record": line_response.SETTINGS, "time stepping": time_stepping.SETTINGS,
         "simulation": simulation.SETTINGS, "realisation": state_space.SETTINGS, "converter": converter.SETTINGS,
         "hum": hum.SETTINGS, "driven lines": record_residual.SETTINGS, "noise level": noise_level.SETTINGS,
         "quiet lines": quiet_lines.SETTINGS}
-    return {**asdict(search), "parts": {name: asdict(one) for name, one in parts.items()}}
+    return {name: asdict(one) for name, one in parts.items()}

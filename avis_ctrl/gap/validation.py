@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.residual import Left
+from avis_ctrl.gap.residual import ModelResidual
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.likelihood import Fitted
@@ -37,7 +37,7 @@ class Power:
 def share_of(model: TableModel, label: str, blocks: Sequence[SpectralBlock], power: Power, with_it: float) -> float:
     """By how much the held-out residual power rises when an effect alone is taken out, nothing refitted, over the
     baseline's excess. with_it : the power that the whole model leaves."""
-    return power.share(Left.of(model.without(label), blocks).nrmse ** 2 - with_it)
+    return power.share(ModelResidual.of(model.without(label), blocks).nrmse ** 2 - with_it)
 
 
 def odds_against(one: Mapping[Group, float], other: Mapping[Group, float], beside: float = 0.0) -> float:

@@ -117,7 +117,7 @@ class Effect(ABC):
     strength : the parameter to which `force` is in proportion, empty where to none.
     holds_states : has resonances of its own, whose states at the ends of a record are to be found with its transient.
     resonant : adds resonances of many parameters, of which a mode of any shape is a first description.
-    outside : of `effects.beyond`, refitted beside the library and never named.
+    outside : of `effects.unnamed`, refitted beside the library and never named.
     """
 
     name: ClassVar[str]

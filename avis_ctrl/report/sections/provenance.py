@@ -28,7 +28,8 @@ def provenance_table(made: Mapping[str, Any], caption: str) -> Section:
 
 def _said(value: Any) -> str:
     if isinstance(value, Mapping):
-        return "; ".join(f"{key} {_said(one)}" for key, one in value.items())
+        return "; ".join(f"{key} ({_said(one)})" if isinstance(one, Mapping) else f"{key} {_said(one)}"
+                         for key, one in value.items())
     return words.number(value) if isinstance(value, float) else str(value)
 
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avis_ctrl.gap.effects.beyond import beyond
-from avis_ctrl.gap.effects.beyond.base import FirstOrder
 from avis_ctrl.gap.effects.library import library
+from avis_ctrl.gap.effects.unnamed.base import FirstOrder
+from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
 from avis_ctrl.gap.motion_estimate import mount_rows
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Score
@@ -54,14 +54,14 @@ def block(truth, name, noise=NOISE):
 
 
 def test_none_of_them_is_in_the_library():
-    assert all(one.outside for one in beyond().values())
+    assert all(one.outside for one in unnamed_faults().values())
     assert not any(one.outside for one in library().values())
-    assert not set(beyond()) & set(library())
+    assert not set(unnamed_faults()) & set(library())
 
 
-@pytest.mark.parametrize("name", [name for name, one in beyond().items() if isinstance(one, FirstOrder)])
+@pytest.mark.parametrize("name", [name for name, one in unnamed_faults().items() if isinstance(one, FirstOrder)])
 def test_first_order_is_the_slope_of_the_whole_model(name):
-    effect = beyond()[name]
+    effect = unnamed_faults()[name]
     score = Score(MODEL, [block(MODEL, "00")])
     for place in (effect.places(MODEL)[0], effect.places(MODEL)[-1]):
         point = effect.starts(MODEL, place)[0]
@@ -78,11 +78,11 @@ def searched(truth, *names):
     data = Data((block(truth, "00"), block(truth, "01")), (0.1, 0.5))
     settings = GapSettings()
     base = fit(MODEL, re_identified(RIG), np.zeros(len(MODEL.names)), data, first_variances(data, settings), settings)
-    return search(base, data, [*(library()[name] for name in names), *beyond().values()])
+    return search(base, data, [*(library()[name] for name in names), *unnamed_faults().values()])
 
 
 def test_crosstalk_is_no_misalignment():
-    truth = MODEL.with_effect(active(beyond()["sensor_crosstalk"], MODEL, "Sz1/Sz3", (0.03,)))
+    truth = MODEL.with_effect(active(unnamed_faults()["sensor_crosstalk"], MODEL, "Sz1/Sz3", (0.03,)))
     step = searched(truth, "sensor_misalignment", "sensor_gain")[0]
     one = step.fitted.model.effects[-1]
     assert one.effect.outside
@@ -96,7 +96,7 @@ def test_a_misalignment_keeps_its_name():
 
 
 def test_a_dead_zone_is_no_force_constant():
-    truth = MODEL.with_effect(active(beyond()["dead_zone"], MODEL, "Az2", (0.01,)))
+    truth = MODEL.with_effect(active(unnamed_faults()["dead_zone"], MODEL, "Az2", (0.01,)))
     one = searched(truth, "actuator_gain")[0].fitted.model.effects[-1]
     assert one.effect.said(one.place, one.by_name) == "a dead zone of Az2"
 

@@ -1,4 +1,4 @@
-"""What those beyond the library have in common: never named, and known to first order in closed form."""
+"""What the faults beyond the library have in common: never named, and known to first order in closed form."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from avis_ctrl.gap.score import Part, Score
 from avis_ctrl.gap.starting_values import Seed
 
 
-class Beyond(Effect):
+class UnnamedFault(Effect):
     """One that is never named."""
 
     outside = True
     looks_like = "what the library has no name for"
 
 
-class FirstOrder(Beyond):
+class FirstOrder(UnnamedFault):
     """One of which `first_order` (k, n, n_y, m) is known: y by each linear parameter, on the lines of a block."""
 
     @abstractmethod

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Table
-from avis_ctrl.gap.effects.beyond.base import FirstOrder, Late, at, by_volts, late, motion, pairs, timing
 from avis_ctrl.gap.effects.mounts import largest_rms
+from avis_ctrl.gap.effects.unnamed.base import FirstOrder, Late, at, by_volts, late, motion, pairs, timing
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Part

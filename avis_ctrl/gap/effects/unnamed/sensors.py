@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Table
-from avis_ctrl.gap.effects.beyond.base import FirstOrder, Late, at, late, motion, only, pairs, timing
 from avis_ctrl.gap.effects.sensors import receptance
+from avis_ctrl.gap.effects.unnamed.base import FirstOrder, Late, at, late, motion, only, pairs, timing
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Part

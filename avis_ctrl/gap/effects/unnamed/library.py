@@ -12,8 +12,8 @@ without the table's being assembled anew (`first_order`).
 
 from __future__ import annotations
 
-from avis_ctrl.gap.effects.beyond.base import Beyond
-from avis_ctrl.gap.effects.beyond.drives import (
+from avis_ctrl.gap.effects.unnamed.base import UnnamedFault
+from avis_ctrl.gap.effects.unnamed.drives import (
     DeadZone,
     DriveAbsolute,
     DriveCrosstalk,
@@ -24,7 +24,7 @@ from avis_ctrl.gap.effects.beyond.drives import (
     ForceDrift,
     MotorLate,
 )
-from avis_ctrl.gap.effects.beyond.sensors import (
+from avis_ctrl.gap.effects.unnamed.sensors import (
     ClockRate,
     SensorCrosstalk,
     SensorCrosstalkOfAll,
@@ -33,14 +33,14 @@ from avis_ctrl.gap.effects.beyond.sensors import (
     SensorQuadratic,
     SensorResonance,
 )
-from avis_ctrl.gap.effects.beyond.table import Gyroscope, QuadraticDrag, QuadraticStiffness
+from avis_ctrl.gap.effects.unnamed.table import Gyroscope, QuadraticDrag, QuadraticStiffness
 
-_BEYOND: tuple[type[Beyond], ...] = (
+_FAULTS: tuple[type[UnnamedFault], ...] = (
     SensorCrosstalk, SensorCrosstalkOfAll, SensorLate, SensorResonance, SensorQuadratic, SensorCubic, ClockRate,
     MotorLate, DriveCrosstalk, DriveQuadratic, DriveAbsolute, DriveCubic, DeadZone, ForceByDeflection, ForceBySquare,
     ForceDrift, QuadraticStiffness, QuadraticDrag, Gyroscope)
 
 
-def beyond() -> dict[str, Beyond]:
+def unnamed_faults() -> dict[str, UnnamedFault]:
     """Every one of them by name."""
-    return {kind.name: kind() for kind in _BEYOND}
+    return {kind.name: kind() for kind in _FAULTS}

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Table
-from avis_ctrl.gap.effects.beyond.base import Beyond
 from avis_ctrl.gap.effects.mounts import has_mounts, largest_rms
+from avis_ctrl.gap.effects.unnamed.base import UnnamedFault
 from avis_ctrl.gap.operators import Operators, mount_geometry
 from avis_ctrl.gap.record_motion import RecordMotion
 
 
-class QuadraticStiffness(Beyond):
+class QuadraticStiffness(UnnamedFault):
     """Force -k2 d^2 at every vertical mount: an air spring is stiffer in than out."""
 
     name = "quadratic_stiffness"
@@ -37,7 +37,7 @@ class QuadraticStiffness(Beyond):
         return "vertical mounts with a term in the square of their deflection"
 
 
-class QuadraticDrag(Beyond):
+class QuadraticDrag(UnnamedFault):
     """Force -c |v| v on the payload at the table's centre, v its velocity against the chassis: air."""
 
     name = "quadratic_drag"
@@ -62,7 +62,7 @@ class QuadraticDrag(Beyond):
         return "drag on the payload in proportion to the square of velocity"
 
 
-class Gyroscope(Beyond):
+class Gyroscope(UnnamedFault):
     """Moment h x w of a rotor with angular momentum h on the payload: s W, W skew-symmetric, on the rotations."""
 
     name = "gyroscope"
