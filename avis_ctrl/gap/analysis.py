@@ -23,8 +23,9 @@ from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, search, with_effect, without_effect
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import left_by, levels, named
+from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.gap.tolerances import of_effect
-from avis_ctrl.gap.validation import Power, halves, odds_against, share_of
+from avis_ctrl.gap.validation import Power, halves, odds_against, share_of, widening
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
@@ -172,11 +173,15 @@ def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Dat
                      for one in (step.fitted, step.before))
     if after <= before:
         return "held-out records do not bear it out"
-    strength = [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
-    for half in halves(best, strength, settings):
+    for half in halves(best, _judged(one), settings):
         if half.p_value < settings.law_p_value and half.change > settings.law_change:
             return f"{half.words} ask for another size, by {100 * half.change:.0f} %"
     return ""
+
+
+def _judged(one: ActiveEffect) -> list[str]:
+    """Parameters of an effect that halves of the data must agree on: without those that may end anywhere."""
+    return [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
 
 
 def _probability(step: Step, settings: GapSettings) -> tuple[float, tuple[str, ...]]:
@@ -215,7 +220,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
               Stage("tolerances", *_figures(ModelResidual.of(fits.tolerant.model, blocks)))]
     stages += [Stage(name_of(label)[0], *_figures(after if one is updated else ModelResidual.of(one.model, blocks)))
                for label, one in _chain(fits, updated, prepared, settings)]
-    found = [_named(one, updated, names, power, after.nrmse ** 2, prepared) for one in updated.model.effects
+    found = [_named(one, updated, names, power, after.nrmse ** 2, prepared, settings) for one in updated.model.effects
              if one.label in updated.labels]
     faults = prepared.faults
     if after.chi2_per_dof <= settings.known_noise:
@@ -276,8 +281,10 @@ def _sensors(faults) -> dict[str, float] | None:
     return None if faults.noise is None else {name: one.value for name, one in faults.noise.sensors.items()}
 
 
-def _named(one, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared) -> NamedEffect:
-    reported = one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names))
+def _named(one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared,
+           settings: GapSettings) -> NamedEffect:
+    covariance = widening(halves(updated, _judged(one), settings), settings) ** 2 * updated.covariance_of(one.names)
+    reported = one.effect.reported(updated.model, one.place, one.by_name, covariance)
     return NamedEffect(one.effect.name, name_of(one.label)[1], one.effect.title, reported,
                        names.probability[one.label], names.rivals[one.label], label=one.label,
                        share=share_of(updated.model, one.label, prepared.held_out, power, with_it))

@@ -56,12 +56,16 @@ def odds_against(one: Mapping[Group, float], other: Mapping[Group, float], besid
 @dataclass(frozen=True)
 class Half:
     """An effect's parameters by half of the data: the half in words, chi-square of the difference from the whole, its
-    p-value, and the largest relative change of a parameter."""
+    degrees of freedom, and the largest relative change of a parameter."""
 
     words: str
     chi2: float
-    p_value: float
+    dof: int
     change: float
+
+    @property
+    def p_value(self) -> float:
+        return float(stats.chi2.sf(self.chi2, self.dof))
 
 
 def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings) -> list[Half]:
@@ -87,8 +91,15 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings) -> list[
         along = (V.T @ step)[known]
         chi2 = float(np.sum(along ** 2 / (size[known] - 1)))
         change = np.abs(root @ V[:, known] @ along * slope) / np.maximum(np.abs(values), 1e-300)
-        found.append(Half(words, chi2, float(stats.chi2.sf(chi2, max(int(known.sum()), 1))), float(change.max())))
+        found.append(Half(words, chi2, max(int(known.sum()), 1), float(change.max())))
     return found
+
+
+def widening(found: Sequence[Half], settings: GapSettings) -> float:
+    """Factor on the standard deviations of an effect's parameters, 1 or more: where halves of the data differ by more
+    than noise, its law is not quite that of the real element, and the parameters are known no better than the halves
+    agree (Birge's ratio; R. T. Birge, Phys. Rev. 40 (1932) 207-227)."""
+    return max([1.0, *(float(np.sqrt(one.chi2 / one.dof)) for one in found if one.p_value < settings.law_p_value)])
 
 
 def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, list[Group]]]:

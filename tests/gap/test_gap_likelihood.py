@@ -12,10 +12,10 @@ from scipy.optimize import minimize
 
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.model_files import model_from_dict, model_to_dict
-from avis_ctrl.gap.settings import GapSettings
+from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap.tolerances import tolerances_behind, within_tolerance
-from avis_ctrl.gap.validation import halves, odds_against
+from avis_ctrl.gap.validation import halves, odds_against, widening
 from avis_ctrl.identification.likelihood import Data, first_variances, fit
 from avis_ctrl.identification.priors import Priors, re_identified, with_tolerances
 from avis_ctrl.identification.response import ResponseModel
@@ -184,6 +184,9 @@ def test_a_parameter_that_moves_with_the_band_refutes_its_law():
     good, bent = (halves(found, ("sensor.Sz1",), settings) for found, _, settings in (found_at(), found_at(bend=0.3)))
     assert min(one.p_value for one in good) > 1e-3
     assert max(one.change for one in bent) > 0.05 and min(one.p_value for one in bent) < 1e-4
+    assert widening(good, SETTINGS) == 1.0
+    worst = max(bent, key=lambda one: one.chi2 / one.dof)
+    assert widening(bent, SETTINGS) == pytest.approx(np.sqrt(worst.chi2 / worst.dof)) and worst.chi2 / worst.dof > 10
     assert {one.words for one in bent} == {"the lower part of the band", "the upper part of the band"}
 
 
