@@ -18,14 +18,13 @@ from functools import cached_property
 from typing import cast
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from avis_ctrl.gap.operators import assemble
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.gap.table_response import Acting, AtMotion, TableResponse
 from avis_ctrl.identification.fit_settings import SETTINGS as FIT_SETTINGS
 from avis_ctrl.identification.fit_settings import FitSettings
-from avis_ctrl.identification.likelihood import Data, Fitted
+from avis_ctrl.identification.likelihood import Data, Fitted, Profile
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitened_real, whitener
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import N_Q, ResponseModel
@@ -229,12 +228,8 @@ class EvidenceScore(Score):
         blocks = [with_distortion(block, level, fitted.variances, settings)
                   for block, level in zip(data.blocks, data.levels, strict=True)]
         self.parts = [Part(self.model, block) for block in blocks]
-        self.weights = fitted.weights
-        # Orthonormal rows that span the Jacobian with its priors.
-        root = np.linalg.cholesky(np.linalg.inv(fitted.covariance))
-        self.basis = solve_triangular(root, np.concatenate([fitted.J, np.eye(len(fitted.z))], axis=1), lower=True)
-        self.e = np.concatenate([fitted.e, -fitted.z])
-        self.e = self.e - self.basis.T @ (self.basis @ self.e)
+        self.profile = Profile(fitted, data, settings)
+        self.basis, self.e = self.profile.basis, self.profile.e
 
     @cached_property
     def plain(self) -> Score:
@@ -243,6 +238,5 @@ class EvidenceScore(Score):
         return Score(self.model, [part.block for part in self.parts])
 
     def directions(self, dY):
-        A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
-        A = np.concatenate([self.weights.flatten(A), np.zeros((len(A), len(self.basis)))], axis=1)
-        return A - (A @ self.basis.T) @ self.basis
+        return self.profile.free(np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)],
+                                                axis=1))

@@ -23,9 +23,9 @@ from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.starting_values import HasRicherLaws, seeds
-from avis_ctrl.gap.table_model import ActiveEffect, active
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
 from avis_ctrl.gap.tolerances import BEYOND, of_effect, tolerances_behind, within_tolerance
-from avis_ctrl.identification.likelihood import Data, Fitted, fit
+from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit
 from avis_ctrl.identification.priors import Priors, tolerances_of
 
 Progress = Callable[[str], None]
@@ -122,10 +122,14 @@ def richer_laws(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> li
     return found
 
 
+def _priors_of(one: ActiveEffect, model: TableModel, settings: GapSettings) -> Priors:
+    return _with_known(of_effect(one, tolerances_of(model.rig), settings), model.priors)
+
+
 def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSettings) -> Fitted | None:
     """The fit with one effect more; None where it came to no end."""
     model = fitted.model.with_effect(one)
-    own = _with_known(of_effect(one, tolerances_of(model.rig), settings), model.priors)
+    own = _priors_of(one, model, settings)
     before = fitted.z.copy()
     before[tolerances_behind(one, fitted.priors.names)] = 0  # the effect begins with what these had to make up for
     z = np.concatenate([before, own.z(np.array(one.values))])
@@ -205,24 +209,28 @@ def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSetti
 
 def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Each
            ) -> dict[str, Fitted]:
-    """Fits of candidates by label: a few iterations for each, then more for those that are not far behind. Left out are
-    those that come to no end, to values that physics forbids, or to one within its tolerance."""
-    rough = replace(settings, rounds=0, iterations=settings.rough_iterations)
-    quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
+    """Fits of candidates by label: at first of each effect's own parameters, the others moving along to first order;
+    then of all parameters, for those that are not far behind. Left out are those that come to no end, to values that
+    physics forbids, or to one within its tolerance."""
+    profile, quick = Profile(now, data, settings), replace(settings, rounds=settings.quick_rounds,
+                                                            iterations=settings.quick_iterations)
 
-    def begun(one: Candidate) -> Fitted | None:
-        return _small(with_effect(now, one.effect, data, rough))
+    def begun(one: Candidate) -> tuple[ActiveEffect, float] | None:
+        model = now.model.only(one.effect)
+        own = _priors_of(one.effect, model, settings)
+        try:
+            z, gain = profile.fit(model, own, own.z(np.array(one.effect.values)), settings.rough_iterations)
+        except (AvisError, np.linalg.LinAlgError, FloatingPointError):
+            return None
+        return one.effect.at(own.values(z).tolist()), gain
 
-    def ended(one: Fitted) -> Fitted | None:
-        whole = _whole(one, now)
-        return _small(_try(whole, whole.model, whole.priors, whole.z, data, quick))
+    def ended(one: ActiveEffect) -> Fitted | None:
+        return _small(with_effect(now, one, data, quick))
     made = [one for one in each(begun, chosen) if one is not None]
     if not made:
         return {}
-    # Against the variances that a fit starts with: what the fit before it makes of them would be no fair measure.
-    level = now.log_evidence
-    most = max(one.log_evidence for one in made) - level
-    near = [one for one in made if one.log_evidence - level >= settings.not_far_behind * most]
+    most = max(gain for _, gain in made)
+    near = [one for one, gain in made if gain >= settings.not_far_behind * most]
     further = [_whole(one, now) for one in each(ended, near) if one is not None]
     stated = tolerances_of(now.model.rig)
     return {one.labels[-1]: one for one in further if not implausible(one)

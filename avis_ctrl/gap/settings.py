@@ -27,9 +27,10 @@ class GapSettings(FitSettings):
     resonance_share : of the largest fall of the sum of squares, that a resonance of any shape must bring for effects
         with a resonance to be looked for [1].
     refits : effects that are refitted at each step of the search, the best by the score test.
-    rough_iterations : most of a first fit of every candidate, at the variances as they are; a sharp resonance that
-        begins half its width away needs more than a few.
-    not_far_behind : share of the best candidate's gain of log evidence by that fit with which another one is fitted on.
+    rough_iterations : most of a first fit of every candidate's own parameters, which cost little; a sharp resonance
+        that begins half its width away needs more than a few.
+    not_far_behind : fraction of the best candidate's gain of log evidence by that fit with which another one is fitted
+        on.
     quick_rounds, quick_iterations : `rounds` and `iterations` of a fit that only compares candidates.
     longest : most effects that are named together.
     certain : gain of log evidence [nats] that a name needs beside the logarithm of the number of candidates: odds of
@@ -66,7 +67,7 @@ class GapSettings(FitSettings):
     shape_spread: float = 1.0
     resonance_share: float = 0.1
     refits: int = 8
-    rough_iterations: int = 8
+    rough_iterations: int = 16
     not_far_behind: float = 0.3
     quick_rounds: int = 4
     quick_iterations: int = 4

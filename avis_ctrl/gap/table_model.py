@@ -24,14 +24,15 @@ from avis_ctrl.rigs.rig import Parameter, Rig
 class ModelSettings:
     """Of a model's derivatives and of its sensors' transients.
 
-    step : step of differences by an effect's parameters, in units of their size [1].
+    step : step of differences by an effect's parameters, in units of their size [1]: curvature and round-off are both
+        far below what a Gauss-Newton step needs.
     probed_Hz : lowest and highest frequency [Hz], and number of those at which the chains of sensors are compared with
         the rig's.
     unchanged : a sensor's chain is another one where its ratio to the rig's varies over these by more than this
         [1]: round-off.
     """
 
-    step: float = 1e-4
+    step: float = 1e-6
     probed_Hz: tuple[float, float, int] = (0.5, 100.0, 5)
     unchanged: float = 1e-6
 
@@ -82,6 +83,7 @@ class TableModel:
     nominal : the rig as its file has it, which sizes the steps of a fit: a parameter that a wrong model has driven to
         nothing must find its way back. None for the base itself.
     corners_differ : no filter cancels a geophone's suspension exactly (`sensor_transients`).
+    held : labels of effects whose parameters are not free.
     """
 
     base: ResponseModel
@@ -89,6 +91,7 @@ class TableModel:
     motion: Mapping[str, RecordMotion] = field(default_factory=dict)
     nominal: ResponseModel | None = None
     corners_differ: bool = False
+    held: frozenset[str] = frozenset()
 
     # What a fit and its blocks ask of a model.
     @property
@@ -122,7 +125,8 @@ class TableModel:
     @cached_property
     def _free(self) -> list[tuple[int, int]]:
         """(effect, parameter) of each free parameter of the effects."""
-        return [(k, j) for k, one in enumerate(self.effects) for j in range(len(one.names))]
+        return [(k, j) for k, one in enumerate(self.effects) if one.label not in self.held
+                for j in range(len(one.names))]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -188,6 +192,11 @@ class TableModel:
     def with_effect(self, effect: ActiveEffect) -> TableModel:
         """The model with one effect more, the last."""
         return replace(self, effects=(*self.effects, effect))
+
+    def only(self, effect: ActiveEffect) -> TableModel:
+        """The model with one effect more, whose parameters alone are free."""
+        return replace(self, base=replace(self.base, names=()), nominal=replace(self.nominal or self.base, names=()),
+                       effects=(*self.effects, effect), held=frozenset(one.label for one in self.effects))
 
     def without(self, label: str) -> TableModel:
         return replace(self, effects=tuple(one for one in self.effects if one.label != label))
@@ -316,33 +325,30 @@ class TableModel:
         return Acting(U, force, reading, output, inner)
 
     def _by_effects(self, omega, U, block, made: Assembled, response: TableResponse, dY: np.ndarray) -> None:
-        """Central differences by the effects' parameters: of what an effect adds to a record, which the response is
-        linear in; of the whole response where it changes the table."""
+        """Differences by the effects' parameters: of what an effect adds to a record, which the response is linear in;
+        of the whole response where it changes the table."""
         n, theta, (low, high) = len(self.base.names), self.values, self.bounds()
         scale = self.scales()
         for row in range(n, len(theta)):
             step = SETTINGS.step * scale[row]
-            # A bound that goes with the payload's mass may have moved past the value.
-            lowest, highest = min(low[row], theta[row]), max(high[row], theta[row])
-            ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]
-            others, k = [self._with_effect_parameter(row - n, end) for end in ends], self._free[row - n][0]
-            width = ends[0] - ends[1]
+            # Away from the nearer bound, which may have moved past the value with the payload's mass.
+            step = step if high[row] - theta[row] > theta[row] - low[row] else -step
+            other, k = self._with_effect_parameter(row - n, theta[row] + step), self._free[row - n][0]
             if self.effects[k].effect.nonlinear:
                 assert block is not None
                 record = self.motion[block.name]
-                up, down = (_added(other.effects[k], record, omega) for other in others)
-                volts, *rest = (None if a is None or b is None else (a - b) / width
-                                for a, b in zip(up, down, strict=True))
+                up, here = (_added(one.effects[k], record, omega) for one in (other, self))
+                volts, *rest = (None if a is None or b is None else (a - b) / step
+                                for a, b in zip(up, here, strict=True))
                 change = np.zeros((len(omega), len(self.inputs), 1), complex)
                 if volts is not None:
                     change[:, :len(self.actuators)] = volts
                 side = AtMotion(made, Acting(change, *rest), np.zeros_like(response.x))
                 dY[row] = side.Y + response.left @ side.push
                 continue
-            sides = [AtMotion(assemble(other.operators(omega), invert=False), response.acting, response.x)
-                     for other in others]
-            # d x = inv(D) (d F - d D x): no second inverse.
-            dY[row] = ((sides[0].Y - sides[1].Y) + response.left @ (sides[0].push - sides[1].push)) / width
+            side = AtMotion(assemble(other.operators(omega), invert=False), response.acting, response.x)
+            # d x = inv(D) (d F - d D x): no second inverse; F = D x where the parameters are.
+            dY[row] = ((side.Y - response.Y) + response.left @ side.push) / step
 
 
 def inseparable_parameters(model: TableModel) -> tuple[tuple[str, ...], ...]:

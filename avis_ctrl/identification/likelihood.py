@@ -7,12 +7,13 @@ z are standardised parameters; the whitened residual e is free of the transients
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
@@ -122,6 +123,45 @@ def first_variances(data: Data, settings: FitSettings) -> Variances:
     return Variances(path, {group: value / count[group] for group, value in distortion.items()})
 
 
+@dataclass(frozen=True, eq=False)
+class _Expansion:
+    """The penalised sum of squares about z (n,): cost + |z|^2 at z, H (n, n) and g (n,) of cost by a step."""
+
+    model: Any
+    z: np.ndarray
+    now: Evaluated
+    H: np.ndarray
+    g: np.ndarray
+    cost: float
+
+    @property
+    def whole(self) -> float:
+        return self.cost + float(self.z @ self.z)
+
+
+def _descent(expand: Callable[[np.ndarray], _Expansion], at: _Expansion, iterations: int, settings: FitSettings
+             ) -> tuple[_Expansion, int]:
+    """Gauss-Newton steps, each shortened until it descends; the last expansion, and how many steps there were."""
+    for steps in range(iterations):
+        step = np.linalg.solve(at.H + np.eye(len(at.z)), at.g - at.z)
+        if step @ (at.g - at.z) < settings.converged * len(at.now.e):
+            return at, steps
+        size, after = 1.0, None
+        while size > settings.shortest_step:
+            try:
+                after = expand(at.z + size * step)
+                if after.whole < at.whole:
+                    break
+            except InputError:
+                pass  # no rig has these values: a shorter step
+            size /= 3
+        else:
+            return at, steps
+        assert after is not None
+        at = after
+    return at, iterations
+
+
 def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: FitSettings = SETTINGS
         ) -> Fitted:
     """Alternate Gauss-Newton steps in z with estimates of the variances."""
@@ -130,37 +170,62 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
     for k in range(settings.rounds + 1):
         paths = [path_contributions(model, block) for block in data.blocks]
         weights = weigh(data.blocks, data.levels, paths, variances, settings)
-        now = _evaluate(model, priors, z, data, weights)
-        H, g, cost = weights.normal_equations(now.J, now.e)
-        for _ in range(settings.iterations):
-            step = np.linalg.solve(H + np.eye(len(z)), g - z)
-            if step @ (g - z) < settings.converged * len(now.e):
-                break
-            size = 1.0
-            while size > settings.shortest_step:
-                trial = z + size * step
-                try:
-                    moved = model.at(priors.values(trial))
-                    own = _evaluate(moved, priors, trial, data, weights)
-                    expansion = weights.normal_equations(own.J, own.e)
-                    if expansion[2] + trial @ trial < cost + z @ z:
-                        break
-                except InputError:
-                    pass  # no rig has these values: a shorter step
-                size /= 3
-            else:
-                break
-            model, z, now, (H, g, cost), steps = moved, trial, own, expansion, steps + 1
-        reached = -0.5 * (cost + z @ z + weights.log_determinant) + _hyper(variances, settings)
+
+        def expand(z: np.ndarray, model: Any = model, weights: Weights = weights) -> _Expansion:
+            moved = model.at(priors.values(z))
+            now = _evaluate(moved, priors, z, data, weights)
+            return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e))
+        at, more = _descent(expand, expand(z), settings.iterations, settings)
+        model, z, steps = at.model, at.z, steps + more
+        reached = -0.5 * (at.whole + weights.log_determinant) + _hyper(variances, settings)
         if k == settings.rounds or reached - before < settings.settled:
             break
-        before, variances = reached, estimated(now.left, data.blocks, data.levels, paths, variances, settings)
-    H = H + np.eye(len(z))
-    # The states at the ends of a record have no prior; each costs what one with unit information would (Schwarz 1978).
-    ends = sum(0.5 * transient_unknowns(block, model) * np.log(2 * block.Y.size) for block in data.blocks)
-    log_evidence = reached - ends - 0.5 * np.linalg.slogdet(H)[1]
-    by_group = _by_group(weights, weights.flatten(now.e[None])[0])
-    return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), by_group, steps, weights, now)
+        before, variances = reached, estimated(at.now.left, data.blocks, data.levels, paths, variances, settings)
+    H = at.H + np.eye(len(z))
+    log_evidence = reached - _price_of_ends(model, data) - 0.5 * np.linalg.slogdet(H)[1]
+    by_group = _by_group(weights, weights.flatten(at.now.e[None])[0])
+    return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), by_group, steps, weights, at.now)
+
+
+def _price_of_ends(model: Any, data: Data) -> float:
+    """The states at the ends of a record have no prior; each costs what one with unit information would (Schwarz 1978).
+    """
+    return sum(0.5 * transient_unknowns(block, model) * np.log(2 * block.Y.size) for block in data.blocks)
+
+
+class Profile:
+    """A fit to which a few parameters are added: those of the fit move along to first order (profile likelihood).
+
+    basis : (n, N + n) orthonormal rows that span its Jacobian, with the priors as rows of their own below the data.
+    """
+
+    def __init__(self, fitted: Fitted, data: Data, settings: FitSettings = SETTINGS):
+        self.fitted, self.data, self.settings = fitted, data, settings
+        root = np.linalg.cholesky(np.linalg.inv(fitted.covariance))
+        self.basis = solve_triangular(root, np.concatenate([fitted.J, np.eye(len(fitted.z))], axis=1), lower=True)
+        self.e = self.free(fitted.white.e[None], -fitted.z)[0]
+
+    def free(self, white: np.ndarray, prior: np.ndarray | float = 0.0) -> np.ndarray:
+        """(k, N + n) of whitened rows (k, N), with those of the priors (n,), free of what the fit's parameters take."""
+        rows = self.fitted.weights.flatten(white)
+        rows = np.concatenate([rows, np.broadcast_to(prior, (len(rows), len(self.fitted.z)))], axis=1)
+        return rows - (rows @ self.basis.T) @ self.basis
+
+    def fit(self, model: Any, priors: Priors, z: np.ndarray, iterations: int) -> tuple[np.ndarray, float]:
+        """z (k,) of the added parameters, the free ones of `model`, and the gain of log evidence with them.
+
+        Raises InputError where no table has the values that it begins with.
+        """
+        weights = self.fitted.weights
+
+        def expand(z: np.ndarray) -> _Expansion:
+            moved = model.at(priors.values(z))
+            now = _evaluate(moved, priors, z, self.data, weights)
+            J, e = self.free(now.J), self.free(now.e[None], -self.fitted.z)[0]
+            return _Expansion(moved, z, now, J @ J.T, J @ e, float(e @ e))
+        at, _ = _descent(expand, expand(z), iterations, self.settings)
+        gain = 0.5 * (float(self.e @ self.e) - at.whole - np.linalg.slogdet(at.H + np.eye(len(z)))[1])
+        return at.z, gain - _price_of_ends(at.model, self.data) + _price_of_ends(self.fitted.model, self.data)
 
 
 def _hyper(variances: Variances, settings: FitSettings) -> float:
