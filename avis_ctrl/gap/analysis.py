@@ -17,15 +17,16 @@ from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
 from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplained
 from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_second_order
+from avis_ctrl.gap.probability import odds_against_fit, probability_of
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
 from avis_ctrl.gap.score import EvidenceScore
-from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, search, with_effect, without_effect
+from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, search, without_effect
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import left_by, levels, named
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.gap.tolerances import of_effect
-from avis_ctrl.gap.validation import Power, halves, odds_against, share_of, widening
+from avis_ctrl.gap.validation import Power, halves, share_of, widening
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
@@ -125,10 +126,7 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
     data, held = (prepared.data(blocks, settings.lines) for blocks in (prepared.fitted, prepared.held_out))
     best, probability, rivals, refused = fits.best, {}, {}, []
     for step in fits.steps:
-        one, others = _probability(step, settings)
-        if one <= settings.sure and step is not fits.steps[-1]:
-            one, others = _probability(_again(step, fits.best, data, settings), settings)
-        probability[step.label], rivals[step.label] = one, others
+        probability[step.label], rivals[step.label] = probability_of(step, settings)
     for step in fits.steps:
         label = step.label
         why = _refusal(fits.best, step, label, probability[label], held, settings)
@@ -140,23 +138,6 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
             best = without_effect(best, label, data, settings) or best
     kept = {label: value for label, value in probability.items() if label in best.labels}
     return Names(best, kept, {label: rivals[label] for label in kept}, tuple(refused))
-
-
-def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
-    """The choice of a step, beside what was found after it: until then several may have stood for the same."""
-    rest = without_effect(best, step.label, data, settings)
-    if rest is None:
-        return step
-    quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
-    known = {name_of(label) for label in best.labels}
-    tried = {step.label: best}
-    for label, fitted in step.tried.items():
-        if name_of(label) in known:
-            continue
-        one = with_effect(rest, fitted.model.effects[-1], data, quick)
-        if one is not None:
-            tried[label] = one
-    return Step(rest, best, tried, step.candidates, step.label)
 
 
 def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Data, settings: GapSettings) -> str:
@@ -182,29 +163,6 @@ def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Dat
 def _judged(one: ActiveEffect) -> list[str]:
     """Parameters of an effect that halves of the data must agree on: without those that may end anywhere."""
     return [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
-
-
-def _probability(step: Step, settings: GapSettings) -> tuple[float, tuple[str, ...]]:
-    """Probability of the effect that was taken among all that were fitted in its place, and the names that cannot be
-    ruled out. What has no name in the library is less probable beforehand."""
-    own, mine = name_of(step.label), step.tried[step.label]
-    odds = {("", ""): odds_against_fit(mine, step.before)}
-    for label, one in step.tried.items():
-        if name_of(label) != own:
-            outside = settings.outside_odds if one.model.effects[-1].effect.outside else 1.0
-            odds[name_of(label)] = max(odds.get(name_of(label), 0.0), odds_against_fit(mine, one) / outside)
-    probability = 1 / (1 + sum(odds.values()))
-    rivals = [name for (name, _), one in sorted(odds.items(), key=lambda item: -item[1])
-              if name not in ("", own[0]) and one * probability > settings.rival]
-    return min(probability, settings.most_sure), tuple(dict.fromkeys(rivals))
-
-
-def odds_against_fit(one: Fitted, other: Fitted) -> float:
-    """Of another fit against one: by evidence, or by how evenly that is spread, whichever is larger."""
-    ahead = one.log_evidence - other.log_evidence
-    beside = ahead - sum(one.log_likelihoods.values()) + sum(other.log_likelihoods.values())
-    return max(math.exp(-min(max(ahead, -50.0), 50.0)),
-               odds_against(one.log_likelihoods, other.log_likelihoods, beside))
 
 
 def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect], seed: int, began: float,

@@ -20,6 +20,7 @@ from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.flexible_mode import resonance
 from avis_ctrl.gap.parallel import Each, one_by_one
+from avis_ctrl.gap.probability import Step, name_of, probability_of
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.starting_values import HasRicherLaws, seeds
@@ -41,31 +42,6 @@ class Candidate:
     effect: ActiveEffect
     fall: float
     p_value: float
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """One more effect: the fit with it, and all fits that were tried in its place, by label.
-
-    before : the fit without it. candidates : how many effects and places were scored. label : of the effect, the last
-    one by default.
-    """
-
-    before: Fitted
-    fitted: Fitted
-    tried: dict[str, Fitted]
-    candidates: int
-    label: str = ""
-
-    def __post_init__(self) -> None:
-        if not self.label:
-            object.__setattr__(self, "label", self.fitted.labels[-1])
-
-
-def name_of(label: str) -> tuple[str, str]:
-    """Name and location of an effect by its label, without the variant of its law."""
-    name, _, place = label.partition("@")
-    return name, place.partition("/")[0]
 
 
 def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each = one_by_one
@@ -166,6 +142,7 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
     tolerance, which show in how far one of them had to move, and hardly in what remains.
 
     enough : whether the search may end with a step, because what it found takes next to nothing.
+    The last step has the fit with everything that was found.
     """
     steps: list[Step] = []
 
@@ -176,14 +153,69 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
             step = _step(now, data, effects, settings, each)
             if step is None:
                 return
+            if steps:  # residual and Jacobian of the last fit alone are of use
+                steps[-1] = replace(steps[-1], fitted=steps[-1].fitted.bare())
             steps.append(step)
             progress(f"step {len(steps)}: {', '.join(step.fitted.labels)}")
             if enough(step):
                 return
     more(effects, enough)
+    for _ in range(settings.revisions):
+        progress("what was found, compared again beside what was found after it")
+        if not _revised(steps, data, settings):
+            break
+        more(effects, enough)
     if steps:
         more([one for one in effects if one.name in BEYOND], lambda step: False)
     return steps
+
+
+def _revised(steps: list[Step], data: Data, settings: GapSettings) -> bool:
+    """Compare effects that are not certain with their rivals again, beside what was found after them: until then
+    several may have stood for the same. Whether one of them was replaced; then what the others explain as well goes."""
+    for k, step in enumerate(steps[:-1]):
+        if probability_of(step, settings)[0] > settings.sure:
+            continue
+        best = steps[-1].fitted
+        again = _again(step, best, data, settings)
+        label = max(again.tried, key=lambda label: again.tried[label].log_evidence)
+        if again.tried[label].log_evidence - best.log_evidence < settings.certain:
+            steps[k] = again
+            continue
+        one = again.tried[label]
+        full = fit(one.model, one.priors, one.z, data, one.variances, settings)
+        steps[k] = replace(again, fitted=full.bare(), label=label)
+        steps[-1] = replace(steps[-1], fitted=full)
+        _pruned(steps, k, data, settings)
+        return True
+    return False
+
+
+def _pruned(steps: list[Step], kept: int, data: Data, settings: GapSettings) -> None:
+    """Without the effects found after one that was replaced that no longer gain the evidence a name needs."""
+    for step in steps[kept + 1:]:
+        best = steps[-1].fitted
+        rest = without_effect(best, step.label, data, settings)
+        if rest is not None and best.log_evidence - rest.log_evidence < settings.certain:
+            steps.remove(step)
+            steps[-1] = replace(steps[-1], fitted=rest)
+
+
+def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
+    """The choice of a step, beside what was found after it."""
+    rest = without_effect(best, step.label, data, settings)
+    if rest is None:
+        return step
+    quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
+    known = {name_of(label) for label in best.labels}
+    tried = {step.label: best.bare()}
+    for label, fitted in step.tried.items():
+        if name_of(label) in known:
+            continue
+        one = with_effect(rest, fitted.model.effects[-1], data, quick)
+        if one is not None:
+            tried[label] = one.bare()
+    return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
 
 
 def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each) -> Step | None:

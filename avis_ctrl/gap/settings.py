@@ -33,6 +33,8 @@ class GapSettings(FitSettings):
         on.
     quick_rounds, quick_iterations : `rounds` and `iterations` of a fit that only compares candidates.
     longest : most effects that are named together.
+    revisions : how often an effect may be replaced by a rival that is better beside what was found after it; twice, for
+        a pair that was named wrong both times.
     certain : gain of log evidence [nats] that a name needs beside the logarithm of the number of candidates: odds of
         a hundred.
     outside_odds : how many times as probable an effect of the library is beforehand as one that has no name in it [1].
@@ -72,6 +74,7 @@ class GapSettings(FitSettings):
     quick_rounds: int = 4
     quick_iterations: int = 4
     longest: int = 5
+    revisions: int = 2
     certain: float = 4.6
     outside_odds: float = 10.0
     rival: float = 0.05

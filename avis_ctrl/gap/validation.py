@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,19 +38,6 @@ def share_of(model: TableModel, label: str, blocks: Sequence[SpectralBlock], pow
     """By how much the held-out residual power rises when an effect alone is taken out, nothing refitted, over the
     baseline's excess. with_it : the power that the whole model leaves."""
     return power.share(ModelResidual.of(model.without(label), blocks).nrmse ** 2 - with_it)
-
-
-def odds_against(one: Mapping[Group, float], other: Mapping[Group, float], beside: float = 0.0) -> float:
-    """Odds of another model against one, by how evenly the difference of their log-likelihoods is spread over bands and
-    levels (Q. H. Vuong, Econometrica 57 (1989) 307-333).
-
-    Textbook laws are not quite those of real elements. A model that is ahead here and behind there is not certain to be
-    the better one, however much it is ahead in sum. beside : difference of what does not belong to any band (priors).
-    """
-    d = np.array([value - other[group] for group, value in one.items() if group in other])
-    spread = float(np.sqrt(np.sum((d - d.mean()) ** 2)))
-    ahead = (float(d.sum()) + beside) / max(spread, 1.0)
-    return float(stats.norm.sf(ahead) / stats.norm.cdf(ahead))
 
 
 @dataclass(frozen=True)

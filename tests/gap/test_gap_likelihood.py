@@ -12,10 +12,11 @@ from scipy.optimize import minimize
 
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.model_files import model_from_dict, model_to_dict
+from avis_ctrl.gap.probability import odds_against
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap.tolerances import tolerances_behind, within_tolerance
-from avis_ctrl.gap.validation import halves, odds_against, widening
+from avis_ctrl.gap.validation import halves, widening
 from avis_ctrl.identification.likelihood import Data, first_variances, fit
 from avis_ctrl.identification.priors import Priors, re_identified, with_tolerances
 from avis_ctrl.identification.response import ResponseModel

@@ -1,0 +1,75 @@
+"""How probable an effect is among those that were fitted in its place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from avis_ctrl.gap.settings import GapSettings
+from avis_ctrl.identification.likelihood import Fitted
+from avis_ctrl.identification.weights import Group
+
+
+def name_of(label: str) -> tuple[str, str]:
+    """Name and location of an effect by its label, without the variant of its law."""
+    name, _, place = label.partition("@")
+    return name, place.partition("/")[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One more effect: the fit with it, and all fits that were tried in its place, by label.
+
+    before : the fit without it. candidates : how many effects and places were scored. label : of the effect, the last
+    one by default.
+    """
+
+    before: Fitted
+    fitted: Fitted
+    tried: dict[str, Fitted]
+    candidates: int
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.label:
+            object.__setattr__(self, "label", self.fitted.labels[-1])
+
+
+def odds_against(one: Mapping[Group, float], other: Mapping[Group, float], beside: float = 0.0) -> float:
+    """Odds of another model against one, by how evenly the difference of their log-likelihoods is spread over bands and
+    levels (Q. H. Vuong, Econometrica 57 (1989) 307-333).
+
+    Textbook laws are not quite those of real elements. A model that is ahead here and behind there is not certain to be
+    the better one, however much it is ahead in sum. beside : difference of what does not belong to any band (priors).
+    """
+    d = np.array([value - other[group] for group, value in one.items() if group in other])
+    spread = float(np.sqrt(np.sum((d - d.mean()) ** 2)))
+    ahead = (float(d.sum()) + beside) / max(spread, 1.0)
+    return float(stats.norm.sf(ahead) / stats.norm.cdf(ahead))
+
+
+def odds_against_fit(one: Fitted, other: Fitted) -> float:
+    """Of another fit against one: by evidence, or by how evenly that is spread, whichever is larger."""
+    ahead = one.log_evidence - other.log_evidence
+    beside = ahead - sum(one.log_likelihoods.values()) + sum(other.log_likelihoods.values())
+    return max(math.exp(-min(max(ahead, -50.0), 50.0)),
+               odds_against(one.log_likelihoods, other.log_likelihoods, beside))
+
+
+def probability_of(step: Step, settings: GapSettings) -> tuple[float, tuple[str, ...]]:
+    """Probability of the effect that was taken among all that were fitted in its place, and the names that cannot be
+    ruled out. What has no name in the library is less probable beforehand."""
+    own, mine = name_of(step.label), step.tried[step.label]
+    odds = {("", ""): odds_against_fit(mine, step.before)}
+    for label, one in step.tried.items():
+        if name_of(label) != own:
+            outside = settings.outside_odds if one.model.effects[-1].effect.outside else 1.0
+            odds[name_of(label)] = max(odds.get(name_of(label), 0.0), odds_against_fit(mine, one) / outside)
+    probability = 1 / (1 + sum(odds.values()))
+    rivals = [name for (name, _), one in sorted(odds.items(), key=lambda item: -item[1])
+              if name not in ("", own[0]) and one * probability > settings.rival]
+    return min(probability, settings.most_sure), tuple(dict.fromkeys(rivals))
