@@ -24,15 +24,14 @@ from avis_ctrl.rigs.rig import Parameter, Rig
 class ModelSettings:
     """Of a model's derivatives and of its sensors' transients.
 
-    step : step of differences by an effect's parameters, in units of their size [1]: curvature and round-off are both
-        far below what a Gauss-Newton step needs.
+    step : step of differences by an effect's parameters, in units of their size [1].
     probed_Hz : lowest and highest frequency [Hz], and number of those at which the chains of sensors are compared with
         the rig's.
     unchanged : a sensor's chain is another one where its ratio to the rig's varies over these by more than this
         [1]: round-off.
     """
 
-    step: float = 1e-6
+    step: float = 1e-4
     probed_Hz: tuple[float, float, int] = (0.5, 100.0, 5)
     unchanged: float = 1e-6
 
@@ -325,30 +324,33 @@ class TableModel:
         return Acting(U, force, reading, output, inner)
 
     def _by_effects(self, omega, U, block, made: Assembled, response: TableResponse, dY: np.ndarray) -> None:
-        """Differences by the effects' parameters: of what an effect adds to a record, which the response is linear in;
-        of the whole response where it changes the table."""
+        """Central differences by the effects' parameters: of what an effect adds to a record, which the response is
+        linear in; of the whole response where it changes the table."""
         n, theta, (low, high) = len(self.base.names), self.values, self.bounds()
         scale = self.scales()
         for row in range(n, len(theta)):
             step = SETTINGS.step * scale[row]
-            # Away from the nearer bound, which may have moved past the value with the payload's mass.
-            step = step if high[row] - theta[row] > theta[row] - low[row] else -step
-            other, k = self._with_effect_parameter(row - n, theta[row] + step), self._free[row - n][0]
+            # A bound that goes with the payload's mass may have moved past the value.
+            lowest, highest = min(low[row], theta[row]), max(high[row], theta[row])
+            ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]
+            others, k = [self._with_effect_parameter(row - n, end) for end in ends], self._free[row - n][0]
+            width = ends[0] - ends[1]
             if self.effects[k].effect.nonlinear:
                 assert block is not None
                 record = self.motion[block.name]
-                up, here = (_added(one.effects[k], record, omega) for one in (other, self))
-                volts, *rest = (None if a is None or b is None else (a - b) / step
-                                for a, b in zip(up, here, strict=True))
+                up, down = (_added(other.effects[k], record, omega) for other in others)
+                volts, *rest = (None if a is None or b is None else (a - b) / width
+                                for a, b in zip(up, down, strict=True))
                 change = np.zeros((len(omega), len(self.inputs), 1), complex)
                 if volts is not None:
                     change[:, :len(self.actuators)] = volts
                 side = AtMotion(made, Acting(change, *rest), np.zeros_like(response.x))
                 dY[row] = side.Y + response.left @ side.push
                 continue
-            side = AtMotion(assemble(other.operators(omega), invert=False), response.acting, response.x)
-            # d x = inv(D) (d F - d D x): no second inverse; F = D x where the parameters are.
-            dY[row] = ((side.Y - response.Y) + response.left @ side.push) / step
+            sides = [AtMotion(assemble(other.operators(omega), invert=False), response.acting, response.x)
+                     for other in others]
+            # d x = inv(D) (d F - d D x): no second inverse.
+            dY[row] = ((sides[0].Y - sides[1].Y) + response.left @ (sides[0].push - sides[1].push)) / width
 
 
 def inseparable_parameters(model: TableModel) -> tuple[tuple[str, ...], ...]:
