@@ -30,6 +30,7 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.gates import Finding
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.gap_design import DesignEffect, design_effect
+from avis_ctrl.study.gap_files import converter_limits
 from avis_ctrl.study.identification import amplifier_corner, amplifier_words
 from avis_ctrl.study.record_checks import check_campaign
 from avis_ctrl.study.rig_channels import in_words_of
@@ -147,9 +148,15 @@ def _design(gap: Gap, options: GapOptions, progress: Progress) -> tuple[DesignEf
 
 
 def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(y_baseline, y_updated), each (samples, n_y), of every record of another campaign, from u and floor."""
-    baseline, updated = (predicted(campaign, model) for model in (found.gap.baseline, found.gap.updated))
-    return [(baseline[record.header.name], updated[record.header.name]) for record in campaign.records]
+    """(y_baseline, y_updated), each (samples, n_y), of every record of another campaign, from u and floor: clipped at
+    the converter's range, y_updated also where a converter was found to clip earlier."""
+    gap, both = found.gap, []
+    effects = [one.to_json() for one in (*gap.effects, *gap.traces)]
+    for model, known in ((gap.baseline, []), (gap.updated, effects)):
+        low, high = converter_limits(model, campaign, known)
+        order = [model.sensors.names.index(name) for name in campaign.y_names]
+        both.append({name: np.clip(y[:, order], low, high) for name, y in predicted(campaign, model).items()})
+    return [(both[0][record.header.name], both[1][record.header.name]) for record in campaign.records]
 
 
 def provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float) -> dict[str, Any]:

@@ -144,10 +144,11 @@ def read_gap(folder: Path) -> dict[str, Any]:
     if not isinstance(found, dict) or found.get("format") != "avis-gap":
         raise InputError("expected the result of avis gap", file=path, field="format",
                          value=found.get("format") if isinstance(found, dict) else type(found).__name__)
-    effects = found.get("effects")
-    if not isinstance(effects, list) or not all(isinstance(one, dict) and isinstance(one.get("name"), str)
-                                                for one in effects):
-        raise InputError("expected a list of named effects", file=path, field="effects")
+    for key in ("effects", "traces"):
+        effects = found.setdefault(key, []) if key == "traces" else found.get(key)
+        if not isinstance(effects, list) or not all(isinstance(one, dict) and isinstance(one.get("name"), str)
+                                                    for one in effects):
+            raise InputError("expected a list of named effects", file=path, field=key)
     return found
 
 
@@ -168,7 +169,8 @@ def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
     InputError : a folder or campaign that does not fit, a place that cannot be written.
     ComputationError : an effect with which the motion diverges; a disk that cannot hold the file.
     """
-    effects = read_gap(folder)["effects"]
+    found = read_gap(folder)
+    effects = [*found["effects"], *found["traces"]]
     models = {"y_baseline": read_model(folder / BASELINE_FILE), "y_updated": read_model(folder / UPDATED_FILE)}
     for model, _ in models.values():
         _require_fit(model, campaign)
@@ -177,7 +179,7 @@ def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
                            "not_predicted": "; ".join(_not_predicted(effects, campaign))})
         # Model by model: records of one length share the model's response.
         for name, (model, clock) in models.items():
-            low, high = _limits(model, campaign, effects if name == "y_updated" else [])
+            low, high = converter_limits(model, campaign, effects if name == "y_updated" else [])
             for source in campaign.records:
                 h = source.header
                 progress(f"{name}, record {h.name}: {h.duration_s:.4g} s")
@@ -219,9 +221,12 @@ def _not_predicted(effects: Sequence[Mapping[str, Any]], campaign: Campaign) -> 
     return said
 
 
-def _limits(model: TableModel, campaign: Campaign, effects: Sequence[Mapping[str, Any]]
-            ) -> tuple[np.ndarray, np.ndarray]:
-    """(n_y,) each, in the campaign's order: range of the converter, and where it was found to clip."""
+def converter_limits(model: TableModel, campaign: Campaign, effects: Sequence[Mapping[str, Any]]
+                     ) -> tuple[np.ndarray, np.ndarray]:
+    """(n_y,) each, in the campaign's order: range of the converter, and where it was found to clip.
+
+    effects : named ones and traces, as gap.json has them.
+    """
     n = len(campaign.y_names)
     known = campaign.y_unit == "V" and model.rig.acquisition is not None
     low, high = (np.full(n, one) for one in (nominal_converter(model.rig).limits_V if known else (-np.inf, np.inf)))

@@ -26,7 +26,7 @@ from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.formats.hdf5 import write_campaign
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rig_file import load_rig as read_rig
-from avis_ctrl.study.gap import GapFinding, GapOptions, provenance
+from avis_ctrl.study.gap import GapFinding, GapOptions, predict, provenance
 from avis_ctrl.study.gap_files import read_gap, write_gap, write_gap_predictions
 from avis_ctrl.study.gap_names import GAP_FILES
 
@@ -270,6 +270,21 @@ def test_predictions(folder, tmp_path):
             updated[:, 0] = np.clip(updated[:, 0], -0.25, 0.5)
             np.testing.assert_allclose(group["y_updated"], updated, atol=1e-9)
             assert np.max(np.abs(group["y_updated"][:, 2] - group["y_baseline"][:, 2])) > 0.01
+
+
+def test_predictions_from_python_are_those_of_the_file(tmp_path):
+    """A converter that clips is a trace here; `avis predict` and `study.gap.predict` both know of it."""
+    gap = replace(gap_of(), traces=(named("sensor_quantisation", "Sz2", clip_high_V=0.5),))
+    path, out, campaign = tmp_path / "gap", tmp_path / "pred.h5", campaign_of(0.5, ("Sz2", "Sy1"), floor=True)
+    path.mkdir()
+    write_gap(path, gap)
+    write_gap_predictions(path, campaign, out)
+    found = predict(GapFinding(gap, campaign, (), {}), campaign)
+    with h5py.File(out) as file:
+        for record, pair in zip(campaign.records, found, strict=True):
+            for name, y in zip(("y_baseline", "y_updated"), pair, strict=True):
+                np.testing.assert_allclose(y, file[f"records/{record.header.name}/{name}"], atol=1e-9)
+    assert max(y[:, 0].max() for _, y in found) <= 0.5 < max(y[:, 0].max() for y, _ in found)
 
 
 def test_predictions_at_the_limits(folder, tmp_path):
