@@ -36,12 +36,14 @@ Progress = Callable[[str], None]
 class Candidate:
     """An effect at a place, where its fit begins, and the fall of the sum of squares by the score test.
 
-    p_value : of as large a fall by chance, over all frequencies and other values that were tried there.
+    p_value : of as large a fall by noise alone, over all frequencies and other values that were tried there.
+    others : further values with which its fit may begin, the most promising first.
     """
 
     effect: ActiveEffect
     fall: float
     p_value: float
+    others: tuple[ActiveEffect, ...] = ()
 
 
 def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each = one_by_one
@@ -60,8 +62,10 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: 
         found = []
         for place in effect.places(model):
             if (effect.name, place.partition("/")[0]) not in taken:
-                found += [Candidate(active(effect, model, place, seed.values), seed.chi2, seed.p_value)
-                          for seed in seeds(effect, score, place)[:1]]
+                best = seeds(effect, score, place)
+                starts = [active(effect, model, place, values)
+                          for values in dict.fromkeys(one.values for one in best[:settings.starts])]
+                found += [Candidate(starts[0], best[0].chi2, best[0].p_value, tuple(starts[1:]))] if best else []
         return found
     resonant = [one for one in effects if one.resonant]
     found = [one for own in each(scored, [one for one in effects if not one.resonant]) for one in own]
@@ -106,10 +110,15 @@ def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSett
     """The fit with one effect more; None where it came to no end."""
     model = fitted.model.with_effect(one)
     own = _priors_of(one, model, settings)
-    before = fitted.z.copy()
-    before[tolerances_behind(one, fitted.priors.names)] = 0  # the effect begins with what these had to make up for
-    z = np.concatenate([before, own.z(np.array(one.values))])
+    z = np.concatenate([_without_tolerances_behind(fitted, one), own.z(np.array(one.values))])
     return _try(fitted, model, fitted.priors.followed_by(own), z, data, settings)
+
+
+def _without_tolerances_behind(fitted: Fitted, one: ActiveEffect) -> np.ndarray:
+    """Standardised parameters of a fit where one of its effects begins: with what tolerances had to make up for."""
+    z = fitted.z.copy()
+    z[tolerances_behind(one, fitted.priors.names)] = 0
+    return z
 
 
 def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings) -> Fitted | None:
@@ -247,14 +256,22 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     profile, quick = Profile(now, data, settings), replace(settings, rounds=settings.quick_rounds,
                                                             iterations=settings.quick_iterations)
 
-    def begun(one: Candidate) -> tuple[ActiveEffect, float] | None:
-        model = now.model.only(one.effect)
-        own = _priors_of(one.effect, model, settings)
+    def fitted(one: ActiveEffect, iterations: int) -> tuple[ActiveEffect, float] | None:
         try:
-            z, gain = profile.fit(model, own, own.z(np.array(one.effect.values)), settings.rough_iterations)
+            at = _without_tolerances_behind(now, one)
+            model = now.model.at(now.priors.values(at)).only(one)
+            own = _priors_of(one, model, settings)
+            z, gain = profile.fit(model, own, own.z(np.array(one.values)), iterations, at)
         except (AvisError, np.linalg.LinAlgError, FloatingPointError):
             return None
-        return one.effect.at(own.values(z).tolist()), gain
+        return one.at(own.values(z).tolist()), gain
+
+    def begun(one: Candidate) -> tuple[ActiveEffect, float] | None:
+        starts = [one.effect, *one.others]
+        if len(starts) > 1:
+            ends = [end for start in starts if (end := fitted(start, settings.first_iterations)) is not None]
+            starts = [max(ends, key=lambda end: end[1])[0]] if ends else []
+        return fitted(starts[0], settings.rough_iterations) if starts else None
 
     def ended(one: ActiveEffect) -> Fitted | None:
         return _small(with_effect(now, one, data, quick))
@@ -262,7 +279,9 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     if not made:
         return {}
     most = max(gain for _, gain in made)
-    near = [one for one, gain in made if gain >= settings.not_far_behind * most]
+    # What acts at full strength or not at all takes more than a first-order move of the rig's parameters.
+    near = [one for one, gain in made if gain >= settings.not_far_behind * most
+            or not any(parameter.linear for parameter in one.parameters)]
     further = [_whole(one, now) for one in each(ended, near) if one is not None]
     stated = tolerances_of(now.model.rig)
     return {one.labels[-1]: one for one in further if not implausible(one)

@@ -27,6 +27,9 @@ class GapSettings(FitSettings):
     resonance_share : of the largest fall of the sum of squares, that a resonance of any shape must bring for effects
         with a resonance to be looked for [1].
     refits : effects that are refitted at each step of the search, the best by the score test.
+    starts : values with which the fit of a candidate may begin, the best by the score test. To first order a narrow
+        resonance at a wrong frequency promises as much as one at the right frequency.
+    first_iterations : of each of these, after which only the best is followed.
     rough_iterations : most of a first fit of every candidate's own parameters, which cost little; a sharp resonance
         that begins half its width away needs more than a few.
     not_far_behind : fraction of the best candidate's gain of log evidence by that fit with which another one is fitted
@@ -69,6 +72,8 @@ class GapSettings(FitSettings):
     shape_spread: float = 1.0
     resonance_share: float = 0.1
     refits: int = 8
+    starts: int = 4
+    first_iterations: int = 4
     rough_iterations: int = 16
     not_far_behind: float = 0.3
     quick_rounds: int = 4

@@ -211,21 +211,25 @@ class Profile:
         rows = np.concatenate([rows, np.broadcast_to(prior, (len(rows), len(self.fitted.z)))], axis=1)
         return rows - (rows @ self.basis.T) @ self.basis
 
-    def fit(self, model: Any, priors: Priors, z: np.ndarray, iterations: int) -> tuple[np.ndarray, float]:
+    def fit(self, model: Any, priors: Priors, z: np.ndarray, iterations: int, at: np.ndarray | None = None
+            ) -> tuple[np.ndarray, float]:
         """z (k,) of the added parameters, the free ones of `model`, and the gain of log evidence with them.
+
+        at : (n,) standardised parameters of the fit in `model`; where the fit ended by default.
 
         Raises InputError where no table has the values that it begins with.
         """
+        rest = -(self.fitted.z if at is None else at)
         weights = self.fitted.weights
 
         def expand(z: np.ndarray) -> _Expansion:
             moved = model.at(priors.values(z))
             now = _evaluate(moved, priors, z, self.data, weights)
-            J, e = self.free(now.J), self.free(now.e[None], -self.fitted.z)[0]
+            J, e = self.free(now.J), self.free(now.e[None], rest)[0]
             return _Expansion(moved, z, now, J @ J.T, J @ e, float(e @ e))
-        at, _ = _descent(expand, expand(z), iterations, self.settings)
-        gain = 0.5 * (float(self.e @ self.e) - at.whole - np.linalg.slogdet(at.H + np.eye(len(z)))[1])
-        return at.z, gain - _price_of_ends(at.model, self.data) + _price_of_ends(self.fitted.model, self.data)
+        end, _ = _descent(expand, expand(z), iterations, self.settings)
+        gain = 0.5 * (float(self.e @ self.e) - end.whole - np.linalg.slogdet(end.H + np.eye(len(z)))[1])
+        return end.z, gain - _price_of_ends(end.model, self.data) + _price_of_ends(self.fitted.model, self.data)
 
 
 def _hyper(variances: Variances, settings: FitSettings) -> float:
