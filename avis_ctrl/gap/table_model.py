@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -326,19 +326,12 @@ class TableModel:
     def _by_effects(self, omega, U, block, made: Assembled, response: TableResponse, dY: np.ndarray) -> None:
         """Central differences by the effects' parameters: of what an effect adds to a record, which the response is
         linear in; of the whole response where it changes the table."""
-        n, theta, (low, high) = len(self.base.names), self.values, self.bounds()
-        scale = self.scales()
-        for row in range(n, len(theta)):
-            step = SETTINGS.step * scale[row]
-            # A bound that goes with the payload's mass may have moved past the value.
-            lowest, highest = min(low[row], theta[row]), max(high[row], theta[row])
-            ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]
-            others, k = [self._with_effect_parameter(row - n, end) for end in ends], self._free[row - n][0]
-            width = ends[0] - ends[1]
-            if self.effects[k].effect.nonlinear:
+        n = len(self.base.names)
+        for row, (effect, others, width, tables) in enumerate(self._beside(omega), n):
+            if effect.nonlinear:
                 assert block is not None
                 record = self.motion[block.name]
-                up, down = (_added(other.effects[k], record, omega) for other in others)
+                up, down = (_added(other, record, omega) for other in others)
                 volts, *rest = (None if a is None or b is None else (a - b) / width
                                 for a, b in zip(up, down, strict=True))
                 change = np.zeros((len(omega), len(self.inputs), 1), complex)
@@ -347,10 +340,26 @@ class TableModel:
                 side = AtMotion(made, Acting(change, *rest), np.zeros_like(response.x))
                 dY[row] = side.Y + response.left @ side.push
                 continue
-            sides = [AtMotion(assemble(other.operators(omega), invert=False), response.acting, response.x)
-                     for other in others]
+            sides = [AtMotion(table, response.acting, response.x) for table in tables]
             # d x = inv(D) (d F - d D x): no second inverse.
             dY[row] = ((sides[0].Y - sides[1].Y) + response.left @ (sides[0].push - sides[1].push)) / width
+
+    @partial(kept_lines, most=1)
+    def _beside(self, omega: np.ndarray) -> list[tuple[Effect, list[ActiveEffect], float, list[Assembled]]]:
+        """For every free parameter of the effects: its effect, that effect on either side, the step between the two,
+        and the table there, not inverted, of one that changes the table."""
+        n, theta, (low, high), found = len(self.base.names), self.values, self.bounds(), []
+        scale = self.scales()
+        for row in range(n, len(theta)):
+            step = SETTINGS.step * scale[row]
+            # A bound that goes with the payload's mass may have moved past the value.
+            lowest, highest = min(low[row], theta[row]), max(high[row], theta[row])
+            ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]
+            others, k = [self._with_effect_parameter(row - n, end) for end in ends], self._free[row - n][0]
+            effect = self.effects[k].effect
+            tables = [] if effect.nonlinear else [assemble(one.operators(omega), invert=False) for one in others]
+            found.append((effect, [one.effects[k] for one in others], ends[0] - ends[1], tables))
+        return found
 
 
 def inseparable_parameters(model: TableModel) -> tuple[tuple[str, ...], ...]:

@@ -33,8 +33,12 @@ class Data:
 
     @staticmethod
     def of(blocks: Sequence[SpectralBlock], levels: Mapping[str, float], lines: int) -> Data:
-        """Some lines of each block; levels [V] by record."""
-        return Data(tuple(thinned(block, lines) for block in blocks), tuple(levels[block.name] for block in blocks))
+        """Some lines of each block; levels [V] by record. Equal lines are one array, so that models keep what they have
+        computed on them (`response.kept_lines`)."""
+        known: dict[bytes, np.ndarray] = {}
+        few = [thinned(block, lines) for block in blocks]
+        shared = (replace(block, omega=known.setdefault(block.omega.tobytes(), block.omega)) for block in few)
+        return Data(tuple(shared), tuple(levels[block.name] for block in blocks))
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,8 +49,10 @@ def _chain_response(chain: StateSpace | None, motion: Motion, lines: bytes) -> n
     return (1.0 if chain is None else chain.frequency_response(omega)[:, 0, 0]) * (1j * omega) ** _POWER[motion]
 
 
-def kept_lines(compute: Callable[[Model, np.ndarray], Value]) -> Callable[[Model, np.ndarray], Value]:
-    """A method of lines omega that keeps what it found last, not to be written to: a fit asks again and again."""
+def kept_lines(compute: Callable[[Model, np.ndarray], Value], most: int = 2
+               ) -> Callable[[Model, np.ndarray], Value]:
+    """A method of lines omega that keeps the `most` results it found last, not to be written to: a fit needs them again
+    and again, and records of one kind share their lines."""
     known: list[tuple[Model, np.ndarray, Value]] = []
 
     @wraps(compute)
@@ -59,7 +61,7 @@ def kept_lines(compute: Callable[[Model, np.ndarray], Value]) -> Callable[[Model
             if one is model and lines is omega:
                 return value
         known.append((model, omega, value := compute(model, omega)))
-        del known[:-2]
+        del known[:-most]
         return value
     return found
 

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.response import FLOOR, N_Q, ResponseModel
+from avis_ctrl.identification.response import FLOOR, N_Q, ResponseModel, kept_lines
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -119,11 +119,16 @@ def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.nd
     the states that a model has inside beside the body.
     The columns have unit norm; each was divided by its own.
     """
-    n, n_in = len(block.omega), len(model.inputs)
+    return _transient_columns(model, block.omega)
+
+
+@kept_lines
+def _transient_columns(model: ResponseModel, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    n, n_in = len(omega), len(model.inputs)
     U = np.zeros((n, n_in + 2 * N_Q, 2 * N_Q), complex)
     U[:, n_in:] = np.eye(2 * N_Q)
-    body = model.driven(block.omega, U, derivative=False).Y
-    columns = np.concatenate([body, model.sensor_transients(block.omega), model.inner_transients(block.omega)], axis=2)
+    body = model.driven(omega, U, derivative=False).Y
+    columns = np.concatenate([body, model.sensor_transients(omega), model.inner_transients(omega)], axis=2)
     norms = np.linalg.norm(columns, axis=(0, 1))
     return columns / norms, norms
 
