@@ -151,8 +151,10 @@ def test_what_is_no_json(content, tmp_path):
 
 def updated_model():
     model = BASE
-    for name, place, values in (("sensor_gain", "Sz1", [0.8]), ("cubic_stiffness", "isolators z", [3e12]),
-                                ("actuator_gain", "Ax2", [1.2]), ("com_offset", "payload", [0.01, 0.0, -0.02])):
+    for name, place, values in (("sensor_gain", "Sz1", [0.8]),
+                                ("cubic_stiffness", "isolators z", [3e12, 0.1, 0.0, -0.1]),
+                                ("actuator_gain", "Ax2", [1.2]),
+                                ("com_offset", "payload", [0.01, 0.0, -0.02])):
         model = model.with_effect(active(library()[name], model, place, values))
     return model
 

@@ -173,7 +173,7 @@ def test_a_settling_drift_is_nearly_over_in_the_middle_of_the_campaign(rig, plai
     assert differ(found.system.frequency_response(found.omega), other.system.frequency_response(found.omega)) < 1e-9
 
 
-@pytest.mark.parametrize("name, place, values", [("cubic_stiffness", "isolators z", (1e9,)),
+@pytest.mark.parametrize("name, place, values", [("cubic_stiffness", "isolators z", (1e9, 0.0, 0.0, 0.0)),
                                                 ("actuator_saturation", "actuators", (3.0,))])
 def test_what_vanishes_with_amplitude_is_left_out_and_said(plain, name, place, values):
     made, without = realise(with_one(plain, name, place, values)), realise(plain)

@@ -129,8 +129,8 @@ def test_linear_effects_as_runge_kutta(name, place, values, table, given):
 
 
 NONLINEAR = [  # name, place, values, what Runge-Kutta takes, when, least effect on y, largest error
-    ("cubic_stiffness", "isolators z", [1e13], {"cubic": 1e13}, {}, 0.2, 1e-4),
-    ("cubic_stiffness", "isolators z", [1e14], {"cubic": 1e14}, {}, 0.5, 2e-3),
+    ("cubic_stiffness", "isolators z", [1e13, 0.0, 0.0, 0.0], {"cubic": 1e13}, {}, 0.2, 1e-4),
+    ("cubic_stiffness", "isolators z", [1e14, 0.0, 0.0, 0.0], {"cubic": 1e14}, {}, 0.5, 2e-3),
     ("contact_friction", "actuators", [3e3, 1e-5, *EVEN], {"friction": (3e3, 1e-5)}, {}, 0.1, 1e-4),
     ("contact_friction", "actuators", [3e4, 1e-7, *EVEN], {"friction": (3e4, 1e-7)}, {}, 0.01, 1e-4),
     ("contact_friction", "actuators", [3e4, 1e-3, *EVEN], {"friction": (3e4, 1e-3)}, {}, 0.5, 2e-3),
@@ -163,7 +163,7 @@ def test_saturation_and_the_drive_limit():
 
 def test_two_effects_at_once():
     """Cubic mounts and friction, with drives that saturate."""
-    model = with_effect("cubic_stiffness", "isolators z", [1e13])
+    model = with_effect("cubic_stiffness", "isolators z", [1e13, 0.0, 0.0, 0.0])
     model = with_effect("contact_friction", "actuators", [3e3, 1e-5, *EVEN], model)
     model = with_effect("actuator_saturation", "actuators", [0.5], model)
     y, _ = Table(RIG).run(np.clip(U, -0.5, 0.5), FS, cubic=1e13, friction=(3e3, 1e-5))
@@ -175,13 +175,13 @@ def test_two_effects_at_once():
     ("payload_flexible_mode", "payload", [60.0, 0.02, *np.linspace(-0.02, 0.02, 12)])])
 def test_cubic_mounts_on_a_table_with_more_coordinates(name, place, values):
     """A chassis that recoils a little, a payload that bends a little: the march has their coordinates."""
-    cubic = with_effect("cubic_stiffness", "isolators z", [1e13])
+    cubic = with_effect("cubic_stiffness", "isolators z", [1e13, 0.0, 0.0, 0.0])
     more = simulate(with_effect(name, place, values, cubic), U, None, FS)
     beside = error(simulate(with_effect(name, place, values), U, None, FS).y, simulate(BARE, U, None, FS).y)
     assert 1e-3 < beside < 0.2
     assert error(more.y, simulate(cubic, U, None, FS).y) < 3 * beside
     # With next to no force the march leaves the linear table as it is.
-    soft = with_effect(name, place, values, with_effect("cubic_stiffness", "isolators z", [1.0]))
+    soft = with_effect(name, place, values, with_effect("cubic_stiffness", "isolators z", [1.0, 0.0, 0.0, 0.0]))
     assert error(simulate(soft, U, None, FS).y, simulate(with_effect(name, place, values), U, None, FS).y) < 1e-9
     assert more.defect < 1e-5
 
@@ -250,7 +250,7 @@ def test_an_effect_with_memory_of_the_users_own():
 
 def test_what_has_no_motion_is_said():
     with pytest.raises(ComputationError, match="cubic_stiffness"):
-        simulate(with_effect("cubic_stiffness", "isolators z", [-1e15]), U, None, FS)
+        simulate(with_effect("cubic_stiffness", "isolators z", [-1e15, 0.0, 0.0, 0.0]), U, None, FS)
 
 
 @pytest.mark.parametrize(("u", "floor", "rate", "message"), [
@@ -338,7 +338,7 @@ def test_records_at_rest_and_short_ones(samples, rms):
     """Noise of the sensors alone moves no mount by more than they could have felt of it."""
     y = rms * np.random.default_rng(1).standard_normal((samples, 6))
     model = with_effect("contact_friction", "actuators", [3e4, 1e-6, *EVEN])
-    model = with_effect("cubic_stiffness", "isolators z", [1e13], model)
+    model = with_effect("cubic_stiffness", "isolators z", [1e13, 0.0, 0.0, 0.0], model)
     model = model.with_effect(active(LargeMotion(), model, "payload", [1.0, 0.0, 0.0]))
     found = motion_of(Campaign("avis", (record_of(np.zeros((samples, 8)), y),)), model)["00"]
     assert np.max(np.abs(found.deflection)) <= rms * 1e-4

@@ -106,9 +106,9 @@ def test_predictions_differ_most_where_it_is_said(frequency, damping):
 
 def test_amplitude_counts_only_in_what_differs():
     """Both hold the same nonlinear effect, which comes last; what differs is linear."""
-    a, b = (with_effect(with_effect(MODEL, "sensor_gain", place, 1.2), "cubic_stiffness", "isolators z", 1e9)
-            for place in ("Sz1", "Sz2"))
+    a, b = (with_effect(with_effect(MODEL, "sensor_gain", place, 1.2), "cubic_stiffness", "isolators z", 1e9,
+                         0.0, 0.0, 0.0) for place in ("Sz1", "Sz2"))
     assert "their predictions differ most" in between("sensor_gain", "sensor_gain", a, b)
-    bent = with_effect(MODEL, "cubic_stiffness", "isolators z", 1e9)
+    bent = with_effect(MODEL, "cubic_stiffness", "isolators z", 1e9, 0.0, 0.0, 0.0)
     assert "only one of them" in between("cubic_stiffness", "sensor_gain", bent, with_effect(
         MODEL, "sensor_gain", "Sz1", 1.2))

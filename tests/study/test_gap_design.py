@@ -222,7 +222,7 @@ def test_an_effect_without_a_realisation_is_said_to_be_unchecked(monkeypatch, ba
     monkeypatch.setattr("avis_ctrl.study.gap_design.realise", lambda model: Realised(
         gain(np.zeros((1, 1))), OMEGA, 0.0, 0.0, notes_on(model)))
     left_out = (active(SensorLowpass(), baseline, "Sz1", (0.08,)),
-                active(library()["cubic_stiffness"], baseline, "isolators z", (1e9,)))
+                active(library()["cubic_stiffness"], baseline, "isolators z", (1e9, 0.0, 0.0, 0.0)))
     updated = replace(baseline, effects=left_out)
     hum = SimpleNamespace(name="mains_hum", location="geophones", label="")
     found = design_effect(SimpleNamespace(baseline=baseline, updated=updated, effects=(hum,)), design)

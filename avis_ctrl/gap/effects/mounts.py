@@ -235,25 +235,36 @@ def leveled(model_or_ops) -> np.ndarray:
 
 @register
 class CubicStiffness(_OfMounts):
-    """Force -k3 d^3 at every vertical mount."""
+    """Force -k3 d^3 at every vertical mount; mounts may differ in k3 about their mean."""
 
     name = "cubic_stiffness"
     title = "the mounts stiffen with amplitude"
     looks_like = "vertical resonances rise with level, and third harmonics appear"
     nonlinear = True
-    strength = "k3_N_per_m3"
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model) ** 2
-        return (EffectParameter("k3_N_per_m3", "N/m^3", "cubic stiffness of each mount", 0.0, -1e4 * size, 1e4 * size,
-                                size),)
+        return (EffectParameter("k3_N_per_m3", "N/m^3", "cubic stiffness, mean of the mounts", 0.0, -1e4 * size,
+                                1e4 * size, size),
+                *(EffectParameter(f"uneven_{i}", "1", f"that of mount {i} over the mean, less one", 0.0, -0.9, 0.9, 0.1,
+                                  False, (0.0,), True) for i in range(1, int(np.sum(vertical(model))))))
 
     def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
-        up = record.vertical
-        return -values["k3_N_per_m3"] * (record.deflection[:, up] ** 3 @ record.rows[up])
+        return stiffened(record.deflection[:, record.vertical] ** 3, record, values)
+
+    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
+                       ) -> np.ndarray | None:
+        """As `force`, from the spectra of the cubes."""
+        cubes = record.kept(self.name, omega, lambda: record.deflection[:, record.vertical] ** 3)
+        return stiffened(cubes, record, values)
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         return "mounts that soften with amplitude" if values["k3_N_per_m3"] < 0 else ""
+
+
+def stiffened(cubes: np.ndarray, record: RecordMotion, values: Mapping[str, float]) -> np.ndarray:
+    """(n, 6) generalized force on the payload by cubes of the mounts' deflections, (n, m), in time or on lines."""
+    return -cubes @ (values["k3_N_per_m3"] * shares(values)[:, None] * record.rows[record.vertical])
 
 
 def largest_rms(model: Table) -> float:
