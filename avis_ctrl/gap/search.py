@@ -279,9 +279,10 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     if not made:
         return {}
     most = max(gain for _, gain in made)
-    # What acts at full strength or not at all takes more than a first-order move of the rig's parameters.
+    # What acts at full strength or not at all takes more than a first-order move of the rig's parameters: of its gain
+    # only the sign is known before these are fitted with it.
     near = [one for one, gain in made if gain >= settings.not_far_behind * most
-            or not any(parameter.linear for parameter in one.parameters)]
+            or (gain > 0 and not any(parameter.linear for parameter in one.parameters))]
     further = [_whole(one, now) for one in each(ended, near) if one is not None]
     stated = tolerances_of(now.model.rig)
     return {one.labels[-1]: one for one in further if not implausible(one)
