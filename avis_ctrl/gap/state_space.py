@@ -22,7 +22,15 @@ from avis_ctrl.gap.effects.attached import elements
 from avis_ctrl.gap.effects.cable import tie
 from avis_ctrl.gap.effects.chassis import of_chassis
 from avis_ctrl.gap.effects.flexible_mode import modes, shape_rows
-from avis_ctrl.gap.effects.mounts import LEVELED, REFERENCE_Hz, contacts, drift_over_stiffness, drifted, surge_omega
+from avis_ctrl.gap.effects.mounts import (
+    LEVELED,
+    REFERENCE_Hz,
+    contacts,
+    drift_over_stiffness,
+    drifted,
+    shares,
+    surge_omega,
+)
 from avis_ctrl.gap.effects.payload import place_of
 from avis_ctrl.gap.operators import MountGeometry, mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
@@ -240,7 +248,7 @@ def _surge(table: ReducedTable, place: str, values: Mapping[str, float]) -> Stat
 def _leveling(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     """Payload against chassis, as the valves feel it."""
     own = np.flatnonzero(table.mounts.along("z"))[:LEVELED]
-    G, k = table.G[own], table.mounts.stiffness[own]
+    G, k = table.G[own], table.mounts.stiffness[own] * shares(values)
     poles, size = [0.0], 2 * np.pi * values["rate_Hz"]
     if "valve_corner_Hz" in values:
         corner = 2 * np.pi * values["valve_corner_Hz"]

@@ -169,17 +169,18 @@ def test_surge_keeps_the_static_stiffness_and_resonates_where_it_says():
     assert told["mass_kg"].std == pytest.approx(mass * 2 * 0.1 / f0)  # m goes as f^-2
 
 
-@pytest.mark.parametrize("valve", [None, 0.4])
-def test_leveling_integrates_the_deflection_of_three_mounts(valve):
+@pytest.mark.parametrize(("law", "values", "valve", "each"), [
+    ("plain", [0.1], None, [1.0, 1.0, 1.0]), ("lag", [0.1, 0.4], 0.4, [1.0, 1.0, 1.0]),
+    ("each", [0.1, 0.3, -0.2], None, [1.3, 0.8, 0.9])])
+def test_leveling_integrates_the_deflection_of_three_mounts(law, values, valve, each):
     rate = 0.1
-    values = [rate] if valve is None else [rate, valve]
-    model = with_effect("leveling_loop", f"isolators 1-3 z/{'plain' if valve is None else 'lag'}", values)
+    model = with_effect("leveling_loop", f"isolators 1-3 z/{law}", values)
     true = []
     for f in F:
         s, table = 2j * np.pi * f, Assembly(RIG).mounts()
-        law = 2 * np.pi * rate / s / (1 + s / (2 * np.pi * valve) if valve else 1)
-        for G, k in zip(table.maps[:3], VERTICAL, strict=False):
-            table.spring(table.row(G[2]), k * law, floor=[0, 0, 1])
+        integral = 2 * np.pi * rate / s / (1 + s / (2 * np.pi * valve) if valve else 1)
+        for G, k, own in zip(table.maps[:3], VERTICAL, each, strict=False):
+            table.spring(table.row(G[2]), k * own * integral, floor=[0, 0, 1])
         true.append(table.response([f])[0])
     np.testing.assert_allclose(model.response(OMEGA), true, rtol=1e-9, atol=1e-20)
     # An integral undoes a static force on three mounts; the fourth alone cannot hold the vertical axis there.

@@ -37,6 +37,7 @@ LINEAR = [
     ("product_of_inertia", "Jxy", (5.0,)), ("mount_relaxation", "isolators z", (0.4, 3.0)),
     ("mount_surge", "isolators z", (40.0, 0.4, 0.03, 0.01, -0.02, 0.02)),
     ("leveling_loop", "isolators 1-3 z/plain", (0.18,)), ("leveling_loop", "isolators 1-3 z/lag", (0.18, 0.5)),
+    ("leveling_loop", "isolators 1-3 z/each", (0.18, 0.2, -0.1)),
     ("base_compliance", "chassis/translation", (2000.0, 0.06, 20.0, 20.0, 14.0)),
     ("base_compliance", "chassis/rocking", (2000.0, 0.06, 20.0, 20.0, 14.0, 25.0, 25.0, 25.0, 0.6, 0.6, 0.6, 0.0, 0.0)),
     ("base_compliance", "chassis/rocking",

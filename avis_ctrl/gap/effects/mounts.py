@@ -177,7 +177,8 @@ def shares(values: Mapping[str, float]) -> np.ndarray:
 
 @register
 class LevelingLoop(_OfMounts):
-    """Every leveled mount k (1 + w/s), w = 2 pi rate, with a valve that lags k (1 + w/(s (1 + s tau))).
+    """Every leveled mount k (1 + w/s), w = 2 pi rate, with a valve that lags k (1 + w/(s (1 + s tau))), or each with a
+    rate of its own.
 
     A valve lets air in at a rate by the height of the payload over the chassis; what air does to height, and so the
     force by it, goes with the mount's own stiffness.
@@ -189,7 +190,7 @@ class LevelingLoop(_OfMounts):
     holds_states = True
 
     def places(self, model: Table) -> tuple[str, ...]:
-        return ("isolators 1-3 z/plain", "isolators 1-3 z/lag") if has_mounts(model) else ()
+        return tuple(f"isolators 1-3 z/{law}" for law in ("plain", "lag", "each")) if has_mounts(model) else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         # Faster than the best damped mode dies away, the loop is unstable: no table that was measured has it.
@@ -197,6 +198,9 @@ class LevelingLoop(_OfMounts):
         rate = EffectParameter("rate_Hz", "Hz", "of the integrator, over 2 pi", 0.0, 0.0, fastest, 0.02)
         if place.endswith("plain"):
             return (rate,)
+        if place.endswith("each"):
+            return (rate, *(EffectParameter(f"uneven_{i}", "1", f"rate of valve {i} over the mean, less one", 0.0, -0.9,
+                                            0.9, 0.1, False, (0.0,), True) for i in range(1, LEVELED)))
         # A valve may be faster than these data tell; its corner then runs to the upper end.
         return (rate, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, *VALVE_Hz, 1.0,
                                       False, (0.1, 0.3, 1.0, 3.0), True))
@@ -209,7 +213,9 @@ class LevelingLoop(_OfMounts):
         ratio = 2 * np.pi * values["rate_Hz"] / ops.s
         if "valve_corner_Hz" in values:
             ratio = ratio / (1 + ops.s / (2 * np.pi * values["valve_corner_Hz"]))
-        ops.stiffness_factor = ops.stiffness_factor + ratio[:, None] * leveled(ops)
+        each = np.zeros(len(leveled(ops)))
+        each[leveled(ops)] = shares(values)
+        ops.stiffness_factor = ops.stiffness_factor + ratio[:, None] * each
         # Each integrator starts with a force of its own, each valve with an opening.
         rows = mount_geometry(ops.base.rig).payload[leveled(ops)].T
         ops.decays.append(rows / ops.s[:, None, None])
