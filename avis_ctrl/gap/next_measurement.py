@@ -10,9 +10,6 @@ import numpy as np
 from avis_ctrl.gap.result import RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel
 
-# Power of the level with which a linear residual grows.
-LINEAR = 1.0
-
 
 @dataclass(frozen=True)
 class NextMeasurementSettings:
@@ -90,13 +87,13 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
     power, std = growth
     told = (f"What remains{where and f', to {where},'} grows as the level of the drive to the power {power:.2f} +- "
             f"{std:.2g}")
-    if abs(power) <= max(SETTINGS.within, 2 * std) and abs(power) < abs(power - LINEAR):
+    if abs(power) <= max(SETTINGS.within, 2 * std) and abs(power) < abs(power - 1):
         return (f"{told}: it hardly depends on the drives. Take a record at rest with the floor measured, and look for "
                 "other sources.")
-    if abs(power - LINEAR) <= max(SETTINGS.within, 2 * std):
+    if abs(power - 1) <= max(SETTINGS.within, 2 * std):
         return (f"{told}: it is linear. Drive one actuator at a time: by which drives and at which sensors it appears "
                 "shows where it acts.")
-    law = ("more slowly than the drive, as friction, play or a limit would have it" if power < LINEAR else
+    law = ("more slowly than the drive, as friction, play or a limit would have it" if power < 1 else
            "faster than the drive, as stiffening, a limit or clipping would have it")
     return (f"{told}: {law}. Repeat one record at three or more levels with a multisine of odd lines: the size of the "
             "lines in between, over the level, shows its law.")
