@@ -162,7 +162,7 @@ class BaseCompliance(Effect):
                 few = Score(score.model, more).chi2
                 near = made.chi2 - made.dof < SETTINGS.followed * (few - made.dof)
                 reached = self._way_by_way(made, place, more, made.dof, SETTINGS.explained * made.dof) if near else made
-        # Chi-square of few lines has lost what the rig's parameters fit of the noise.
+        # The rig's parameters fit a part of the noise too, on few lines a larger one.
         found = Seed(_effect(reached).values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2,
                      len(reached.model.names), len(own) + SETTINGS.alike_Hz[2], few - reached.chi2)
         return [found] if found.chi2 > 0 else own
