@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, register, told_from_none
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import about, at_points, peaks, positions, project, unit_matrices
 from avis_ctrl.gap.effects.line_of_action import best_direction, foot, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
@@ -94,7 +94,7 @@ class AttachedOscillator(AtPoint):
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         names = [name for name in values if name.startswith("along_")] or ["mass_kg"]
-        if not told_from_none(values, std, names):
+        if not differs_from_zero(values, std, names):
             return "a sprung mass that the data do not distinguish from zero"
         if "along_x" in values and np.abs(foot(values)).max() > 0.999 * LIBRARY.reach_m:
             return f"a line of action that passes {LIBRARY.reach_m:g} m from the table"

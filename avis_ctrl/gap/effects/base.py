@@ -89,7 +89,7 @@ class EffectParameter:
 
     none : value without the effect. low, high : what physics allows. size : one unit of it in a fit.
     linear : the effect vanishes as this goes to `none`, at first in proportion.
-    grid : for one that is not linear, where to look for it. optional : one that may end at its bounds.
+    grid : for one that is not linear, values of the search. optional : one that may end at its bounds.
     """
 
     name: str
@@ -113,8 +113,8 @@ class Reported:
     unit: str
 
 
-def told_from_none(values: Mapping[str, float], std: Mapping[str, float], names: Iterable[str]) -> bool:
-    """Whether one of some parameters is more than three of its standard deviations from zero."""
+def differs_from_zero(values: Mapping[str, float], std: Mapping[str, float], names: Iterable[str]) -> bool:
+    """Whether any of these parameters is more than three of its standard deviations from zero."""
     return any(abs(values[name]) > 3 * std[name] for name in names)
 
 
@@ -200,7 +200,7 @@ class Effect(ABC):
         return None if reading is None else record.spectrum(reading, omega)
 
     def starts(self, model: Table, place: str) -> Sequence[np.ndarray]:
-        """Where to look: (n_parameters,) each, shape parameters on their grid and the linear ones at none."""
+        """Starts of the search: (n_parameters,) each, shape parameters on their grid and the linear ones at none."""
         parameters = self.parameters(model, place)
         points = [np.array([])]
         for one in parameters:

@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, register, told_from_none
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.mounts import has_mounts
 from avis_ctrl.gap.effects.sensors import receptance
@@ -144,12 +144,13 @@ class BaseCompliance(Effect):
         measured noise.
         """
         blocks = [thinned(part.block, SETTINGS.lines, seed=2) for part in score.parts]
-        own = self._by_ways(score, place)
+        own = self._by_coordinate(score, place)
         few = Score(score.model, blocks).chi2
         wide, steep = (score.chi2 > times * score.dof for times in (SETTINGS.wide, SETTINGS.steep))
         starts = [one.values for one in own]
-        shares = [[_with_share(block, share) for block in blocks] for share in (SETTINGS.fractions if steep else ())]
-        reached = self._followed(score.model, place, starts, [*shares, blocks], wide)
+        relative = [[_with_relative_noise(block, fraction) for block in blocks]
+                    for fraction in (SETTINGS.fractions if steep else ())]
+        reached = self._followed(score.model, place, starts, [*relative, blocks], wide)
         if steep and starts and (reached is None or reached.chi2 > SETTINGS.converged * reached.dof):
             straight = self._followed(score.model, place, starts, [blocks], False)
             reached = min((one for one in (reached, straight) if one is not None), key=_chi2, default=None)
@@ -161,7 +162,7 @@ class BaseCompliance(Effect):
             if made is not None:
                 few = Score(score.model, more).chi2
                 near = made.chi2 - made.dof < SETTINGS.followed * (few - made.dof)
-                reached = self._way_by_way(made, place, more, made.dof, SETTINGS.explained * made.dof) if near else made
+                reached = self._one_by_one(made, place, more, made.dof, SETTINGS.explained * made.dof) if near else made
         # The rig's parameters fit a part of the noise too, on few lines a larger one.
         found = Seed(_effect(reached).values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2,
                      len(reached.model.names), len(own) + SETTINGS.alike_Hz[2], few - reached.chi2)
@@ -187,7 +188,7 @@ class BaseCompliance(Effect):
         enough = SETTINGS.negligible * gap if later else SETTINGS.explained * noise
         for one in made[:SETTINGS.followed_fits] if wide else []:
             if one.chi2 - noise < SETTINGS.followed * gap and made[0].chi2 > enough:
-                made = sorted([*made, self._way_by_way(one, place, first, noise, enough)], key=_chi2)
+                made = sorted([*made, self._one_by_one(one, place, first, noise, enough)], key=_chi2)
         reached = made[0] if made else None
         for then in later:
             reached = reached and _short_fit(cast(TableModel, reached.model), then, SETTINGS.later_iterations)
@@ -203,7 +204,7 @@ class BaseCompliance(Effect):
         expected = [(self._expected(model, place, values, blocks), values) for values in starts]
         return sorted(one for one in expected if one[0] < np.inf)
 
-    def _way_by_way(self, reached: LikelihoodFit, place: str, blocks: Sequence[SpectralBlock],
+    def _one_by_one(self, reached: LikelihoodFit, place: str, blocks: Sequence[SpectralBlock],
                     noise: float, enough: float) -> LikelihoodFit:
         """A fit refined with other frequencies of coupled coordinates, while chi-square comes nearer to `noise`, that
         of an exact model, and until it is below `enough`. The parameters of the other coordinates can compensate for a
@@ -233,7 +234,7 @@ class BaseCompliance(Effect):
     def _standing(self, model: TableModel, place: str, values: tuple[float, ...]) -> TableModel:
         return model.with_effect(ActiveEffect(self, place, self.parameters(model, place), values))
 
-    def _by_ways(self, score: Score, place: str) -> list[Seed]:
+    def _by_coordinate(self, score: Score, place: str) -> list[Seed]:
         """From the best resonance of each coordinate by itself; the masses are estimated together."""
         ways = WAYS[:3] if place.endswith("translation") else WAYS
         zeta, grid = SETTINGS.first_damping, np.geomspace(*SETTINGS.own_Hz)
@@ -269,7 +270,7 @@ class BaseCompliance(Effect):
         return [Seed(tuple(float(v) for v in values), took.chi2, 2 * len(best))]
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
-        return "" if told_from_none(values, std, ["mass_kg"]) else (
+        return "" if differs_from_zero(values, std, ["mass_kg"]) else (
             "a chassis so heavy that the data do not distinguish it from a fixed one")
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -308,9 +309,9 @@ def of_chassis(values: Mapping[str, float]) -> np.ndarray:
     return found
 
 
-def _with_share(block: SpectralBlock, share: float) -> SpectralBlock:
+def _with_relative_noise(block: SpectralBlock, fraction: float) -> SpectralBlock:
     """The block with noise of this fraction of its response added to its own."""
-    relative, = relative_noise([block], share)
+    relative, = relative_noise([block], fraction)
     assert block.noise is not None and relative.noise is not None
     return block.with_noise(block.noise + relative.noise, block.dof)
 

@@ -53,8 +53,8 @@ class PayloadFlexibleMode(Effect):
     def priors(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Where no motor pushes, a shape is of the size that it has elsewhere.
 
-        A mode is held by the mounts' stiffness at these points, too: what they add to w^2 and 2 z w cannot be told
-        from the mode's own, and along one combination of them no force on the payload shows them either.
+        A mode is held by the mounts' stiffness at these points, too: what they add to w^2 and 2 z w cannot be
+        separated from the mode's own, and forces on the payload do not show one combination of them.
         """
         found: dict[str, tuple[float, float]] = {}
         parameters = self.parameters(model, place)

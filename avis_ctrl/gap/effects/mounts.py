@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, register, told_from_none
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, differs_from_zero, register
 from avis_ctrl.gap.operators import Operators, mount_geometry
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Score
@@ -126,7 +126,7 @@ class MountSurge(_OfMounts):
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
-        return "" if told_from_none(values, std, ["frequency_Hz"]) else (
+        return "" if differs_from_zero(values, std, ["frequency_Hz"]) else (
             "a resonance whose frequency the data do not determine")
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -137,9 +137,9 @@ class MountSurge(_OfMounts):
 
     def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
-        """Means over the mounts; how these scatter goes into their standard deviations, for it is what one number for
-        all mounts leaves open. Of the mass that is of frequency, share and scatter; the mean stiffness is taken as it
-        is."""
+        """Means over the mounts. Their standard deviations include the scatter of the mounts, which one value for all
+        of them does not describe; that of the mass follows from frequency, payload_share and scatter, with the mean
+        stiffness taken as exact."""
         found = super().reported(model, place, values, covariance)
         k = mount_geometry(model.effective.rig).stiffness[vertical(model)]
         f, a, w = values["frequency_Hz"], values["payload_share"], surge_omega(values)
