@@ -14,7 +14,7 @@ from avis_ctrl.gap.detection_limits import detection_limits
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
-from avis_ctrl.gap.next_measurement import LINEAR, between, grows, of_unexplained
+from avis_ctrl.gap.next_measurement import between, grows, of_unexplained
 from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_second_order
 from avis_ctrl.gap.probability import odds_against_fit, probability_of
@@ -193,7 +193,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     records, shares = every_record(prepared, fits.base.model, updated.model, _sensors(faults))
     growth = grows(records)
     remainder = Remainder(after.nrmse, after.nrmse / max(after.noise_nrmse, 1e-300), power.share(excess),
-                          None if growth is None else bool(growth[0] > LINEAR + 2 * growth[1]))
+                          None if growth is None else bool(growth[0] > 1 + 2 * growth[1]))
     closed = after.chi2_per_dof <= settings.within_noise or excess <= 0
     small = math.sqrt(max(excess, 0.0)) < settings.small
     verdict = _verdict(told, closed, closed or small, remainder, settings)

@@ -1,4 +1,4 @@
-"""What to measure next: what tells two explanations apart, or, without any, what tells most of what is missing."""
+"""What to measure next: what separates two explanations, or, without any, what shows most of what is missing."""
 
 from __future__ import annotations
 
@@ -10,18 +10,15 @@ import numpy as np
 from avis_ctrl.gap.result import RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel
 
-# Power of the level with which a linear residual grows.
-LINEAR = 1.0
-
 
 @dataclass(frozen=True)
 class NextMeasurementSettings:
     """Of what to measure next.
 
-    telling : residual power over that of the noise from which a record tells how the residual grows [1].
+    telling : residual power over that of the noise from which a record shows how the residual grows [1].
     another_level : ratio from which levels are two [1].
     within : how far a power of the level may be from none, or from the linear one, to count as it [1].
-    unsure : standard deviation from which a power is not told [1]: two of them reach from what grows with the
+    unsure : standard deviation from which a power is not reported [1]: two of them reach from what grows with the
         drives to what does not.
     points : points at which predictions are compared, all over the band and again about where they differ most.
     near : fraction of the largest difference of two predictions, above which a frequency belongs to the band to look
@@ -42,7 +39,7 @@ SETTINGS = NextMeasurementSettings()
 
 
 def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
-    """What tells two explanations apart: where the predictions of their refitted models differ most."""
+    """What separates two explanations: where the predictions of their refitted models differ most."""
     bent = {_bent_beside(a, b), _bent_beside(b, a)}
     if True in bent:
         why = ("only one of them depends on amplitude" if bent == {True, False} else
@@ -80,7 +77,7 @@ def _about(size: np.ndarray, k: int) -> tuple[int, int]:
 
 
 def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str:
-    """Where to look at what no effect accounts for, and what the levels of these records already say of it."""
+    """Where to measure what no effect explains, and how it depends on the level in these records."""
     where = _where(places)
     growth = grows(records)
     if growth is None:
@@ -90,24 +87,25 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
     power, std = growth
     told = (f"What remains{where and f', to {where},'} grows as the level of the drive to the power {power:.2f} +- "
             f"{std:.2g}")
-    if abs(power) <= max(SETTINGS.within, 2 * std) and abs(power) < abs(power - LINEAR):
+    if abs(power) <= max(SETTINGS.within, 2 * std) and abs(power) < abs(power - 1):
         return (f"{told}: it hardly depends on the drives. Take a record at rest with the floor measured, and look for "
                 "other sources.")
-    if abs(power - LINEAR) <= max(SETTINGS.within, 2 * std):
+    if abs(power - 1) <= max(SETTINGS.within, 2 * std):
         return (f"{told}: it is linear. Drive one actuator at a time: by which drives and at which sensors it appears "
                 "shows where it acts.")
-    law = ("more slowly than the drive, as friction, play or a limit would have it" if power < LINEAR else
+    law = ("more slowly than the drive, as friction, play or a limit would have it" if power < 1 else
            "faster than the drive, as stiffening, a limit or clipping would have it")
     return (f"{told}: {law}. Repeat one record at three or more levels with a multisine of odd lines: the size of the "
             "lines in between, over the level, shows its law.")
 
 
 def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
-    """(power, std) of the level with which the residual beyond noise grows; None where one level or noise tells none.
+    """(power, std) of the level with which the residual beyond noise grows; None without a clear power.
 
-    Least squares of log residual on log level over the records, noise taken off in power. The residual is told over the
-    noise, which is another one where the floor is measured, and other signals meet another part of the gap: records of
-    each kind have a size of their own, all the same power. None, too, where its standard deviation is `unsure` or more.
+    Least squares of log residual on log level over the records, noise subtracted in power. The residual is relative to
+    the noise, which depends on whether the floor is measured, and different signals excite different parts of the gap:
+    each kind of record has its own size, all have the same power. None where the levels are too close, too few records
+    are above the noise, or the standard deviation is `unsure` or more.
     """
     telling = [r for r in records if r.level_V > 0 and r.after ** 2 > SETTINGS.telling]
     kinds = sorted({r.kind for r in telling})

@@ -21,14 +21,24 @@ class StartSettings:
         around a table.
     halvings : how often the step between places is halved about the best: to some 2 cm.
     polar, around : rows and columns of a half-sphere of directions, about 16 degrees apart.
-    surge_Hz : lowest and highest frequency of a resonance inside the mounts [Hz], and number of those looked at.
+    surge_Hz : lowest and highest frequency of a resonance inside the mounts [Hz], and number of those searched.
     least_surge_damping : damping ratio with which the fit of such a resonance begins at least [1]: from a narrow one
         at the wrong frequency no fit finds the right one.
     peak_step, peak_reach : steps of the logarithm of frequency in which the residual's power is averaged [1], and steps
         on either side whose median it is compared with.
     peak_height : power over that median from which a step is a peak [1].
     peaks_apart : logarithm of the ratio of two peaks' frequencies, at least [1]: some half widths.
-    most_peaks : peaks that are looked at, the highest first.
+    most_peaks : peaks that are searched, the highest first.
+    attached_Hz : lowest and highest frequency of a sprung mass [Hz], and number of those searched: from the lowest
+        resonance of a suspension to the end of the band of most records.
+    dampings : damping ratios at which a sprung mass is searched [1]: one narrow, one broad resonance.
+    followed_places : places at which three frequencies are searched on a finer grid, the best first.
+    narrowest : least damping ratio for which the frequency grid of a sprung mass is made [1]; a smaller one would need
+        more frequencies than a search can afford.
+    stiff_Hz : frequency of a sprung mass along an axis in which it shows no resonance [Hz]: above the band.
+    mode_Hz : lowest and highest frequency of a mode of the payload [Hz], and number of those searched.
+    modes_apart : logarithm of the ratio of two modes' frequencies, at least [1]: some half widths.
+    smallest_shape : prior standard deviation, at least, of a mode shape where no channel shows it [1/sqrt(kg)].
     """
 
     places_m: tuple[tuple[float, float, int], ...] = ((-0.6, 0.6, 7), (-0.5, 0.5, 6), (-0.3, 0.4, 4))
@@ -42,6 +52,14 @@ class StartSettings:
     peak_height: float = 1.5
     peaks_apart: float = 0.06
     most_peaks: int = 5
+    attached_Hz: tuple[float, float, int] = (1.2, 90.0, 28)
+    dampings: tuple[float, ...] = (0.03, 0.15)
+    followed_places: int = 6
+    narrowest: float = 0.02
+    stiff_Hz: float = 150.0
+    mode_Hz: tuple[float, float, int] = (7.0, 140.0, 22)
+    modes_apart: float = 0.08
+    smallest_shape: float = 1e-3
 
 
 SETTINGS = StartSettings()
@@ -71,7 +89,7 @@ class Seed:
 
 @runtime_checkable
 class FindsItsStart(Protocol):
-    """An effect that looks for its starting values in a way of its own."""
+    """An effect that searches its starting values by a method of its own."""
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         """Where refits may begin, the most promising first."""

@@ -19,18 +19,11 @@ from scipy.optimize import nnls
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.attached import elements
+from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
 from avis_ctrl.gap.effects.cable import tie
 from avis_ctrl.gap.effects.chassis import of_chassis
 from avis_ctrl.gap.effects.flexible_mode import modes, shape_rows
-from avis_ctrl.gap.effects.mounts import (
-    LEVELED,
-    REFERENCE_Hz,
-    contacts,
-    drift_over_stiffness,
-    drifted,
-    shares,
-    surge_omega,
-)
+from avis_ctrl.gap.effects.mounts import contacts, drift_over_stiffness, drifted, shares, surge_omega
 from avis_ctrl.gap.effects.payload import place_of
 from avis_ctrl.gap.operators import MountGeometry, mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
@@ -207,7 +200,7 @@ def ladder(power: float) -> tuple[float, list[tuple[float, float]]]:
     """
     f = np.geomspace(*SETTINGS.ladder_Hz, 200)
     s = 2j * np.pi * f
-    wanted = (s / (2 * np.pi * REFERENCE_Hz)) ** power
+    wanted = (s / (2 * np.pi * LIBRARY.loss_Hz)) ** power
     if power == 0:
         return 1.0, []
     for count, reach in ((count, reach) for count in range(2, 24) for reach in (3.0, 10.0, 30.0)):
@@ -247,7 +240,7 @@ def _surge(table: ReducedTable, place: str, values: Mapping[str, float]) -> Stat
 
 def _leveling(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
     """Payload against chassis, as the valves feel it."""
-    own = np.flatnonzero(table.mounts.along("z"))[:LEVELED]
+    own = np.flatnonzero(table.mounts.along("z"))[:LIBRARY.leveled]
     G, k = table.G[own], table.mounts.stiffness[own] * shares(values)
     poles, size = [0.0], 2 * np.pi * values["rate_Hz"]
     if "valve_corner_Hz" in values:

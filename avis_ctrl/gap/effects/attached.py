@@ -8,22 +8,17 @@ from functools import partial
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, register, told_from_none
+from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import about, at_points, peaks, positions, project, unit_matrices
 from avis_ctrl.gap.effects.line_of_action import best_direction, foot, told
-from avis_ctrl.gap.effects.payload import AtPoint, REACH_m, place_of
+from avis_ctrl.gap.effects.payload import AtPoint, place_of
 from avis_ctrl.gap.effects.sensors import second_order
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.score import Score
-from avis_ctrl.gap.starting_values import Seed
+from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.rigs.rigid_body import point_map
-
-# Damping ratios at which seeds are looked for, how often the step between frequencies or places is halved about the
-# best, and places from which that begins.
-DAMPINGS, HALVINGS, STARTS = (0.03, 0.15), 3, 6
-# Least damping ratio by which the steps between frequencies are chosen, and the frequency of a mass that is held fast.
-NARROW, STIFF_Hz = 0.02, 150.0
 
 
 @register
@@ -46,7 +41,7 @@ class AttachedOscillator(AtPoint):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         mass = model.rig.mounted_body().mass
         frequency = EffectParameter("frequency_Hz", "Hz", "of the mass on its spring", 0.0, 0.3, 300.0, 10.0, False,
-                                    tuple(np.geomspace(1.2, 90.0, 28)))
+                                    tuple(np.geomspace(*SETTINGS.attached_Hz)))
         damping = EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 2.0, 0.05, False, (0.05,), True)
         own = EffectParameter("mass_kg", "kg", "sprung mass", 0.0, 0.0, mass, 0.01 * mass)
         variant = place.partition("/")[2]
@@ -71,14 +66,14 @@ class AttachedOscillator(AtPoint):
             ops.inner.append(row[:, None] / second_order(ops.s, frequency, values["damping"])[:, None, None])
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Over frequency, damping, places and directions; the mass follows."""
+        """Over frequencies, damping ratios, places and directions; the mass follows from the score test."""
         parameters = self.parameters(score.model, place)
         found = _along_three_axes(score, parameters) if place.endswith("axes") else _along_one(score, parameters)
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
         """Along three axes, from a fit along one direction: the nearest axis keeps its frequency, and along the others
-        a resonance is looked for at each frequency, anywhere on the line of action."""
+        a resonance is searched at each frequency, anywhere on the line of action."""
         if not one.place.endswith("oblique"):
             return []
         values = one.by_name
@@ -86,10 +81,11 @@ class AttachedOscillator(AtPoint):
         mass, first = float(a @ a), int(np.argmax(np.abs(a)))
         parameters = self.parameters(score.model, "payload/axes")
         # Resonances of a damping ratio zeta are 2 zeta wide: a step of zeta misses none.
-        grid, damping = parameters[1].grid, max(values["damping"], NARROW)
-        frequencies = (*np.geomspace(grid[0], grid[-1], 2 + int(np.log(grid[-1] / grid[0]) / damping)), STIFF_Hz)
+        grid, damping = parameters[1].grid, max(values["damping"], SETTINGS.narrowest)
+        count = 2 + int(np.log(grid[-1] / grid[0]) / damping)
+        frequencies = (*np.geomspace(grid[0], grid[-1], count), SETTINGS.stiff_Hz)
         others = [k for k in range(3) if k != first]
-        points = place_of(values) + np.outer(np.linspace(-REACH_m, REACH_m, 25), a / np.sqrt(mass))
+        points = place_of(values) + np.outer(np.linspace(-LIBRARY.reach_m, LIBRARY.reach_m, 25), a / np.sqrt(mass))
         pair, point = _along_the_others(score, values["damping"], frequencies, points,
                                         "".join("xyz"[k] for k in others))
         along = np.full(3, values["frequency_Hz"])
@@ -98,10 +94,10 @@ class AttachedOscillator(AtPoint):
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         names = [name for name in values if name.startswith("along_")] or ["mass_kg"]
-        if not told_from_none(values, std, names):
-            return "a sprung mass that the data do not tell from none"
-        if "along_x" in values and np.abs(foot(values)).max() > 0.999 * REACH_m:
-            return f"a line of action that passes {REACH_m:g} m from the table"
+        if not differs_from_zero(values, std, names):
+            return "a sprung mass that the data do not distinguish from zero"
+        if "along_x" in values and np.abs(foot(values)).max() > 0.999 * LIBRARY.reach_m:
+            return f"a line of action that passes {LIBRARY.reach_m:g} m from the table"
         return ""
 
     def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
@@ -143,21 +139,21 @@ def sprung(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
 def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:
     """Best place and direction at each frequency of the grid and of the residual's peaks; finer about the best."""
     every = positions(parameters)
-    most = parameters[0].high
+    most, looks = parameters[0].high, len(parameters[3].grid) * len(SETTINGS.dampings)
 
     def at(f: float, zeta: float, points: np.ndarray = every) -> Seed | None:
         G, b = project(score, partial(sprung, frequency_Hz=f, damping=zeta), ("sprung", f, zeta))
         chi2, k, d, mass = best_direction(G, b, points)
         a = min(np.sqrt(max(mass, 0.0)), 0.7 * most) * d
-        return Seed((*a, f, zeta, *points[k]), chi2, 7, len(parameters[3].grid) * len(DAMPINGS)) if mass > 0 else None
+        return Seed((*a, f, zeta, *points[k]), chi2, 7, looks) if mass > 0 else None
 
     grid = parameters[3].grid
-    found = [seed for f in grid for zeta in DAMPINGS if (seed := at(f, zeta))]
+    found = [seed for f in grid for zeta in SETTINGS.dampings if (seed := at(f, zeta))]
     found += [seed for f in peaks(score) for zeta in (0.01, 0.05) if (seed := at(f, zeta))]
     if not found:
         return []
     best, step, step_m = max(found, key=lambda seed: seed.chi2), np.sqrt(grid[1] / grid[0]), 0.5
-    for _ in range(HALVINGS):
+    for _ in range(SETTINGS.halvings):
         f, zeta, point = *best.values[3:5], np.array(best.values[5:])
         near = [seed for one, other in ((f, zeta), (f * step, zeta), (f / step, zeta), (f, zeta / 2))
                 if (seed := at(one, other, about(point, step_m)))]
@@ -178,11 +174,11 @@ def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> li
     def at(point: np.ndarray) -> tuple[float, float, list[int], np.ndarray]:
         rows = at_points(point[None], "xyz")[0]
         return *_best_triple(np.einsum("ap,fpgq,bq->fagb", rows, G, rows, optimize=True), b @ rows.T), point
-    starts = sorted((at(point) for point in points), key=lambda one: -one[0])[:STARTS]
+    starts = sorted((at(point) for point in points), key=lambda one: -one[0])[:SETTINGS.followed_places]
     found = []
     for chi2, mass, triple, point in starts:
         best = chi2, mass, triple, point
-        for halving in range(1, HALVINGS + 1):
+        for halving in range(1, SETTINGS.halvings + 1):
             near = about(best[3], 0.5 ** halving)
             best = max(best, at(near[_best_point(G, b, at_points(near, "xyz"), best[2])]), key=lambda one: one[0])
         chi2, mass, triple, point = best
@@ -194,8 +190,8 @@ def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> li
 
 def _along_the_others(score: Score, damping: float, frequencies: Sequence[float], points: np.ndarray, axes: str
                       ) -> tuple[tuple[float, float], np.ndarray]:
-    """Frequencies along two axes, and the point (3,), that take most together. Their masses are left free: what has no
-    name has taken a part of what they do."""
+    """Frequencies along two axes, and the point (3,), that take most together. Their masses are left free: effects
+    without a name have taken part of their response."""
     kept = np.concatenate([unit_matrices(score, partial(sprung, frequency_Hz=f, damping=damping)) for f in frequencies],
                           dtype=np.float32)
     n = len(frequencies)

@@ -30,21 +30,32 @@ from avis_ctrl.rigs.rig import Rig
 
 @dataclass(frozen=True)
 class LibrarySettings:
-    """Of what the library takes for granted.
+    """Assumptions of the library of effects.
 
     tilted_rad : tilt up to which a sensor counts as lying along an earth axis [rad]: far more than one is mounted by.
     tried_Hz : frequencies at which an effect of the user's own is tried out [Hz]: below, at and above the suspension.
+    reach_m : largest distance along each axis from the geometric centre at which something can be fixed to a payload
+        [m].
+    loss_Hz : frequency at which the stiffness of a mount with structural damping equals that of the rig file [Hz]: near
+        the suspension's own resonances.
+    leveled : mounts with a leveling valve, the first ones; three points determine a plane.
+    valve_Hz : lowest and highest corner frequency of a leveling valve [Hz]: at the lower one the valve hardly acts, at
+        the upper one it acts without lag.
     """
 
     tilted_rad: float = 0.3
     tried_Hz: tuple[float, ...] = (0.3, 3.0, 30.0)
+    reach_m: float = 2.0
+    loss_Hz: float = 3.0
+    leveled: int = 3
+    valve_Hz: tuple[float, float] = (0.01, 100.0)
 
 
 SETTINGS = LibrarySettings()
 
 
 class Table(Protocol):
-    """What an effect asks of the table that it acts on: of the model without it (`gap.table_model.TableModel`).
+    """What an effect uses of the table that it acts on: the model without it (`gap.table_model.TableModel`).
 
     base : the rig and its free parameters. effective : the same with what other effects set of the rig's parameters.
     motion : records in time, by name.
@@ -78,7 +89,7 @@ class EffectParameter:
 
     none : value without the effect. low, high : what physics allows. size : one unit of it in a fit.
     linear : the effect vanishes as this goes to `none`, at first in proportion.
-    grid : for one that is not linear, where to look for it. optional : one that may end at its bounds.
+    grid : for one that is not linear, values of the search. optional : one that may end at its bounds.
     """
 
     name: str
@@ -102,8 +113,8 @@ class Reported:
     unit: str
 
 
-def told_from_none(values: Mapping[str, float], std: Mapping[str, float], names: Iterable[str]) -> bool:
-    """Whether one of some parameters is more than three of its standard deviations from zero."""
+def differs_from_zero(values: Mapping[str, float], std: Mapping[str, float], names: Iterable[str]) -> bool:
+    """Whether any of these parameters is more than three of its standard deviations from zero."""
     return any(abs(values[name]) > 3 * std[name] for name in names)
 
 
@@ -189,7 +200,7 @@ class Effect(ABC):
         return None if reading is None else record.spectrum(reading, omega)
 
     def starts(self, model: Table, place: str) -> Sequence[np.ndarray]:
-        """Where to look: (n_parameters,) each, shape parameters on their grid and the linear ones at none."""
+        """Starts of the search: (n_parameters,) each, shape parameters on their grid and the linear ones at none."""
         parameters = self.parameters(model, place)
         points = [np.array([])]
         for one in parameters:

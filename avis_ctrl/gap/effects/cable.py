@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, register, told_from_none
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import about, at_points, positions, project
 from avis_ctrl.gap.effects.line_of_action import best_direction, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
@@ -65,7 +65,7 @@ class CableStiffness(AtPoint):
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
         names = [name for name in values if name.startswith(("along_", "k_"))]
-        return "" if told_from_none(values, std, names) else (
+        return "" if differs_from_zero(values, std, names) else (
             "a cable whose stiffness the data do not distinguish from zero")
 
     def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from typing import cast
@@ -10,7 +11,7 @@ from typing import cast
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, register, told_from_none
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.mounts import has_mounts
 from avis_ctrl.gap.effects.sensors import receptance
@@ -26,35 +27,74 @@ from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rigid_body import point_map
 
 WAYS = ("x", "y", "z", "rx", "ry", "rz")
-# Below this the suspension's own modes are in the way of the first look.
-LOWEST_Hz = 7.0
-# Where a way of moving is looked for that the score finds nothing in [Hz].
-STIFF_Hz = 90.0
-# Starts of which the most promising are followed: mass over the payload's, frequencies alike along all ways, and
-# radii of gyration and heights [m] of a frame of a table's size.
-TRIAL_MASS, TRIAL_Hz = 2.0, tuple(np.geomspace(6.0, 90.0, 13).tolist())
-SHAPE = (0.45, 0.45, 0.45, -0.4, -0.1)
-# Lines of a record; what follows only where the gap is more than this times the noise.
-TRIAL_LINES, PLAIN = 50, 1.3
-# Of the starts that one step makes most promising so many are fitted with so many iterations, and then the best of
-# these; by shares of the response, where the step is a good guide and four iterations lead half way, in one go.
-TRIED, TRIED_BY_SHARES = ((7, 4), (3, 8)), ((3, 12),)
-# Where the gap is more than this times the noise, starts are followed by weights that ask at first for these shares of
-# the response, with so many iterations by the next ones; where that leads to no end at this times the noise, what each
-# way by itself tells is followed by the noise's own, too.
-STEEP, SHARES, LATER_ITERATIONS, AN_END = 100.0, (0.3, 0.03), 8, 2.0
-# A start by a share of the response, or a step along one way, is taken where it leaves less than this of the gap; and
-# ways are looked at one by one where all together leave less than that, of so many starts.
-PROMISING, FOLLOWED, BOTH = 0.8, 0.25, 2
-# By a share of the response nothing is left where it is less than this of the gap.
-NOTHING = 0.01
-# Where a chassis leaves more than so many times the noise, its ways are looked at again by so many lines of a record,
-# which tell minima apart that few do not.
-NOT_YET, MORE_LINES = 1.1, 150
-# Where else the frequency of one way is looked for, over the median of all ways, and how often.
-ELSEWHERE, ROUNDS = (0.65, 0.8, 1.0, 1.25, 1.55), 6
-# Ways of which a frame's low mass makes two modes, so that one may stand for the other.
+# Coordinates that the low mass of a frame couples, so that one can compensate for the other.
 TOGETHER = (("x", "ry"), ("y", "rx"), ("z",), ("rz",))
+
+
+@dataclass(frozen=True)
+class ChassisSettings:
+    """Of the search for the starting values of a chassis.
+
+    A coordinate is one of x, y, z, rx, ry, rz of the chassis. The gap is chi-square less its degrees of freedom.
+    Weights relative to the response stand for noise of that fraction of the response, added to the measured noise.
+
+    own_Hz : lowest and highest frequency [Hz] of the resonance of one coordinate, and number of those searched; below
+        the lowest the suspension's own modes dominate.
+    stiff_Hz : frequency of a coordinate in which no resonance was found [Hz]: near the end of the band.
+    first_damping : damping ratio of that search [1]: broad enough that no step of the grid passes by a resonance.
+    least_gain : ratio of the falls of chi-square with one more coordinate and without it, below which that coordinate
+        counts as stiff [1].
+    mass_ratio : ratio of the masses of two coordinates, up to which both can be of one chassis [1].
+    alike_Hz : lowest and highest frequency [Hz] of starts with one frequency for all coordinates, and their number.
+    alike_mass : mass of these starts over that of the payload [1].
+    alike_shape : their radii of gyration about x, y, z, height of the mass and height of the springs over the mass [m]:
+        of a frame as large as a table.
+    lines, more_lines : lines of a record for short fits, and for the last one: more lines separate minima that few do
+        not.
+    wide : chi-square per degree of freedom above which starts with one frequency are tried, and coordinates one by one.
+    steep : the same above which fits begin with weights relative to the response.
+    fractions : of the response, for these weights, one after the other; the last fit uses the measured noise.
+    tried : (number of starts, iterations of each fit) of successive rounds, each with the best of the one before.
+    tried_by_fractions : the same with weights relative to the response, which need one round only: the first-order
+        prediction is good there.
+    later_iterations : iterations of a fit that continues from an earlier one.
+    converged : chi-square per degree of freedom up to which the fits with relative weights have led to the minimum.
+    promising : fraction of the gap that may remain after a start or a step for it to be followed.
+    followed : fraction of the gap up to which a fit is refined one coordinate after the other.
+    followed_fits : number of fits refined in this way, the best first.
+    negligible : fraction of the gap below which nothing is left to explain with relative weights.
+    explained : chi-square per degree of freedom below which nothing is left to explain with the measured noise.
+    elsewhere : other frequencies of a coordinate, over the median of all coordinates [1].
+    rounds : most coordinates that are changed one after the other.
+    """
+
+    own_Hz: tuple[float, float, int] = (7.0, 90.0, 26)
+    stiff_Hz: float = 90.0
+    first_damping: float = 0.06
+    least_gain: float = 1.05
+    mass_ratio: float = 3.0
+    alike_Hz: tuple[float, float, int] = (6.0, 90.0, 13)
+    alike_mass: float = 2.0
+    alike_shape: tuple[float, ...] = (0.45, 0.45, 0.45, -0.4, -0.1)
+    lines: int = 50
+    more_lines: int = 150
+    wide: float = 1.3
+    steep: float = 100.0
+    fractions: tuple[float, ...] = (0.3, 0.03)
+    tried: tuple[tuple[int, int], ...] = ((7, 4), (3, 8))
+    tried_by_fractions: tuple[tuple[int, int], ...] = ((3, 12),)
+    later_iterations: int = 8
+    converged: float = 2.0
+    promising: float = 0.8
+    followed: float = 0.25
+    followed_fits: int = 2
+    negligible: float = 0.01
+    explained: float = 1.1
+    elsewhere: tuple[float, ...] = (0.65, 0.8, 1.0, 1.25, 1.55)
+    rounds: int = 6
+
+
+SETTINGS = ChassisSettings()
 
 
 @register
@@ -95,95 +135,97 @@ class BaseCompliance(Effect):
                                 (0.0,), True))
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Short fits to few lines: from where each way of moving resonates best by itself, and from the most promising
-        of like frequencies along all ways, where one step of all parameters together is expected to lead furthest. The
-        best is followed, each way of moving sought elsewhere beside the others.
+        """Short fits to few lines: from the best resonance of each coordinate by itself, and from one frequency for all
+        coordinates, the best by the score test with all parameters. The best fit is then refined with other
+        frequencies of one coordinate after the other.
 
-        Six resonances of a per cent of damping, each some widths away from where it is sought: by the noise's own
-        weights every line between them is a wall. By weights relative to the response, as of one who looks at a Bode
-        plot, they are slopes; from there the weights go to those of the noise.
+        With six resonances of one per cent of damping, each some half widths off, a fit by the measured noise stops in
+        a local minimum. Weights relative to the response, as in a Bode plot, widen the minimum; the last fit is by the
+        measured noise.
         """
-        blocks = [thinned(part.block, TRIAL_LINES, seed=2) for part in score.parts]
-        own = self._by_ways(score, place)
+        blocks = [thinned(part.block, SETTINGS.lines, seed=2) for part in score.parts]
+        own = self._by_coordinate(score, place)
         few = Score(score.model, blocks).chi2
-        wide, steep = (score.chi2 > times * score.dof for times in (PLAIN, STEEP))
+        wide, steep = (score.chi2 > times * score.dof for times in (SETTINGS.wide, SETTINGS.steep))
         starts = [one.values for one in own]
-        shares = [[_with_share(block, share) for block in blocks] for share in (SHARES if steep else ())]
-        reached = self._followed(score.model, place, starts, [*shares, blocks], wide)
-        if steep and starts and (reached is None or reached.chi2 > AN_END * reached.dof):
+        relative = [[_with_relative_noise(block, fraction) for block in blocks]
+                    for fraction in (SETTINGS.fractions if steep else ())]
+        reached = self._followed(score.model, place, starts, [*relative, blocks], wide)
+        if steep and starts and (reached is None or reached.chi2 > SETTINGS.converged * reached.dof):
             straight = self._followed(score.model, place, starts, [blocks], False)
             reached = min((one for one in (reached, straight) if one is not None), key=_chi2, default=None)
         if reached is None:
             return own
-        if wide and reached.chi2 - reached.dof < FOLLOWED * (few - reached.dof):
-            more = [thinned(part.block, MORE_LINES, seed=2) for part in score.parts]
-            made = _short_fit(cast(TableModel, reached.model), more, LATER_ITERATIONS)
+        if wide and reached.chi2 - reached.dof < SETTINGS.followed * (few - reached.dof):
+            more = [thinned(part.block, SETTINGS.more_lines, seed=2) for part in score.parts]
+            made = _short_fit(cast(TableModel, reached.model), more, SETTINGS.later_iterations)
             if made is not None:
                 few = Score(score.model, more).chi2
-                near = made.chi2 - made.dof < FOLLOWED * (few - made.dof)
-                reached = self._way_by_way(made, place, more, made.dof, NOT_YET * made.dof) if near else made
-        # On few lines the rig's parameters take their part of the noise, too.
+                near = made.chi2 - made.dof < SETTINGS.followed * (few - made.dof)
+                reached = self._one_by_one(made, place, more, made.dof, SETTINGS.explained * made.dof) if near else made
+        # The rig's parameters fit a part of the noise too, on few lines a larger one.
         found = Seed(_effect(reached).values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2,
-                     len(reached.model.names), len(own) + len(TRIAL_Hz), few - reached.chi2)
+                     len(reached.model.names), len(own) + SETTINGS.alike_Hz[2], few - reached.chi2)
         return [found] if found.chi2 > 0 else own
 
     def _followed(self, model: TableModel, place: str, starts: Sequence[tuple[float, ...]],
                   weights: Sequence[Sequence[SpectralBlock]], wide: bool) -> LikelihoodFit | None:
-        """The best of what starts lead to by the first weights, followed by the others. wide : with those of one
-        frequency, and way by way."""
+        """The best fit from these starts by the first weights, continued with the later ones; None where all fail.
+        wide : starts with one frequency for all coordinates too, and refinement one coordinate after the other."""
         first, *later = weights
         start = Score(model, first)
-        # What a share of the response adds to the noise is none: all that is left counts.
+        # Relative weights are no noise: all of chi-square counts as the gap.
         noise = 0 if later else start.dof
         gap = start.chi2 - noise
         alike = [values for left, values in (self._alike(model, place, first) if wide else [])
-                 if left - noise < PROMISING * gap or not later]
+                 if left - noise < SETTINGS.promising * gap or not later]
         trials = [self._standing(model, place, values) for values in [*starts, *alike]]
         made: list[LikelihoodFit] = []
-        for most, iterations in TRIED_BY_SHARES if later else TRIED:
+        for most, iterations in SETTINGS.tried_by_fractions if later else SETTINGS.tried:
             fits = [_short_fit(one, first, iterations) for one in trials[:most]]
             made = sorted((one for one in fits if one is not None), key=_chi2)
             trials = [cast(TableModel, one.model) for one in made]
-        enough = NOTHING * gap if later else NOT_YET * noise
-        for one in made[:BOTH] if wide else []:
-            if one.chi2 - noise < FOLLOWED * gap and made[0].chi2 > enough:
-                made = sorted([*made, self._way_by_way(one, place, first, noise, enough)], key=_chi2)
+        enough = SETTINGS.negligible * gap if later else SETTINGS.explained * noise
+        for one in made[:SETTINGS.followed_fits] if wide else []:
+            if one.chi2 - noise < SETTINGS.followed * gap and made[0].chi2 > enough:
+                made = sorted([*made, self._one_by_one(one, place, first, noise, enough)], key=_chi2)
         reached = made[0] if made else None
         for then in later:
-            reached = reached and _short_fit(cast(TableModel, reached.model), then, LATER_ITERATIONS)
+            reached = reached and _short_fit(cast(TableModel, reached.model), then, SETTINGS.later_iterations)
         return reached
 
     def _alike(self, model: TableModel, place: str, blocks: Sequence[SpectralBlock]
                ) -> list[tuple[float, tuple[float, ...]]]:
-        """Starts of one frequency along all ways, the most promising first, and the chi-square expected of each."""
+        """(expected chi-square, values) of starts with one frequency for all coordinates, the best first."""
         payload = model.rig.mounted_body().mass
-        shape = () if place.endswith("translation") else SHAPE
-        starts = [(TRIAL_MASS * payload, 0.05, *[f] * (6 if shape else 3), *shape) for f in TRIAL_Hz]
+        shape = () if place.endswith("translation") else SETTINGS.alike_shape
+        starts = [(SETTINGS.alike_mass * payload, 0.05, *[f] * (6 if shape else 3), *shape)
+                  for f in np.geomspace(*SETTINGS.alike_Hz).tolist()]
         expected = [(self._expected(model, place, values, blocks), values) for values in starts]
         return sorted(one for one in expected if one[0] < np.inf)
 
-    def _way_by_way(self, reached: LikelihoodFit, place: str, blocks: Sequence[SpectralBlock],
+    def _one_by_one(self, reached: LikelihoodFit, place: str, blocks: Sequence[SpectralBlock],
                     noise: float, enough: float) -> LikelihoodFit:
-        """A fit with the frequencies of ways that go together sought elsewhere, as long as that brings it nearer to
-        `noise`, the chi-square of an exact model, and until it is `enough`. With ten parameters of the others, which
-        may stand for them, nothing leads there downhill."""
-        for _ in range(ROUNDS):
+        """A fit refined with other frequencies of coupled coordinates, while chi-square comes nearer to `noise`, that
+        of an exact model, and until it is below `enough`. The parameters of the other coordinates can compensate for a
+        wrong frequency: a local minimum, out of which no descent leads."""
+        for _ in range(SETTINGS.rounds):
             if reached.chi2 < enough:
                 return reached
             now = _effect(reached)
             rest = cast(TableModel, reached.model).without(now.label)
             left, values = min((self._expected(rest, place, moved, blocks), moved) for moved in _elsewhere(now))
-            if left - noise > PROMISING * (reached.chi2 - noise):
+            if left - noise > SETTINGS.promising * (reached.chi2 - noise):
                 return reached
-            made = _short_fit(self._standing(rest, place, values), blocks, LATER_ITERATIONS)
-            if made is None or made.chi2 - noise > PROMISING * (reached.chi2 - noise):
+            made = _short_fit(self._standing(rest, place, values), blocks, SETTINGS.later_iterations)
+            if made is None or made.chi2 - noise > SETTINGS.promising * (reached.chi2 - noise):
                 return reached
             reached = made
         return reached
 
     def _expected(self, model: TableModel, place: str, values: tuple[float, ...], blocks: Sequence[SpectralBlock]
                   ) -> float:
-        """Chi-square that one step of all parameters from a start is expected to leave; infinite without a step."""
+        """Chi-square expected after one step of all parameters from a start; infinite where the step fails."""
         try:
             return Score(self._standing(model, place, values), blocks).chi2
         except (AvisError, np.linalg.LinAlgError):
@@ -192,10 +234,10 @@ class BaseCompliance(Effect):
     def _standing(self, model: TableModel, place: str, values: tuple[float, ...]) -> TableModel:
         return model.with_effect(ActiveEffect(self, place, self.parameters(model, place), values))
 
-    def _by_ways(self, score: Score, place: str) -> list[Seed]:
-        """Where each way of moving resonates best by itself; masses follow from all of them together."""
+    def _by_coordinate(self, score: Score, place: str) -> list[Seed]:
+        """From the best resonance of each coordinate by itself; the masses are estimated together."""
         ways = WAYS[:3] if place.endswith("translation") else WAYS
-        zeta, grid = 0.06, np.geomspace(LOWEST_Hz, STIFF_Hz, 26)
+        zeta, grid = SETTINGS.first_damping, np.geomspace(*SETTINGS.own_Hz)
         rows, labels = [], []
         for f in grid:
             key = ("recoil", float(f))
@@ -212,14 +254,15 @@ class BaseCompliance(Effect):
         chosen = [labels.index((way, f)) for way, f in best.items()]
         took = reduction(gram[np.ix_(chosen, chosen)], fall[chosen])
         inverse = dict(zip(best, took.coefficients, strict=True))
-        # The way that was found first tells the mass best; one that would need another mass is no recoil.
+        # The first coordinate found determines the mass best; one that needs another mass is no recoil.
         leader = inverse[moving[0]]
         if leader <= 0:
             return []
-        best = {way: f for way, f in best.items() if len(way) > 1 or leader / 3 < inverse[way] < 3 * leader}
+        ratio = SETTINGS.mass_ratio
+        best = {way: f for way, f in best.items() if len(way) > 1 or leader / ratio < inverse[way] < ratio * leader}
         mass = self.parameters(score.model, place)[0]
         m = float(np.clip(1 / leader, 2 * mass.low, mass.high / 2))
-        at = {way: best.get(way, STIFF_Hz) for way in ways}
+        at = {way: best.get(way, SETTINGS.stiff_Hz) for way in ways}
         values = [m, zeta, *(at[way] for way in ways[:3])]
         if len(ways) > 3:
             radii = [np.sqrt(1 / (inverse[way] * m)) if inverse.get(way, 0.0) > 0 else 0.6 for way in ways[3:]]
@@ -227,8 +270,8 @@ class BaseCompliance(Effect):
         return [Seed(tuple(float(v) for v in values), took.chi2, 2 * len(best))]
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
-        return "" if told_from_none(values, std, ["mass_kg"]) else (
-            "a chassis so heavy that the data do not tell it from one that stands still")
+        return "" if differs_from_zero(values, std, ["mass_kg"]) else (
+            "a chassis so heavy that the data do not distinguish it from a fixed one")
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         mass, damping, stiffness = of_chassis(values)
@@ -266,21 +309,21 @@ def of_chassis(values: Mapping[str, float]) -> np.ndarray:
     return found
 
 
-def _with_share(block: SpectralBlock, share: float) -> SpectralBlock:
-    """The block with noise of this share of its response beside its own."""
-    relative, = relative_noise([block], share)
+def _with_relative_noise(block: SpectralBlock, fraction: float) -> SpectralBlock:
+    """The block with noise of this fraction of its response added to its own."""
+    relative, = relative_noise([block], fraction)
     assert block.noise is not None and relative.noise is not None
     return block.with_noise(block.noise + relative.noise, block.dof)
 
 
 def _elsewhere(one: ActiveEffect) -> Iterator[tuple[float, ...]]:
-    """Values of a chassis with the frequencies of ways that go together at others, around the median of all ways."""
+    """Values of a chassis with other frequencies of coupled coordinates, about the median of all coordinates."""
     names = [parameter.name for parameter in one.parameters]
     free = [way for way in WAYS if f"{way}_Hz" in names]
     middle = np.median([one.by_name[f"{way}_Hz"] for way in free])
     for ways in [[way for way in together if way in free] for together in TOGETHER]:
         # One of two may be right as it is.
-        for factors in product((None, *ELSEWHERE), repeat=len(ways)):
+        for factors in product((None, *SETTINGS.elsewhere), repeat=len(ways)):
             moved = list(one.values)
             for way, factor in zip(ways, factors, strict=True):
                 if factor is None:
@@ -288,7 +331,7 @@ def _elsewhere(one: ActiveEffect) -> Iterator[tuple[float, ...]]:
                 k = names.index(f"{way}_Hz")
                 moved[k] = float(min(factor * middle, 0.9 * one.parameters[k].high))
                 if len(way) > 1:
-                    moved[names.index(f"gyration_{way[1]}_m")] = SHAPE[0]
+                    moved[names.index(f"gyration_{way[1]}_m")] = SETTINGS.alike_shape[0]
             if any(factors):
                 yield tuple(moved)
 
@@ -309,9 +352,9 @@ def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock], iterations: i
 
 
 def _greedy(gram: np.ndarray, fall: np.ndarray, labels: list[tuple[str, float]]) -> dict[str, float]:
-    """Ways of moving and their frequencies, one after the other, each the best beside those before it.
+    """Coordinates and their frequencies, chosen one after the other, each the best beside those before it.
 
-    A way that adds little, or would need a negative mass, is taken as stiff.
+    A coordinate that adds little, or would need a negative mass, is taken as stiff.
     """
     best: dict[str, float] = {}
     took = 0.0
@@ -324,7 +367,7 @@ def _greedy(gram: np.ndarray, fall: np.ndarray, labels: list[tuple[str, float]])
                 one = reduction(gram[np.ix_(own, own)], fall[own])
                 if np.all(one.coefficients > 0):
                     trials.append((one.chi2, k))
-        if not trials or max(trials)[0] < 1.05 * took:
+        if not trials or max(trials)[0] < SETTINGS.least_gain * took:
             return best
         took, k = max(trials)
         best[labels[k][0]] = labels[k][1]

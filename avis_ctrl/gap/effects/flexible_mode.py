@@ -12,18 +12,11 @@ from avis_ctrl.gap.effects.impedance import paths, peaks
 from avis_ctrl.gap.effects.sensors import receptance, second_order
 from avis_ctrl.gap.operators import AddedCoordinate, Operators, mount_geometry
 from avis_ctrl.gap.score import Score, reduction
-from avis_ctrl.gap.starting_values import Seed
+from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 
-# Frequencies at which a mode is looked for [Hz].
-FREQUENCIES_Hz = tuple(np.geomspace(7.0, 140.0, 22).tolist())
 # Variants by number of modes.
 COUNTS = {"": 1, "two": 2, "three": 3}
-# log of the ratio of two modes' frequencies from which on they are looked for apart.
-APART = 0.08
-# 1/sqrt(kg) that a shape is expected to have at least, where nothing is seen of it.
-SMALLEST_SHAPE = 1e-3
-
 
 @register
 class PayloadFlexibleMode(Effect):
@@ -49,7 +42,7 @@ class PayloadFlexibleMode(Effect):
             of, of_mode = ("", "of the mode") if k == 0 else (f"_{k + 1}", f"of mode {k + 1}")
             found += [
                 EffectParameter(f"frequency{of}_Hz", "Hz", f"{of_mode}, free", 0.0, 3.0, 400.0, 20.0, False,
-                                FREQUENCIES_Hz),
+                                tuple(np.geomspace(*SETTINGS.mode_Hz).tolist())),
                 EffectParameter(f"damping{of}", "1", f"damping ratio {of_mode}", 0.0, 1e-4, 0.5, 0.02, False, (0.02,),
                                 True),
                 *(EffectParameter(f"shape{of}_{name.replace('.', '_')}", "1/sqrt(kg)",
@@ -60,8 +53,8 @@ class PayloadFlexibleMode(Effect):
     def priors(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Where no motor pushes, a shape is of the size that it has elsewhere.
 
-        A mode is held by the mounts' stiffness at these points, too: what they add to w^2 and 2 z w cannot be told
-        from the mode's own, and along one combination of them no force on the payload shows them either.
+        A mode is held by the mounts' stiffness at these points, too: what they add to w^2 and 2 z w cannot be
+        separated from the mode's own, and forces on the payload do not show one combination of them.
         """
         found: dict[str, tuple[float, float]] = {}
         parameters = self.parameters(model, place)
@@ -69,7 +62,7 @@ class PayloadFlexibleMode(Effect):
         for k in range(0, len(parameters), own):
             shape = parameters[k + 2:k + own]
             size = np.sqrt(np.mean(np.square([values[one.name] for one in shape if not one.optional])))
-            found |= {one.name: (0.0, max(float(size), SMALLEST_SHAPE)) for one in shape if one.optional}
+            found |= {one.name: (0.0, max(float(size), SETTINGS.smallest_shape)) for one in shape if one.optional}
         return found
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -85,7 +78,7 @@ class PayloadFlexibleMode(Effect):
         return _one_mode(score, ()) if COUNTS[place.partition("/")[2]] == 1 else []
 
     def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
-        """One mode more, where the fitted ones leave most."""
+        """One mode more, where the residual of the fitted ones is largest."""
         more = {count: place for place in self.places(score.model) for count in [COUNTS[place.partition("/")[2]]]}
         place = more.get(COUNTS[one.place.partition("/")[2]] + 1)
         found = _one_mode(score, [frequency for frequency, *_ in modes(one.by_name)]) if place else []
@@ -134,12 +127,12 @@ def resonance(score: Score) -> float:
 
 
 def _looks(score: Score) -> tuple[list[tuple[float, float]], list[tuple[np.ndarray, np.ndarray]]]:
-    """Frequency and damping ratio of every mode that is looked for, and the Gram matrix of its paths with their product
+    """Frequency and damping ratio of every mode that is searched, and the Gram matrix of its paths with their product
     with the residual."""
     if "looks" not in score.kept:
-        lowest = FREQUENCIES_Hz[0]
-        tried = [(f, 0.02) for f in FREQUENCIES_Hz]
-        tried += [(f, zeta) for f in peaks(score) if f > lowest for zeta in (0.005, 0.02)]
+        frequencies = np.geomspace(*SETTINGS.mode_Hz).tolist()
+        tried = [(f, 0.02) for f in frequencies]
+        tried += [(f, zeta) for f in peaks(score) if f > frequencies[0] for zeta in (0.005, 0.02)]
         kept = [paths(score, partial(receptance, frequency_Hz=f, damping=zeta)) for f, zeta in tried]
         score.kept["looks"] = tried, [(A @ A.T, A @ score.e) for A in kept]
     return score.kept["looks"]
@@ -150,7 +143,7 @@ def _one_mode(score: Score, beside: Sequence[float]) -> list[Seed]:
     at, products = _looks(score)
     found = []
     for (f, zeta), (G, b) in zip(at, products, strict=True):
-        if all(abs(np.log(f / other)) > APART for other in beside):
+        if all(abs(np.log(f / other)) > SETTINGS.modes_apart for other in beside):
             took = reduction(G, b)
             if seed := _seed(score.model, f, zeta, took.coefficients, took.chi2, len(at)):
                 found.append(seed)

@@ -7,19 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 from numba import njit
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, register, told_from_none
+from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, differs_from_zero, register
 from avis_ctrl.gap.operators import Operators, mount_geometry
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.gap.table_model import ActiveEffect
-
-# Frequency at which the mounts' stiffness is meant where it depends on frequency.
-REFERENCE_Hz = 3.0
-# Mounts with a leveling valve: a fourth would be one too many to level a plane.
-LEVELED = 3
-# Corners of a leveling valve [Hz]: at the upper end it follows at once, at the lower one hardly ever.
-VALVE_Hz = 0.01, 100.0
 
 
 def has_mounts(model: Table) -> bool:
@@ -67,8 +61,8 @@ class MountRelaxation(_OfMounts):
 class StructuralDamping(_OfMounts):
     """Loss nearly independent of frequency in every mount.
 
-    causal : k (s/w_ref)^a, loss factor tan(pi a/2) at every frequency, with the rise of stiffness that causality asks
-    for. complex : k (1 + j eta), the textbook's constant, which no passive element has over all frequencies.
+    causal : k (s/w_ref)^a, loss factor tan(pi a/2) at every frequency, with the rise of stiffness that causality
+    requires. complex : k (1 + j eta), the textbook's constant, which no passive element has over all frequencies.
     """
 
     name = "structural_damping"
@@ -87,7 +81,7 @@ class StructuralDamping(_OfMounts):
         if place.endswith("complex"):
             factor = np.full(len(ops.s), 1 + 1j * eta)
         else:
-            factor = (ops.s / (2 * np.pi * REFERENCE_Hz)) ** (2 / np.pi * np.arctan(eta))
+            factor = (ops.s / (2 * np.pi * LIBRARY.loss_Hz)) ** (2 / np.pi * np.arctan(eta))
         ops.stiffness_factor = ops.stiffness_factor * factor[:, None]
 
 
@@ -132,8 +126,8 @@ class MountSurge(_OfMounts):
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
-        return "" if told_from_none(values, std, ["frequency_Hz"]) else (
-            "a resonance of which the data do not tell the frequency")
+        return "" if differs_from_zero(values, std, ["frequency_Hz"]) else (
+            "a resonance whose frequency the data do not determine")
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
         up = vertical(ops)
@@ -143,9 +137,9 @@ class MountSurge(_OfMounts):
 
     def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
                  ) -> dict[str, Reported]:
-        """Means over the mounts; how these scatter goes into their standard deviations, for it is what one number for
-        all mounts leaves open. Of the mass that is of frequency, share and scatter; the mean stiffness is taken as it
-        is."""
+        """Means over the mounts. Their standard deviations include the scatter of the mounts, which one value for all
+        of them does not describe; that of the mass follows from frequency, payload_share and scatter, with the mean
+        stiffness taken as exact."""
         found = super().reported(model, place, values, covariance)
         k = mount_geometry(model.effective.rig).stiffness[vertical(model)]
         f, a, w = values["frequency_Hz"], values["payload_share"], surge_omega(values)
@@ -180,8 +174,8 @@ class LevelingLoop(_OfMounts):
     """Every leveled mount k (1 + w/s), w = 2 pi rate, with a valve that lags k (1 + w/(s (1 + s tau))), or each with a
     rate of its own.
 
-    A valve lets air in at a rate by the height of the payload over the chassis; what air does to height, and so the
-    force by it, goes with the mount's own stiffness.
+    A valve lets air in at a rate by the height of the payload over the chassis; the force by this air is in
+    proportion to the mount's own stiffness.
     """
 
     name = "leveling_loop"
@@ -200,13 +194,13 @@ class LevelingLoop(_OfMounts):
             return (rate,)
         if place.endswith("each"):
             return (rate, *(EffectParameter(f"uneven_{i}", "1", f"rate of valve {i} over the mean, less one", 0.0, -0.9,
-                                            0.9, 0.1, False, (0.0,), True) for i in range(1, LEVELED)))
-        # A valve may be faster than these data tell; its corner then runs to the upper end.
-        return (rate, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, *VALVE_Hz, 1.0,
-                                      False, (0.1, 0.3, 1.0, 3.0), True))
+                                            0.9, 0.1, False, (0.0,), True) for i in range(1, LIBRARY.leveled)))
+        # A valve may be faster than the data can show; its corner then runs to the upper end.
+        return (rate, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, *LIBRARY.valve_Hz,
+                                      1.0, False, (0.1, 0.3, 1.0, 3.0), True))
 
     def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
-        slow = values.get("valve_corner_Hz", np.inf) < 1.001 * VALVE_Hz[0]
+        slow = values.get("valve_corner_Hz", np.inf) < 1.001 * LIBRARY.valve_Hz[0]
         return "valves so slow that the loop does not level" if slow else ""
 
     def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
@@ -228,7 +222,7 @@ class LevelingLoop(_OfMounts):
         found = super().reported(model, place, values, covariance)
         rate, g = found["rate_Hz"], mount_geometry(model.rig)
         by_rate = 2 * np.pi * float(np.mean(g.stiffness[leveled(model)]))
-        if values.get("valve_corner_Hz", 0.0) > 0.999 * VALVE_Hz[1]:
+        if values.get("valve_corner_Hz", 0.0) > 0.999 * LIBRARY.valve_Hz[1]:
             del found["valve_corner_Hz"]
         return {**found, "integral_gain_N_per_ms": Reported(by_rate * rate.value, by_rate * rate.std, "N/(m s)")}
 
@@ -236,7 +230,7 @@ class LevelingLoop(_OfMounts):
 def leveled(model_or_ops) -> np.ndarray:
     """(n_g,) which mount rows the leveling acts on: the first three vertical ones."""
     up = vertical(model_or_ops)
-    return up & (np.cumsum(up) <= LEVELED)
+    return up & (np.cumsum(up) <= LIBRARY.leveled)
 
 
 @register

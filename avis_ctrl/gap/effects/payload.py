@@ -6,10 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, register
+from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, Table, register
 
 PRODUCTS = {"Jxy": "J12", "Jxz": "J13", "Jyz": "J23"}
-REACH_m = 2.0  # how far from the geometric centre something can be fixed to a payload
 
 
 @register
@@ -59,7 +58,7 @@ class AtPoint(Effect):
 
     def position(self) -> tuple[EffectParameter, ...]:
         return tuple(EffectParameter(f"{axis}_m", "m", f"its place along {axis}, from the geometric centre", 0.0,
-                                     -REACH_m, REACH_m, 0.2, False, grid)
+                                     -SETTINGS.reach_m, SETTINGS.reach_m, 0.2, False, grid)
                      for axis, grid in zip("xyz", ((-0.4, 0.0, 0.4), (-0.3, 0.0, 0.3), (-0.15, 0.25)), strict=True))
 
 
