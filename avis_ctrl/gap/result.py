@@ -65,8 +65,9 @@ class NamedEffect:
                 **({} if self.share is None else {"share": self.share})}
 
     def in_words(self) -> str:
-        """With its place, first parameters and probability."""
-        sizes = ", ".join(f"{spoken(name, p.unit)} {sized(p)}" for name, p in list(self.parameters.items())[:3])
+        """With its place, first parameters and probability; how single mounts differ stands in the table alone."""
+        first = [(name, p) for name, p in self.parameters.items() if not name.startswith("uneven_")][:3]
+        sizes = ", ".join(f"{spoken(name, p.unit)} {sized(p)}" for name, p in first)
         ties = (f", or {' or '.join(self.indistinguishable_from)}, which this data cannot tell from it"
                 if self.indistinguishable_from else "")
         return f"{self.title} ({self.name}, {self.location}: {sizes}; probability {self.probability:.2f}{ties})"

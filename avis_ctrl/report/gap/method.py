@@ -32,9 +32,11 @@ def method(gap: Gap) -> Section:
                   "record; they are projected out. E are relative errors of every path from a drive to a sensor, "
                   "constant over a third of an octave and within a level: what has no name. Their variance, and that "
                   "of an additional noise (distortion), is estimated for each sensor, band and level, and they are "
-                  "integrated out. So the standard deviations of all parameters contain what has no name."),
+                  "integrated out. Standard deviations contain them as far as they are independent from band to band "
+                  "and from level to level; where they are not, the standard deviations are too small."),
         Paragraph("Evidence. Of a model with certain effects, by Laplace's method, J the penalised sum of squares at "
-                  "the estimate, C the covariance of path errors and noise, H the information with priors:"),
+                  "the estimate, C the covariance of path errors and noise, H the information with priors; the "
+                  "constant contains the price of the states at the ends of the records:"),
         Formula("ln p(Y) = -J/2 - 1/2 ln det C - 1/2 ln det H + \"const.\"",
                 "log evidence is minus half the sum of squares, less half the log determinants"),
         Paragraph("Search. A score test with priors says by how much each effect at each place would lower J to first "
