@@ -1,0 +1,50 @@
+"""Tuning values of the search on one axis, beside those of the table's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from avis_ctrl.gap.settings import GapSettings
+
+
+@dataclass(frozen=True)
+class AxisSettings(GapSettings):
+    """Values that no data determine.
+
+    spans : parts of a record, of which every third is held out; each holds several periods of what moves slowly.
+    segments : half-overlapping windows of a span; three give a span's middle the same weight as its ends.
+    lines_per_band : lines of a segment in a band of the discrepancy; more make the fit longer and hardly better.
+    floor : noise that nobody can exclude, over the response of a band [1]; 80 dB is what good converters have.
+    oversampled : samples of the motion for each measured one, for functions whose harmonics would fold back.
+    pairs : pairs of effects that are fitted at each step, the best by the score test.
+    bumps : splines of a function of unknown shape; as many as tell a stop from a cubic spring.
+    no_model : part of the response that a model may leave before the columns themselves are in doubt [1]; friction and
+        springs are seldom half of it.
+    much_better : part of that which exchanged columns may leave to be believed [1]; half of the power.
+    coherent : coherence of force and motion up to which the noise of the motion bends a fit by a tenth at most [1].
+    least_cutoff_Hz : of a drive's data where the coherence ends earlier [Hz]; friction needs its harmonics.
+    repeats : change of the motion from one repetition to the next, over its r.m.s., up to which it repeats [1].
+    alike : part of one effect's prediction that another one lacks, below which they are the same [1]; its square is far
+        below what any evidence tells.
+    least_angle : travel from which a position may be an angle whose sine bends [rad].
+    octaves_per_band : width of a band of the discrepancy where lines are few, as in a stepped sine.
+    """
+
+    spans: int = 6
+    segments: int = 3
+    lines_per_band: int = 24
+    floor: float = 1e-4
+    oversampled: int = 4
+    pairs: int = 3
+    bumps: int = 12
+    no_model: float = 0.5
+    much_better: float = 0.7
+    coherent: float = 0.9
+    least_cutoff_Hz: float = 60.0
+    repeats: float = 1e-3
+    alike: float = 1e-2
+    least_angle: float = 1.0
+    octaves_per_band: float = 4.0
+
+
+SETTINGS = AxisSettings()
