@@ -102,7 +102,7 @@ class Lines:
         shortest = min(len(one.force) for one in self.records)
         self.length = shortest // (2 if whole else settings.spans) * 2 // (settings.segments + 1)
         self.length = min(self.length, max(int(shortest / settings.spans), 2))
-        k = np.arange(1, max(self.length // 2, 1), 2)
+        k = np.arange(0, max(self.length // 2, 1), 2)
         f = k * rate / max(self.length, 1)
         inside = (f >= band_Hz[0]) & (f <= min(band_Hz[1], 0.45 * rate))
         self.k = _thinned(k[inside], f[inside], settings)
@@ -110,7 +110,8 @@ class Lines:
             raise InputError(f"expected at least {settings.fewest_lines // 4} lines of the band in each of "
                              f"{settings.spans * settings.segments} segments: a longer record or a wider band",
                              field="samples", value=shortest)
-        self.s = 2j * np.pi * self.k * rate / self.length
+        # The mean of a window is a line too, at a frequency that is nearly none.
+        self.s = 2j * np.pi * np.maximum(self.k, 1e-3) * rate / self.length
         self.starts, self.held_out = [], []
         for number, one in enumerate(self.records):
             starts, held = self._segments(len(one.force), number if whole else None)
@@ -165,7 +166,8 @@ class Lines:
         found = np.zeros((len(starts), len(self.k)), complex)
         for shift, c in ((-1, -0.25), (0, 0.5), (1, -0.25)):
             at = self.k + shift
-            found += c * (2j * np.pi * at * self.rate / self.length) ** order * X[:, at]
+            line = np.where(at[None] < 0, X[:, np.abs(at)].conj(), X[:, np.abs(at)])
+            found += c * (2j * np.pi * at * self.rate / self.length) ** order * line
         return found
 
     def of(self, shape: Shape) -> list[np.ndarray]:
@@ -200,18 +202,14 @@ class Lines:
 
 def floor_of(omega: np.ndarray, Y: np.ndarray, settings: AxisSettings) -> np.ndarray:
     """(n, 1, 1) the least noise of every line."""
-    own = bands(omega, settings.bands_per_octave)
-    power = np.abs(Y[:, 0, 0]) ** 2
-    mean = {band: float(np.mean(power[own == band])) for band in np.unique(own)}
-    least = 1e-12 * float(np.mean(power))
-    return np.array([settings.floor ** 2 * max(mean[band], least) for band in own])[:, None, None]
+    return np.full((len(omega), 1, 1), settings.floor ** 2 * float(np.mean(np.abs(Y) ** 2)))
 
 
 def _thinned(k: np.ndarray, f: np.ndarray, settings: AxisSettings) -> np.ndarray:
     keep = []
     if not len(k):
         return k
-    own = bands(2 * np.pi * f, settings.bands_per_octave)
+    own = bands(2 * np.pi * np.maximum(f, 1e-6), 3)
     for band in np.unique(own):
         inside = k[own == band]
         few = min(len(inside), settings.lines_per_band)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
@@ -129,6 +129,7 @@ def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress
     """Models with more effects each, the first one the base; an effect is added where the evidence rises by more than
     the number of candidates explains, and dropped where others have made it idle."""
     settings, steps = explored.settings, [base]
+    effects = [one for one in effects if not one.outside]
     price = settings.certain + math.log(len(effects))
     while len(steps[-1].labels) < settings.longest:
         now = steps[-1]
@@ -138,17 +139,13 @@ def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress
         for c in shortlist(found, now.e, settings):
             one = explored.with_effects(now, c.effects)
             if one is not None and not at_an_edge(one):
-                outside = sum(effect.outside for effect, _ in c.effects)
-                tried.append((one.log_evidence - len(c.effects) * price - outside * math.log(settings.outside_odds),
-                              one))
+                tried.append((one.log_evidence - len(c.effects) * price, one))
         if not tried or max(score for score, _ in tried) <= now.log_evidence:
             break
         steps.append(_without_idle(max(tried, key=lambda item: item[0])[1], explored))
         if any(set(one.labels) == set(steps[-1].labels) for one in steps[:-1]):
             steps.pop()
             break
-        if steps[-1].model.effects[-1].outside:
-            break  # what nobody has named takes whatever follows
     return steps
 
 
@@ -171,6 +168,19 @@ def at_an_edge(fitted: Fitted) -> str:
     return ""
 
 
+def unnamed(now: Fitted, explored: Explored, effects: Sequence[Effect]) -> Fitted | None:
+    """The best model with a function that has no name beside what is named; None where none is called for."""
+    settings, tried = explored.settings, []
+    others = [one for one in effects if one.outside]
+    for c in candidates(now, explored.data, others, settings):
+        one = explored.with_effects(now, c.effects)
+        if one is not None:
+            tried.append(one)
+    best = max(tried, key=lambda one: one.log_evidence, default=None)
+    price = settings.certain + math.log(max(len(others), 1) * settings.outside_odds)
+    return best if best is not None and best.log_evidence > now.log_evidence + price else None
+
+
 @dataclass(frozen=True, eq=False)
 class Rival:
     """Another effect in the place of one: the fit, its odds, and whether it predicts the same."""
@@ -188,7 +198,7 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
     if rest is None:
         return []
     own = next(one for one in best.model.effects if one.label == label)
-    found = candidates(rest, explored.data, effects, settings)
+    found = candidates(rest, explored.data, [one for one in effects if not one.outside], settings)
     mine = next((c for c in found if c.effects[0][0].label == label), None)
     least = 0.5 * mine.fall if mine is not None else 0.0
     known: list[Rival] = []
@@ -199,9 +209,8 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
         one = explored.with_effects(rest, c.effects)
         if one is None or at_an_edge(one):
             continue
-        prior = settings.outside_odds if effect.outside else 1.0
         same = mine is not None and same_directions(mine.directions, c.directions, settings)
-        known.append(Rival(effect, one, odds_against_fit(best, one) / prior, same))
+        known.append(Rival(effect, one, odds_against_fit(best, one), same))
     return sorted(known, key=lambda r: -r.odds)
 
 
@@ -219,7 +228,3 @@ def odds_against_fit(one: Fitted, other: Fitted) -> float:
     beside = ahead - sum(one.log_likelihoods.values()) + sum(other.log_likelihoods.values())
     return max(math.exp(-min(max(ahead, -50.0), 50.0)),
                odds_against(one.log_likelihoods, other.log_likelihoods, beside))
-
-
-def settings_for(settings: AxisSettings, **changes: float) -> AxisSettings:
-    return replace(settings, **changes)  # type: ignore[arg-type]

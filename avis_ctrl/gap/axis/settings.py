@@ -13,7 +13,9 @@ class AxisSettings(GapSettings):
 
     spans : parts of a record, of which every third is held out; each holds several periods of what moves slowly.
     segments : half-overlapping windows of a span; three give a span's middle the same weight as its ends.
-    lines_per_band : lines of a segment in a band of the discrepancy; more make the fit longer and hardly better.
+    lines_per_band : lines of a segment in a third of an octave; more make the fit longer and hardly better.
+    bands_per_octave : of the discrepancy; none, one variance for all lines. What laws of friction leave is largest where
+        the force is: with a variance for each band the evidence would give the low ones up as noise.
     floor : noise that nobody can exclude, over the response of a band [1]; 80 dB is what good converters have.
     oversampled : samples of the motion for each measured one, for functions whose harmonics would fold back.
     pairs : pairs of effects that are fitted at each step, the best by the score test.
@@ -27,12 +29,12 @@ class AxisSettings(GapSettings):
     alike : part of one effect's prediction that another one lacks, below which they are the same [1]; its square is far
         below what any evidence tells.
     least_angle : travel from which a position may be an angle whose sine bends [rad].
-    octaves_per_band : width of a band of the discrepancy where lines are few, as in a stepped sine.
     """
 
     spans: int = 6
     segments: int = 3
     lines_per_band: int = 24
+    bands_per_octave: float = 0.0  # type: ignore[assignment]
     floor: float = 1e-4
     oversampled: int = 4
     pairs: int = 3
@@ -44,7 +46,6 @@ class AxisSettings(GapSettings):
     repeats: float = 1e-3
     alike: float = 1e-2
     least_angle: float = 1.0
-    octaves_per_band: float = 4.0
 
 
 SETTINGS = AxisSettings()
