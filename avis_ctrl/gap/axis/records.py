@@ -177,6 +177,13 @@ class Lines:
                                            for i, m in enumerate(self.motion)]
         return self.kept[id(shape)][1]
 
+    def of_lines(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) number of the segment of each line of a block, and when it begins [s]."""
+        record, segment = self.rows[name]
+        many = max(len(starts) for starts in self.starts)
+        when = [self.starts[i][j] / self.rate for i, j in zip(record, segment, strict=True)]
+        return np.repeat(record * many + segment, len(self.k)), np.repeat(when, len(self.k))
+
     def pick(self, columns: Sequence[np.ndarray], name: str) -> np.ndarray:
         """(n,) of a block."""
         record, segment = self.rows[name]

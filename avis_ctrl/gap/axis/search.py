@@ -21,6 +21,7 @@ from avis_ctrl.gap.score import reduction
 from avis_ctrl.gap.validation import odds_against
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened
+from avis_ctrl.identification.single_axis.fit import not_below
 
 Progress = Callable[[str], None]
 
@@ -209,22 +210,78 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
         one = explored.with_effects(rest, c.effects)
         if one is None or at_an_edge(one):
             continue
-        same = mine is not None and same_directions(mine.directions, c.directions, settings)
-        known.append(Rival(effect, one, odds_against_fit(best, one), same))
+        known.append(Rival(effect, one, odds_against_fit(best, one), alike(best, one, settings)))
     return sorted(known, key=lambda r: -r.odds)
 
 
-def same_directions(A: np.ndarray, B: np.ndarray, settings: AxisSettings) -> bool:
-    """Whether two effects change the prediction alike."""
-    if len(A) != len(B):
-        return False
-    Q = np.linalg.qr(A.T)[0]
-    return bool(np.linalg.norm(B - (B @ Q) @ Q.T) < settings.alike * np.linalg.norm(B))
+def alike(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
+    """Whether two models predict the same within a small part of what they leave."""
+    return bool(np.linalg.norm(one.white.e - other.white.e) < settings.alike * np.linalg.norm(one.white.e))
 
 
 def odds_against_fit(one: Fitted, other: Fitted) -> float:
-    """Of another fit against one: by evidence, or by how evenly that is spread, whichever is larger."""
+    """Of another fit against one: by evidence, or by how evenly that is spread over segments and octaves, whichever is
+    larger: what is left of a real record is no white noise."""
     ahead = one.log_evidence - other.log_evidence
-    beside = ahead - sum(one.log_likelihoods.values()) + sum(other.log_likelihoods.values())
-    return max(math.exp(-min(max(ahead, -50.0), 50.0)),
-               odds_against(one.log_likelihoods, other.log_likelihoods, beside))
+    mine, theirs = cells(one), cells(other)
+    beside = ahead - sum(mine.values()) + sum(theirs.values())
+    return max(math.exp(-min(max(ahead, -50.0), 50.0)), odds_against(mine, theirs, beside))
+
+
+def cells(fitted: Fitted) -> dict[tuple[int, int], float]:
+    """Log-likelihood by segment and octave."""
+    rows, e2 = row_table(fitted), fitted.e ** 2
+    for one in fitted.weights.paths:
+        e2[one.rows] += fitted.weights.log_determinants[one.group] / len(one.rows)
+    octave = np.floor(np.log2(rows.frequency)).astype(int)
+    found: dict[tuple[int, int], float] = {}
+    for segment, band, value in zip(rows.segment, octave, e2, strict=True):
+        found[segment, band] = found.get((segment, band), 0.0) - 0.5 * float(value)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Of each real number of the stacked residual: frequency [rad/s], segment, begin [s], loudness."""
+
+    frequency: np.ndarray
+    segment: np.ndarray
+    when: np.ndarray
+    level: np.ndarray
+
+
+def row_table(fitted: Fitted) -> Rows:
+    columns: list[list[np.ndarray]] = [[], [], [], []]
+    for block, level in zip(fitted.model.lines.fitted.blocks, fitted.model.lines.fitted.levels, strict=True):
+        segment, when = fitted.model.lines.of_lines(block.name)
+        for column, values in zip(columns, (block.omega, segment, when, np.full(len(when), level)), strict=True):
+            column.append(np.tile(np.repeat(values, block.Y.shape[1]), 2))
+    return Rows(*(np.concatenate(column) for column in columns))
+
+
+def parts(fitted: Fitted, names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
+    """Halves of the data by band, time and level, each with half of the information on some parameters."""
+    rows = row_table(fitted)
+    information = np.sum(fitted.J[[fitted.priors.names.index(name) for name in names]] ** 2, axis=0)
+    found = []
+    for values, words in ((rows.frequency, ("the lower part of the band", "the upper part of the band")),
+                          (rows.when, ("the first half of the record", "the second half of the record")),
+                          (rows.level, ("low levels", "high levels"))):
+        order = np.argsort(values, kind="stable")
+        middle = values[order][np.searchsorted(np.cumsum(information[order]), information.sum() / 2)]
+        below = values <= middle
+        if below.any() and not below.all():
+            found += [(words[0], np.flatnonzero(below)), (words[1], np.flatnonzero(~below))]
+    return found
+
+
+def robust(fitted: Fitted) -> np.ndarray:
+    """Covariance of the values of all parameters, with the scores summed over each segment (K. Liang, S. Zeger,
+    Biometrika 73 (1986) 13): whatever correlation there is inside a segment counts. Not below that of the fit."""
+    segment = row_table(fitted).segment
+    groups = np.unique(segment)
+    scores = np.array([fitted.J[:, segment == one] @ fitted.e[segment == one] - fitted.z / len(groups)
+                       for one in groups])
+    P, few = fitted.covariance, len(groups) / max(len(groups) - 1, 1)
+    slope = fitted.priors.slopes(fitted.z)
+    return not_below(few * P @ (scores.T @ scores) @ P, P) * np.outer(slope, slope)

@@ -28,6 +28,8 @@ class AxisSettings(GapSettings):
     repeats : change of the motion from one repetition to the next, over its r.m.s., up to which it repeats [1].
     alike : part of one effect's prediction that another one lacks, below which they are the same [1]; its square is far
         below what any evidence tells.
+    right_shape : part of what a free function takes off the power that named effects must take [1]; with less, more than
+        half of the r.m.s. stays: they are neighbours of the truth.
     least_angle : travel from which a position may be an angle whose sine bends [rad].
     """
 
@@ -45,6 +47,7 @@ class AxisSettings(GapSettings):
     least_cutoff_Hz: float = 60.0
     repeats: float = 1e-3
     alike: float = 1e-2
+    right_shape: float = 0.75
     least_angle: float = 1.0
 
 
