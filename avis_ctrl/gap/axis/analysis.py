@@ -146,13 +146,15 @@ def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, name
     before, after = power(base), power(best)
     floor = problem.noise if problem.noise is not None else min(after, power(free) if free is not None else after)
     excess = max(before - floor, 1e-300)
-    covariance = robust(best)
-    effects = [_reported(one, best, covariance, after, excess, problem) for one in names]
+    left = max(after - floor, 0.0) / excess
+    shares = {one.effect.label: float(np.clip((power(best.model.without(one.effect.label)) - after) / excess, 0.0, 1.0))
+              for one in names}
+    covariance = _widened(best, names, shares, left)
+    effects = [_reported(one, best, covariance, shares[one.effect.label], problem) for one in names]
     effects.sort(key=lambda one: -(one.share or 0.0))
     told = tuple(one for one in effects if (one.share or 0.0) >= settings.trace)
     traces = tuple(one for one in effects if (one.share or 0.0) < settings.trace)
     stages = _stages(base, best, [one.label for one in effects], explored, problem)
-    left = max(after - floor, 0.0) / excess
     closed = after <= settings.within_noise * floor or max(after - floor, 0.0) < settings.small ** 2
     if told:
         verdict = "explained" if closed or left <= 1 - settings.explained else "partly explained"
@@ -171,19 +173,47 @@ def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, name
                    _pictures(base, best, stages, problem), _plain(problem, best))
 
 
-def _reported(one: Name, best: Fitted, covariance: np.ndarray, after: float, excess: float, problem: Problem
-              ) -> NamedEffect:
-    found = {}
-    for p, value in zip(one.effect.parameters, best.model.of(one.effect), strict=True):
-        k = best.model.names.index(f"{p.name}@{one.effect.label}")
-        found[p.name] = Reported(float(value), one.widened * float(np.sqrt(covariance[k, k])),
-                                 p.unit.format(**problem.units))
-    for name, (value, unit) in one.effect.fixed.items():
+def _widened(best: Fitted, names: Sequence[Name], shares: Mapping[str, float], left: float) -> np.ndarray:
+    """Covariance of all parameters. No law is quite that of the real element: those of an effect are known no better
+    than halves of the data agree, and what remains beyond noise may point along the effect, with a correlation of
+    anything from -1 to 1 (its variance is 1/3)."""
+    factor, beside = np.ones(len(best.model.names)), np.zeros(len(best.model.names))
+    for one in names:
+        for p, value in zip(one.effect.parameters, best.model.of(one.effect), strict=True):
+            k = best.model.names.index(f"{p.name}@{one.effect.label}")
+            factor[k] = one.widened
+            beside[k] = value ** 2 * left / (3 * max(shares[one.effect.label], left, 1e-12))
+    return robust(best) * np.outer(factor, factor) + np.diag(beside)
+
+
+def _reported(one: Name, best: Fitted, covariance: np.ndarray, share: float, problem: Problem) -> NamedEffect:
+    values, effect = best.model.of(one.effect), one.effect
+    rows = [best.model.names.index(f"{p.name}@{effect.label}") for p in effect.parameters]
+    own = covariance[np.ix_(rows, rows)]
+    if effect.derived:
+        found = _propagated(effect.derived, values, own, problem)
+    else:
+        found = {p.name: Reported(float(value), float(np.sqrt(own[k, k])), p.unit.format(**problem.units))
+                 for k, (p, value) in enumerate(zip(effect.parameters, values, strict=True))}
+    for name, (value, unit) in effect.fixed.items():
         found[name] = Reported(value, float("nan"), unit.format(**problem.units))
-    rise = power(best.model.without(one.effect.label)) - after
-    return NamedEffect(one.effect.name, one.effect.location, one.effect.title, found, one.probability,
-                       tuple(dict.fromkeys(r.effect.key for r in one.rivals)), one.effect.label,
-                       share=float(np.clip(rise / excess, 0.0, 1.0)))
+    return NamedEffect(effect.name, effect.location, effect.title, found, one.probability,
+                       tuple(dict.fromkeys(r.effect.key for r in one.rivals)), effect.label, share=share)
+
+
+def _propagated(function: Callable[[np.ndarray], Mapping[str, tuple[float, str]]], values: np.ndarray,
+                covariance: np.ndarray, problem: Problem) -> dict[str, Reported]:
+    """With standard deviations to first order."""
+    found = {}
+    for name, (value, unit) in function(values).items():
+        slope = np.zeros(len(values))
+        for k in range(len(values)):
+            step = np.zeros(len(values))
+            step[k] = 1e-6 * abs(values[k])
+            if step[k]:
+                slope[k] = (function(values + step)[name][0] - value) / step[k]
+        found[name] = Reported(float(value), float(np.sqrt(slope @ covariance @ slope)), unit.format(**problem.units))
+    return found
 
 
 def _stages(base: Fitted, best: Fitted, labels: Sequence[str], explored: Explored, problem: Problem) -> list[AxisStage]:
@@ -201,21 +231,9 @@ def _stages(base: Fitted, best: Fitted, labels: Sequence[str], explored: Explore
 
 
 def _ratios(problem: Problem, best: Fitted, covariance: np.ndarray) -> dict[str, Reported]:
-    """With standard deviations to first order."""
     names = [name.partition("@")[0] for name in best.model.names]
-
-    def at(values: np.ndarray) -> Mapping[str, tuple[float, str]]:
-        return problem.ratios(dict(zip(names, values, strict=True)))
-    values, found = best.model.values, {}
-    for name, (value, unit) in at(values).items():
-        slope = np.zeros(len(values))
-        for k in range(len(values)):
-            step = np.zeros(len(values))
-            step[k] = 1e-6 * abs(values[k])
-            if step[k]:
-                slope[k] = (at(values + step)[name][0] - value) / step[k]
-        found[name] = Reported(value, float(np.sqrt(slope @ covariance @ slope)), unit.format(**problem.units))
-    return found
+    return _propagated(lambda values: problem.ratios(dict(zip(names, values, strict=True))), best.model.values,
+                       covariance, problem)
 
 
 def _plain(problem: Problem, best: Fitted) -> dict[str, Any]:

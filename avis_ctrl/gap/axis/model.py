@@ -44,7 +44,8 @@ class Effect:
     effects that predict the same. shapes : forces, functions of the motion, one for each of the first parameters.
     dynamics : (s, p) added to Z. path : (s, p) factor of the path from force to mass. channel : (s, p) factor of one
     channel of a sensor. seeds : values where a fit may begin. law : variant of the effect. outside : a function without
-    a name, which stands for whatever the library does not hold.
+    a name, which stands for whatever the library does not hold. fixed : values of the law, with units. derived : what is
+    reported in the place of the parameters. implausible : (p) why physics forbids values; empty where it does not.
     """
 
     name: str
@@ -60,6 +61,8 @@ class Effect:
     law: str = ""
     outside: bool = False
     fixed: dict[str, tuple[float, str]] = field(default_factory=dict)
+    derived: Callable[[np.ndarray], dict[str, tuple[float, str]]] | None = None
+    implausible: Callable[[np.ndarray], str] | None = None
 
     @property
     def label(self) -> str:

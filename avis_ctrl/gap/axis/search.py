@@ -161,8 +161,10 @@ def _without_idle(now: Fitted, explored: Explored) -> Fitted:
 
 
 def at_an_edge(fitted: Fitted) -> str:
-    """In words, a parameter of an effect at the end of its range; empty where none is."""
+    """In words, a parameter of an effect at the end of its range, or beyond what physics allows; empty where none is."""
     for one in fitted.model.effects:
+        if one.implausible and (reason := one.implausible(fitted.model.of(one))):
+            return reason
         for p, value in zip(one.parameters, fitted.model.of(one), strict=True):
             if value <= p.low or value >= p.high:
                 return f"{p.name} of {one.name} ends at {value:.3g} {p.unit}, the limit of its range"
@@ -278,10 +280,9 @@ def parts(fitted: Fitted, names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
 def robust(fitted: Fitted) -> np.ndarray:
     """Covariance of the values of all parameters, with the scores summed over each segment (K. Liang, S. Zeger,
     Biometrika 73 (1986) 13): whatever correlation there is inside a segment counts. Not below that of the fit."""
-    segment = row_table(fitted).segment
+    segment, slope = row_table(fitted).segment, fitted.priors.slopes(fitted.z)
     groups = np.unique(segment)
     scores = np.array([fitted.J[:, segment == one] @ fitted.e[segment == one] - fitted.z / len(groups)
                        for one in groups])
     P, few = fitted.covariance, len(groups) / max(len(groups) - 1, 1)
-    slope = fitted.priors.slopes(fitted.z)
     return not_below(few * P @ (scores.T @ scores) @ P, P) * np.outer(slope, slope)
