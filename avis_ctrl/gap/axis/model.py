@@ -210,12 +210,11 @@ def base_priors(model: AxisModel, positive: Sequence[bool], settings: AxisSettin
 
 
 def sizes(model: AxisModel, at: Sequence[int]) -> np.ndarray:
-    """Values of parameters that change the prediction by as much as the whole response, r.m.s. over fitted lines, each
-    in the size of the response there."""
+    """Values of parameters that change the prediction by as much as the whole response, r.m.s. over fitted lines."""
     power, total = np.zeros(len(at)), 0
     for block in model.lines.fitted.blocks:
         dY = model.columns(block)[list(at)]
-        scale = np.sqrt(np.mean(np.abs(block.Y) ** 2, axis=(0, 2)))[:, None]
+        scale = float(np.sqrt(np.mean(np.abs(block.Y) ** 2)))
         power += np.sum(np.abs(dY / scale) ** 2, axis=(1, 2, 3))
         total += block.Y.size
     return 1 / np.sqrt(np.maximum(power / total, 1e-300))

@@ -217,8 +217,10 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
 
 
 def alike(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
-    """Whether two models predict the same within a small part of what they leave."""
-    return bool(np.linalg.norm(one.white.e - other.white.e) < settings.alike * np.linalg.norm(one.white.e))
+    """Whether two models predict the same within the data: were one of them true, the other would be behind by less than
+    that in log-likelihood [nats] on average."""
+    left = one.white.e - other.white.e
+    return bool(0.5 * left @ left < settings.alike)
 
 
 def odds_against_fit(one: Fitted, other: Fitted) -> float:

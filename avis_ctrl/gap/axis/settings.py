@@ -18,6 +18,7 @@ class AxisSettings(GapSettings):
         the force is: with a variance for each band the evidence would give the low ones up as noise.
     floor : noise that nobody can exclude, over the response of a band [1]; 80 dB is what good converters have.
     oversampled : samples of the motion for each measured one, for functions whose harmonics would fold back.
+    refits : effects that are refitted at each step of the search, the best by the score test; a fit is short.
     pairs : pairs of effects that are fitted at each step, the best by the score test.
     bumps : splines of a function of unknown shape; as many as tell a stop from a cubic spring.
     no_model : part of the response that a model may leave before the columns themselves are in doubt [1]; friction and
@@ -26,10 +27,10 @@ class AxisSettings(GapSettings):
     coherent : coherence of force and motion up to which the noise of the motion bends a fit by a tenth at most [1].
     least_cutoff_Hz : of a drive's data where the coherence ends earlier [Hz]; friction needs its harmonics.
     repeats : change of the motion from one repetition to the next, over its r.m.s., up to which it repeats [1].
-    alike : part of one effect's prediction that another one lacks, below which they are the same [1]; its square is far
-        below what any evidence tells.
+    alike : mean difference of log-likelihood below which two effects are one for the data [nats].
     right_shape : part of what a free function takes off the power that named effects must take [1]; with less, more than
         half of the r.m.s. stays: they are neighbours of the truth.
+    frequencies : of a stepped sine that a search needs.
     least_angle : travel from which a position may be an angle whose sine bends [rad].
     """
 
@@ -39,6 +40,7 @@ class AxisSettings(GapSettings):
     bands_per_octave: float = 0.0  # type: ignore[assignment]
     floor: float = 1e-4
     oversampled: int = 4
+    refits: int = 12
     pairs: int = 3
     bumps: int = 12
     no_model: float = 0.5
@@ -46,8 +48,9 @@ class AxisSettings(GapSettings):
     coherent: float = 0.9
     least_cutoff_Hz: float = 60.0
     repeats: float = 1e-3
-    alike: float = 1e-2
+    alike: float = 1.0
     right_shape: float = 0.75
+    frequencies: int = 8
     least_angle: float = 1.0
 
 
