@@ -76,7 +76,7 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
     explored = Explored(problem.model.lines.fitted, settings)
     progress("base model")
     base = explored.base(problem.model, base_priors(problem.model, problem.positive, settings))
-    best = search(base, explored, problem.effects, progress)[-1]
+    best = _first_of_alike(search(base, explored, problem.effects, progress)[-1], explored, problem)
     progress("names")
     names, refused = [], []
     while True:
@@ -96,6 +96,18 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
         refused += [replace(one, refused="a function of another shape takes far more") for one in names]
         names, best = [], base
     return _gap(problem, base, best, free, names, refused, explored, settings)
+
+
+def _first_of_alike(best: Fitted, explored: Explored, problem: Problem) -> Fitted:
+    """Of effects that predict the same, the one that the library has first."""
+    place = {one.key: k for k, one in reversed(list(enumerate(problem.effects)))}
+    for label in best.labels:
+        own = next(one for one in best.model.effects if one.label == label)
+        same = [r for r in rivals(best, label, explored, problem.effects) if r.same and place[r.effect.key] <
+                place[own.key]]
+        if same:
+            best = min(same, key=lambda r: place[r.effect.key]).fitted
+    return best
 
 
 def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, settings: AxisSettings) -> Name:

@@ -30,11 +30,13 @@ class Channels:
     """Responses as blocks for the likelihood. Outputs are magnitude and phase of each response: Y is 1 + j for the
     former, 0 for the latter, and the model predicts Y and the logarithm of its own response over the measured one.
 
-    f : (n,) Hz, n even. measured : (n, responses). names : of the channels, one or two. rows : pairs by block.
+    f : (n,) Hz, n even. measured : (n, responses). spread : (pairs,) what
+    the discrepancy is expected to be proportional to, by which all outputs are divided. names : of the channels, one or two. rows : pairs by block.
     """
 
     f: np.ndarray
     measured: np.ndarray
+    spread: np.ndarray
     names: tuple[str, ...]
     fitted: Data
     held: Data
@@ -65,7 +67,7 @@ class SensorModel(AxisModel):
                  for kind, h in zip(c.names, H, strict=True)]
         found = np.log(np.stack([H[0], *([H[1] / H[0]] if len(H) > 1 else [])], axis=1) / c.measured[rows])
         parts = np.stack([1 + found.real, found.imag], axis=2).reshape(len(rows), -1)
-        return parts[::2] + 1j * parts[1::2]
+        return (parts[::2] + 1j * parts[1::2]) / c.spread[pairs][:, None]
 
     def contributions(self, block: SpectralBlock) -> np.ndarray:
         return np.zeros((*block.Y.shape[:2], 1))  # what is constant over the band is a gain, which is free
@@ -114,15 +116,19 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     measured = np.stack([H[0], *([H[1] / H[0]] if len(H) > 1 else [])], axis=1)[:n]
     noise = np.stack([relative[names[0]] + h ** 2, *([both] if len(H) > 1 else [])], axis=1)[:n] / 2
     noise = np.repeat(np.maximum(noise[::2] + noise[1::2], settings.floor ** 2), 2, axis=1)
+    # A mass that is not linear scatters by as much as its harmonics carry, beside what is alike at all frequencies.
+    spread = np.sqrt(1 + (h[:n] / max(float(np.median(h)), 1e-12)) ** 2)
+    spread = np.sqrt(spread[::2] * spread[1::2])
+    noise = noise / spread[:, None] ** 2
     pairs, rows, data = np.arange(n // 2), {}, {}
     inner = (pairs % 3 == 1) & (pairs < n // 2 - 1)  # the ends, where effects show most, are fitted
     for name, inside in (("fitted", ~inner), ("held out", inner)):
         at = rows[name] = pairs[inside]
-        Y = np.tile([1 + 1j, 0], len(names)) * np.ones((len(at), 1))
+        Y = np.tile([1 + 1j, 0], len(names)) / spread[at][:, None]
         block = SpectralBlock(name, 2 * np.pi * np.sqrt(f[2 * at] * f[2 * at + 1]), np.zeros((len(at), 0, 1)),
                               Y[:, :, None])
         data[name] = Data((block.with_noise(noise[at][:, :, None] * np.eye(2 * len(names))),), (1.0,))
-    lines = Channels(f, measured, names, data["fitted"], data["held out"], rows, settings)
+    lines = Channels(f, measured, spread, names, data["fitted"], data["held out"], rows, settings)
     units = dict(zip(start.names, start.information.units, strict=True))
     model = SensorModel(lines, tuple(units.items()), (), np.asarray(start.values, float))
     positive = tuple(name in ("corner_Hz", "damping") for name in start.names)
@@ -130,7 +136,7 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
         f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the mass itself is "
         "nonlinear, which no effect of a channel holds.",)
     outputs = " and ".join(names)
-    return Problem("seismometer", model, positive, sensor_effects(f, names), float(np.mean(noise[rows["held out"]])),
+    return Problem("seismometer", model, positive, sensor_effects(f, names), float(np.sum(noise[rows["held out"]]) / np.sum(np.abs(data["held out"].blocks[0].Y) ** 2)),
                    {"F": "", "x": "", "input": "drive", "output": outputs}, notes=notes)
 
 
@@ -150,7 +156,7 @@ def sensor_effects(f: np.ndarray, channels: Sequence[str]) -> list[Effect]:
         # A mode of damping 0.87 has the phase of a delay to fourth order, and a mount has not.
         damping = mode(p)["damping"][0]
         return f"a mount with a damping of {damping:.2g} is none" if damping > LARGEST_MODE_DAMPING else ""
-    for place in (*reversed(channels), *(("drive",) if len(channels) > 1 else ())):
+    for place in ("drive", *reversed(channels)) if len(channels) > 1 else channels:
         what = f"of the {place}"
         found += [
             # No channel is early; the drive's column may have been logged late.
