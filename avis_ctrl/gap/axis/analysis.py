@@ -182,7 +182,8 @@ def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, name
     return AxisGap(problem.kind, verdict, told, traces, tuple(stages), where, tuple(said), onward, base_values,
                    _ratios(problem, best, covariance), ups,
                    None if problem.noise is None else float(np.sqrt(after / max(problem.noise, 1e-300))), left,
-                   _pictures(base, best, stages, problem), _plain(problem, best))
+                   _pictures(base, best, stages), {"kind": problem.kind, **problem.plain, "baseline": _plain(base),
+                                                   "updated": _plain(best)})
 
 
 def _widened(best: Fitted, names: Sequence[Name], shares: Mapping[str, float], left: float) -> np.ndarray:
@@ -248,13 +249,10 @@ def _ratios(problem: Problem, best: Fitted, covariance: np.ndarray) -> dict[str,
                        covariance, problem)
 
 
-def _plain(problem: Problem, best: Fitted) -> dict[str, Any]:
-    model = best.model
-    return {**problem.plain, "kind": problem.kind, "base": {name: float(value) for (name, _), value in
-                                                            zip(model.base, model.values, strict=False)},
-            "effects": [{"label": one.label, "values": model.of(one).tolist(), "fixed": {k: v for k, (v, _) in
-                                                                                      one.fixed.items()}}
-                        for one in model.effects]}
+def _plain(fitted: Fitted) -> dict[str, Any]:
+    model = fitted.model
+    return {"base": {name: float(value) for (name, _), value in zip(model.base, model.values, strict=False)},
+            "effects": [{"label": one.label, "values": model.of(one).tolist()} for one in model.effects]}
 
 
 def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
@@ -273,7 +271,7 @@ def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
     return tuple(found)
 
 
-def _pictures(base: Fitted, best: Fitted, stages: Sequence[AxisStage], problem: Problem) -> tuple[Picture, ...]:
+def _pictures(base: Fitted, best: Fitted, stages: Sequence[AxisStage]) -> tuple[Picture, ...]:
     at = np.arange(len(stages), dtype=float)
     ladder = Picture("Gap on held-out data", "stage", "error over measured [%]",
                      (Series("left", at, np.array([100 * one.nrmse for one in stages]), "bars"),), (), "linear", "log",

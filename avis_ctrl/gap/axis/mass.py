@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 
 import numpy as np
 from scipy import signal
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.axis.analysis import Problem
-from avis_ctrl.gap.axis.mass_effects import drive_effects, oscillator_effects
+from avis_ctrl.gap.axis.mass_effects import Scale, drive_effects, oscillator_effects, unnamed_forces
 from avis_ctrl.gap.axis.model import MassModel
 from avis_ctrl.gap.axis.records import Lines, Signals
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
@@ -49,11 +50,11 @@ def drive(records: Sequence[Signals], rate: float, cutoff_Hz: float | None = Non
     start[0] = start[0] if start[0] > 0 else lines.size / float(np.sqrt(np.mean(np.abs(lines.A[0]) ** 2)))
     model = MassModel(lines, (("M", "{F} s^2/{x}"), ("Fv", "{F} s/{x}")), (), start)
     noise, notes = repeated(lines, records, "position")
-    if max(cutoff_Hz, high) < 1 / (2 * np.pi * 1e-3):
-        notes = (*notes, "The band ends where a delay and a lag of a millisecond are hardly told apart.")
-    return Problem("drive", model, (True, False), drive_effects(lines), noise,
+    scale = Scale.of(lines, pitches=True)
+    return Problem("drive", model, (True, False), [*drive_effects(scale), *unnamed_forces(lines)], noise,
                    {"F": "N", "x": "m", "input": "position", "output": "force"},
-                   lambda v: {"time constant M/Fv": (v["M"] / v["Fv"], "s")} if v["Fv"] > 0 else {}, notes)
+                   lambda v: {"time constant M/Fv": (v["M"] / v["Fv"], "s")} if v["Fv"] > 0 else {}, notes,
+                   {"scale": asdict(scale), "cutoff_Hz": cutoff_Hz, "rate_Hz": rate})
 
 
 def oscillator(records: Sequence[Signals], rate: float, band_Hz: tuple[float, float] | None = None,
@@ -90,8 +91,10 @@ def oscillator(records: Sequence[Signals], rate: float, band_Hz: tuple[float, fl
             if name in v:
                 found[f"{name}/k"] = v[name] / v["k"], "1/{x}^" + str(int(name[1]) - 1)
         return found
-    return Problem("oscillator", model, (True, False, True), oscillator_effects(lines), noise,
-                   {"F": "u", "x": "y", "input": "u", "output": "y", **(units or {})}, ratios, notes)
+    scale = Scale.of(lines, pitches=False)
+    return Problem("oscillator", model, (True, False, True), [*oscillator_effects(scale), *unnamed_forces(lines)], noise,
+                   {"F": "u", "x": "y", "input": "u", "output": "y", **(units or {})}, ratios, notes,
+                   {"scale": asdict(scale), "rate_Hz": rate})
 
 
 def _least_squares(columns: Sequence[np.ndarray], y: np.ndarray, weight: np.ndarray | float = 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -16,6 +17,29 @@ DECAY = "free decays from several amplitudes"
 AT_REST = "the force at rest in several positions"
 FASTER = "faster motion: the phase of a delay stays proportional to frequency, that of a lag bends"
 RELEASED = "the force at rest, released and unloaded: a constant force stays, friction does not"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What the library takes from the data: travel, largest speed and largest displacement, the lines' band [Hz], the
+    periods a unit of position of a force that may be periodic, and the travel from which a position may be an angle."""
+
+    travel: float
+    speed: float
+    reach: float
+    low_Hz: float
+    high_Hz: float
+    pitches: tuple[float, ...] = ()
+    least_angle: float = 1.0
+
+    @staticmethod
+    def of(lines: Lines, pitches: bool) -> Scale:
+        def most(value: Callable[[Motion], float]) -> float:
+            return max(float(value(m)) for m in lines.motion)
+        high = float(lines.s.imag.max()) / (2 * np.pi)
+        return Scale(most(lambda m: np.ptp(m.q)), most(lambda m: np.max(np.abs(m.v))), most(lambda m: np.max(np.abs(m.q))),
+                     max(float(lines.s.imag.min()) / (2 * np.pi), high / 100), high,
+                     tuple(_pitches(lines)) if pitches else (), lines.settings.least_angle)
 
 
 def _force(name: str, title: str, separated_by: str, *columns: tuple[str, str, Shape], low: float = -np.inf,
@@ -39,17 +63,16 @@ def _lag(s: np.ndarray, p: np.ndarray) -> np.ndarray:
     return 1 / (1 + s * p[0])
 
 
-def _path(lines: Lines, location: str) -> list[Effect]:
-    longest = 100 / float(lines.s.imag.max())
+def _path(scale: Scale, location: str) -> list[Effect]:
+    longest = 16 / scale.high_Hz
     return [Effect("delay", location, "a pure delay between force and motion", (Parameter("delay_s", "s", -longest,
                    longest),), FASTER, path=_delay),
             Effect("actuator_lag", location, "a first-order lag of the actuator",
                    (Parameter("time_constant_s", "s", 0.0, longest),), FASTER, path=_lag)]
 
 
-def _attached_to(lines: Lines, name: str, title: str, location: str) -> Effect:
-    low, high = float(lines.s.imag.min()) / (2 * np.pi), float(lines.s.imag.max()) / (2 * np.pi)
-    low = max(low, high / 100)
+def _attached_to(scale: Scale, name: str, title: str, location: str) -> Effect:
+    low, high = scale.low_Hz, scale.high_Hz
     seeds = tuple((0.0, f, 0.03) for f in np.geomspace(low * 1.05, high / 1.05, 24))
     return Effect(name, location, title, (
         Parameter("mass", "{F} s^2/{x}", 0.0), Parameter("frequency_Hz", "Hz", low / 2, 2 * high, linear=False),
@@ -73,7 +96,7 @@ def _once(make: Callable[[Motion], list[np.ndarray]], count: int) -> list[Shape]
     return [partial(one, k) for k in range(count)]
 
 
-def _unnamed(lines: Lines) -> list[Effect]:
+def unnamed_forces(lines: Lines) -> list[Effect]:
     count = lines.settings.bumps
     # One scale for all records, so that a shape is the same function in each.
     q, v = (np.concatenate([getattr(m, name) for m in lines.motion]) for name in ("q", "v"))
@@ -101,11 +124,9 @@ def _spline(x: np.ndarray, knots: np.ndarray, count: int) -> list[np.ndarray]:
     return [np.interp(x, knots, one) for one in table]
 
 
-def drive_effects(lines: Lines) -> list[Effect]:
-    """The library of a drive; what depends on the data is the travel."""
+def drive_effects(scale: Scale) -> list[Effect]:
+    """The library of a drive."""
     at = partial(_force, location="drive")
-    travel = max(float(np.ptp(m.q)) for m in lines.motion)
-    top = max(float(np.max(np.abs(m.v))) for m in lines.motion)
     found = [
         at("coulomb_friction", "Coulomb friction, a force of constant size against the motion", SLOW,
            ("Fc", "{F}", lambda m: m.sign), low=0.0),
@@ -124,21 +145,20 @@ def drive_effects(lines: Lines) -> list[Effect]:
            ("k3", "{F}/{x}^3", lambda m: (m.q - m.middle) ** 3))]
     found += [at("stribeck_friction", "Stribeck friction, which falls as the drive starts to move", SLOW,
                  ("Fs", "{F}", partial(_stribeck, speed)), low=0.0, law=f"{k}", fixed={"v_s": (speed, "{x}/s")})
-              for k, speed in enumerate(top * 2.0 ** -np.arange(2, 8))]
+              for k, speed in enumerate(scale.speed * 2.0 ** -np.arange(2, 8))]
     found += [at("presliding", "presliding, friction that is a spring before it slips",
                  "very small slow motion about one position",
                  ("Fc_presliding", "{F}", partial(_presliding, distance)), low=0.0, law=f"{k}",
-                 fixed={"distance": (distance, "{x}")}) for k, distance in enumerate(travel * 4.0 ** -np.arange(3, 8))]
-    if travel >= lines.settings.least_angle:
+                 fixed={"distance": (distance, "{x}")}) for k, distance in enumerate(scale.travel * 4.0 ** -np.arange(3, 8))]
+    if scale.travel >= scale.least_angle:
         found.append(at("gravity", "gravity on a turning load, m g r sin(angle)", AT_REST,
                         ("sine", "{F}", lambda m: np.sin(m.q)), ("cosine", "{F}", lambda m: np.cos(m.q))))
     found += [at("cogging", "a force that is periodic in the position (cogging, pitch of a screw)",
                  "slow motion over the whole travel", ("sine", "{F}", partial(_wave, np.sin, n)),
                  ("cosine", "{F}", partial(_wave, np.cos, n)), law=f"{k}", fixed={"periods": (n, "1/{x}")})
-              for k, n in enumerate(_pitches(lines))]
-    return [*found, *_path(lines, "drive"),
-            _attached_to(lines, "two_mass_flexibility", "a second mass behind a flexible coupling", "drive"),
-            *_unnamed(lines)]
+              for k, n in enumerate(scale.pitches)]
+    return [*found, *_path(scale, "drive"),
+            _attached_to(scale, "two_mass_flexibility", "a second mass behind a flexible coupling", "drive")]
 
 
 def _stribeck(speed: float, m: Motion) -> np.ndarray:
@@ -166,10 +186,9 @@ def _pitches(lines: Lines, few: int = 2) -> list[float]:
     return [float(tried[k]) for k in peaks[:few]]
 
 
-def oscillator_effects(lines: Lines) -> list[Effect]:
+def oscillator_effects(scale: Scale) -> list[Effect]:
     """The library of an oscillator."""
     at = partial(_force, location="oscillator")
-    reach = max(float(np.max(np.abs(m.q))) for m in lines.motion)
     found = [
         at("cubic_stiffness", "cubic stiffness, a restoring force k3 y^3", SWEEP,
            ("k3", "{F}/{x}^3", lambda m: m.q ** 3)),
@@ -191,7 +210,6 @@ def oscillator_effects(lines: Lines) -> list[Effect]:
                location="input")]
     found += [at("hysteresis", "hysteresis, joints that stick at small amplitude and slip at large", DECAY,
                  ("F_slip", "{F}", partial(Motion.dahl, distance=distance)), low=0.0, law=f"{k}",
-                 fixed={"distance": (distance, "{x}")}) for k, distance in enumerate(reach * 2.0 ** -np.arange(0, 6))]
-    return [*found, *_path(lines, "input"),
-            _attached_to(lines, "attached_oscillator", "a second mode, a sprung mass on the oscillator", "oscillator"),
-            *_unnamed(lines)]
+                 fixed={"distance": (distance, "{x}")}) for k, distance in enumerate(scale.reach * 2.0 ** -np.arange(0, 6))]
+    return [*found, *_path(scale, "input"),
+            _attached_to(scale, "attached_oscillator", "a second mode, a sprung mass on the oscillator", "oscillator")]
