@@ -5,6 +5,8 @@ With R = M s^2 q + d s q + k q + forces and Z = M s^2 + d s + k + inner dynamics
     drive:       F = R / P                     oscillator:   q = q_measured + (P F - R)/Z
 
 The second is P F / Z but for what a window spills, which R holds exactly. Both are linear in the forces' coefficients.
+The linear part of a force, alpha q + beta v at the level of the record, belongs to Z as well: without it the force would
+predict the noise of the very q that it is computed from.
 """
 
 from __future__ import annotations
@@ -170,12 +172,16 @@ class MassModel(AxisModel):
         for one, p in zip(self.effects, split(self.values, self.effects, len(self.base)), strict=True):
             own = [pick(self.lines.of(shape), name) for shape in one.shapes]
             R = R + sum((c * column for c, column in zip(p, own, strict=False)), np.zeros(len(s)))
+            linear = [np.zeros(len(s))] * len(own)
+            if self.lines.solves_for == "position" and one.location != "input":
+                linear = [alpha + beta * s for alpha, beta in map(self.lines.linear_part, one.shapes)]
+                Z = Z + sum((c * part for c, part in zip(p, linear, strict=False)), np.zeros(len(s)))
             if one.dynamics:
                 added = one.dynamics(s, p)
                 Z, R = Z + added, R + added * q
             if one.path:
                 P = P * one.path(s, p)
-            found.append((one, p, own))
+            found.append((one, p, own, linear))
         return {"s": s, "Z": Z, "R": R, "P": P, "q": q, "regressors": regressors, "effects": found,
                 "F": pick(self.lines.F, name)}
 
@@ -190,8 +196,8 @@ class MassModel(AxisModel):
         def force(column: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
             return column / a["P"] if drive else -column / a["Z"] - f / a["Z"] ** 2 * z
         dY = [force(one, s ** (2 - k)) for k, one in enumerate(a["regressors"])]
-        for one, p, own in a["effects"]:
-            dY += [force(column) for column in own]
+        for one, p, own, linear in a["effects"]:
+            dY += [force(*both) for both in zip(own, linear, strict=True)]
             for slope in slopes(one.dynamics, s, p) if one.dynamics else ():
                 dY.append(force(slope * a["q"], slope))
             for slope in slopes(one.path, s, p) if one.path else ():

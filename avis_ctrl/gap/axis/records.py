@@ -119,6 +119,7 @@ class Lines:
             self.held_out.append(held)
         self.motion = [self._motion(one) for one in self.records]
         self.kept: dict[int, tuple[Shape, list[np.ndarray]]] = {}
+        self.linear: dict[int, tuple[float, float]] = {}
         self.F = [self.transform(one.force, i) for i, one in enumerate(self.records)]
         self.Q, self.V, self.A = ([self.transform(one.position, i, order) for i, one in enumerate(self.records)]
                                   for order in range(3))
@@ -176,6 +177,18 @@ class Lines:
             self.kept[id(shape)] = shape, [self.transform(np.broadcast_to(shape(m), m.q.shape), i)
                                            for i, m in enumerate(self.motion)]
         return self.kept[id(shape)][1]
+
+    def linear_part(self, shape: Shape) -> tuple[float, float]:
+        """Coefficients of q and v in the best linear approximation of a function of the motion."""
+        if id(shape) not in self.linear:
+            m = self.motion[0]
+            step = max(1, len(m.q) // 50_000)
+            X = np.column_stack([m.q - np.mean(m.q), m.v, np.ones_like(m.q)])[::step]
+            size = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
+            N = np.broadcast_to(shape(m), m.q.shape)[::step]
+            x = np.linalg.lstsq(X / size, N, rcond=None)[0] / size
+            self.linear[id(shape)] = float(x[0]), float(x[1])
+        return self.linear[id(shape)]
 
     def of_lines(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """(n,) number of the segment of each line of a block, and when it begins [s]."""
