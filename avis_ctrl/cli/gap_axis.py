@@ -55,7 +55,7 @@ def gap_axis(
         if scale else None
     options: dict[str, Any] = {"band_Hz": band_Hz, "cutoff_Hz": cutoff_Hz}
     options = {name: value for name, value in options.items() if value is not None}
-    reading = {"output": output, "range_s": range_s, "resample_Hz": resample_Hz}
+    reading: dict[str, Any] = {"output": output, "range_s": range_s, "resample_Hz": resample_Hz}
     console = Console(highlight=False)
     files: list[str] = []
     with output_folder(out, ("gap.json", "gap.html", "gap.pdf", MODEL_FILE)) if out else nullcontext() as folder:

@@ -17,7 +17,9 @@ from avis_ctrl.gap.tuning_values import tuning_values
 FOLDER = Path(avis_ctrl.gap.__file__).parent
 FILES = sorted(FOLDER.rglob("*.py"))
 # What no tuning can change: physics, mathematics, names, tables.
-NO_TUNING = {"ALL", "AT_REST", "BEYOND", "DECAY", "FASTER", "GRID", "HIGHER", "PROBLEMS", "RAYLEIGH", "RELEASED", "REST", "SLOW", "SWEEP", "UNITS", "BY_PHYSICS", "DIRECTIONS", "FILES", "FLOOR", "FORMAT", "GRAVITY", "HANN_COST",
+NO_TUNING = {"ALL", "AT_REST", "BEYOND", "DECAY", "FASTER",
+             "GRID", "HIGHER", "PROBLEMS", "RAYLEIGH", "RELEASED", "REST", "SLOW", "SWEEP", "UNITS",
+             "BY_PHYSICS", "DIRECTIONS", "FILES", "FLOOR", "FORMAT", "GRAVITY", "HANN_COST",
              "HANN_SHARED", "LEVELED", "LINEAR", "MAINS_HZ", "MOUNT", "PRODUCTS", "REACH_m", "REFERENCE_Hz",
              "SETTINGS", "SYMMETRIC", "VALVE_Hz", "VERDICTS", "VERSION", "_AT_REST", "_FAULTS",
              "_ELSEWHERE", "_MADE", "_NOTES"}

@@ -130,7 +130,7 @@ def levels(campaign: Campaign, band_Hz: tuple[float, float] | None = None, trans
             raise InputError("expected repeated periods and more realisations than inputs: without them noise and "
                              "distortion are not separated", field=f"records at {level:g} V")
         found.append(one)
-    low, high = _common(*found, settings)
+    low, high = _common(found[0], found[1])
     change = high.value - low.value
     size = np.sqrt(np.mean(np.abs(low.value) ** 2, axis=0))
     variance = np.maximum(low.variance() + high.variance(), 1e-12 * size ** 2)
@@ -151,8 +151,7 @@ def levels(campaign: Campaign, band_Hz: tuple[float, float] | None = None, trans
     return replace(problem, notes=notes, units={"input": low.inputs[j], "output": low.outputs[i]})
 
 
-def _common(a: FrequencyResponse, b: FrequencyResponse, settings: AxisSettings
-            ) -> tuple[FrequencyResponse, FrequencyResponse]:
+def _common(a: FrequencyResponse, b: FrequencyResponse) -> tuple[FrequencyResponse, FrequencyResponse]:
     if (a.inputs, a.outputs) != (b.inputs, b.outputs):
         raise InputError("expected the same channels at both levels", field="inputs", value=(a.inputs, b.inputs))
     both = np.intersect1d(np.round(a.frequency_Hz, 6), np.round(b.frequency_Hz, 6))

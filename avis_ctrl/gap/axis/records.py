@@ -112,7 +112,8 @@ class Lines:
                              field="samples", value=shortest)
         # The mean of a window is a line too, at a frequency that is nearly none.
         self.s = 2j * np.pi * np.maximum(self.k, 1e-3) * rate / self.length
-        self.starts, self.held_out = [], []
+        self.starts: list[np.ndarray] = []
+        self.held_out: list[np.ndarray] = []
         for number, one in enumerate(self.records):
             starts, held = self._segments(len(one.force), number if whole else None)
             self.starts.append(starts)
@@ -134,10 +135,10 @@ class Lines:
             starts = np.arange(0, n - self.length + 1, step)
             return starts, np.full(len(starts), record % 3 == 1)
         span = n // self.settings.spans
-        starts = [span * j + step * i for j in range(self.settings.spans) for i in range(self.settings.segments)]
+        begins = [span * j + step * i for j in range(self.settings.spans) for i in range(self.settings.segments)]
         held = [j % 3 == 1 for j in range(self.settings.spans) for _ in range(self.settings.segments)]
-        keep = [start + self.length <= n for start in starts]
-        return np.array(starts)[keep], np.array(held)[keep]
+        keep = [start + self.length <= n for start in begins]
+        return np.array(begins)[keep], np.array(held)[keep]
 
     def _motion(self, one: Signals) -> Motion:
         over = self.settings.oversampled
@@ -211,7 +212,7 @@ class Lines:
         for one in np.unique(level):
             name = f"{'held out' if held else 'fitted'} {one:g}"
             inside = level == one
-            self.rows[name] = tuple(np.array(at)[inside].T)  # type: ignore[assignment]
+            self.rows[name] = tuple(np.array(at)[inside].T)
             omega = np.tile(self.s.imag, int(inside.sum()))
             Y = self.pick(self.Y, name)[:, None, None]
             blocks.append(SpectralBlock(name, omega, np.zeros((len(omega), 0, 1)), Y).with_noise(
