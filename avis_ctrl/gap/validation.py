@@ -75,7 +75,8 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
     middle by information, and at low and high level.
 
     A parameter that moves with the band or the level refutes its law. Of a true law the difference has the covariance
-    P_half - P (J. A. Hausman, Econometrica 46 (1978) 1251-1271). parts : other halves, in words and rows of the residual.
+    P_half - P (J. A. Hausman, Econometrica 46 (1978) 1251-1271). parts : other halves, in words and rows of the
+    residual.
     """
     rows = [fitted.priors.names.index(name) for name in names if name in fitted.priors.names]
     slope, values = fitted.priors.slopes(fitted.z)[rows], fitted.priors.values(fitted.z)[rows]

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ MODEL_FILE = "axis_model.json"
 
 def write_axis_gap(folder: Path, gap: AxisGap, source: str, options: dict[str, Any]) -> list[str]:
     """gap.json, gap.html, gap.pdf and, of a drive or an oscillator, axis_model.json; their names."""
-    made = {"avis_ctrl": avis_ctrl.__version__, "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    made = {"avis_ctrl": avis_ctrl.__version__, "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "measurement": source, "inputs_sha256": hashlib.sha256(json.dumps(options, sort_keys=True, default=str
                                                                               ).encode()).hexdigest(),
             "options": options, "settings": asdict(SETTINGS)}
@@ -74,7 +74,8 @@ def write_axis_predictions(folder: Path, paths: Sequence[Path], out: Path) -> li
     kind = model["kind"]
     records, rate = signals_in(kind, paths, reading)
     if abs(rate / model["rate_Hz"] - 1) > 1e-3:
-        raise InputError(f"expected records of {model['rate_Hz']:g} Hz, as the model's", field="sample_rate_Hz", value=rate)
+        raise InputError(f"expected records of {model['rate_Hz']:g} Hz, as the model's", field="sample_rate_Hz",
+        value=rate)
     errors = []
     with replacing(out) as file:
         file.attrs.update({"format": "avis-prediction", "version": 1, "kind": kind})

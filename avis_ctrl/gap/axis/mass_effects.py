@@ -149,7 +149,8 @@ def drive_effects(scale: Scale) -> list[Effect]:
     found += [at("presliding", "presliding, friction that is a spring before it slips",
                  "very small slow motion about one position",
                  ("Fc_presliding", "{F}", partial(_presliding, distance)), low=0.0, law=f"{k}",
-                 fixed={"distance": (distance, "{x}")}) for k, distance in enumerate(scale.travel * 4.0 ** -np.arange(3, 8))]
+                 fixed={"distance": (distance, "{x}")}) for k, distance in enumerate(scale.travel * 4.0 **
+                 -np.arange(3, 8))]
     if scale.travel >= scale.least_angle:
         found.append(at("gravity", "gravity on a turning load, m g r sin(angle)", AT_REST,
                         ("sine", "{F}", lambda m: np.sin(m.q)), ("cosine", "{F}", lambda m: np.cos(m.q))))
@@ -210,6 +211,7 @@ def oscillator_effects(scale: Scale) -> list[Effect]:
                location="input")]
     found += [at("hysteresis", "hysteresis, joints that stick at small amplitude and slip at large", DECAY,
                  ("F_slip", "{F}", partial(Motion.dahl, distance=distance)), low=0.0, law=f"{k}",
-                 fixed={"distance": (distance, "{x}")}) for k, distance in enumerate(scale.reach * 2.0 ** -np.arange(0, 6))]
+                 fixed={"distance": (distance, "{x}")}) for k, distance in enumerate(scale.reach * 2.0 ** -np.arange(0,
+                 6))]
     return [*found, *_path(scale, "input"),
             _attached_to(scale, "attached_oscillator", "a second mode, a sprung mass on the oscillator", "oscillator")]

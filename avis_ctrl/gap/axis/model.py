@@ -5,7 +5,8 @@ With R = M s^2 q + d s q + k q + forces and Z = M s^2 + d s + k + inner dynamics
     drive:       F = R / P                     oscillator:   q = q_measured + (P F - R)/Z
 
 The second is P F / Z but for what a window spills, which R holds exactly. Both are linear in the forces' coefficients.
-The linear part of a force, alpha q + beta v at the level of the record, belongs to Z as well: without it the force would
+The linear part of a force, alpha q + beta v at the level of the record, belongs to Z as well: without it the force
+would
 predict the noise of the very q that it is computed from.
 """
 
@@ -28,7 +29,8 @@ Curve = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Parameter:
-    """unit : with {F} and {x} for those of force and position. A linear one begins at zero; another one, positive, where
+    """unit : with {F} and {x} for those of force and position. A linear one begins at zero; another one, positive,
+    where
     the effect's seeds begin, within its range."""
 
     name: str
@@ -46,7 +48,8 @@ class Effect:
     effects that predict the same. shapes : forces, functions of the motion, one for each of the first parameters.
     dynamics : (s, p) added to Z. path : (s, p) factor of the path from force to mass. channel : (s, p) factor of one
     channel of a sensor. seeds : values where a fit may begin. law : variant of the effect. outside : a function without
-    a name, which stands for whatever the library does not hold. fixed : values of the law, with units. derived : what is
+    a name, which stands for whatever the library does not hold. fixed : values of the law, with units. derived : what
+    is
     reported in the place of the parameters. implausible : (p) why physics forbids values; empty where it does not.
     """
 
@@ -207,7 +210,8 @@ class MassModel(AxisModel):
 
 
 def base_priors(model: AxisModel, positive: Sequence[bool], settings: AxisSettings = SETTINGS) -> Priors:
-    """Of the base model's parameters, so wide that they bend nothing: a factor of e, or as much as the whole response."""
+    """Of the base model's parameters, so wide that they bend nothing: a factor of e, or as much as the whole
+    response."""
     v = model.values[:len(model.base)]
     size = sizes(model, list(range(len(v))))
     up = np.asarray(positive, bool)

@@ -38,7 +38,8 @@ class AxisGap:
 
     verdict : "none", "explained", "partly explained" or "unexplained" (contract of `avis gap`). effects : named, by
     their share; traces : those that take next to nothing. stages : base model, then one effect more each. where : bands
-    that hold most of what the last stage leaves. sentences : the first one says all. parameters : of the updated model's
+    that hold most of what the last stage leaves. sentences : the first one says all. parameters : of the updated
+    model's
     base. model : the updated and the base model as plain data, which `simulation` reads.
     """
 

@@ -161,7 +161,8 @@ def _without_idle(now: Fitted, explored: Explored) -> Fitted:
 
 
 def at_an_edge(fitted: Fitted) -> str:
-    """In words, a parameter of an effect at the end of its range, or beyond what physics allows; empty where none is."""
+    """In words, a parameter of an effect at the end of its range, or beyond what physics allows; empty where none
+    is."""
     for one in fitted.model.effects:
         if one.implausible and (reason := one.implausible(fitted.model.of(one))):
             return reason
@@ -217,7 +218,8 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
 
 
 def alike(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
-    """Whether two models predict the same within the data: were one of them true, the other would be behind by less than
+    """Whether two models predict the same within the data: were one of them true, the other would be behind by less
+    than
     that in log-likelihood [nats] on average."""
     left = one.white.e - other.white.e
     return bool(0.5 * left @ left < settings.alike)

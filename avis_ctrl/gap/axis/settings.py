@@ -14,7 +14,8 @@ class AxisSettings(GapSettings):
     spans : parts of a record, of which every third is held out; each holds several periods of what moves slowly.
     segments : half-overlapping windows of a span; three give a span's middle the same weight as its ends.
     lines_per_band : lines of a segment in a third of an octave; more make the fit longer and hardly better.
-    bands_per_octave : of the discrepancy; none, one variance for all lines. What laws of friction leave is largest where
+    bands_per_octave : of the discrepancy; none, one variance for all lines. What laws of friction leave is largest
+    where
         the force is: with a variance for each band the evidence would give the low ones up as noise.
     floor : noise that nobody can exclude, over the response of a band [1]; 80 dB is what good converters have.
     oversampled : samples of the motion for each measured one, for functions whose harmonics would fold back.
@@ -28,7 +29,8 @@ class AxisSettings(GapSettings):
     least_cutoff_Hz : of a drive's data where the coherence ends earlier [Hz]; friction needs its harmonics.
     repeats : change of the motion from one repetition to the next, over its r.m.s., up to which it repeats [1].
     alike : mean difference of log-likelihood below which two effects are one for the data [nats].
-    right_shape : part of what a free function takes off the power that named effects must take [1]; with less, more than
+    right_shape : part of what a free function takes off the power that named effects must take [1]; with less, more
+    than
         half of the r.m.s. stays: they are neighbours of the truth.
     frequencies : of a stepped sine that a search needs.
     least_angle : travel from which a position may be an angle whose sine bends [rad].

@@ -1,4 +1,5 @@
-"""What an identified axis does in another record: the motion of an oscillator by its input alone, integrated in time; the
+"""What an identified axis does in another record: the motion of an oscillator by its input alone, integrated in time;
+the
 force of a drive by its motion."""
 
 from __future__ import annotations
