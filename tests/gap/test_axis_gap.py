@@ -129,10 +129,6 @@ def friction_gap(data, rate=1000.0):
     return find_axis_gap("drive", records=[Signals("a", data["force"], data["position"])], rate=rate)
 
 
-def coulomb(v):
-    return 15 * math.tanh(v / 1e-3)
-
-
 def test_drive_without_a_gap_names_nothing():
     gap = friction_gap(drive(lambda v: 0.0))
     assert gap.verdict == "none" and not gap.effects

@@ -305,8 +305,7 @@ def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], trac
                 f"falls from {first} to {last}."]
     if traces:
         said.append("Traces, below 1 % of the gap: " + "; ".join(
-            f"{one.name} ({', '.join(f'{key} {sized(p)}' for key, p in one.parameters.items())})" for one in traces) +
-            ".")
+            f"{one.name} ({', '.join(f'{key} {sized(p)}' for key, p in one.parameters.items())})" for one in traces) + ".")
     for one in names:
         delay = one.effect.name == "delay" and next(p for e in (*told, *traces) if e.label == one.effect.label
                                                     for p in e.parameters.values()).value < 0
@@ -320,10 +319,8 @@ def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], trac
     if stages[-1].chi2_per_dof is None:
         said.append("Nothing in these data repeats, so that the noise is not measured.")
     else:
-        said.append(f"What remains of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured
-        noise.")
+        said.append(f"What remains of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured noise.")
     if free is not None:
-        said.append(f"What remains behaves most like {free.model.effects[-1].title}, for which the library has no
-        name.")
+        said.append(f"What remains behaves most like {free.model.effects[-1].title}, for which the library has no name.")
     lost = [f"{one.effect.name} comes near, but {one.refused}" for one in refused]
     return [*said, *problem.notes, *(f"Not named: {'; '.join(lost)}." for _ in lost[:1])]

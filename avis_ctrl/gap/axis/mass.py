@@ -76,7 +76,7 @@ def oscillator(records: Sequence[Signals], rate: float, band_Hz: tuple[float, fl
         return left, bool(x[0] > 0 and x[2] > 0)
     require_oriented(fitted, records, ("u", "y"), settings)
     lines = Lines(records, rate, "position", band, None, settings)
-    start, left = _modal_start(lines)
+    start, _ = _modal_start(lines)
     if not (start[0] > 0 and start[2] > 0):
         raise ComputationError("no oscillator fits", measured=f"mass {start[0]:.3g}, stiffness {start[2]:.3g}",
                                cause="no resonance in the band, or columns of another kind",

@@ -31,8 +31,7 @@ class Channels:
     former, 0 for the latter, and the model predicts Y and the logarithm of its own response over the measured one.
 
     f : (n,) Hz, n even. measured : (n, responses). spread : (pairs,) what
-    the discrepancy is expected to be proportional to, by which all outputs are divided. names : of the channels, one
-    or two. rows : pairs by block.
+    the discrepancy is expected to be proportional to, by which all outputs are divided. names : of the channels, one or two. rows : pairs by block.
     """
 
     f: np.ndarray
@@ -134,8 +133,7 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     model = SensorModel(lines, tuple(units.items()), (), np.asarray(start.values, float))
     positive = tuple(name in ("corner_Hz", "damping") for name in start.names)
     notes = () if not np.any(h) else (
-        f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the mass itself
-        is "
+        f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the mass itself is "
         "nonlinear, which no effect of a channel holds.",)
     outputs = " and ".join(names)
     return Problem("seismometer", model, positive, sensor_effects(f, names), float(np.sum(noise[rows["held out"]]) / np.sum(np.abs(data["held out"].blocks[0].Y) ** 2)),

@@ -60,8 +60,7 @@ def _remaining(gap: AxisGap) -> Section:
     rows = [(f"{one['from_Hz']:.3g} to {one['to_Hz']:.3g} Hz", str(one["output"]), f"{100 * one['share']:.3g} %")
             for one in gap.where]
     return Section("What remains", "remaining", (
-        Paragraph(f"{100 * gap.stages[-1].nrmse:.3g} % of held-out data remains, {100 * gap.share_left:.3g} % of the
-        power "
+        Paragraph(f"{100 * gap.stages[-1].nrmse:.3g} % of held-out data remains, {100 * gap.share_left:.3g} % of the power "
                   "that the base model leaves beyond noise."),
         table("Where most of it lies.", ("band", "output", "share"), rows, "llr"),
         figure_of("lines", "What the base and the updated model leave.", gap.pictures[1:2])))
