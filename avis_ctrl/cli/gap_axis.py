@@ -18,15 +18,15 @@ def gap_axis(
                                          "CSV per frequency; for levels a folder of u_*mV*.npy and y_*mV*.npy")],
     columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="drive: force, position, "
                                                 "reference; oscillator: u, y; seismometer: drive, coil and/or "
-                                                "displacement; each also t; by name, or in CSV by number from 1; levels: "
-                                                "none")] = None,
+                                                "displacement; each also t; by name, or in CSV by number from 1; "
+                                                "levels: none")] = None,
     scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="factors to SI units")] = None,
     sample_rate_Hz: SAMPLE_RATE = None,
     band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz, of what is "
                                                                 "fitted; around one mode of a structure")] = None,
-    cutoff_Hz: Annotated[float | None, typer.Option("--cutoff", metavar="HZ", help="low-pass of the motion of which a "
-                                                    "drive's friction is formed; the fit itself runs as far up as force "
-                                                    "and motion are coherent")] = None,
+    cutoff_Hz: Annotated[float | None, typer.Option("--cutoff", metavar="HZ", help="low-pass of the motion of which "
+                                                    "a drive's friction is formed; the fit itself runs as far up as "
+                                                    "force and motion are coherent")] = None,
     output: Annotated[str, typer.Option("--output", metavar="KIND", help="what the column of y or position holds: "
                                         "position, velocity or acceleration")] = "position",
     range_s: Annotated[tuple[float, float] | None, typer.Option("--range", metavar="START END", help="s, part of each "
@@ -72,7 +72,8 @@ def gap_axis(
         console.print(f"{name} = {sized(one)}", markup=False)
     for stage in found.stages:
         noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
-        console.print(f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True, markup=False)
+        console.print(f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True,
+                      markup=False)
     if folder:
         console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
 

@@ -86,4 +86,5 @@ def axis_gap_reports(gap: AxisGap, source: str, provenance: Mapping[str, object]
     return {"gap.html": html.render(found), "gap.pdf": pdf.render(found)}
 
 
-__all__ = ["axis_gap_reports", "gap_html", "gap_pdf", "identification_html", "identification_pdf", "render_html", "render_pdf"]
+__all__ = ["axis_gap_reports", "gap_html", "gap_pdf", "identification_html", "identification_pdf", "render_html",
+           "render_pdf"]

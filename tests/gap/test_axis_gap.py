@@ -146,7 +146,8 @@ def test_drive_with_friction_and_an_offset():
 def test_joint_with_friction_and_a_constant_force(seed):
     gap = friction_gap(joint(seed), 500.0)
     assert set(names(gap)) == {"coulomb_friction", "force_offset"}
-    assert next(e for e in gap.effects if e.name == "coulomb_friction").parameters["Fc"].value == pytest.approx(12, rel=.1)
+    friction = next(e for e in gap.effects if e.name == "coulomb_friction")
+    assert friction.parameters["Fc"].value == pytest.approx(12, rel=.1)
 
 
 def test_exchanged_columns_and_a_flipped_sign_are_refused():
@@ -199,11 +200,13 @@ def test_emps_has_friction(data):
 def test_silverbox_and_what_its_model_predicts(data, tmp_path):
     path = file_of(data, "silverbox/Schroeder80mV.mat")
     how = {"sample_rate_Hz": 1e7 / 2 ** 14}
-    gap = find_axis_gap_in("oscillator", path, {"u": "V1", "y": "V2"}, band_Hz=(1.0, 200.0), range_s=(37.0, 115.0), **how)
+    gap = find_axis_gap_in("oscillator", path, {"u": "V1", "y": "V2"}, band_Hz=(1.0, 200.0),
+                           range_s=(37.0, 115.0), **how)
     assert names(gap) == ["cubic_stiffness"] and gap.verdict == "explained"
     ratio = gap.ratios["k3/k"]
     assert 3.983 < ratio.value < 4.002 and ratio.std > 0.0095  # other stretches scatter over this range
-    (record,), rate = signals_in("oscillator", [path], Reading({"u": "V1", "y": "V2"}, {}, range_s=(130.0, 140.0), **how))
+    (record,), rate = signals_in("oscillator", [path],
+                                Reading({"u": "V1", "y": "V2"}, {}, range_s=(130.0, 140.0), **how))
     left = [np.std((predicted(gap.model, which, record, rate) - record.position)[500:-100]) / np.std(record.position)
             for which in ("baseline", "updated")]
     assert left[1] < 0.01 < 0.1 < left[0]

@@ -298,14 +298,15 @@ def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], trac
     if verdict == "none":
         said = [f"Nothing is missing that these data can show: the model leaves {last} of held-out data."]
     elif verdict == "unexplained":
-        said = [f"The base model leaves {first} of held-out data, more than noise, and no effect of the library accounts "
-                "for it: unexplained."]
+        said = [f"The base model leaves {first} of held-out data, more than noise, and no effect of the library "
+                "accounts for it: unexplained."]
     else:
         said = [f"The model lacks {'; and '.join(one.in_words() for one in told)}; with that the gap on held-out data "
                 f"falls from {first} to {last}."]
     if traces:
         said.append("Traces, below 1 % of the gap: " + "; ".join(
-            f"{one.name} ({', '.join(f'{key} {sized(p)}' for key, p in one.parameters.items())})" for one in traces) + ".")
+            f"{one.name} ({', '.join(f'{key} {sized(p)}' for key, p in one.parameters.items())})"
+            for one in traces) + ".")
     for one in names:
         delay = one.effect.name == "delay" and next(p for e in (*told, *traces) if e.label == one.effect.label
                                                     for p in e.parameters.values()).value < 0
@@ -319,8 +320,10 @@ def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], trac
     if stages[-1].chi2_per_dof is None:
         said.append("Nothing in these data repeats, so that the noise is not measured.")
     else:
-        said.append(f"What remains of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured noise.")
+        said.append(f"What remains of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured "
+                    "noise.")
     if free is not None:
-        said.append(f"What remains behaves most like {free.model.effects[-1].title}, for which the library has no name.")
+        said.append(f"What remains behaves most like {free.model.effects[-1].title}, for which the library has "
+                    "no name.")
     lost = [f"{one.effect.name} comes near, but {one.refused}" for one in refused]
     return [*said, *problem.notes, *(f"Not named: {'; '.join(lost)}." for _ in lost[:1])]

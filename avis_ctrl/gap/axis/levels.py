@@ -88,8 +88,8 @@ def level_effects() -> list[Effect]:
         Effect("hysteresis", "mode", "hysteresis, which softens the mode and adds loss as the level rises",
                (Parameter("stiffness_lost", "1", 0.0),), "the loop of force and displacement at low frequency",
                dynamics=lambda s, p: -p[0] * (1 - 1j * RAYLEIGH) * np.ones_like(s)),
-        Effect("softening", "mode", "a spring that softens as the level rises", (Parameter("stiffness_lost", "1", 0.0),),
-               sweep, dynamics=lambda s, p: -p[0] * np.ones_like(s)),
+        Effect("softening", "mode", "a spring that softens as the level rises",
+               (Parameter("stiffness_lost", "1", 0.0),), sweep, dynamics=lambda s, p: -p[0] * np.ones_like(s)),
         Effect("hardening", "mode", "a spring that stiffens as the level rises", (
             Parameter("stiffness_gained", "1", 0.0),), sweep, dynamics=lambda s, p: p[0] * np.ones_like(s)),
         Effect("friction_damping", "mode", "friction, whose damping falls as the level rises", (

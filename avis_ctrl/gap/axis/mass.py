@@ -92,7 +92,8 @@ def oscillator(records: Sequence[Signals], rate: float, band_Hz: tuple[float, fl
                 found[f"{name}/k"] = v[name] / v["k"], "1/{x}^" + str(int(name[1]) - 1)
         return found
     scale = Scale.of(lines, pitches=False)
-    return Problem("oscillator", model, (True, False, True), [*oscillator_effects(scale), *unnamed_forces(lines)], noise,
+    return Problem("oscillator", model, (True, False, True), [*oscillator_effects(scale), *unnamed_forces(lines)],
+                   noise,
                    {"F": "u", "x": "y", "input": "u", "output": "y", **(units or {})}, ratios, notes,
                    {"scale": asdict(scale), "rate_Hz": rate})
 

@@ -37,7 +37,8 @@ class Scale:
         def most(value: Callable[[Motion], float]) -> float:
             return max(float(value(m)) for m in lines.motion)
         high = float(lines.s.imag.max()) / (2 * np.pi)
-        return Scale(most(lambda m: np.ptp(m.q)), most(lambda m: np.max(np.abs(m.v))), most(lambda m: np.max(np.abs(m.q))),
+        return Scale(most(lambda m: np.ptp(m.q)), most(lambda m: np.max(np.abs(m.v))),
+                     most(lambda m: np.max(np.abs(m.q))),
                      max(float(lines.s.imag.min()) / (2 * np.pi), high / 100), high,
                      tuple(_pitches(lines)) if pitches else (), lines.settings.least_angle)
 

@@ -6,8 +6,7 @@ With R = M s^2 q + d s q + k q + forces and Z = M s^2 + d s + k + inner dynamics
 
 The second is P F / Z but for what a window spills, which R holds exactly. Both are linear in the forces' coefficients.
 The linear part of a force, alpha q + beta v at the level of the record, belongs to Z as well: without it the force
-would
-predict the noise of the very q that it is computed from.
+would predict the noise of the very q that it is computed from.
 """
 
 from __future__ import annotations
@@ -29,8 +28,7 @@ Curve = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Parameter:
-    """unit : with {F} and {x} for those of force and position. A linear one begins at zero; another one, positive,
-    where
+    """unit : with {F} and {x} for those of force and position. A linear one begins at zero; another one, positive, where
     the effect's seeds begin, within its range."""
 
     name: str
@@ -48,8 +46,7 @@ class Effect:
     effects that predict the same. shapes : forces, functions of the motion, one for each of the first parameters.
     dynamics : (s, p) added to Z. path : (s, p) factor of the path from force to mass. channel : (s, p) factor of one
     channel of a sensor. seeds : values where a fit may begin. law : variant of the effect. outside : a function without
-    a name, which stands for whatever the library does not hold. fixed : values of the law, with units. derived : what
-    is
+    a name, which stands for whatever the library does not hold. fixed : values of the law, with units. derived : what is
     reported in the place of the parameters. implausible : (p) why physics forbids values; empty where it does not.
     """
 
@@ -175,7 +172,7 @@ class MassModel(AxisModel):
         for one, p in zip(self.effects, split(self.values, self.effects, len(self.base)), strict=True):
             own = [pick(self.lines.of(shape), name) for shape in one.shapes]
             R = R + sum((c * column for c, column in zip(p, own, strict=False)), np.zeros(len(s)))
-            linear = [np.zeros(len(s))] * len(own)
+            linear = [np.zeros(len(s), complex)] * len(own)
             if self.lines.solves_for == "position" and one.location != "input":
                 linear = [alpha + beta * s for alpha, beta in map(self.lines.linear_part, one.shapes)]
                 Z = Z + sum((c * part for c, part in zip(p, linear, strict=False)), np.zeros(len(s)))

@@ -5,8 +5,8 @@ from that of the signal itself (M. Shinbrot, NACA TN 3288, 1954),
 
     F{w x'}(omega_k) = sum_l c_l j omega_(k+l) X_(k+l),    c = (-1/4, 1/2, -1/4)
 
-so that M F{w x''} + d F{w x'} + k F{w x} = F{w F} on every line exactly, whatever the state at the ends. Of neighbouring
-lines, whose noise is correlated by 2/3, every other one is taken.
+so that M F{w x''} + d F{w x'} + k F{w x} = F{w F} on every line exactly, whatever the state at the ends. Of
+neighbouring lines, whose noise is correlated by 2/3, every other one is taken.
 """
 
 from __future__ import annotations

@@ -30,8 +30,8 @@ class Channels:
     """Responses as blocks for the likelihood. Outputs are magnitude and phase of each response: Y is 1 + j for the
     former, 0 for the latter, and the model predicts Y and the logarithm of its own response over the measured one.
 
-    f : (n,) Hz, n even. measured : (n, responses). spread : (pairs,) what
-    the discrepancy is expected to be proportional to, by which all outputs are divided. names : of the channels, one or two. rows : pairs by block.
+    f : (n,) Hz, n even. measured : (n, responses). spread : (pairs,) what the discrepancy is expected to be
+    proportional to, by which all outputs are divided. names : of the channels, one or two. rows : pairs by block.
     """
 
     f: np.ndarray
@@ -133,10 +133,12 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     model = SensorModel(lines, tuple(units.items()), (), np.asarray(start.values, float))
     positive = tuple(name in ("corner_Hz", "damping") for name in start.names)
     notes = () if not np.any(h) else (
-        f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the mass itself is "
-        "nonlinear, which no effect of a channel holds.",)
+        f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the mass itself "
+        "is nonlinear, which no effect of a channel holds.",)
     outputs = " and ".join(names)
-    return Problem("seismometer", model, positive, sensor_effects(f, names), float(np.sum(noise[rows["held out"]]) / np.sum(np.abs(data["held out"].blocks[0].Y) ** 2)),
+    power = float(np.sum(np.abs(data["held out"].blocks[0].Y) ** 2))
+    return Problem("seismometer", model, positive, sensor_effects(f, names),
+                   float(np.sum(noise[rows["held out"]])) / power,
                    {"F": "", "x": "", "input": "drive", "output": outputs}, notes=notes)
 
 
@@ -166,7 +168,8 @@ def sensor_effects(f: np.ndarray, channels: Sequence[str]) -> list[Effect]:
             Effect("first_order_lag", place, f"a first-order lag {what}",
                    (Parameter("time_constant_s", "s", 0.0, longest),), HIGHER, channel=lambda s, p: 1 / (1 + s * p[0])),
             Effect("mechanical_mode", place, f"a mechanical mode {what}", (
-                Parameter("lag_s", "s", 0.0), Parameter("inverse_square_s2", "s^2", 0.0, (2 * np.pi * 1.05 * top) ** -2)),
+                Parameter("lag_s", "s", 0.0),
+                Parameter("inverse_square_s2", "s^2", 0.0, (2 * np.pi * 1.05 * top) ** -2)),
                 "frequencies up to the mode, where the magnitude rises",
                 channel=lambda s, p: 1 / (1 + p[0] * s + p[1] * s ** 2), derived=mode, implausible=heavy),
             Effect("highpass", place, f"a first-order high-pass (AC coupling) {what}",

@@ -42,7 +42,8 @@ def _effects(gap: AxisGap) -> Section:
                      ", ".join(one.indistinguishable_from) or "-") for one in several]
             pieces.append(table(caption, ("effect", "place", "size", "probability", "share", "or"), rows, "lllrrl"))
     if gap.runners_up:
-        pieces.append(table("What else was fitted in the place of an effect.", ("effect", "in the place of", "probability"),
+        pieces.append(table("What else was fitted in the place of an effect.",
+                            ("effect", "in the place of", "probability"),
                             [(one.name, one.instead_of, f"{one.probability:.2g}") for one in gap.runners_up], "llr"))
     if gap.next_experiment:
         pieces.append(Paragraph(f"What would tell them apart: {gap.next_experiment}."))
@@ -60,8 +61,8 @@ def _remaining(gap: AxisGap) -> Section:
     rows = [(f"{one['from_Hz']:.3g} to {one['to_Hz']:.3g} Hz", str(one["output"]), f"{100 * one['share']:.3g} %")
             for one in gap.where]
     return Section("What remains", "remaining", (
-        Paragraph(f"{100 * gap.stages[-1].nrmse:.3g} % of held-out data remains, {100 * gap.share_left:.3g} % of the power "
-                  "that the base model leaves beyond noise."),
+        Paragraph(f"{100 * gap.stages[-1].nrmse:.3g} % of held-out data remains, {100 * gap.share_left:.3g} % of the "
+                  "power that the base model leaves beyond noise."),
         table("Where most of it lies.", ("band", "output", "share"), rows, "llr"),
         figure_of("lines", "What the base and the updated model leave.", gap.pictures[1:2])))
 
