@@ -28,8 +28,8 @@ Curve = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Parameter:
-    """unit : with {F} and {x} for those of force and position. A linear one begins at zero; another one, positive, where
-    the effect's seeds begin, within its range."""
+    """unit : with {F} and {x} for those of force and position. A linear one begins at zero; another one, positive,
+    where the effect's seeds begin, within its range."""
 
     name: str
     unit: str
@@ -46,8 +46,8 @@ class Effect:
     effects that predict the same. shapes : forces, functions of the motion, one for each of the first parameters.
     dynamics : (s, p) added to Z. path : (s, p) factor of the path from force to mass. channel : (s, p) factor of one
     channel of a sensor. seeds : values where a fit may begin. law : variant of the effect. outside : a function without
-    a name, which stands for whatever the library does not hold. fixed : values of the law, with units. derived : what is
-    reported in the place of the parameters. implausible : (p) why physics forbids values; empty where it does not.
+    a name, which stands for whatever the library does not hold. fixed : values of the law, with units. derived : what
+    is reported in the place of the parameters. implausible : (p) why physics forbids values; empty where it does not.
     """
 
     name: str
