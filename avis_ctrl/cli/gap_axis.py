@@ -47,6 +47,7 @@ def gap_axis(
     from avis_ctrl.cli.console import Progress
     from avis_ctrl.gap.axis import find_axis_gap_in
     from avis_ctrl.gap.result import sized
+    from avis_ctrl.report import axis_gap_reports
     from avis_ctrl.study.files import output_folder
     from avis_ctrl.study.gap_axis import MODEL_FILE, write_axis_gap
 
@@ -63,8 +64,8 @@ def gap_axis(
             found = find_axis_gap_in(kind, [path, *(also or ())] if also else path, roles, scale=factors,
                                      sample_rate_Hz=sample_rate_Hz, progress=progress, **reading, **options)
         if folder:
-            files = write_axis_gap(folder, found, path.name, {"kind": kind, "columns": roles, "scale": factors,
-                                                              "sample_rate_Hz": sample_rate_Hz, **reading, **options})
+            given = {"kind": kind, "columns": roles, "scale": factors, "sample_rate_Hz": sample_rate_Hz}
+            files = write_axis_gap(folder, found, path.name, {**given, **reading, **options}, axis_gap_reports)
     console.print(f"verdict: {found.verdict}")
     for sentence in found.sentences:
         console.print(sentence, soft_wrap=True, markup=False)

@@ -16,6 +16,7 @@ from avis_ctrl.gap.axis import Signals, find_axis_gap, find_axis_gap_in
 from avis_ctrl.gap.axis.find import Reading, signals_in
 from avis_ctrl.gap.axis.simulation import predicted
 from avis_ctrl.identification.single_axis.seismometer import Responses
+from avis_ctrl.report import axis_gap_reports
 from avis_ctrl.study.gap_axis import write_axis_gap, write_axis_predictions
 
 RATE = 600.0
@@ -210,7 +211,7 @@ def test_silverbox_and_what_its_model_predicts(data, tmp_path):
     left = [np.std((predicted(gap.model, which, record, rate) - record.position)[500:-100]) / np.std(record.position)
             for which in ("baseline", "updated")]
     assert left[1] < 0.01 < 0.1 < left[0]
-    files = write_axis_gap(tmp_path, gap, path.name, {})
+    files = write_axis_gap(tmp_path, gap, path.name, {}, axis_gap_reports)
     assert set(files) == {"gap.json", "gap.html", "gap.pdf", "axis_model.json"}
     assert json.loads((tmp_path / "gap.json").read_text())["effects"][0]["name"] == "cubic_stiffness"
     (_, baseline, updated), = write_axis_predictions(tmp_path, [path], tmp_path / "p.h5")
@@ -228,7 +229,8 @@ def test_mirror_depends_on_the_level_and_no_single_effect_explains_it(data):
 
 def test_laser_of_the_sm3_is_late(data):
     folder = file_of(data, "seismometer_sm3")
-    adc = dict(line.split(",") for line in (folder / "calcontrol.cal").read_text().split())
+    rows = (line.split(",") for line in (folder / "calcontrol.cal").read_text().split())
+    adc = dict(zip(*rows, strict=True))
     laser = float(adc["ch3cal"]) * 1e-9 * float(adc["laserres"]) * float(adc["lcalconst"])
     gap = find_axis_gap_in("seismometer", folder, {"drive": "FuncGen", "coil": "Current", "displacement": "Laser",
                                                    "t": "Seconds"},
