@@ -196,6 +196,7 @@ def test_emps_has_friction(data):
     gap = find_axis_gap_in("drive", file_of(data, "emps/DATA_EMPS.mat"), EMPS, scale={"force": 35.15})
     assert names(gap)[:2] == ["coulomb_friction", "viscous_asymmetry"]
     assert gap.parameters["M"].value == pytest.approx(95.109, rel=0.01)  # published
+    assert json.loads(json.dumps(gap.to_json(), allow_nan=False))["effects"]
 
 
 def test_silverbox_and_what_its_model_predicts(data, tmp_path):
