@@ -253,6 +253,8 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     """Fits of candidates by label: at first of each effect's own parameters, the others moving along to first order;
     then of all parameters, for those that are not far behind. Left out are those that come to no end, to values that
     physics forbids, or to one within its tolerance."""
+    if not chosen:
+        return {}
     profile, quick = Profile(now, data, settings), replace(settings, rounds=settings.quick_rounds,
                                                             iterations=settings.quick_iterations)
 
