@@ -25,8 +25,8 @@ from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, search, 
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import left_by, levels, named
 from avis_ctrl.gap.table_model import ActiveEffect
-from avis_ctrl.gap.tolerances import of_effect
-from avis_ctrl.gap.validation import Power, halves, share_of, widening
+from avis_ctrl.gap.tolerances import moved, of_effect
+from avis_ctrl.gap.validation import Power, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
@@ -212,7 +212,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
                fits.base.model, updated.model, _considered(fits, names, prepared, settings), heat_map(before, after),
                tuple(one for one in sentences if one), prepared.halves.how, seed, time.monotonic() - began,
                updated.covariance_of(updated.model.names), limits, shares, records, faults.raised if closed else (),
-               traces, remainder, _moved(updated))
+               traces, remainder, _moved(updated, settings))
 
 
 def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSettings) -> list[tuple[str, Fitted]]:
@@ -241,8 +241,7 @@ def _sensors(faults) -> dict[str, float] | None:
 
 def _named(one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared,
            settings: GapSettings) -> NamedEffect:
-    covariance = widening(halves(updated, _judged(one), settings), settings) ** 2 * updated.covariance_of(one.names)
-    reported = one.effect.reported(updated.model, one.place, one.by_name, covariance)
+    reported = one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names))
     return NamedEffect(one.effect.name, name_of(one.label)[1], one.effect.title, reported,
                        names.probability[one.label], names.rivals[one.label], label=one.label,
                        share=share_of(updated.model, one.label, prepared.held_out, power, with_it))
@@ -262,10 +261,12 @@ def _verdict(told: Sequence[NamedEffect], closed: bool, small: bool, left: Remai
     return "explained" if closed or left.share <= 1 - settings.explained else "partly explained"
 
 
-def _moved(fitted: Fitted) -> tuple[Tolerance, ...]:
+def _moved(fitted: Fitted, settings: GapSettings) -> tuple[Tolerance, ...]:
     """Every value of the rig file with a tolerance, the most moved first."""
-    known = re_identified(fitted.model.rig).names
-    return fitted.moved([name for name in fitted.priors.names if "@" not in name and name not in known])
+    rig = fitted.model.rig
+    known = re_identified(rig).names
+    names = [name for name in fitted.priors.names if "@" not in name and name not in known]
+    return moved(fitted, names, tolerances_of(rig), settings)
 
 
 def _next(told: Sequence[NamedEffect], fits: Fits, names: Names) -> str | None:

@@ -25,7 +25,7 @@ from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.starting_values import HasRicherLaws, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
-from avis_ctrl.gap.tolerances import BEYOND, of_effect, tolerances_behind, within_tolerance
+from avis_ctrl.gap.tolerances import BEYOND, held, of_effect, released, tolerances_behind, within_tolerance
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit
 from avis_ctrl.identification.priors import Priors, tolerances_of
 
@@ -111,7 +111,7 @@ def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSett
     model = fitted.model.with_effect(one)
     own = _priors_of(one, model, settings)
     z = np.concatenate([_without_tolerances_behind(fitted, one), own.z(np.array(one.values))])
-    return _try(fitted, model, fitted.priors.followed_by(own), z, data, settings)
+    return _try(fitted, model, held(fitted.priors, one, settings).followed_by(own), z, data, settings)
 
 
 def _without_tolerances_behind(fitted: Fitted, one: ActiveEffect) -> np.ndarray:
@@ -124,8 +124,10 @@ def _without_tolerances_behind(fitted: Fitted, one: ActiveEffect) -> np.ndarray:
 def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings) -> Fitted | None:
     """The fit with one effect less."""
     model = fitted.model.without(label)
+    one = next(effect for effect in fitted.model.effects if effect.label == label)
     rows = [fitted.priors.names.index(name) for name in model.names]
-    return _try(fitted, model, fitted.priors.of(model.names), fitted.z[rows], data, settings)
+    priors = released(fitted.priors, one, settings)
+    return _try(fitted, model, priors.of(model.names), fitted.z[rows], data, settings)
 
 
 def _with_known(priors: Priors, known) -> Priors:

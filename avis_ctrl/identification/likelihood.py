@@ -16,12 +16,23 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.identification.clusters import cluster_variances, clusterings
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.maximum_likelihood import block_residual, transient_unknowns
 from avis_ctrl.identification.priors import Priors, Tolerance
 from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.identification.weights import Group, Variances, Weights, bands, estimated, path_contributions, weigh
+from avis_ctrl.identification.weights import (
+    Group,
+    Variances,
+    Weights,
+    bands,
+    estimated,
+    log_prior,
+    mean_noise,
+    path_contributions,
+    weigh,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +67,8 @@ class Fitted:
 
     model : at the estimate. priors, z (n,), covariance (n, n) of z. variances : of what is not explained.
     log_evidence : Laplace. log_likelihoods : by level and band; what is in the evidence beside their sum is of priors.
-    iterations : Gauss-Newton steps. weights : of the data. white : residual and Jacobian, whitened by noise and
-    distortion; both empty once only the evidence is of interest (`bare`).
+    iterations : Gauss-Newton steps. bands_per_octave : of the groups. weights : of the data. white : residual and
+    Jacobian, whitened by noise and distortion; both empty once only the evidence is of interest (`bare`).
     """
 
     model: Any
@@ -68,12 +79,13 @@ class Fitted:
     log_evidence: float
     log_likelihoods: Mapping[Group, float]
     iterations: int
+    bands_per_octave: int
     weights: Weights
     white: Evaluated
 
     def bare(self) -> Fitted:
         """Without residual, Jacobian and weights, which take most of the memory."""
-        return replace(self, weights=Weights((), (), {}), white=Evaluated(np.empty(0), np.empty((0, 0)), []))
+        return replace(self, weights=Weights((), (), {}, {}), white=Evaluated(np.empty(0), np.empty((0, 0)), []))
 
     @cached_property
     def e(self) -> np.ndarray:
@@ -88,7 +100,7 @@ class Fitted:
     @property
     def rows(self) -> dict[Group, np.ndarray]:
         """Entries of `e` by level and band."""
-        return {one.group: one.rows for one in self.weights.paths}
+        return dict(self.weights.rows)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -98,7 +110,7 @@ class Fitted:
     def moved(self, names: Sequence[str]) -> tuple[Tolerance, ...]:
         """Of values of the rig file that have a tolerance, the most moved first."""
         units = dict(zip(self.model.names, self.model.units, strict=True))
-        values, std = self.priors.values(self.z), np.sqrt(np.diag(self.covariance)) * self.priors.slopes(self.z)
+        values, std = self.priors.values(self.z), np.sqrt(np.diag(self.covariance)) * self._units
         at = [self.priors.names.index(name) for name in names]
         rows = [Tolerance(name, float(values[k]), float(std[k]), float(self.z[k]), units[name])
                 for name, k in zip(names, at, strict=True)]
@@ -106,21 +118,40 @@ class Fitted:
 
     def covariance_of(self, names: Sequence[str]) -> np.ndarray:
         """(k, k) of some parameters in their units; zero for those that are not free."""
-        slopes = self.priors.slopes(self.z)
         rows = [self.priors.names.index(name) if name in self.priors.names else -1 for name in names]
-        return np.pad((self.covariance * slopes) * slopes[:, None], (0, 1))[np.ix_(rows, rows)]
+        return np.pad((self.covariance * self._units) * self._units[:, None], (0, 1))[np.ix_(rows, rows)]
+
+    @property
+    def _units(self) -> np.ndarray:
+        """(n,) from standardised parameters to standard deviations in their units."""
+        return self.priors.slopes(self.z) * self.widening
+
+    @cached_property
+    def widening(self) -> np.ndarray:
+        """(n,) factor on the standard deviations, 1 or more: where octaves or levels differ in what they ask of a
+        parameter by more than the model expects (`clusters`). 1 for a fit without its residual."""
+        own = np.diag(self.covariance)
+        if not len(self.white.e):
+            return np.ones(len(own))
+
+        def variances(parts: Sequence[Sequence[Group]]) -> np.ndarray:
+            rows = [np.concatenate([self.weights.rows[group] for group in part]) for part in parts]
+            return cluster_variances(self.covariance, self.J, self.e, rows) if len(rows) > 1 else own
+        by_octave, by_level = clusterings(list(self.weights.rows), self.bands_per_octave)
+        octaves = np.mean([variances(parts) for parts in by_octave], axis=0)
+        return np.sqrt(np.maximum.reduce([own, octaves, variances(by_level)]) / own)
 
 
 def first_variances(data: Data, settings: FitSettings) -> Variances:
     """Where nothing is known yet: a relative error of every path, and distortion as a part of it."""
-    path: dict[Group, np.ndarray] = {}
+    path: dict[int, np.ndarray] = {}
     distortion: dict[Group, np.ndarray] = {}
     count: dict[Group, int] = {}
     for block, level in zip(data.blocks, data.levels, strict=True):
         own = bands(block.omega, settings.bands_per_octave)
         for band in np.unique(own):
             at, group = own == band, (level, int(band))
-            path[group] = np.full(block.Y.shape[1], settings.first_error ** 2)
+            path[int(band)] = np.full(block.Y.shape[1], settings.first_error ** 2)
             power = settings.first_error ** 2 * np.sum(np.abs(block.Y[at, :, 0]) ** 2, axis=0)
             distortion[group] = distortion.get(group, 0.0) + settings.first_distortion * power
             count[group] = count.get(group, 0) + int(at.sum())
@@ -169,7 +200,7 @@ def _descent(expand: Callable[[np.ndarray], _Expansion], at: _Expansion, iterati
 def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: FitSettings = SETTINGS
         ) -> Fitted:
     """Alternate Gauss-Newton steps in z with estimates of the variances."""
-    steps, before = 0, -np.inf
+    steps, best, noise = 0, None, mean_noise(data.blocks, data.levels, settings)
     model = model.at(priors.values(z))
     for k in range(settings.rounds + 1):
         paths = [path_contributions(model, block) for block in data.blocks]
@@ -181,14 +212,20 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
             return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e))
         at, more = _descent(expand, expand(z), settings.iterations, settings)
         model, z, steps = at.model, at.z, steps + more
-        reached = -0.5 * (at.whole + weights.log_determinant) + _hyper(variances, settings)
-        if k == settings.rounds or reached - before < settings.settled:
+        reached = -0.5 * (at.whole + weights.log_determinant) + log_prior(variances, noise, settings)
+        rise = reached - best[0] if best else np.inf
+        if rise > 0:
+            best = reached, at, weights, variances
+        if k == settings.rounds or rise < settings.settled:
             break
-        before, variances = reached, estimated(at.now.left, data.blocks, data.levels, paths, variances, settings)
-    H = at.H + np.eye(len(z))
-    log_evidence = reached - _price_of_ends(model, data) - 0.5 * np.linalg.slogdet(H)[1]
+        variances = estimated(at.now.left, data.blocks, data.levels, paths, variances, settings)
+    assert best is not None
+    reached, at, weights, variances = best
+    H = at.H + np.eye(len(at.z))
+    log_evidence = reached - _price_of_ends(at.model, data) - 0.5 * np.linalg.slogdet(H)[1]
     by_group = _by_group(weights, weights.flatten(at.now.e[None])[0])
-    return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), by_group, steps, weights, at.now)
+    return Fitted(at.model, priors, at.z, np.linalg.inv(H), variances, float(log_evidence), by_group, steps,
+                  settings.bands_per_octave, weights, at.now)
 
 
 def _price_of_ends(model: Any, data: Data) -> float:
@@ -236,12 +273,6 @@ class Profile:
         return end.z, gain - _price_of_ends(end.model, self.data) + _price_of_ends(self.fitted.model, self.data)
 
 
-def _hyper(variances: Variances, settings: FitSettings) -> float:
-    """Logarithm of the prior of the path variances, but for a constant."""
-    nu, v0 = settings.error_weight, settings.least_error ** 2
-    return sum(float(np.sum(-(nu / 2 + 1) * np.log(v) - nu * v0 / (2 * v))) for v in variances.path.values())
-
-
 def log_likelihoods(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> dict[Group, float]:
     """Of records that no fit has seen, by level and band, by the fitted parameters and variances."""
     paths = [path_contributions(fitted.model, block) for block in data.blocks]
@@ -251,8 +282,8 @@ def log_likelihoods(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS
 
 
 def _by_group(weights: Weights, flat: np.ndarray) -> dict[Group, float]:
-    return {one.group: -0.5 * float(flat[one.rows] @ flat[one.rows] + weights.log_determinants[one.group])
-            for one in weights.paths}
+    return {group: -0.5 * float(flat[rows] @ flat[rows] + weights.log_determinants[group])
+            for group, rows in weights.rows.items()}
 
 
 def _evaluate(model: Any, priors: Priors, z: np.ndarray, data: Data, weights: Weights, derivative: bool = True
