@@ -14,7 +14,7 @@ from avis_ctrl.gap.detection_limits import detection_limits
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
-from avis_ctrl.gap.next_measurement import between, grows, of_unexplained
+from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
 from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_second_order
 from avis_ctrl.gap.probability import odds_against_fit, probability_of
@@ -50,13 +50,13 @@ class Fits:
 
 @dataclass(frozen=True, eq=False)
 class Names:
-    """What is named. updated : the model with it. probability, rivals : by label of its effects. refused : why what was
-    found is not named, in sentences."""
+    """What is named. updated : the model with it. probability, rivals : by label of its effects. refused : by label, why
+    an effect that was found is not named, a sentence."""
 
     updated: Fitted
     probability: dict[str, float]
     rivals: dict[str, tuple[str, ...]]
-    refused: tuple[str, ...] = ()
+    refused: dict[str, str]
 
 
 def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, float] | None = None,
@@ -124,7 +124,7 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
     """What was found and stands: the more probable of its alternatives, of the same size in both halves of band and
     level, and borne out by held-out records."""
     data, held = (prepared.data(blocks, settings.lines) for blocks in (prepared.fitted, prepared.held_out))
-    best, probability, rivals, refused = fits.best, {}, {}, []
+    best, probability, rivals, refused = fits.best, {}, {}, {}
     for step in fits.steps:
         probability[step.label], rivals[step.label] = probability_of(step, settings)
     for step in fits.steps:
@@ -132,12 +132,12 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
         why = _refusal(fits.best, step, label, probability[label], held, settings)
         if why:
             one = next(effect for effect in fits.best.model.effects if effect.label == label)
-            refused.append(f"it behaves most like {one.effect.said(one.place, one.by_name)}, for which the library has "
-                           "no name" if one.effect.outside else
-                           f"{one.effect.name} comes nearest, but {why}: not named")
+            refused[label] = (f"it behaves most like {one.effect.said(one.place, one.by_name)}, for which the library "
+                              "has no name" if one.effect.outside else
+                              f"{one.effect.name} comes nearest, but {why}: not named")
             best = without_effect(best, label, data, settings) or best
     kept = {label: value for label, value in probability.items() if label in best.labels}
-    return Names(best, kept, {label: rivals[label] for label in kept}, tuple(refused))
+    return Names(best, kept, {label: rivals[label] for label in kept}, refused)
 
 
 def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Data, settings: GapSettings) -> str:
@@ -191,9 +191,8 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     traces = tuple(one for one in found if (one.share or 0.0) < settings.trace)
     excess = after.nrmse ** 2 - noise
     records, shares = every_record(prepared, fits.base.model, updated.model, _sensors(faults))
-    growth = grows(records)
     remainder = Remainder(after.nrmse, after.nrmse / max(after.noise_nrmse, 1e-300), power.share(excess),
-                          None if growth is None else bool(growth[0] > 1 + 2 * growth[1]))
+                          grows_faster(records))
     closed = after.chi2_per_dof <= settings.within_noise or excess <= 0
     small = math.sqrt(max(excess, 0.0)) < settings.small
     verdict = _verdict(told, closed, closed or small, remainder, settings)
@@ -206,7 +205,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         progress("how large an effect would have had to be to be seen")
         data = prepared.data(prepared.fitted, settings.lines)
         limits = detection_limits(EvidenceScore(fits.tolerant, data, settings), effects)
-    sentences = (_opening(verdict, told, traces, stages, remainder, after), *names.refused,
+    sentences = (_opening(verdict, told, traces, stages, remainder, after), *names.refused.values(),
                  _remains(remainder, remaining), prepared.noise)
     return Gap(verdict, told, tuple(stages), where if verdict != "none" else (), remaining, after.noise_nrmse, onward,
                fits.base.model, updated.model, _considered(fits, names, prepared, settings), heat_map(before, after),
@@ -290,7 +289,8 @@ def _considered(fits: Fits, names: Names, prepared: Prepared, settings: GapSetti
             effect = one.model.effects[-1]
             if effect.effect.outside or label in names.updated.labels:
                 continue
-            reason = implausible(one) or (f"step {number}: log evidence {top - one.log_evidence:.3g} behind")
+            reason = names.refused.get(label) or implausible(one) or (
+                f"step {number}: log evidence {top - one.log_evidence:.3g} behind")
             reported = effect.effect.reported(one.model, effect.place, effect.by_name, one.covariance_of(effect.names))
             chi2 = ModelResidual.of(one.model, thin).chi2_per_dof
             rows.append(Considered(effect.effect.name, name_of(label)[1], chi2,

@@ -243,7 +243,7 @@ class Gap:
             "effects": [one.to_json() for one in self.effects],
             "traces": [one.to_json() for one in self.traces],
             "gap": [{"stage": one.name, "nrmse": one.nrmse, "chi2_per_dof": one.chi2_per_dof} for one in self.stages],
-            "where": _places(self.where if self.verdict != "partly explained" else self.remaining),
+            "where": _places(self.remaining if self.verdict != "none" else ()),
             "remaining": None if self.left is None else {
                 "nrmse": self.left.nrmse, "over_noise": self.left.over_noise, "share": self.left.share,
                 "where": _places(self.remaining), "grows_with_level": self.left.grows_with_level},
