@@ -50,8 +50,11 @@ class Fits:
 
 @dataclass(frozen=True, eq=False)
 class Names:
-    """What is named. updated : the model with it. probability, rivals : by label of its effects. refused : by label, why
-    an effect that was found is not named, a sentence."""
+    """What is named.
+
+    updated : the model with it. probability, rivals : by label of its effects. refused : why an effect is not named, by
+    its label.
+    """
 
     updated: Fitted
     probability: dict[str, float]

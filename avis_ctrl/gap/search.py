@@ -26,7 +26,7 @@ from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.starting_values import HasRicherLaws, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
 from avis_ctrl.gap.tolerances import BEYOND, held, of_effect, released, tolerances_behind, within_tolerance
-from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit
+from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit, without_path_errors
 from avis_ctrl.identification.priors import Priors, tolerances_of
 
 Progress = Callable[[str], None]
@@ -96,7 +96,7 @@ def richer_laws(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> li
         last = one.model.effects[-1]
         law = last.effect
         if isinstance(law, HasRicherLaws):
-            whole = fit(one.model, one.priors, one.z, data, one.variances, replace(settings, rounds=0, iterations=0))
+            whole = without_path_errors(one, data, settings)
             found += [Candidate(active(last.effect, one.model, place, values), 0.0, 0.0)
                       for place, values in law.richer(EvidenceScore(whole, data, settings), last)]
     return found
@@ -218,12 +218,13 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     if rest is None:
         return step
     quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
+    begun = without_path_errors(rest, data, settings)
     known = {name_of(label) for label in best.labels}
     tried = {step.label: best.bare()}
     for label, fitted in step.tried.items():
         if name_of(label) in known:
             continue
-        one = with_effect(rest, fitted.model.effects[-1], data, quick)
+        one = with_effect(begun, fitted.model.effects[-1], data, quick)
         if one is not None:
             tried[label] = one.bare()
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
@@ -231,17 +232,18 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
 
 def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each) -> Step | None:
     """The effect of the largest evidence; None where none beats the present model."""
-    found = candidates(now, data, effects, settings, each)
-    tried = _tried(now, shortlist(found, settings), data, settings, each)
+    begun = without_path_errors(now, data, settings)
+    found = candidates(begun, data, effects, settings, each)
+    tried = _tried(begun, shortlist(found, settings), data, settings, each)
     if not tried:
         return None
     last = tried
     while last:
-        last = _tried(now, richer_laws(list(last.values()), data, settings), data, settings, each)
+        last = _tried(begun, richer_laws(list(last.values()), data, settings), data, settings, each)
         tried |= {label: one for label, one in last.items()
                   if label not in tried or one.log_evidence > tried[label].log_evidence}
     best = max(tried, key=lambda label: tried[label].log_evidence)
-    tried |= _tried(now, other_laws(found, best, tried), data, settings, each)
+    tried |= _tried(begun, other_laws(found, best, tried), data, settings, each)
     best = max(tried, key=lambda label: tried[label].log_evidence)
     start = tried[best]
     if start.log_evidence - now.log_evidence < settings.certain + math.log(len(found)):

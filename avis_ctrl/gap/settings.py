@@ -72,7 +72,7 @@ class GapSettings(FitSettings):
     held: float = 1e-3
     effect_sizes: float = 100.0
     shape_spread: float = 1.0
-    resonance_share: float = 0.1
+    resonance_share: float = 0.5
     refits: int = 8
     starts: int = 4
     first_iterations: int = 4

@@ -228,6 +228,21 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
                   settings.bands_per_octave, weights, at.now)
 
 
+def without_path_errors(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> Fitted:
+    """The fit with path errors at the least there are, so that distortion stands for what is not explained.
+
+    Path errors take what is missing from the model out of the residual, and with it what shows where a missing effect
+    lies. Its evidence does not compare with that of other fits.
+    """
+    paths = [path_contributions(fitted.model, block) for block in data.blocks]
+    path = {band: np.full_like(v, settings.least_error ** 2) for band, v in fitted.variances.path.items()}
+    left = fitted.white.left or [block_residual(fitted.model, block, np.sqrt(2) * np.eye(block.Y.shape[1])[None, None],
+                                                derivative=False)[2].error[:, :, 0] for block in data.blocks]
+    variances = estimated(left, data.blocks, data.levels, paths, Variances(path, fitted.variances.distortion), settings,
+                          hold_path=True)
+    return fit(fitted.model, fitted.priors, fitted.z, data, variances, replace(settings, rounds=0))
+
+
 def _price_of_ends(model: Any, data: Data) -> float:
     """The states at the ends of a record have no prior; each costs what one with unit information would (Schwarz 1978).
     """
@@ -252,6 +267,11 @@ class Profile:
         rows = np.concatenate([rows, np.broadcast_to(prior, (len(rows), len(self.fitted.z)))], axis=1)
         return rows - (rows @ self.basis.T) @ self.basis
 
+    @cached_property
+    def _white_basis(self) -> np.ndarray:
+        """(N, n) products with `basis` of whitened rows."""
+        return self.fitted.weights.flatten(self.basis[:, :-len(self.fitted.z)]).T.copy()
+
     def fit(self, model: Any, priors: Priors, z: np.ndarray, iterations: int, at: np.ndarray | None = None
             ) -> tuple[np.ndarray, float]:
         """z (k,) of the added parameters, the free ones of `model`, and the gain of log evidence with them.
@@ -266,8 +286,10 @@ class Profile:
         def expand(z: np.ndarray) -> _Expansion:
             moved = model.at(priors.values(z))
             now = _evaluate(moved, priors, z, self.data, weights)
-            J, e = self.free(now.J), self.free(now.e[None], rest)[0]
-            return _Expansion(moved, z, now, J @ J.T, J @ e, float(e @ e))
+            # The products of the rows that `free` would give.
+            H, g, cost = weights.normal_equations(now.J, now.e)
+            A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e):] @ rest
+            return _Expansion(moved, z, now, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
         end, _ = _descent(expand, expand(z), iterations, self.settings)
         gain = 0.5 * (float(self.e @ self.e) - end.whole - np.linalg.slogdet(end.H + np.eye(len(z)))[1])
         return end.z, gain - _price_of_ends(end.model, self.data) + _price_of_ends(self.fitted.model, self.data)

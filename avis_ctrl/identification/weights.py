@@ -36,10 +36,14 @@ class Variances:
 
     def of_path(self, band: int) -> np.ndarray:
         """v (n_y,) of a band, or of the nearest that was fitted."""
+        if band in self.path:
+            return self.path[band]
         return self.path[min(self.path, key=lambda one: abs(one - band))]
 
     def of_distortion(self, level: float, band: int) -> np.ndarray:
         """s (n_y,) of a level and band, or of the nearest that was fitted."""
+        if (level, band) in self.distortion:
+            return self.distortion[level, band]
         return self.distortion[min(self.distortion, key=lambda one: (
             abs(np.log(max(one[0], 1e-9) / max(level, 1e-9))), abs(one[1] - band)))]
 
@@ -173,8 +177,10 @@ def mean_noise(blocks: Sequence[SpectralBlock], levels: Sequence[float], setting
 
 
 def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], levels: Sequence[float],
-              paths: Sequence[np.ndarray], old: Variances, settings: FitSettings) -> Variances:
+              paths: Sequence[np.ndarray], old: Variances, settings: FitSettings, hold_path: bool = False) -> Variances:
     """The most likely variances of path errors and distortion for residuals left (n, n_y) of each block.
+
+    hold_path : those of path errors stay as they are.
 
     Sensor by sensor and band by band, with the mean noise n_l of a level l, the covariance of the residual e is
     W = D + v G G^H, D = n_l + s_l on the lines of level l, G (m, k) the contributions of the inputs. With
@@ -217,7 +223,7 @@ def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], level
         known = np.real(np.sum(np.swapaxes(K, -1, -2)[:, None] * M, axis=(-1, -2)))
         of_v = (np.sum(np.abs(x) ** 2, axis=-1) + half * v0) / v ** 2
         of_s = power / d ** 2 + half * s0 / s ** 2
-        v = v * np.sqrt(of_v / ((k - np.real(np.einsum("byaa->by", K)) / v + half) / v))
+        v = v if hold_path else v * np.sqrt(of_v / ((k - np.real(np.einsum("byaa->by", K)) / v + half) / v))
         s = s * np.sqrt(of_s / (lines / d - known / d ** 2 + half / s))
     return Variances({band: v[b] for band, b in row.items()},
                      {(level, band): s[row[band], column[level]] for level, band in noise})
