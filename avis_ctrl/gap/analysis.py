@@ -213,7 +213,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     return Gap(verdict, told, tuple(stages), where if verdict != "none" else (), remaining, after.noise_nrmse, onward,
                fits.base.model, updated.model, _considered(fits, names, prepared, settings), heat_map(before, after),
                tuple(one for one in sentences if one), prepared.halves.how, seed, time.monotonic() - began,
-               updated.covariance_of(updated.model.names), limits, shares, records, faults.raised if closed else (),
+               updated.whole_covariance(), limits, shares, records, faults.raised if closed else (),
                traces, remainder, _moved(updated, settings))
 
 

@@ -19,21 +19,27 @@ import numpy as np
 from avis_ctrl.identification.weights import Group
 
 
-def cluster_variances(P: np.ndarray, J: np.ndarray, e: np.ndarray, clusters: Sequence[np.ndarray]) -> np.ndarray:
-    """(n,) diagonal of V.
+def cluster_moves(P: np.ndarray, J: np.ndarray, e: np.ndarray, clusters: Sequence[np.ndarray]) -> np.ndarray:
+    """(n_c, n) delta of each cluster.
 
     P : (n, n) covariance of standardised parameters, inv(J J^T + I). J : (n, N) negative derivative of e (N,).
     clusters : entries of e of each.
     """
-    L = np.linalg.cholesky(P)
-    found = np.sum(P ** 2, axis=1)
+    L, found = np.linalg.cholesky(P), []
     for at in clusters:
         X = L.T @ J[:, at]
         size, vectors = np.linalg.eigh(X @ X.T)
         remaining = np.maximum(1 - size, np.finfo(float).eps)
-        delta = L @ (vectors @ ((vectors.T @ (X @ e[at])) / np.sqrt(remaining)))
-        found += delta ** 2
-    return found
+        found.append(L @ (vectors @ ((vectors.T @ (X @ e[at])) / np.sqrt(remaining))))
+    return np.array(found)
+
+
+def covering(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """(k, k) covariance of at least A and B in every direction; A positive definite."""
+    L = np.linalg.cholesky(A)
+    ratio, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, B).T))
+    root = L @ (vectors * np.sqrt(np.maximum(ratio, 1.0)))
+    return np.asarray(root @ root.T)
 
 
 def clusterings(groups: Sequence[Group], bands_per_octave: int) -> tuple[list[list[list[Group]]], list[list[Group]]]:

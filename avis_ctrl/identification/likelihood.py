@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.clusters import cluster_variances, clusterings
+from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.maximum_likelihood import block_residual, transient_unknowns
 from avis_ctrl.identification.priors import Priors, Tolerance
@@ -110,36 +110,49 @@ class Fitted:
     def moved(self, names: Sequence[str]) -> tuple[Tolerance, ...]:
         """Of values of the rig file that have a tolerance, the most moved first."""
         units = dict(zip(self.model.names, self.model.units, strict=True))
-        values, std = self.priors.values(self.z), np.sqrt(np.diag(self.covariance)) * self._units
         at = [self.priors.names.index(name) for name in names]
-        rows = [Tolerance(name, float(values[k]), float(std[k]), float(self.z[k]), units[name])
-                for name, k in zip(names, at, strict=True)]
-        return tuple(sorted(rows, key=lambda one: -abs(one.moved)))
+        values, slopes = self.priors.values(self.z), self.priors.slopes(self.z)
+        std = np.sqrt(np.max([one.diagonal() for one in (self.covariance, *self._by_clusters)], axis=0))
+        found = [Tolerance(name, float(values[k]), float(std[k] * slopes[k]), float(self.z[k]), units[name])
+                 for name, k in zip(names, at, strict=True)]
+        return tuple(sorted(found, key=lambda one: -abs(one.moved)))
 
     def covariance_of(self, names: Sequence[str]) -> np.ndarray:
-        """(k, k) of some parameters in their units; zero for those that are not free."""
-        rows = [self.priors.names.index(name) if name in self.priors.names else -1 for name in names]
-        return np.pad((self.covariance * self._units) * self._units[:, None], (0, 1))[np.ix_(rows, rows)]
+        """(k, k) of some parameters in their units; zero for those that are not free.
 
-    @property
-    def _units(self) -> np.ndarray:
-        """(n,) from standardised parameters to standard deviations in their units."""
-        return self.priors.slopes(self.z) * self.widening
+        In every direction at least what the model says, and what octaves and levels differ by (`clusters`).
+        """
+        free = [k for k, name in enumerate(names) if name in self.priors.names]
+        rows = [self.priors.names.index(names[k]) for k in free]
+        own = self.covariance[np.ix_(rows, rows)]
+        for robust in self._by_clusters if rows else ():
+            own = covering(own, robust[np.ix_(rows, rows)])
+        found, slopes = np.zeros((len(names), len(names))), self.priors.slopes(self.z)[rows]
+        found[np.ix_(free, free)] = own * slopes * slopes[:, None]
+        return found
+
+    def whole_covariance(self) -> np.ndarray:
+        """(n, n) of all parameters in their units: by the model, times what octaves or levels differ by beyond it, in
+        the mean over all directions, for there are fewer octaves and levels than directions."""
+        ratios = [float(np.mean(np.diag(np.linalg.solve(self.covariance, one)))) for one in self._by_clusters]
+        slopes = self.priors.slopes(self.z)
+        return np.asarray(max(1.0, *ratios) * self.covariance * slopes * slopes[:, None])
 
     @cached_property
-    def widening(self) -> np.ndarray:
-        """(n,) factor on the standard deviations, 1 or more: where octaves or levels differ in what they ask of a
-        parameter by more than the model expects (`clusters`). 1 for a fit without its residual."""
-        own = np.diag(self.covariance)
+    def _by_clusters(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n, n) covariances of z by what octaves and what levels differ by; the model's own for a fit without its
+        residual, or with one cluster."""
         if not len(self.white.e):
-            return np.ones(len(own))
+            return self.covariance, self.covariance
 
-        def variances(parts: Sequence[Sequence[Group]]) -> np.ndarray:
+        def robust(parts: Sequence[Sequence[Group]]) -> np.ndarray:
             rows = [np.concatenate([self.weights.rows[group] for group in part]) for part in parts]
-            return cluster_variances(self.covariance, self.J, self.e, rows) if len(rows) > 1 else own
+            if len(rows) == 1:
+                return self.covariance
+            moves = cluster_moves(self.covariance, self.J, self.e, rows)
+            return np.asarray(self.covariance @ self.covariance + moves.T @ moves)
         by_octave, by_level = clusterings(list(self.weights.rows), self.bands_per_octave)
-        octaves = np.mean([variances(parts) for parts in by_octave], axis=0)
-        return np.sqrt(np.maximum.reduce([own, octaves, variances(by_level)]) / own)
+        return np.mean([robust(parts) for parts in by_octave], axis=0), robust(by_level)
 
 
 def first_variances(data: Data, settings: FitSettings) -> Variances:

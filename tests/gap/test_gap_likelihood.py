@@ -17,7 +17,7 @@ from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap.tolerances import tolerances_behind, within_tolerance
 from avis_ctrl.gap.validation import halves
-from avis_ctrl.identification.clusters import cluster_variances, clusterings
+from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
 from avis_ctrl.identification.likelihood import Data, first_variances, fit
 from avis_ctrl.identification.priors import Priors, re_identified, with_tolerances
 from avis_ctrl.identification.response import ResponseModel
@@ -196,9 +196,15 @@ def test_a_parameter_that_moves_with_the_band_refutes_its_law():
 def test_standard_deviations_cover_what_octaves_differ_by():
     """One gain above 8 Hz, another below: known no better than these agree, and no worse."""
     good, bent = found_at()[0], found_at(bend=0.3)[0]
-    assert 1 <= good.widening[0] < 3
-    std = float(np.sqrt(bent.covariance_of(["sensor.Sz1"])[0, 0])) / bent.priors.mean[0]
-    assert bent.widening[0] > 10 and 0.03 < std < 0.3
+    wide, relative = [], []
+    for one in (good, bent):
+        std = float(np.sqrt(one.covariance_of(["sensor.Sz1"])[0, 0]))
+        assert std == pytest.approx(one.moved(["sensor.Sz1"])[0].std)
+        assert std == pytest.approx(float(np.sqrt(one.whole_covariance()[0, 0])))
+        relative.append(std / one.priors.mean[0])
+        wide.append(std / float(np.sqrt(one.covariance[0, 0]) * one.priors.slopes(one.z)[0]))
+    assert 1 <= wide[0] < 3
+    assert wide[1] > 10 and 0.03 < relative[1] < 0.3
 
 
 def test_cluster_variances_are_right_in_the_mean_where_the_model_holds_and_where_clusters_are_alike():
@@ -214,8 +220,21 @@ def test_cluster_variances_are_right_in_the_mean_where_the_model_holds_and_where
             noise[:, at] += common * rng.standard_normal((4000, 1))
         y = z @ J + noise
         found = y @ J.T @ P
-        variances = [cluster_variances(P, J, own - x @ J, clusters) for own, x in zip(y[:1000], found, strict=False)]
-        assert_allclose(np.mean(variances, axis=0), np.mean((found - z) ** 2, axis=0), rtol=0.1 if not common else 0.25)
+        moves = [cluster_moves(P, J, own - x @ J, clusters) for own, x in zip(y[:1000], found, strict=False)]
+        variances = np.diag(P @ P) + np.mean([np.sum(one ** 2, axis=0) for one in moves], axis=0)
+        assert_allclose(variances, np.mean((found - z) ** 2, axis=0), rtol=0.1 if not common else 0.25)
+
+
+def test_a_covering_covariance_is_no_smaller_in_any_direction():
+    rng = np.random.default_rng(2)
+    for k in (1, 3, 5):
+        X, few = rng.standard_normal((k, k + 2)), rng.standard_normal((k, 2))
+        A, B = X @ X.T, few @ few.T
+        C = covering(A, B)
+        for one in (A, B):
+            assert np.min(np.linalg.eigvalsh(C - one)) > -1e-9 * np.max(C)
+        assert_allclose(covering(A, 0.5 * A), A, rtol=1e-9)
+        assert_allclose(covering(A, 3 * A), 3 * A, rtol=1e-9)
 
 
 def test_clusters_are_octaves_of_bands_and_levels():
