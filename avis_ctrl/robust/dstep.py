@@ -3,7 +3,9 @@
 Only magnitudes matter for scalar scalings, and log sigma_max(D N D^-1) is convex in log |d| with the gradient
 |u_i|^2 - |v_i|^2 of its singular vectors (Sezginer and Overton, IEEE TAC 35, 1990). So after the semidefinite
 fit of single blocks, all parameters are moved together by linear programs in a trust region, on what counts:
-the peak over frequency of the loop scaled by the realised D(s).
+the peak over frequency of the loop scaled by the realised D(s). Repeated blocks take part with the scalar factors
+of their matrices, which grow before these do: the best scalings at one frequency are not unique, and a fit to them,
+block by block, may cost far more than a common one of the same order.
 """
 
 from __future__ import annotations
@@ -176,9 +178,9 @@ def _grown(points: PointwiseScalings, best: DStep, allowed_cost: float, max_stat
         share = _blame(points, best.scalings)
         if not np.any(share > 0):
             break
-        candidates = (_raised(points, best, np.flatnonzero(share >= part * np.max(share)), max_states, by, shaped)
-                      # Shapes of matrices last: most often what they have in common decides, with fewer parameters.
-                      for shaped in (False, True)
+        candidates = (_raised(points, best, np.flatnonzero(share >= part * np.max(share)), max_states, by, matrices)
+                      # Matrices last: most often their factors are enough, and a factor is refined with all the rest.
+                      for matrices in (False, True)
                       # One more order may not pay where two do: a resonance needs a pair of roots.
                       for part, by in ((0.4, 1), (0.4, 2), (0.999, 1), (0.999, 2)))
         better = next((new for new in candidates if new is not None and new.cost < max(0.9 * best.cost, allowed_cost)),
@@ -223,17 +225,17 @@ def _constants(points: PointwiseScalings) -> Scalings:
 
 
 def _raised(points: PointwiseScalings, step: DStep, blocks: np.ndarray, max_states: int, by: int,
-            shaped: bool) -> DStep | None:
+            matrices: bool) -> DStep | None:
     """The step with some blocks refitted at a higher order and everything refined; None where they may not grow.
 
-    shaped : raise the orders of the matrices of repeated blocks, with constant factors, instead of their factors'.
+    matrices : raise the orders of repeated blocks by matrices of that order, instead of by their scalar factors.
     """
     scalings = step.scalings
-    if shaped and not any(k in points.X for k in blocks):
+    if matrices and not any(k in points.X for k in blocks):
         return None
     for k in blocks:
         part = scalings.parts[k]
-        if shaped and isinstance(part, MatrixScaling):
+        if matrices and isinstance(part, MatrixScaling):
             order = part.order // points.structure.blocks[k].rows + by
             if order > MAX_ORDER // 2:
                 return None

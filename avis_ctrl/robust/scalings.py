@@ -203,8 +203,8 @@ def _section(zeros: np.ndarray, poles: np.ndarray) -> tuple[np.ndarray, np.ndarr
 class MatrixScaling:
     """Square D(s) = d(s) F(s) of a repeated scalar block; F is a state space with stable zeros and poles.
 
-    The factor d takes what all copies have in common, mostly with a constant F: it has few parameters, and is refined
-    together with the scalings of the other blocks.
+    Most often a constant F is enough. The factor has few parameters, which are refined together with the scalings of
+    the other blocks.
     """
 
     system: StateSpace

@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 import pytest
+import scipy.optimize as so
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, connect, gain, hinf_norm, lft_lower, summing_junction, tf
@@ -140,17 +141,21 @@ def test_real_blocks_are_said_to_be_treated_as_complex_and_both_are_measured():
     assert as_complex.gamma == pytest.approx(result.mu_upper_complex, rel=1e-6)
 
 
-def test_repeated_block_takes_a_matrix_scaling():
-    """One delta acts on two springs: musyn scales it by a 2 x 2 D(s), and the result obeys its own bound."""
+def stiffness_in_halves() -> StateSpace:
+    """The table with the same stiffness error twice: w_k is split in halves, each seeing z_k."""
     P, _ = table()
-    # the same stiffness error twice: w_k is split in halves, each seeing z_k
     n_w = np.zeros((5, 6))
     n_w[0, :2] = 0.5
     n_w[1:, 2:] = np.eye(4)
     n_z = np.zeros((6, 5))
     n_z[:2, 0] = 1.0
     n_z[2:, 1:] = np.eye(4)
-    Q = StateSpace(P.A, P.B @ n_w, n_z @ P.C, n_z @ P.D @ n_w)
+    return StateSpace(P.A, P.B @ n_w, n_z @ P.C, n_z @ P.D @ n_w)
+
+
+def test_repeated_block_takes_a_matrix_scaling():
+    """One delta acts on two springs: musyn scales it by a 2 x 2 D(s), and the result obeys its own bound."""
+    P, Q = table()[0], stiffness_in_halves()
     result = musyn(Q, [ComplexScalar(2), ComplexFull(1, 1)], 1, 1, max_iterations=3)
     plain = musyn(P, [ComplexScalar(1), ComplexFull(1, 1)], 1, 1, max_iterations=3)
     assert result.scalings.parts[0].__class__.__name__ == "MatrixScaling"
@@ -270,6 +275,20 @@ def test_descent_learns_the_curvature():
             step = step / 3
     found = descend(P, 2, 2, start, (1e-3, 1e3), evaluations=40)
     assert found.evaluations <= 40 and found.gamma < 0.98 * gamma < 0.95 * found.gamma_before
+
+
+def test_descent_moves_the_factor_of_a_repeated_block():
+    """From a D far off, to the optimum of constant D = d I found by a search over d."""
+    Q = stiffness_in_halves()
+    structure = BlockStructure.of([ComplexScalar(2), ComplexFull(1, 1)]).with_performance(2, 2)
+    found = descend(Q, 1, 1, Scalings.uniform(structure, 3.0), (1e-2, 1e4))
+    problem, full = ScaledProblem.of(Q, 1, 1), Scalings.uniform(structure, 1.0)
+
+    def optimum(log_d):
+        return find_gamma(problem.normal(with_parameters(full, np.array(log_d))).plant, 1e-6).upper.gamma
+
+    best = so.minimize(optimum, [0.0, 0.0], method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-5}).fun
+    assert found.gamma == pytest.approx(best, rel=2e-3) and found.gamma < 0.9 * found.gamma_before
 
 
 @pytest.mark.parametrize(("d", "orders"), [((1.0, 1.0), (1, 1, 0)), ((0.3, 3.0), (1, 0, 0))])
