@@ -234,9 +234,13 @@ def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[
     """
     problem = ScaledProblem.of(P, nmeas, ncon)
     places = np.geomspace(*band, max(3, int(2 * np.log10(band[1] / band[0]))))[1:-1]
-    free = [k for k in free_parameters(scalings) if scalings.parts[k].scalar.order < MAX_ORDER]
+    room = max_states - scalings.added_states
+    free = [k for k in free_parameters(scalings) if scalings.parts[k].scalar.order < MAX_ORDER
+            and scalings.structure.blocks[k].rows + scalings.structure.blocks[k].cols <= room]
+    if not free:
+        return None
     slopes = np.array([_neutral_slopes(problem, scalings, free, place) for place in places])
-    if not slopes.size or np.max(np.abs(slopes)) < 1e-3:
+    if np.max(np.abs(slopes)) < 1e-3:
         return None
     best = np.argmax(np.abs(slopes), axis=0)
     strength = np.abs(slopes[best, range(len(free))])
