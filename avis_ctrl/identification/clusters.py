@@ -19,18 +19,21 @@ import numpy as np
 from avis_ctrl.identification.weights import Group
 
 
-def cluster_moves(P: np.ndarray, J: np.ndarray, e: np.ndarray, clusters: Sequence[np.ndarray]) -> np.ndarray:
+def cluster_moves(P: np.ndarray, J: np.ndarray, e: np.ndarray, clusters: Sequence[np.ndarray],
+                  least_elsewhere: float = 0.0) -> np.ndarray:
     """(n_c, n) delta of each cluster.
 
     P : (n, n) covariance of standardised parameters, inv(J J^T + I). J : (n, N) negative derivative of e (N,).
-    clusters : entries of e of each.
+    clusters : entries of e of each. least_elsewhere : fraction of the information on a direction that is not of the
+    cluster, below which it does not count there: there is nothing to compare it with.
     """
     L, found = np.linalg.cholesky(P), []
     for at in clusters:
         X = L.T @ J[:, at]
         size, vectors = np.linalg.eigh(X @ X.T)
-        remaining = np.maximum(1 - size, np.finfo(float).eps)
-        found.append(L @ (vectors @ ((vectors.T @ (X @ e[at])) / np.sqrt(remaining))))
+        elsewhere = np.maximum(1 - size, np.finfo(float).eps)
+        along = np.where(elsewhere > least_elsewhere, vectors.T @ (X @ e[at]) / np.sqrt(elsewhere), 0.0)
+        found.append(L @ (vectors @ along))
     return np.array(found)
 
 

@@ -36,6 +36,9 @@ class FitSettings:
     least_distortion : distortion that nobody can exclude, over the noise [1], the scale of its prior: the noise's own
         estimate leaves as much open.
     least_eigenvalue : of the path errors' covariance over that of the noise, below which a direction is left out [1].
+    least_elsewhere : fraction of the information on a combination of parameters that an octave or a level must leave
+        to others to be compared with them [1]: of what one octave alone determines, the others say nothing, and
+        round-off of the fit would count a hundredfold.
     shortest_step : part of a Gauss-Newton step below which no shorter one is tried [1].
     converged : change of the penalised sum of squares, relative to the number of data, below which a fit has converged.
     """
@@ -57,6 +60,7 @@ class FitSettings:
     first_distortion: float = 0.01
     least_distortion: float = 0.02
     least_eigenvalue: float = 1e-8
+    least_elsewhere: float = 0.05
     shortest_step: float = 1e-3
     converged: float = 1e-5
 

@@ -67,8 +67,8 @@ class Fitted:
 
     model : at the estimate. priors, z (n,), covariance (n, n) of z. variances : of what is not explained.
     log_evidence : Laplace. log_likelihoods : by level and band; what is in the evidence beside their sum is of priors.
-    iterations : Gauss-Newton steps. bands_per_octave : of the groups. weights : of the data. white : residual and
-    Jacobian, whitened by noise and distortion; both empty once only the evidence is of interest (`bare`).
+    iterations : Gauss-Newton steps. settings : of the fit. weights : of the data. white : residual and Jacobian,
+    whitened by noise and distortion; both empty once only the evidence is of interest (`bare`).
     """
 
     model: Any
@@ -79,7 +79,7 @@ class Fitted:
     log_evidence: float
     log_likelihoods: Mapping[Group, float]
     iterations: int
-    bands_per_octave: int
+    settings: FitSettings
     weights: Weights
     white: Evaluated
 
@@ -149,9 +149,9 @@ class Fitted:
             rows = [np.concatenate([self.weights.rows[group] for group in part]) for part in parts]
             if len(rows) == 1:
                 return self.covariance
-            moves = cluster_moves(self.covariance, self.J, self.e, rows)
+            moves = cluster_moves(self.covariance, self.J, self.e, rows, self.settings.least_elsewhere)
             return np.asarray(self.covariance @ self.covariance + moves.T @ moves)
-        by_octave, by_level = clusterings(list(self.weights.rows), self.bands_per_octave)
+        by_octave, by_level = clusterings(list(self.weights.rows), self.settings.bands_per_octave)
         return np.mean([robust(parts) for parts in by_octave], axis=0), robust(by_level)
 
 
@@ -238,7 +238,7 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
     log_evidence = reached - _price_of_ends(at.model, data) - 0.5 * np.linalg.slogdet(H)[1]
     by_group = _by_group(weights, weights.flatten(at.now.e[None])[0])
     return Fitted(at.model, priors, at.z, np.linalg.inv(H), variances, float(log_evidence), by_group, steps,
-                  settings.bands_per_octave, weights, at.now)
+                  settings, weights, at.now)
 
 
 def without_path_errors(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> Fitted:

@@ -225,6 +225,16 @@ def test_cluster_variances_are_right_in_the_mean_where_the_model_holds_and_where
         assert_allclose(variances, np.mean((found - z) ** 2, axis=0), rtol=0.1 if not common else 0.25)
 
 
+def test_a_cluster_does_not_count_where_no_other_knows_anything():
+    """Of a resonance in one octave, residuals there say nothing of how octaves differ."""
+    J = np.zeros((2, 20))
+    J[0, :10], J[1] = np.sqrt(1e7), np.sqrt(0.2)
+    P = np.linalg.inv(J @ J.T + np.eye(2))
+    moves = cluster_moves(P, J, np.ones(20), [np.arange(10), np.arange(10, 20)], 0.05)
+    assert np.abs(moves[0, 0]) < 1e-6 < np.abs(cluster_moves(P, J, np.ones(20), [np.arange(10)])[0, 0])
+    assert np.abs(moves[1, 1]) > 0.1
+
+
 def test_a_covering_covariance_is_no_smaller_in_any_direction():
     rng = np.random.default_rng(2)
     for k in (1, 3, 5):
