@@ -213,16 +213,18 @@ def _pruned(steps: list[Step], kept: int, data: Data, settings: GapSettings) -> 
 
 
 def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
-    """The choice of a step, beside what was found after it."""
+    """The choice of a step, beside what was found after it. Rivals that were further behind than all that was found
+    after it gained stay out: that much may have been theirs."""
     rest = without_effect(best, step.label, data, settings)
     if rest is None:
         return step
     quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
     begun = without_path_errors(rest, data, settings)
     known = {name_of(label) for label in best.labels}
-    tried = {step.label: best.bare()}
+    tried, mine = {step.label: best.bare()}, step.tried[step.label].log_evidence
+    later = max(best.log_evidence - step.fitted.log_evidence, 0.0) + settings.certain
     for label, fitted in step.tried.items():
-        if name_of(label) in known:
+        if name_of(label) in known or mine - fitted.log_evidence > later:
             continue
         one = with_effect(begun, fitted.model.effects[-1], data, quick)
         if one is not None:

@@ -48,9 +48,9 @@ class GapSettings(FitSettings):
     most_sure : largest probability that is reported [1]: what nobody thought of leaves so much.
     trace : share of the gap's power below which an effect is a trace [1].
     minor : share of what the model with tolerances leaves below which a trace ends the search [1].
-    law_p_value, law_change : an effect is refuted where its parameters from half of the data (by band, by level) differ
-        from the whole with a smaller p-value than this [1] and by more than this share [1]; real elements follow their
-        textbook law to some per cent only, which no p-value knows.
+    law_p_value, law_change : an effect is refuted where one of its parameters from half of the data (by band, by level)
+        differs from the whole with a smaller p-value than this [1] and by more than this fraction of itself [1]; real
+        elements follow their textbook law to some per cent only, which no p-value knows.
     least_difference : of the variance of a difference between a half and the whole over the whole's, below which it is
         round-off [1].
     most_of_half : variance of a half over the whole's, above which that half says nothing of a direction [1].
