@@ -57,9 +57,9 @@ class NamedEffect:
     share: float | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """As the contract has it."""
+        """As the contract has it; no standard deviation, null, of a value that the law fixes."""
         return {"name": self.name, "location": self.location,
-                "parameters": {key: {"value": p.value, "std": p.std, "unit": p.unit}
+                "parameters": {key: {"value": p.value, "std": p.std if np.isfinite(p.std) else None, "unit": p.unit}
                                for key, p in self.parameters.items()},
                 "probability": self.probability, "indistinguishable_from": list(self.indistinguishable_from),
                 **({} if self.share is None else {"share": self.share})}

@@ -92,7 +92,9 @@ class Weights:
 
 
 def path_contributions(model: Any, block: SpectralBlock) -> np.ndarray:
-    """(n, n_y, n_in): what each input of a record contributes to each sensor."""
+    """(n, n_y, n_in): what each input of a record contributes to each sensor, or what a model calls its parts."""
+    if hasattr(model, "contributions"):
+        return np.asarray(model.contributions(block))
     U = np.zeros((*block.U.shape[:2], block.U.shape[1]), complex)
     k = np.arange(block.U.shape[1])
     U[:, k, k] = block.U[:, :, 0]
@@ -178,16 +180,20 @@ def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], level
     for group, parts in members.items():
         e, G, noise = (np.concatenate([part[k] for part in parts]) for k in range(3))
         n = noise.mean(axis=0)[:, None]
-        U, sigma, _ = np.linalg.svd(np.swapaxes(G, 0, 1), full_matrices=True)
-        size = np.zeros(U.shape[:2])
-        size[:, :sigma.shape[1]] = sigma ** 2
+        U, sigma, _ = np.linalg.svd(np.swapaxes(G, 0, 1), full_matrices=False)
         power = np.abs(np.einsum("ymk,my->yk", U.conj(), e)) ** 2
+        # All directions beside those of the contributions are alike: one entry of mean power stands for them.
+        rest = len(e) - sigma.shape[1]
+        beside = np.maximum(np.sum(np.abs(e) ** 2, axis=0) - power.sum(axis=1), 0.0)[:, None] / max(rest, 1)
+        size = np.pad(sigma ** 2, ((0, 0), (0, 1)))
+        power, count = np.hstack([power, beside]), np.r_[np.ones(sigma.shape[1]), rest]
         v, s = (one[:, None].copy() for one in old.of(group))
         for _ in range(settings.climbs):
             w = n + s + v * size
             rise = np.sum(size * power / w ** 2, axis=1, keepdims=True) + nu * v0 / (2 * v ** 2)
             v *= np.sqrt(rise / (np.sum(size / w, axis=1, keepdims=True) + (nu / 2 + 1) / v))
-            s *= np.sqrt(np.sum(power / w ** 2, axis=1, keepdims=True) / np.sum(1 / w, axis=1, keepdims=True))
+            s *= np.sqrt(np.sum(count * power / w ** 2, axis=1, keepdims=True)
+                         / np.sum(count / w, axis=1, keepdims=True))
             s = np.maximum(s, settings.least_distortion * n)
         path_variance[group], distortion[group] = v[:, 0], s[:, 0]
     return Variances(path_variance, distortion)

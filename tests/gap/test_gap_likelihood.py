@@ -181,6 +181,31 @@ def test_variances_are_the_most_likely_ones():
         assert_allclose(np.log([found.path[0.2, band][c], found.distortion[0.2, band][c]]), best.x, atol=0.02)
 
 
+@pytest.mark.parametrize("lines", [60, 8])
+def test_variances_of_a_table_are_those_of_the_whole_space(lines):
+    """Against the same steps with every direction of the residual written out; more and fewer lines than inputs."""
+    settings, model, one = GapSettings(bands_per_octave=1), bare(), block(bare(), 6, lines)
+    start, G = first_variances(Data((one,), (0.2,)), settings), path_contributions(model, one)
+    rng = np.random.default_rng(7)
+    e = 0.05 * (rng.standard_normal((lines, 6)) + 1j * rng.standard_normal((lines, 6)))
+    found = estimated([e], [one], [0.2], [G], start, settings)
+    band = np.floor(np.log2(one.omega) + 1e-9).astype(int)
+    nu, v0 = settings.error_weight, settings.least_error ** 2
+    for b in np.unique(band):
+        at = band == b
+        for c in range(6):
+            size, U = np.linalg.eigh(G[at, c] @ G[at, c].conj().T)
+            size, power = np.maximum(size, 0), np.abs(U.conj().T @ e[at, c]) ** 2
+            v, s = (x[c] for x in start.of((0.2, int(b))))
+            for _ in range(settings.climbs):
+                w = 1e-3 + s + v * size
+                v *= np.sqrt((np.sum(size * power / w ** 2) + nu * v0 / (2 * v ** 2))
+                             / (np.sum(size / w) + (nu / 2 + 1) / v))
+                s *= np.sqrt(np.sum(power / w ** 2) / np.sum(1 / w))
+                s = max(s, settings.least_distortion * 1e-3)
+            assert_allclose([found.path[0.2, b][c], found.distortion[0.2, b][c]], [v, s], rtol=1e-6)
+
+
 def test_a_parameter_that_moves_with_the_band_refutes_its_law():
     good, bent = (halves(found, ("sensor.Sz1",), settings) for found, _, settings in (found_at(), found_at(bend=0.3)))
     assert min(one.p_value for one in good) > 1e-3

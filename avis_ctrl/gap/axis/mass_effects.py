@@ -1,0 +1,218 @@
+"""What a drive or an oscillator may lack: forces of the motion, inner dynamics, and the path from force to mass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from avis_ctrl.gap.axis.model import Effect, Parameter
+from avis_ctrl.gap.axis.records import Lines, Motion, Shape, bumps
+
+SLOW = "slow motion at several constant speeds"
+SWEEP = "a sine swept slowly up and down at several levels"
+DECAY = "free decays from several amplitudes"
+AT_REST = "the force at rest in several positions"
+FASTER = "faster motion: the phase of a delay stays proportional to frequency, that of a lag bends"
+RELEASED = "the force at rest, released and unloaded: a constant force stays, friction does not"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What the library takes from the data: travel, largest speed and largest displacement, the lines' band [Hz], the
+    periods a unit of position of a force that may be periodic, and the travel from which a position may be an angle."""
+
+    travel: float
+    speed: float
+    reach: float
+    low_Hz: float
+    high_Hz: float
+    pitches: tuple[float, ...] = ()
+    least_angle: float = 1.0
+
+    @staticmethod
+    def of(lines: Lines, pitches: bool) -> Scale:
+        def most(value: Callable[[Motion], float]) -> float:
+            return max(float(value(m)) for m in lines.motion)
+        high = float(lines.s.imag.max()) / (2 * np.pi)
+        return Scale(most(lambda m: np.ptp(m.q)), most(lambda m: np.max(np.abs(m.v))),
+                     most(lambda m: np.max(np.abs(m.q))),
+                     max(float(lines.s.imag.min()) / (2 * np.pi), high / 100), high,
+                     tuple(_pitches(lines)) if pitches else (), lines.settings.least_angle)
+
+
+def _force(name: str, title: str, separated_by: str, *columns: tuple[str, str, Shape], low: float = -np.inf,
+           location: str = "", law: str = "", fixed: dict[str, tuple[float, str]] | None = None) -> Effect:
+    return Effect(name, location, title, tuple(Parameter(symbol, unit, low) for symbol, unit, _ in columns),
+                  separated_by, tuple(shape for *_, shape in columns), law=law, fixed=fixed or {})
+
+
+def _attached(s: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """A sprung mass adds m s^2 (2 zeta w s + w^2)/(s^2 + 2 zeta w s + w^2) (Den Hartog, 1956)."""
+    w = 2 * np.pi * p[1]
+    inner = 2 * p[2] * w * s + w ** 2
+    return p[0] * s ** 2 * inner / (s ** 2 + inner)
+
+
+def _delay(s: np.ndarray, p: np.ndarray) -> np.ndarray:
+    return np.exp(-s * p[0])
+
+
+def _lag(s: np.ndarray, p: np.ndarray) -> np.ndarray:
+    return 1 / (1 + s * p[0])
+
+
+def _path(scale: Scale, location: str) -> list[Effect]:
+    longest = 16 / scale.high_Hz
+    return [Effect("delay", location, "a pure delay between force and motion", (Parameter("delay_s", "s", -longest,
+                   longest),), FASTER, path=_delay),
+            Effect("actuator_lag", location, "a first-order lag of the actuator",
+                   (Parameter("time_constant_s", "s", 0.0, longest),), FASTER, path=_lag)]
+
+
+def _attached_to(scale: Scale, name: str, title: str, location: str) -> Effect:
+    low, high = scale.low_Hz, scale.high_Hz
+    seeds = tuple((0.0, f, 0.03) for f in np.geomspace(low * 1.05, high / 1.05, 24))
+    return Effect(name, location, title, (
+        Parameter("mass", "{F} s^2/{x}", 0.0), Parameter("frequency_Hz", "Hz", low / 2, 2 * high, linear=False),
+        Parameter("damping", "1", 1e-4, 1.0, linear=False)), "a finer resolution about the second resonance",
+        dynamics=_attached, seeds=seeds)
+
+
+def _free(name: str, title: str, shapes: Sequence[Shape]) -> Effect:
+    return Effect(name, "unnamed", title, tuple(Parameter(f"c{k}", "{F}") for k in range(len(shapes))),
+                  shapes=tuple(shapes), outside=True)
+
+
+def _once(make: Callable[[Motion], list[np.ndarray]], count: int) -> list[Shape]:
+    """Shapes of a function that makes all of them at once."""
+    kept: dict[int, tuple[Motion, list[np.ndarray]]] = {}
+
+    def one(k: int, m: Motion) -> np.ndarray:
+        if id(m) not in kept:
+            kept[id(m)] = m, make(m)
+        return kept[id(m)][1][k]
+    return [partial(one, k) for k in range(count)]
+
+
+def unnamed_forces(lines: Lines) -> list[Effect]:
+    count = lines.settings.bumps
+    # One scale for all records, so that a shape is the same function in each.
+    q, v = (np.concatenate([getattr(m, name) for m in lines.motion]) for name in ("q", "v"))
+    knots_q, knots_v = (np.quantile(x, np.linspace(0, 1, 4096)) for x in (q, np.abs(v)))
+
+    def position(m: Motion) -> list[np.ndarray]:
+        return _spline(m.q, knots_q, count)
+
+    def velocity(m: Motion) -> list[np.ndarray]:
+        half = _spline(np.abs(m.v), knots_v, count // 2)
+        return [one * side for one in half for side in (m.v > 0, m.v < 0)]
+
+    def both(m: Motion) -> list[np.ndarray]:
+        x, w = (m.q - m.middle) / m.size, m.v / m.speed
+        return [x ** i * w ** j for i in range(5) for j in range(5) if i + j in (2, 3, 4, 5) and i * j]
+    return [_free("function_of_position", "a force that is another function of the position", _once(position, count)),
+            _free("function_of_velocity", "a force that is another function of the velocity",
+                  _once(velocity, count // 2 * 2)),
+            _free("function_of_both", "a force of position and velocity together",
+                  _once(both, sum(1 for i in range(5) for j in range(5) if i + j in (2, 3, 4, 5) and i * j)))]
+
+
+def _spline(x: np.ndarray, knots: np.ndarray, count: int) -> list[np.ndarray]:
+    table = bumps(knots, count)
+    return [np.interp(x, knots, one) for one in table]
+
+
+def drive_effects(scale: Scale) -> list[Effect]:
+    """The library of a drive."""
+    at = partial(_force, location="drive")
+    found = [
+        at("coulomb_friction", "Coulomb friction, a force of constant size against the motion", SLOW,
+           ("Fc", "{F}", lambda m: m.sign), low=0.0),
+        at("force_offset", "a constant force (weight on an inclined axis, or an offset of the current sensor)",
+           RELEASED, ("offset", "{F}", lambda m: np.ones_like(m.v))),
+        at("coulomb_asymmetry", "Coulomb friction that differs between the two directions", RELEASED,
+           ("Fc_ahead_less_back", "{F}", lambda m: np.abs(m.sign) / 2)),
+        at("viscous_asymmetry", "viscous friction that differs between the two directions",
+           "several constant speeds in each direction", ("Fv_ahead_less_back", "{F} s/{x}",
+                                                         lambda m: np.abs(m.v) / 2)),
+        at("quadratic_drag", "a drag that grows with the square of the speed", SLOW,
+           ("c2", "{F} s^2/{x}^2", lambda m: np.abs(m.v) * m.v), low=0.0),
+        at("stiffness", "a spring to the ground (a cable, a hose)", AT_REST,
+           ("k", "{F}/{x}", lambda m: m.q - m.middle)),
+        at("cubic_stiffness", "a spring that stiffens with the cube of the displacement from mid travel", AT_REST,
+           ("k3", "{F}/{x}^3", lambda m: (m.q - m.middle) ** 3))]
+    found += [at("stribeck_friction", "Stribeck friction, which falls as the drive starts to move", SLOW,
+                 ("Fs", "{F}", partial(_stribeck, speed)), low=0.0, law=f"{k}", fixed={"v_s": (speed, "{x}/s")})
+              for k, speed in enumerate(scale.speed * 2.0 ** -np.arange(2, 8))]
+    found += [at("presliding", "presliding, friction that is a spring before it slips",
+                 "very small slow motion about one position",
+                 ("Fc_presliding", "{F}", partial(_presliding, distance)), low=0.0, law=f"{k}",
+                 fixed={"distance": (distance, "{x}")}) for k, distance in enumerate(scale.travel * 4.0 **
+                 -np.arange(3, 8))]
+    if scale.travel >= scale.least_angle:
+        found.append(at("gravity", "gravity on a turning load, m g r sin(angle)", AT_REST,
+                        ("sine", "{F}", lambda m: np.sin(m.q)), ("cosine", "{F}", lambda m: np.cos(m.q))))
+    found += [at("cogging", "a force that is periodic in the position (cogging, pitch of a screw)",
+                 "slow motion over the whole travel", ("sine", "{F}", partial(_wave, np.sin, n)),
+                 ("cosine", "{F}", partial(_wave, np.cos, n)), law=f"{k}", fixed={"periods": (n, "1/{x}")})
+              for k, n in enumerate(scale.pitches)]
+    return [*found, *_path(scale, "drive"),
+            _attached_to(scale, "two_mass_flexibility", "a second mass behind a flexible coupling", "drive")]
+
+
+def _stribeck(speed: float, m: Motion) -> np.ndarray:
+    return m.sign * np.exp(-(m.v / speed) ** 2)
+
+
+def _presliding(distance: float, m: Motion) -> np.ndarray:
+    return m.dahl(distance) - m.sign
+
+
+def _wave(function: Callable[[np.ndarray], np.ndarray], n: float, m: Motion) -> np.ndarray:
+    return function(2 * np.pi * n * m.q)
+
+
+def _pitches(lines: Lines, few: int = 2) -> list[float]:
+    """Periods a unit of position at which what friction and inertia leave is strongest, in the time domain."""
+    m, one = lines.motion[0], lines.records[0]
+    step = lines.settings.oversampled * max(1, len(one.force) // 20_000)
+    q, v = m.q[::step], m.v[::step]
+    X = np.column_stack([np.ones_like(q), v, np.sign(v), np.gradient(v), q - m.middle])
+    left = m.u[::step] - X @ np.linalg.lstsq(X, m.u[::step], rcond=None)[0]
+    tried = np.arange(2.0, 100.0, 0.25) / float(np.ptp(q))
+    power = np.array([abs(np.sum(left * np.exp(-2j * np.pi * n * q))) for n in tried])
+    peaks = [k for k in np.argsort(-power) if power[k] == power[max(k - 3, 0):k + 4].max()]
+    return [float(tried[k]) for k in peaks[:few]]
+
+
+def oscillator_effects(scale: Scale) -> list[Effect]:
+    """The library of an oscillator."""
+    at = partial(_force, location="oscillator")
+    found = [
+        at("cubic_stiffness", "cubic stiffness, a restoring force k3 y^3", SWEEP,
+           ("k3", "{F}/{x}^3", lambda m: m.q ** 3)),
+        at("quadratic_stiffness", "quadratic stiffness, a restoring force k2 y^2",
+           "the mean displacement under a sine at several levels", ("k2", "{F}/{x}^2", lambda m: m.q ** 2)),
+        at("quadratic_damping", "quadratic damping, a force d2 |y'| y'", DECAY,
+           ("d2", "{F} s^2/{x}^2", lambda m: np.abs(m.v) * m.v), low=0.0),
+        at("cubic_damping", "cubic damping, a force d3 y'^3", DECAY, ("d3", "{F} s^3/{x}^3", lambda m: m.v ** 3),
+           low=0.0),
+        at("coulomb_friction", "friction damping, a force of constant size against the motion", DECAY,
+           ("Fc", "{F}", lambda m: m.sign), low=0.0),
+        at("position_damping", "damping that grows with the square of the position, a force c y^2 y'", DECAY,
+           ("c", "{F} s/{x}^3", lambda m: m.q ** 2 * m.v), low=0.0),
+        _force("input_nonlinearity", "a drive whose gain changes with its level, u + g u^3",
+               "the response far above the resonance at several levels", ("g", "1/{F}^2", lambda m: -m.u ** 3),
+               location="input"),
+        _force("input_nonlinearity_even", "a drive whose gain differs between the two directions, u + g u^2",
+               "the response far above the resonance at several levels", ("g", "1/{F}", lambda m: -m.u ** 2),
+               location="input")]
+    found += [at("hysteresis", "hysteresis, joints that stick at small amplitude and slip at large", DECAY,
+                 ("F_slip", "{F}", partial(Motion.dahl, distance=distance)), low=0.0, law=f"{k}",
+                 fixed={"distance": (distance, "{x}")}) for k, distance in enumerate(scale.reach * 2.0 ** -np.arange(0,
+                 6))]
+    return [*found, *_path(scale, "input"),
+            _attached_to(scale, "attached_oscillator", "a second mode, a sprung mass on the oscillator", "oscillator")]
