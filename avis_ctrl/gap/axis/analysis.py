@@ -208,8 +208,6 @@ def _reported(one: Name, best: Fitted, covariance: np.ndarray, share: float, pro
     else:
         found = {p.name: Reported(float(value), float(np.sqrt(own[k, k])), p.unit.format(**problem.units))
                  for k, (p, value) in enumerate(zip(effect.parameters, values, strict=True))}
-    for name, (value, unit) in effect.fixed.items():
-        found[name] = Reported(value, float("nan"), unit.format(**problem.units))
     return NamedEffect(effect.name, effect.location, effect.title, found, one.probability,
                        tuple(dict.fromkeys(r.effect.key for r in one.rivals)), effect.label, share=share)
 

@@ -12,7 +12,7 @@ would predict the noise of the very q that it is computed from.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,13 +29,15 @@ Curve = Callable[[np.ndarray, np.ndarray], np.ndarray]
 @dataclass(frozen=True)
 class Parameter:
     """unit : with {F} and {x} for those of force and position. A linear one begins at zero; another one, positive,
-    where the effect's seeds begin, within its range."""
+    where the effect's seeds begin, within its range. step : relative, of the derivative by one that shapes a force: a
+    force with an edge changes evenly over it."""
 
     name: str
     unit: str
     low: float = -np.inf
     high: float = np.inf
     linear: bool = True
+    step: float = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +45,13 @@ class Effect:
     """What a model of one axis may lack.
 
     name, location : as reported. title : what is missing, in words. separated_by : the measurement that tells it from
-    effects that predict the same. shapes : forces, functions of the motion, one for each of the first parameters.
+    effects that predict the same. shapes : forces, functions of the motion, one for each of the first parameters; the
+    others, which are not linear, shape all of them. variable : "position", "velocity" or "input", where the force is a
+    function of it alone: a free function of the same then judges its shape.
     dynamics : (s, p) added to Z. path : (s, p) factor of the path from force to mass. channel : (s, p) factor of one
     channel of a sensor. seeds : values where a fit may begin. law : variant of the effect. outside : a function without
-    a name, which stands for whatever the library does not hold. fixed : values of the law, with units. derived : what
-    is reported in the place of the parameters. implausible : (p) why physics forbids values; empty where it does not.
+    a name, which stands for whatever the library does not hold. derived : what is reported in the place of the
+    parameters. implausible : (p) why physics forbids values; empty where it does not.
     """
 
     name: str
@@ -61,8 +65,8 @@ class Effect:
     channel: Curve | None = None
     seeds: tuple[tuple[float, ...], ...] = ()
     law: str = ""
+    variable: str = ""
     outside: bool = False
-    fixed: dict[str, tuple[float, str]] = field(default_factory=dict)
     derived: Callable[[np.ndarray], dict[str, tuple[float, str]]] | None = None
     implausible: Callable[[np.ndarray], str] | None = None
 
@@ -163,46 +167,51 @@ class MassModel(AxisModel):
 
     lines: Lines
 
-    def _parts(self, block: SpectralBlock) -> dict[str, Any]:
-        pick, name, s = self.lines.pick, block.name, 1j * block.omega
-        regressors = [pick(one, name) for one in (self.lines.A, self.lines.V, self.lines.Q)[:len(self.base)]]
-        Z = sum(x * s ** (2 - k) for k, x in enumerate(self.values[:len(self.base)]))
+    def _force(self, one: Effect, p: np.ndarray, name: str, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(shapes, n) of an effect on the lines of a block, and their linear parts."""
+        by = tuple(map(float, p[len(one.shapes):]))
+        own = np.array([self.lines.pick(self.lines.of(shape, by), name) for shape in one.shapes])
+        if self.lines.solves_for == "force" or one.location == "input":
+            return own, np.zeros_like(own)
+        return own, np.array([alpha + beta * s for alpha, beta in (self.lines.linear_part(shape, by)
+                                                                   for shape in one.shapes)])
+
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
+        name, s, n = block.name, 1j * block.omega, len(self.base)
+        F, q = self.lines.pick(self.lines.F, name), self.lines.pick(self.lines.Q, name)
+        regressors = [self.lines.pick(one, name) for one in (self.lines.A, self.lines.V, self.lines.Q)[:n]]
+        Z = sum(x * s ** (2 - k) for k, x in enumerate(self.values[:n]))
         R = sum(x * one for x, one in zip(self.values, regressors, strict=False))
-        q, P, found = pick(self.lines.Q, name), np.ones(len(s), complex), []
-        for one, p in zip(self.effects, split(self.values, self.effects, len(self.base)), strict=True):
-            own = [pick(self.lines.of(shape), name) for shape in one.shapes]
-            R = R + sum((c * column for c, column in zip(p, own, strict=False)), np.zeros(len(s)))
-            linear = [np.zeros(len(s), complex)] * len(own)
-            if self.lines.solves_for == "position" and one.location != "input":
-                linear = [alpha + beta * s for alpha, beta in map(self.lines.linear_part, one.shapes)]
-                Z = Z + sum((c * part for c, part in zip(p, linear, strict=False)), np.zeros(len(s)))
+        P, several = np.ones(len(s), complex), split(self.values, self.effects, n)
+        for one, p in zip(self.effects, several, strict=True):
+            if one.shapes:
+                own, linear = self._force(one, p, name, s)
+                R, Z = R + p[:len(own)] @ own, Z + p[:len(own)] @ linear
             if one.dynamics:
                 added = one.dynamics(s, p)
                 Z, R = Z + added, R + added * q
             if one.path:
                 P = P * one.path(s, p)
-            found.append((one, p, own, linear))
-        return {"s": s, "Z": Z, "R": R, "P": P, "q": q, "regressors": regressors, "effects": found,
-                "F": pick(self.lines.F, name)}
-
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
-        a = self._parts(block)
-        drive, s = self.lines.solves_for == "force", a["s"]
-        f = a["P"] * a["F"] - a["R"]
-        Y = a["R"] / a["P"] if drive else a["q"] + f / a["Z"]
+        drive, f = self.lines.solves_for == "force", P * F - R
+        Y = R / P if drive else q + f / Z
         if not derivative:
             return Answer(Y[:, None, None], np.empty((0, len(s), 1, 1)))
 
         def force(column: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
-            return column / a["P"] if drive else -column / a["Z"] - f / a["Z"] ** 2 * z
-        dY = [force(one, s ** (2 - k)) for k, one in enumerate(a["regressors"])]
-        for one, p, own, linear in a["effects"]:
-            dY += [force(*both) for both in zip(own, linear, strict=True)]
+            return column / P if drive else -column / Z - f / Z ** 2 * z
+        dY = [force(one, s ** (2 - k)) for k, one in enumerate(regressors)]
+        for one, p in zip(self.effects, several, strict=True):
+            c = p[:len(one.shapes)]
+            if one.shapes:
+                dY += [force(*both) for both in zip(*self._force(one, p, name, s), strict=True)]
+            for h in np.diag(p * [q.step for q in one.parameters])[len(c):] if one.shapes else ():
+                up, down = (self._force(one, p + step, name, s) for step in (h, -h))
+                dY.append(force(*(c @ (a - b) / (2 * h.sum()) for a, b in zip(up, down, strict=True))))
             for slope in slopes(one.dynamics, s, p) if one.dynamics else ():
-                dY.append(force(slope * a["q"], slope))
+                dY.append(force(slope * q, slope))
             for slope in slopes(one.path, s, p) if one.path else ():
-                P = one.path(s, p)
-                dY.append(-Y * slope / P if drive else a["P"] / P * slope * a["F"] / a["Z"])
+                own_path = one.path(s, p)  # type: ignore[misc]
+                dY.append(-Y * slope / own_path if drive else P / own_path * slope * F / Z)
         return Answer(Y[:, None, None], np.array(dY)[:, :, None, None])
 
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
 from scipy import signal
 from scipy.interpolate import BSpline, make_interp_spline
@@ -53,15 +54,20 @@ class Motion:
 
     def dahl(self, distance: float) -> np.ndarray:
         """Friction of size one that is a spring before it slips (P. R. Dahl, 1968): dz/dq = (1 - z sign v)/distance.
-        Between two reversals it is an exponential of the path."""
-        turns = np.flatnonzero(np.diff(self.sign) != 0) + 1
-        z, found = 0.0, np.empty_like(self.q)
-        for a, b in zip(np.r_[0, turns], np.r_[turns, len(self.q)], strict=True):
-            way = float(self.sign[a])
-            along = np.abs(self.q[a:b] - self.q[max(a - 1, 0)])
-            found[a:b] = way + (z - way) * np.exp(-along / distance)
-            z = float(found[b - 1])
-        return found
+        """
+        return _dahl(self.q, distance)
+
+
+@numba.njit(cache=True)
+def _dahl(q, distance):  # pragma: no cover
+    found, z = np.empty_like(q), 0.0
+    found[0] = 0.0
+    for i in range(1, len(q)):
+        step = q[i] - q[i - 1]
+        way = 1.0 if step > 0 else -1.0
+        z = way + (z - way) * np.exp(-abs(step) / distance)
+        found[i] = z
+    return found
 
 
 def bumps(x: np.ndarray, count: int) -> list[np.ndarray]:
@@ -72,7 +78,8 @@ def bumps(x: np.ndarray, count: int) -> list[np.ndarray]:
     return list(flat.T)
 
 
-Shape = Callable[[Motion], np.ndarray]
+# A force of size one by the motion, and by what shapes it.
+Shape = Callable[..., np.ndarray]
 
 
 class Lines:
@@ -119,8 +126,8 @@ class Lines:
             self.starts.append(starts)
             self.held_out.append(held)
         self.motion = [self._motion(one) for one in self.records]
-        self.kept: dict[int, tuple[Shape, list[np.ndarray]]] = {}
-        self.linear: dict[int, tuple[float, float]] = {}
+        self.kept: dict[tuple, tuple[Shape, list[np.ndarray]]] = {}
+        self.linear: dict[tuple, tuple[Shape, tuple[float, float]]] = {}
         self.F = [self.transform(one.force, i) for i, one in enumerate(self.records)]
         self.Q, self.V, self.A = ([self.transform(one.position, i, order) for i, one in enumerate(self.records)]
                                   for order in range(3))
@@ -172,24 +179,31 @@ class Lines:
             found += c * (2j * np.pi * at * self.rate / self.length) ** order * line
         return found
 
-    def of(self, shape: Shape) -> list[np.ndarray]:
-        """(segments, k) of a function of the motion, by record; computed once."""
-        if id(shape) not in self.kept:
-            self.kept[id(shape)] = shape, [self.transform(np.broadcast_to(shape(m), m.q.shape), i)
-                                           for i, m in enumerate(self.motion)]
-        return self.kept[id(shape)][1]
+    def of(self, shape: Shape, by: tuple[float, ...] = ()) -> list[np.ndarray]:
+        """(segments, k) of a function of the motion, shaped by some parameters, by record; computed once."""
+        key = id(shape), by
+        if key not in self.kept:
+            self.kept[key] = shape, [self.transform(np.broadcast_to(shape(m, *by), m.q.shape), i)
+                                     for i, m in enumerate(self.motion)]
+        return self.kept[key][1]
 
-    def linear_part(self, shape: Shape) -> tuple[float, float]:
+    def linear_part(self, shape: Shape, by: tuple[float, ...] = ()) -> tuple[float, float]:
         """Coefficients of q and v in the best linear approximation of a function of the motion."""
-        if id(shape) not in self.linear:
-            m = self.motion[0]
-            step = max(1, len(m.q) // 50_000)
-            X = np.column_stack([m.q - np.mean(m.q), m.v, np.ones_like(m.q)])[::step]
-            size = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
-            N = np.broadcast_to(shape(m), m.q.shape)[::step]
-            x = np.linalg.lstsq(X / size, N, rcond=None)[0] / size
-            self.linear[id(shape)] = float(x[0]), float(x[1])
-        return self.linear[id(shape)]
+        key = id(shape), by
+        if key not in self.linear:
+            m, fit, step = self._linear
+            N = np.broadcast_to(shape(m, *by), m.q.shape)[::step]
+            alpha, beta, _ = fit @ N
+            self.linear[key] = shape, (float(alpha), float(beta))
+        return self.linear[key][1]
+
+    @cached_property
+    def _linear(self) -> tuple[Motion, np.ndarray, int]:
+        m = self.motion[0]
+        step = max(1, len(m.q) // 50_000)
+        X = np.column_stack([m.q - np.mean(m.q), m.v, np.ones_like(m.q)])[::step]
+        size = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
+        return m, np.linalg.pinv(X / size) / size[:, None], step
 
     def of_lines(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """(n,) number of the segment of each line of a block, and when it begins [s]."""

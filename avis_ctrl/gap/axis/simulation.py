@@ -46,13 +46,19 @@ def _filtered(x: np.ndarray, curve, rate: float) -> np.ndarray:
     return np.fft.irfft(np.fft.rfft(np.r_[x, x[::-1]]) * curve(s), 2 * n)[:n]
 
 
+def _shaped(one: Effect, p: np.ndarray, motion: Motion) -> np.ndarray:
+    """The force of an effect."""
+    n = len(one.shapes)
+    return sum((c * shape(motion, *p[n:]) for c, shape in zip(p[:n], one.shapes, strict=True)), np.zeros_like(motion.q))
+
+
 def _force(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarray]], record: Signals, rate: float,
            cutoff_Hz: float) -> np.ndarray:
     lines = Lines([record], rate, "force", (0.0, cutoff_Hz), cutoff_Hz, SETTINGS)
     motion, over = lines.motion[0], SETTINGS.oversampled
     found = base["M"] * np.gradient(motion.v, 1 / (over * rate)) + base["Fv"] * motion.v
     for one, p in effects:
-        found = found + sum((c * shape(motion) for c, shape in zip(p, one.shapes, strict=False)), np.zeros_like(found))
+        found = found + _shaped(one, p, motion)
         if one.dynamics:
             found = found + _filtered(motion.q - motion.middle, lambda s, f=one.dynamics, p=p: f(s, p), over * rate)
     for one, p in effects:
@@ -66,11 +72,9 @@ def _motion(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarra
             scale: Scale) -> np.ndarray:
     """From the measured state at the begin, by Runge-Kutta. Static forces of position and velocity are a table."""
     over, u = 2 * SETTINGS.oversampled, record.force
-    ones = np.ones_like(u)
     for one, p in effects:
-        for c, shape in zip(p, one.shapes, strict=False):
-            if one.location == "input":
-                u = u - c * shape(Motion(0 * u, 0 * u, record.force, 0.0, 1.0, 1.0)) * ones
+        if one.location == "input" and one.shapes:
+            u = u - _shaped(one, p, Motion(0 * u, 0 * u, record.force, 0.0, 1.0, 1.0))
         if one.path:
             u = _filtered(u, lambda s, f=one.path, p=p: f(s, p), rate)
     fine = signal.resample_poly(np.r_[u, u[-1], u[-1]], 2 * over, 1, window=("kaiser", 8.0), padtype="line")
@@ -80,11 +84,11 @@ def _motion(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarra
     table, slip, sprung = np.zeros(q.size), np.array([0.0, 1.0]), np.zeros(3)
     for one, p in effects:
         if one.name == "hysteresis":
-            slip = np.array([p[0], one.fixed["distance"][0]])
+            slip = np.array([p[0], p[1]])
         elif one.dynamics:
             sprung = np.array([p[0], 2 * np.pi * p[1], p[2]])
         elif one.location != "input":
-            table = table + sum((c * shape(flat) for c, shape in zip(p, one.shapes, strict=False)), np.zeros(q.size))
+            table = table + _shaped(one, p, flat)
     start = np.array([record.position[0], (record.position[1] - record.position[0]) * rate])
     found = _integrated(fine, over, len(record.force), 1 / (rate * over), base["m"], base["d"], base["k"],
                         table.reshape(q.shape), reach, speed, slip, sprung, start)
