@@ -17,8 +17,8 @@ from functools import cached_property
 
 import numba
 import numpy as np
-from scipy import signal
-from scipy.interpolate import BSpline, make_interp_spline
+from scipy import fft, signal
+from scipy.interpolate import BSpline
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
@@ -68,6 +68,21 @@ def _dahl(q, distance):  # pragma: no cover
         z = way + (z - way) * np.exp(-abs(step) / distance)
         found[i] = z
     return found
+
+
+def _finer(x: np.ndarray, over: int, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """(over n,) a band-limited signal at `over` times its rate, and its derivative. Without the line between its ends
+    it is turned about them, so that it goes on without a step. A filter for each phase would add a ripple at the old
+    rate: a velocity that friction takes for a reversal."""
+    n = len(x)
+    slope, t = (x[-1] - x[0]) / (n - 1), np.arange(over * n) / over
+    bent = x - x[0] - slope * np.arange(n)
+    X = fft.rfft(np.r_[bent, -bent[-2:0:-1]])
+    s = 2j * np.pi * rate * np.arange(len(X)) / (2 * (n - 1))
+
+    def at_all(X: np.ndarray) -> np.ndarray:
+        return over * fft.irfft(X, over * 2 * (n - 1))[:over * n]
+    return at_all(X) + x[0] + slope * t, at_all(s * X) + slope * rate
 
 
 def bumps(x: np.ndarray, count: int) -> list[np.ndarray]:
@@ -155,16 +170,8 @@ class Lines:
                 return x
             return signal.sosfiltfilt(signal.butter(4, 2 * self.smooth_Hz / self.rate, output="sos"), x)
 
-        def fine(x: np.ndarray) -> np.ndarray:
-            # The ends are mirrored: without it they would ring.
-            pad = min(len(x) - 1, 200)
-            long = np.concatenate([2 * x[0] - x[pad:0:-1], x, 2 * x[-1] - x[-2:-pad - 2:-1]])
-            return signal.resample_poly(long, over, 1, window=("kaiser", 8.0), padtype="line"
-                                        )[over * pad:over * (pad + len(x))]
-        q = fine(smooth(one.position))
-        t = np.arange(len(q)) / (over * self.rate)
-        v = make_interp_spline(t, q, k=5).derivative()(t)
-        return Motion(q, v, fine(one.force), float((q.max() + q.min()) / 2), float(np.std(q)),
+        q, v = _finer(smooth(one.position), over, self.rate)
+        return Motion(q, v, _finer(one.force, over, self.rate)[0], float((q.max() + q.min()) / 2), float(np.std(q)),
                       float(np.sqrt(np.mean(v ** 2))))
 
     def transform(self, x: np.ndarray, record: int, order: int = 0) -> np.ndarray:
