@@ -39,15 +39,12 @@ def drive(records: Sequence[Signals], rate: float, cutoff_Hz: float | None = Non
     def fitted(some: Sequence[Signals]) -> tuple[float, bool]:
         lines = Lines(some, rate, "force", band, cutoff_Hz, settings)
         shapes = (lambda m: m.sign, lambda m: np.ones_like(m.v), lambda m: m.q)
-        columns = [lines.A, lines.V, *(lines.of(shape) for shape in shapes)]
-        x, left = _least_squares([np.concatenate([c.ravel() for c in one]) for one in columns],
-                                 np.concatenate([f.ravel() for f in lines.F]))
+        x, left = _least_squares(_flat(lines.A, lines.V, *map(lines.of, shapes)), *_flat(lines.F))
         return left, bool(x[0] > 0)
     require_oriented(fitted, records, ("force", "position"), settings)
     lines = Lines(records, rate, "force", band, cutoff_Hz, settings)
-    start, _ = _least_squares([np.concatenate([c.ravel() for c in one]) for one in (lines.A, lines.V)],
-                              np.concatenate([f.ravel() for f in lines.F]))
-    start[0] = start[0] if start[0] > 0 else lines.size / float(np.sqrt(np.mean(np.abs(lines.A[0]) ** 2)))
+    start, _ = _least_squares(_flat(lines.A, lines.V), *_flat(lines.F))
+    start[0] = start[0] if start[0] > 0 else lines.size / float(np.sqrt(np.mean(np.abs(_flat(lines.A)[0]) ** 2)))
     model = MassModel(lines, (("M", "{F} s^2/{x}"), ("Fv", "{F} s/{x}")), (), start)
     noise, notes = repeated(lines, records, "position")
     scale = Scale.of(lines, pitches=True)
@@ -108,10 +105,15 @@ def _least_squares(columns: Sequence[np.ndarray], y: np.ndarray, weight: np.ndar
     return x, float(np.linalg.norm(y - X @ x) / max(float(np.linalg.norm(y)), 1e-300))
 
 
+def _flat(*columns: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """(n,) lines of all records, of each column."""
+    return [np.concatenate([one.sum(axis=2).ravel() for one in several]) for several in columns]
+
+
 def _modal_start(lines: Lines, steps: int = 8) -> tuple[np.ndarray, float]:
     """m, d, k by iterated weights 1/|D| (C. Sanathanan, J. Koerner, IEEE T-AC 8 (1963) 56), and the part of y that the
     oscillator leaves."""
-    A, V, Q, F = (np.concatenate([one.ravel() for one in several]) for several in (lines.A, lines.V, lines.Q, lines.F))
+    A, V, Q, F = _flat(lines.A, lines.V, lines.Q, lines.F)
     s = np.concatenate([np.tile(lines.s, len(one)) for one in lines.Q])
     weight = 1 / np.abs(s) ** 2
     x = np.zeros(3)
@@ -180,7 +182,7 @@ def repeated(lines: Lines, records: Sequence[Signals], guide: str) -> tuple[floa
     if not inside.any():
         return None, ()
     # The middle one of the segments: a start or a single disturbance is no noise.
-    noise = float(np.median(np.mean(np.abs(lines.transform(change, 0)[inside]) ** 2, axis=1)))
+    noise = float(np.median(np.mean(np.abs(lines.transform(change, 0).sum(axis=2)[inside]) ** 2, axis=1)))
     whole = float(np.mean([np.mean(np.abs(block.Y) ** 2) for block in lines.held.blocks]))
     return noise / whole, (f"The {guide} repeats every {lag / lines.rate:.4g} s; from one repetition to the next the "
                            f"response scatters by {100 * np.sqrt(noise / whole):.2g} %, which is the measured noise.",)

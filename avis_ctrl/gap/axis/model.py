@@ -2,9 +2,10 @@
 
 With R = M s^2 q + d s q + k q + forces and Z = M s^2 + d s + k + inner dynamics, P the path from force to mass:
 
-    drive:       F = R / P                     oscillator:   q = q_measured + (P F - R)/Z
+    drive:  F = F_measured - (P F - R)/P       oscillator:  q = q_measured + (P F - R)/Z
 
-The second is P F / Z but for what a window spills, which R holds exactly. Both are linear in the forces' coefficients.
+This is R / P and P F / Z but for what a window spills, which P F - R holds exactly. Both are linear in the forces'
+coefficients.
 The linear part of a force, alpha q + beta v at the level of the record, belongs to Z as well: without it the force
 would predict the noise of the very q that it is computed from.
 """
@@ -167,51 +168,53 @@ class MassModel(AxisModel):
 
     lines: Lines
 
-    def _force(self, one: Effect, p: np.ndarray, name: str, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(shapes, n) of an effect on the lines of a block, and their linear parts."""
+    def _force(self, one: Effect, p: np.ndarray, block: SpectralBlock) -> tuple[np.ndarray, np.ndarray]:
+        """(shapes, n, 3) of an effect on the lines of a block, and their linear parts (shapes, n)."""
         by = tuple(map(float, p[len(one.shapes):]))
-        own = np.array([self.lines.pick(self.lines.of(shape, by), name) for shape in one.shapes])
+        own = np.array([self.lines.pick(self.lines.of(shape, by), block.name) for shape in one.shapes])
         if self.lines.solves_for == "force" or one.location == "input":
-            return own, np.zeros_like(own)
-        return own, np.array([alpha + beta * s for alpha, beta in (self.lines.linear_part(shape, by)
-                                                                   for shape in one.shapes)])
+            return own, np.zeros(own.shape[:2])
+        return own, np.array([alpha + 1j * beta * block.omega for alpha, beta in (self.lines.linear_part(shape, by)
+                                                                                  for shape in one.shapes)])
 
     def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
-        name, s, n = block.name, 1j * block.omega, len(self.base)
-        F, q = self.lines.pick(self.lines.F, name), self.lines.pick(self.lines.Q, name)
-        regressors = [self.lines.pick(one, name) for one in (self.lines.A, self.lines.V, self.lines.Q)[:n]]
+        n, s, around = len(self.base), 1j * block.omega, self.lines.around(block.omega)
+        A, V, Q, F = (self.lines.pick(one, block.name) for one in (self.lines.A, self.lines.V, self.lines.Q,
+                                                                   self.lines.F))
+        regressors, several = (A, V, Q)[:n], split(self.values, self.effects, n)
         Z = sum(x * s ** (2 - k) for k, x in enumerate(self.values[:n]))
         R = sum(x * one for x, one in zip(self.values, regressors, strict=False))
-        P, several = np.ones(len(s), complex), split(self.values, self.effects, n)
+        P = np.ones(around.shape, complex)
         for one, p in zip(self.effects, several, strict=True):
             if one.shapes:
-                own, linear = self._force(one, p, name, s)
-                R, Z = R + p[:len(own)] @ own, Z + p[:len(own)] @ linear
+                own, linear = self._force(one, p, block)
+                R, Z = R + np.tensordot(p[:len(own)], own, 1), Z + p[:len(own)] @ linear
             if one.dynamics:
-                added = one.dynamics(s, p)
-                Z, R = Z + added, R + added * q
+                Z, R = Z + one.dynamics(s, p), R + one.dynamics(around, p) * Q
             if one.path:
-                P = P * one.path(s, p)
-        drive, f = self.lines.solves_for == "force", P * F - R
-        Y = R / P if drive else q + f / Z
+                P = P * one.path(around, p)
+        drive, f = self.lines.solves_for == "force", np.sum(P * F - R, axis=1)
+        D = -P[:, 1] if drive else Z
+        Y = (F if drive else Q).sum(axis=1) + f / D
         if not derivative:
             return Answer(Y[:, None, None], np.empty((0, len(s), 1, 1)))
 
         def force(column: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
-            return column / P if drive else -column / Z - f / Z ** 2 * z
+            return -column.sum(axis=1) / D - (0.0 if drive else f / D ** 2 * z)
         dY = [force(one, s ** (2 - k)) for k, one in enumerate(regressors)]
         for one, p in zip(self.effects, several, strict=True):
             c = p[:len(one.shapes)]
             if one.shapes:
-                dY += [force(*both) for both in zip(*self._force(one, p, name, s), strict=True)]
+                dY += [force(*both) for both in zip(*self._force(one, p, block), strict=True)]
             for h in np.diag(p * [q.step for q in one.parameters])[len(c):] if one.shapes else ():
-                up, down = (self._force(one, p + step, name, s) for step in (h, -h))
-                dY.append(force(*(c @ (a - b) / (2 * h.sum()) for a, b in zip(up, down, strict=True))))
-            for slope in slopes(one.dynamics, s, p) if one.dynamics else ():
-                dY.append(force(slope * q, slope))
-            for slope in slopes(one.path, s, p) if one.path else ():
-                own_path = one.path(s, p)  # type: ignore[misc]
-                dY.append(-Y * slope / own_path if drive else P / own_path * slope * F / Z)
+                up, down = (self._force(one, p + step, block) for step in (h, -h))
+                dY.append(force(*(np.tensordot(c, a - b, 1) / (2 * h.sum()) for a, b in zip(up, down, strict=True))))
+            if one.dynamics:
+                dY += [force(slope * Q, z) for slope, z in zip(slopes(one.dynamics, around, p),
+                                                              slopes(one.dynamics, s, p), strict=True)]
+            if one.path:
+                dP = [P / one.path(around, p) * slope for slope in slopes(one.path, around, p)]
+                dY += [np.sum(slope * F, axis=1) / D + (f / D ** 2 * slope[:, 1] if drive else 0.0) for slope in dP]
         return Answer(Y[:, None, None], np.array(dY)[:, :, None, None])
 
 

@@ -5,8 +5,9 @@ from that of the signal itself (M. Shinbrot, NACA TN 3288, 1954),
 
     F{w x'}(omega_k) = sum_l c_l j omega_(k+l) X_(k+l),    c = (-1/4, 1/2, -1/4)
 
-so that M F{w x''} + d F{w x'} + k F{w x} = F{w F} on every line exactly, whatever the state at the ends. Of
-neighbouring lines, whose noise is correlated by 2/3, every other one is taken.
+so that M F{w x''} + d F{w x'} + k F{w x} = F{w F} on every line exactly, whatever the state at the ends. The three
+summands are kept apart: a response (a delay, a sprung mass) acts on each at its own frequency, for on their sum it
+would move the window too. Of neighbouring lines, whose noise is correlated by 2/3, every other one is taken.
 """
 
 from __future__ import annotations
@@ -146,7 +147,7 @@ class Lines:
         self.F = [self.transform(one.force, i) for i, one in enumerate(self.records)]
         self.Q, self.V, self.A = ([self.transform(one.position, i, order) for i, one in enumerate(self.records)]
                                   for order in range(3))
-        self.Y = self.F if solves_for == "force" else self.Q
+        self.Y = [one.sum(axis=2) for one in (self.F if solves_for == "force" else self.Q)]
         self.rows: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self.fitted, self.held = self._data(False), self._data(True)
         self.size = float(np.sqrt(np.mean([np.mean(np.abs(block.Y) ** 2) for block in self.fitted.blocks])))
@@ -175,19 +176,21 @@ class Lines:
                       float(np.sqrt(np.mean(v ** 2))))
 
     def transform(self, x: np.ndarray, record: int, order: int = 0) -> np.ndarray:
-        """(segments, k) of the windowed derivative of a signal at the sample rate, or `oversampled` times it."""
+        """(segments, k, 3) summands of the windowed derivative of a signal at the sample rate, or `oversampled` times
+        it."""
         over = round(len(x) / len(self.records[record].force))
         starts, length = self.starts[record] * over, self.length * over
         X = np.fft.rfft(np.stack([x[a:a + length] for a in starts]), axis=1) / length
-        found = np.zeros((len(starts), len(self.k)), complex)
-        for shift, c in ((-1, -0.25), (0, 0.5), (1, -0.25)):
-            at = self.k + shift
-            line = np.where(at[None] < 0, X[:, np.abs(at)].conj(), X[:, np.abs(at)])
-            found += c * (2j * np.pi * at * self.rate / self.length) ** order * line
-        return found
+        at = self.k[:, None] + np.array([-1, 0, 1])
+        lines = np.where(at < 0, X[:, np.abs(at)].conj(), X[:, np.abs(at)])
+        return np.array([-0.25, 0.5, -0.25]) * (2j * np.pi * at * self.rate / self.length) ** order * lines
+
+    def around(self, omega: np.ndarray) -> np.ndarray:
+        """(n, 3) rad/s, times j, of the summands of lines (n,)."""
+        return 1j * (omega[:, None] + 2 * np.pi * self.rate / self.length * np.array([-1, 0, 1]))
 
     def of(self, shape: Shape, by: tuple[float, ...] = ()) -> list[np.ndarray]:
-        """(segments, k) of a function of the motion, shaped by some parameters, by record; computed once."""
+        """(segments, k, 3) of a function of the motion, shaped by some parameters, by record; computed once."""
         key = id(shape), by
         if key not in self.kept:
             self.kept[key] = shape, [self.transform(np.broadcast_to(shape(m, *by), m.q.shape), i)
@@ -220,7 +223,7 @@ class Lines:
         return np.repeat(record * many + segment, len(self.k)), np.repeat(when, len(self.k))
 
     def pick(self, columns: Sequence[np.ndarray], name: str) -> np.ndarray:
-        """(n,) of a block."""
+        """(n,) or (n, 3) of a block."""
         record, segment = self.rows[name]
         return np.concatenate([columns[i][j] for i, j in zip(record, segment, strict=True)])
 
