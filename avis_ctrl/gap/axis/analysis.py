@@ -76,7 +76,7 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
     explored = Explored(problem.model.lines.fitted, settings)
     progress("base model")
     base = explored.base(problem.model, base_priors(problem.model, problem.positive, settings))
-    best = _first_of_alike(search(base, explored, problem.effects, progress)[-1], explored, problem)
+    best = _first_of_alike(search(base, explored, problem.effects, progress), explored, problem)
     progress("names")
     names, refused = [], []
     while True:

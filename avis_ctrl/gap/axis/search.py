@@ -38,7 +38,7 @@ class Candidate:
 
 @dataclass(eq=False)
 class Explored:
-    """Fits by the set of their effects' labels."""
+    """Fits by the set of their effects' labels; the order in which effects are found has no influence."""
 
     data: Data
     settings: AxisSettings
@@ -126,28 +126,46 @@ def shortlist(found: Sequence[Candidate], left: np.ndarray, settings: AxisSettin
     return [*singles[:settings.refits], *pairs[:settings.pairs]]
 
 
-def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress: Progress) -> list[Fitted]:
-    """Models with more effects each, the first one the base; an effect is added where the evidence rises by more than
-    the number of candidates explains, and dropped where others have made it idle."""
-    settings, steps = explored.settings, [base]
+def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress: Progress) -> Fitted:
+    """The model with effects that the data ask for. An effect is added where the evidence rises by more than the number
+    of candidates explains, and dropped where others have made it idle; where none is left, each is compared with every
+    other in its place, and the search continues if one is better."""
+    settings, now, revisions = explored.settings, base, 0
     effects = [one for one in effects if not one.outside]
     price = settings.certain + math.log(len(effects))
-    while len(steps[-1].labels) < settings.longest:
-        now = steps[-1]
+    while True:
         progress(f"candidates beside {', '.join(now.labels) or 'the base model'}")
-        found = candidates(now, explored.data, effects, settings)
-        tried = []
-        for c in shortlist(found, now.e, settings):
-            one = explored.with_effects(now, c.effects)
-            if one is not None and not at_an_edge(one):
-                tried.append((one.log_evidence - len(c.effects) * price, one))
-        if not tried or max(score for score, _ in tried) <= now.log_evidence:
-            break
-        steps.append(_without_idle(max(tried, key=lambda item: item[0])[1], explored))
-        if any(set(one.labels) == set(steps[-1].labels) for one in steps[:-1]):
-            steps.pop()
-            break
-    return steps
+        tried = [now]
+        if len(now.labels) < settings.longest:
+            for c in shortlist(candidates(now, explored.data, effects, settings), now.e, settings):
+                one = explored.with_effects(now, c.effects)
+                if one is not None and not at_an_edge(one):
+                    tried.append(one)
+        best = max(tried, key=lambda one: one.log_evidence - (len(one.labels) - len(now.labels)) * price)
+        if best is not now:
+            best = _without_idle(_revised(best, explored, effects, laws_only=True), explored)
+        if best is now or best.log_evidence <= now.log_evidence:
+            revisions += 1
+            best = _without_idle(_revised(now, explored, effects, laws_only=False), explored)
+            if revisions > settings.revisions or best.labels == now.labels:
+                return best
+        now = best
+
+
+def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_only: bool) -> Fitted:
+    """Each effect replaced by another law of it, or by any other, where the evidence rises."""
+    settings = explored.settings
+    for label in now.labels:
+        own, rest = next(one for one in now.model.effects if one.label == label), explored.without(now, label)
+        if rest is None:
+            continue
+        laws = [one for one in effects if one.key == own.key]
+        found = candidates(rest, explored.data, laws if laws_only else effects, settings)
+        for c in found[:settings.starts + len(laws)]:
+            one = explored.with_effects(rest, c.effects)
+            if one is not None and not at_an_edge(one) and one.log_evidence > now.log_evidence + settings.settled:
+                now = one
+    return now
 
 
 def _without_idle(now: Fitted, explored: Explored) -> Fitted:
