@@ -120,7 +120,8 @@ def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, setti
             by_key[other.effect.key] = max(by_key.get(other.effect.key, 0.0), other.odds)
     probability = min(1 / (1 + nothing + sum(by_key.values())), settings.most_sure)
     near = tuple(r for r in others if r.same or r.odds * probability > settings.rival)
-    parameters = [f"{p.name}@{one.label}" for p in one.parameters]
+    # What shapes a force is often known from a part of the data alone.
+    parameters = [f"{p.name}@{one.label}" for p in one.parameters if p.linear]
     found = halves(best, parameters, settings, parts(best, parameters))
     return Name(one, probability, near, _refusal(best, rest, one, probability, found, settings),
                 widening(found, settings))

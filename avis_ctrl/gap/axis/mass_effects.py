@@ -154,15 +154,19 @@ def drive_effects(scale: Scale) -> list[Effect]:
     at = partial(_force, location="drive")
     friction = partial(at, "coulomb_friction", "Coulomb friction, a force of constant size against the motion", SLOW,
                        low=0.0, variable="velocity")
+    rounded, creeping = _shape("v_rounded", "{x}/s", scale.speed), _falling(scale.speed, 10)[1::2]
     found = [
         friction(("Fc", "{F}", lambda m: m.sign)),
         # Creeping through rest, where no friction jumps.
         friction(("Fc", "{F}", lambda m, speed: np.tanh(m.v / speed)), law="rounded",
-                 shaped_by=_shape("v_rounded", "{x}/s", scale.speed), seeds=_falling(scale.speed, 10)[1::2]),
+                 shaped_by=rounded, seeds=creeping),
         at("force_offset", "a constant force (weight on an inclined axis, or an offset of the current sensor)",
            RELEASED, ("offset", "{F}", lambda m: np.ones_like(m.v))),
         at("coulomb_asymmetry", "Coulomb friction that differs between the two directions", RELEASED,
            ("Fc_ahead_less_back", "{F}", lambda m: np.abs(m.sign) / 2)),
+        at("coulomb_asymmetry", "Coulomb friction that differs between the two directions", RELEASED,
+           ("Fc_ahead_less_back", "{F}", lambda m, speed: np.abs(np.tanh(m.v / speed)) / 2), law="rounded",
+           shaped_by=rounded, seeds=creeping),
         at("viscous_asymmetry", "viscous friction that differs between the two directions",
            "several constant speeds in each direction",
            ("Fv_ahead_less_back", "{F} s/{x}", lambda m: np.abs(m.v) / 2)),
