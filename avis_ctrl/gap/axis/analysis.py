@@ -78,24 +78,40 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
     base = explored.base(problem.model, base_priors(problem.model, problem.positive, settings))
     best = _first_of_alike(search(base, explored, problem.effects, progress), explored, problem)
     progress("names")
-    names, refused = [], []
+    refused: list[Name] = []
     while True:
-        names = [_name(best, one, explored, problem, settings) for one in best.model.effects]
-        weak = [one for one in names if one.refused]
-        if not weak:
+        names = [_name(best, one, explored, problem, settings) for one in best.model.effects if not one.outside]
+        worst = min((one for one in names if one.refused), key=lambda one: one.probability, default=None)
+        better = None if worst else _better_shape(best, explored, problem, settings)
+        if better is not None:
+            best, variable = better
+            wrong = [one for one in names if one.effect.variable == variable]
+            refused += [replace(one, refused=f"another function of the {variable} leaves far less") for one in wrong]
+        else:
+            wrong = [worst] if worst else []
+            refused += wrong
+        for one in wrong:
+            best = explored.without(best, one.effect.label) or base
+        if not wrong:
             break
-        refused += weak
-        worst = min(weak, key=lambda one: one.probability)
-        rest = explored.without(best, worst.effect.label)
-        if rest is None:
-            break
-        best = rest
     free = unnamed(best, explored, problem.effects)
     told = power(base) - power(best)
-    if best.labels and free is not None and told < settings.right_shape * (power(base) - power(free)):
+    if not names or free is not None and told < settings.right_shape * (power(base) - power(free)):
         refused += [replace(one, refused="a function of another shape takes far more") for one in names]
-        names, best = [], base
+        names, best, free = [], base, unnamed(base, explored, problem.effects)
     return _gap(problem, base, best, free, names, refused, explored, settings)
+
+
+def _better_shape(best: Fitted, explored: Explored, problem: Problem, settings: AxisSettings
+                  ) -> tuple[Fitted, str] | None:
+    """With a free function of what a named force is a function of, where that leaves far less: a neighbour of the truth
+    is not the truth."""
+    known = {one.variable for one in best.model.effects if one.outside}
+    for variable in sorted({one.variable for one in best.model.effects if one.variable} - known):
+        free = unnamed(best, explored, [one for one in problem.effects if one.outside and one.variable == variable])
+        if free is not None and power(free) < (1 - settings.right_shape) * power(best):
+            return free, variable
+    return None
 
 
 def _first_of_alike(best: Fitted, explored: Explored, problem: Problem) -> Fitted:
@@ -113,7 +129,7 @@ def _first_of_alike(best: Fitted, explored: Explored, problem: Problem) -> Fitte
 def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, settings: AxisSettings) -> Name:
     others = rivals(best, one.label, explored, problem.effects)
     rest = explored.without(best, one.label)
-    nothing = 0.0 if rest is None else odds_against_fit(best, rest)
+    nothing = 0.0 if rest is None else odds_against_fit(best, rest, settings)
     by_key: dict[str, float] = {}
     for other in others:
         if not other.same:
@@ -123,13 +139,15 @@ def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, setti
     # What shapes a force is often known from a part of the data alone.
     parameters = [f"{p.name}@{one.label}" for p in one.parameters if p.linear]
     found = halves(best, parameters, settings, parts(best, parameters))
-    return Name(one, probability, near, _refusal(best, rest, one, probability, found, settings),
+    return Name(one, probability, near, _refusal(best, rest, one, probability, found, settings, max(
+        others, key=lambda r: r.odds).effect.name if sum(by_key.values()) > nothing else "nothing"),
                 widening(found, settings))
 
 
-def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float, found, settings: AxisSettings) -> str:
+def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float, found, settings: AxisSettings,
+             rival: str) -> str:
     if probability < settings.headline:
-        return f"another explanation is as probable ({probability:.2f})"
+        return f"{rival} in its place is as probable"
     if edge := at_an_edge(best):
         return edge
     held = best.model.lines.held
@@ -156,28 +174,35 @@ def power(fitted: Fitted | AxisModel, by_line: bool = False) -> Any:
 
 def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, names: Sequence[Name],
          refused: Sequence[Name], explored: Explored, settings: AxisSettings) -> AxisGap:
-    before, after = power(base), power(best)
-    floor = problem.noise if problem.noise is not None else min(after, power(free) if free is not None else after)
+    outside = [one.label for one in best.model.effects if one.outside]
+    whole = power(best)
+    before, after = power(base), whole
+    for label in outside:
+        rest = explored.without(best, label)
+        after = max(after, power(rest) if rest else before)
+    floor = problem.noise if problem.noise is not None else min(whole, power(free) if free is not None else whole)
     excess = max(before - floor, 1e-300)
     left = max(after - floor, 0.0) / excess
-    shares = {one.effect.label: float(np.clip((power(best.model.without(one.effect.label)) - after) / excess, 0.0, 1.0))
+    shares = {one.effect.label: float(np.clip((power(best.model.without(one.effect.label)) - whole) / excess, 0.0, 1.0))
               for one in names}
     covariance = _widened(best, names, shares, left)
     effects = [_reported(one, best, covariance, shares[one.effect.label], problem) for one in names]
     effects.sort(key=lambda one: -(one.share or 0.0))
     told = tuple(one for one in effects if (one.share or 0.0) >= settings.trace)
     traces = tuple(one for one in effects if (one.share or 0.0) < settings.trace)
-    stages = _stages(base, best, [one.label for one in effects], explored, problem)
+    stages = _stages(base, best, [*(one.label for one in effects), *outside], explored, problem)
     closed = after <= settings.within_noise * floor or max(after - floor, 0.0) < settings.small ** 2
     if told:
-        verdict = "explained" if closed or left <= 1 - settings.explained else "partly explained"
+        verdict = "explained" if closed else "partly explained"
     else:
         verdict = "none" if closed else "unexplained"
     base_values = {name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])),
                                   unit.format(**problem.units)) for k, (name, unit) in enumerate(best.model.base)}
     where = _where(best, problem)
     onward = next((one.effect.separated_by for one in names if one.rivals), None)
-    said = _sentences(problem, verdict, told, traces, stages, names, refused, free, settings)
+    unknown = next((one.title for fitted in (best, free) if fitted is not None for one in fitted.model.effects
+                    if one.outside), "")
+    said = _sentences(problem, verdict, told, traces, stages, names, refused, unknown)
     ups = tuple(RunnerUp(r.effect.key, one.effect.key, min(r.odds * one.probability, settings.most_sure))
                 for one in names for r in one.rivals)
     return AxisGap(problem.kind, verdict, told, traces, tuple(stages), where, tuple(said), onward, base_values,
@@ -251,7 +276,8 @@ def _ratios(problem: Problem, best: Fitted, covariance: np.ndarray) -> dict[str,
 def _plain(fitted: Fitted) -> dict[str, Any]:
     model = fitted.model
     return {"base": {name: float(value) for (name, _), value in zip(model.base, model.values, strict=False)},
-            "effects": [{"label": one.label, "values": model.of(one).tolist()} for one in model.effects]}
+            "effects": [{"label": one.label, "values": model.of(one).tolist()} for one in model.effects
+                        if not one.outside]}
 
 
 def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
@@ -291,8 +317,7 @@ def percent(share: float) -> str:
 
 
 def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], traces: Sequence[NamedEffect],
-               stages: Sequence[AxisStage], names: Sequence[Name], refused: Sequence[Name], free: Fitted | None,
-               settings: AxisSettings) -> list[str]:
+               stages: Sequence[AxisStage], names: Sequence[Name], refused: Sequence[Name], unknown: str) -> list[str]:
     first, last = percent(stages[0].nrmse), percent(stages[-1].nrmse)
     if verdict == "none":
         said = [f"Nothing is missing that these data can show: the model leaves {last} of held-out data."]
@@ -301,7 +326,7 @@ def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], trac
                 "accounts for it: unexplained."]
     else:
         said = [f"The model lacks {'; and '.join(one.in_words() for one in told)}; with that the gap on held-out data "
-                f"falls from {first} to {last}."]
+                f"falls from {first} to {last}{', and more is missing' * (verdict != 'explained')}."]
     if traces:
         said.append("Traces, below 1 % of the gap: " + "; ".join(
             f"{one.name} ({', '.join(f'{key} {sized(p)}' for key, p in one.parameters.items())})"
@@ -321,8 +346,7 @@ def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], trac
     else:
         said.append(f"What remains of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured "
                     "noise.")
-    if free is not None:
-        said.append(f"What remains behaves most like {free.model.effects[-1].title}, for which the library has "
-                    "no name.")
-    lost = [f"{one.effect.name} comes near, but {one.refused}" for one in refused]
-    return [*said, *problem.notes, *(f"Not named: {'; '.join(lost)}." for _ in lost[:1])]
+    if unknown:
+        said.append(f"What remains behaves most like {unknown}, for which the library has no name.")
+    lost = {one.effect.name: f"{one.effect.name} comes near, but {one.refused}" for one in refused}
+    return [*said, *problem.notes, *(f"Not named: {'; '.join(lost.values())}." for _ in [lost] if lost)]

@@ -38,8 +38,9 @@ def drive(records: Sequence[Signals], rate: float, cutoff_Hz: float | None = Non
 
     def fitted(some: Sequence[Signals]) -> tuple[float, bool]:
         lines = Lines(some, rate, "force", band, cutoff_Hz, settings)
-        shapes = (lambda m: m.sign, lambda m: np.ones_like(m.v), lambda m: m.q)
-        x, left = _least_squares(_flat(lines.A, lines.V, *map(lines.of, shapes)), *_flat(lines.F))
+        # A spring or a stop acts as a mass of the other sign.
+        places = next(one for one in unnamed_forces(lines) if one.variable == "position").shapes
+        x, left = _least_squares(_flat(lines.A, lines.V, *map(lines.of, (lambda m: m.sign, *places))), *_flat(lines.F))
         return left, bool(x[0] > 0)
     require_oriented(fitted, records, ("force", "position"), settings)
     lines = Lines(records, rate, "force", band, cutoff_Hz, settings)

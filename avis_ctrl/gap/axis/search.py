@@ -19,7 +19,7 @@ from avis_ctrl.gap.axis.model import AxisModel, Effect, effect_priors
 from avis_ctrl.gap.axis.settings import AxisSettings
 from avis_ctrl.gap.probability import odds_against
 from avis_ctrl.gap.score import reduction
-from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit
+from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, unseen
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened
 from avis_ctrl.identification.single_axis.fit import not_below
 
@@ -231,7 +231,7 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
         one = explored.with_effects(rest, c.effects)
         if one is None or at_an_edge(one):
             continue
-        known.append(Rival(effect, one, odds_against_fit(best, one), alike(best, one, settings)))
+        known.append(Rival(effect, one, odds_against_fit(best, one, settings), alike(best, one, settings)))
     return sorted(known, key=lambda r: -r.odds)
 
 
@@ -243,24 +243,28 @@ def alike(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
     return bool(0.5 * left @ left < settings.alike)
 
 
-def odds_against_fit(one: Fitted, other: Fitted) -> float:
-    """Of another fit against one: by evidence, or by how evenly that is spread over segments and octaves, whichever is
-    larger: what is left of a real record is no white noise."""
-    ahead = one.log_evidence - other.log_evidence
-    mine, theirs = cells(one), cells(other)
-    beside = ahead - sum(mine.values()) + sum(theirs.values())
+def odds_against_fit(one: Fitted, other: Fitted, settings: AxisSettings) -> float:
+    """Of another fit against one: by the evidence of what was fitted and the likelihood of what was held out, or by how
+    evenly both are spread over segments and octaves, whichever is larger: what is left of a real record is no white
+    noise."""
+    mine, theirs = cells(one, False, settings), cells(other, False, settings)
+    beside = one.log_evidence - other.log_evidence - sum(mine.values()) + sum(theirs.values())
+    mine, theirs = mine | cells(one, True, settings), theirs | cells(other, True, settings)
+    ahead = sum(mine.values()) - sum(theirs.values()) + beside
     return max(math.exp(-min(max(ahead, -50.0), 50.0)), odds_against(mine, theirs, beside))
 
 
-def cells(fitted: Fitted) -> dict[tuple[int, int], float]:
-    """Log-likelihood by segment and octave."""
-    rows, e2 = row_table(fitted), fitted.e ** 2
-    for one in fitted.weights.paths:
-        e2[one.rows] += fitted.weights.log_determinants[one.group] / len(one.rows)
+def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int, int, bool], float]:
+    """Log-likelihood by segment and octave, of what was fitted or held out."""
+    data = fitted.model.lines.held if held else fitted.model.lines.fitted
+    weights, e = unseen(fitted, data, settings) if held else (fitted.weights, fitted.e)
+    rows, e2 = row_table(fitted, data), e ** 2
+    for one in weights.paths:
+        e2[one.rows] += weights.log_determinants[one.group] / len(one.rows)
     octave = np.floor(np.log2(rows.frequency)).astype(int)
-    found: dict[tuple[int, int], float] = {}
+    found: dict[tuple[int, int, bool], float] = {}
     for segment, band, value in zip(rows.segment, octave, e2, strict=True):
-        found[segment, band] = found.get((segment, band), 0.0) - 0.5 * float(value)
+        found[segment, band, held] = found.get((segment, band, held), 0.0) - 0.5 * float(value)
     return found
 
 
@@ -274,9 +278,9 @@ class Rows:
     level: np.ndarray
 
 
-def row_table(fitted: Fitted) -> Rows:
+def row_table(fitted: Fitted, data: Data) -> Rows:
     columns: list[list[np.ndarray]] = [[], [], [], []]
-    for block, level in zip(fitted.model.lines.fitted.blocks, fitted.model.lines.fitted.levels, strict=True):
+    for block, level in zip(data.blocks, data.levels, strict=True):
         segment, when = fitted.model.lines.of_lines(block.name)
         for column, values in zip(columns, (block.omega, segment, when, np.full(len(when), level)), strict=True):
             column.append(np.tile(np.repeat(values, block.Y.shape[1]), 2))
@@ -285,7 +289,7 @@ def row_table(fitted: Fitted) -> Rows:
 
 def parts(fitted: Fitted, names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
     """Halves of the data by band, time and level, each with half of the information on some parameters."""
-    rows = row_table(fitted)
+    rows = row_table(fitted, fitted.model.lines.fitted)
     information = np.sum(fitted.J[[fitted.priors.names.index(name) for name in names]] ** 2, axis=0)
     found = []
     for values, words in ((rows.frequency, ("the lower part of the band", "the upper part of the band")),
@@ -302,7 +306,7 @@ def parts(fitted: Fitted, names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
 def robust(fitted: Fitted) -> np.ndarray:
     """Covariance of the values of all parameters, with the scores summed over each segment (K. Liang, S. Zeger,
     Biometrika 73 (1986) 13): whatever correlation there is inside a segment counts. Not below that of the fit."""
-    segment, slope = row_table(fitted).segment, fitted.priors.slopes(fitted.z)
+    segment, slope = row_table(fitted, fitted.model.lines.fitted).segment, fitted.priors.slopes(fitted.z)
     groups = np.unique(segment)
     scores = np.array([fitted.J[:, segment == one] @ fitted.e[segment == one] - fitted.z / len(groups)
                        for one in groups])

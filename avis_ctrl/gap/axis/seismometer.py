@@ -114,12 +114,13 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     both = sum(relative.values()) if ratio_variance is None else np.asarray(ratio_variance)
     n -= n % 2
     measured = np.stack([H[0], *([H[1] / H[0]] if len(H) > 1 else [])], axis=1)[:n]
-    noise = np.stack([relative[names[0]] + h ** 2, *([both] if len(H) > 1 else [])], axis=1)[:n] / 2
-    noise = np.repeat(np.maximum(noise[::2] + noise[1::2], settings.floor ** 2), 2, axis=1)
+    measured_noise, noise = (np.repeat(np.maximum(one[::2] + one[1::2], settings.floor ** 2), 2, axis=1)
+                             for one in (np.stack([relative[names[0]] + harmonic, *([both] if len(H) > 1 else [])],
+                                                  axis=1)[:n] / 2 for harmonic in (0.0, h ** 2)))
     # A mass that is not linear scatters by as much as its harmonics carry, beside what is alike at all frequencies.
     spread = np.sqrt(1 + (h[:n] / max(float(np.median(h)), 1e-12)) ** 2)
     spread = np.sqrt(spread[::2] * spread[1::2])
-    noise = noise / spread[:, None] ** 2
+    measured_noise, noise = measured_noise / spread[:, None] ** 2, noise / spread[:, None] ** 2
     pairs, rows, data = np.arange(n // 2), {}, {}
     inner = (pairs % 3 == 1) & (pairs < n // 2 - 1)  # the ends, where effects show most, are fitted
     for name, inside in (("fitted", ~inner), ("held out", inner)):
@@ -138,7 +139,7 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     outputs = " and ".join(names)
     power = float(np.sum(np.abs(data["held out"].blocks[0].Y) ** 2))
     return Problem("seismometer", model, positive, sensor_effects(f, names),
-                   float(np.sum(noise[rows["held out"]])) / power,
+                   float(np.sum(measured_noise[rows["held out"]])) / power,
                    {"F": "", "x": "", "input": "drive", "output": outputs}, notes=notes)
 
 
