@@ -81,8 +81,10 @@ class ModeModel(AxisModel):
         return Answer(Y[:, None, None], np.array(dY).reshape(len(dY), len(Y), 1, 1))
 
 
-def level_effects() -> list[Effect]:
-    """What a level may do to a mode. Values are of the higher level less the lower, over the stiffness."""
+def level_effects(scatters: bool) -> list[Effect]:
+    """What a level may do to a mode. Values are of the higher level less the lower, over the stiffness. scatters : the
+    response scatters from one realisation to the next as much as a static law of the drive makes it; a gain that
+    follows the level does not."""
     sweep = "a sine swept slowly up and down about the mode at several levels"
     return [
         Effect("hysteresis", "mode", "hysteresis, which softens the mode and adds loss as the level rises",
@@ -96,9 +98,13 @@ def level_effects() -> list[Effect]:
             Parameter("damping_ratio_lost", "1", 0.0),), sweep, dynamics=lambda s, p: -2 * p[0] * s),
         Effect("quadratic_damping", "mode", "a damping that grows with the level", (
             Parameter("damping_ratio_gained", "1", 0.0),), sweep, dynamics=lambda s, p: 2 * p[0] * s),
-        Effect("gain_nonlinearity", "drive", "a gain of the drive or the sensor that depends on the level", (
-            Parameter("gain_change", "1"),), "the response far from every mode at several levels",
-            path=lambda s, p: 1 + p[0] * np.ones_like(s)),
+        Effect("saturation" if scatters else "gain_by_level", "drive", "a drive or a sensor that saturates" if scatters
+               else "a gain of the drive or the sensor that falls with the level", (Parameter("gain_lost", "1", 0.0),),
+               "the response far from every mode at several levels", path=lambda s, p: 1 - p[0] * np.ones_like(s)),
+        Effect("dead_zone" if scatters else "gain_by_level", "drive", "a drive or a sensor with a dead zone" if scatters
+               else "a gain of the drive or the sensor that rises with the level",
+               (Parameter("gain_gained", "1", 0.0),), "the response far from every mode at several levels",
+               law="" if scatters else "rising", path=lambda s, p: 1 + p[0] * np.ones_like(s)),
         Effect("drive_hysteresis", "drive", "hysteresis of the drive (piezo), whose gain and lag grow with the level", (
             Parameter("gain_gained", "1", 0.0),), "the drive's loop of input and output at low frequency",
             path=lambda s, p: 1 + p[0] * (1 - 1j * RAYLEIGH) * np.ones_like(s)),
@@ -135,7 +141,7 @@ def levels(campaign: Campaign, band_Hz: tuple[float, float] | None = None, trans
     change = high.value - low.value
     size = np.sqrt(np.mean(np.abs(low.value) ** 2, axis=0))
     variance = np.maximum(low.variance() + high.variance(), 1e-12 * size ** 2)
-    mode, mode_words = _mode(low, high, band_Hz)
+    mode, mode_words = _mode(low, high, band_Hz, settings)
     half = max(8 * mode[1] * mode[0], 20 * float(np.median(np.diff(low.frequency_Hz))))
     band = (mode[0] - half, mode[0] + half) if band_Hz is None else band_Hz
     use = (low.frequency_Hz >= band[0]) & (low.frequency_Hz <= band[1])
@@ -161,9 +167,10 @@ def _common(a: FrequencyResponse, b: FrequencyResponse) -> tuple[FrequencyRespon
     return tuple(r.at(np.isin(np.round(r.frequency_Hz, 6), both)) for r in (a, b))  # type: ignore[return-value]
 
 
-def _mode(low: FrequencyResponse, high: FrequencyResponse, band: tuple[float, float] | None
+def _mode(low: FrequencyResponse, high: FrequencyResponse, band: tuple[float, float] | None, settings: AxisSettings
           ) -> tuple[tuple[float, float], tuple[str, ...]]:
-    """Frequency [Hz] and damping of the mode of the lower level that moves most, in words too."""
+    """Frequency [Hz] and damping of the mode of the lower level about which the responses change most, in words too.
+    A mode of another shape is another mode, and has not moved."""
     f = low.frequency_Hz
     loud = 20 * np.log10(np.maximum(np.sqrt(np.sum(np.abs(high.value) ** 2, axis=(1, 2))), 1e-300))
     smooth = signal.savgol_filter(loud, 5, 2)
@@ -178,14 +185,16 @@ def _mode(low: FrequencyResponse, high: FrequencyResponse, band: tuple[float, fl
             a, b = resonance(low, float(f[peak])), resonance(high, float(f[peak]))
         except AvisError:
             continue  # no single mode there
+        alike = abs(np.vdot(a.residue, b.residue)) / (np.linalg.norm(a.residue) * np.linalg.norm(b.residue))
         moved = abs(b.frequency_Hz - a.frequency_Hz) / max(np.hypot(a.frequency_std_Hz, b.frequency_std_Hz), 1e-300)
-        found.append((moved, a, b))
+        found.append((moved if alike ** 2 >= settings.same_shape else 0.0, a, b))
     if not found:
         raise InputError("expected a mode that stands out; give a band around one", field="band_Hz", value=band)
     words = [f"{a.frequency_Hz:.5g} +- {a.frequency_std_Hz:.2g} Hz to {b.frequency_Hz:.5g} +- "
              f"{b.frequency_std_Hz:.2g} Hz ({100 * (b.frequency_Hz / a.frequency_Hz - 1):+.2g} %)"
              for moved, a, b in sorted(found, key=lambda one: one[1].frequency_Hz) if moved > 4]
-    best = max(found, key=lambda one: (one[0] > 4, abs(np.log(one[2].frequency_Hz / one[1].frequency_Hz))))[1]
+    change = np.sum(np.abs((high.value - low.value) / np.sqrt(np.mean(np.abs(low.value) ** 2, axis=0))) ** 2, axis=(1, 2))
+    best = max((a for _, a, _ in found), key=lambda a: change[np.abs(f / a.frequency_Hz - 1) < 2 * a.damping].sum())
     return (best.frequency_Hz, best.damping), (f"Modes move with the level: {'; '.join(words)}.",) if words else ()
 
 
@@ -206,6 +215,9 @@ def _problem(low: FrequencyResponse, high: FrequencyResponse, i: int, j: int, mo
                                              ).with_noise(variance[at][:, None, None]))
             if out:
                 noise.append(variance[at])
+    change = float(np.sqrt(np.mean(np.abs(high.value[:, i, j] - low.value[:, i, j]) ** 2)))
+    # Of one realisation: the response is a mean of as many as there are experiments for each input.
+    scatter = float(np.sqrt(np.mean(np.maximum(high.variance("distortion")[:, i, j], 0.0)) * high.dof / n))
     data = {out: Data(tuple(several), (1.0, 2.0)) for out, several in blocks.items()}
     middle = float(np.sqrt(omega[0] * omega[-1]))
     lines = TwoLevels(data[False], data[True], ("fitted high", "held out high"), middle, size, settings)
@@ -221,7 +233,7 @@ def _problem(low: FrequencyResponse, high: FrequencyResponse, i: int, j: int, mo
     def ratios(v: Mapping[str, float]) -> dict[str, tuple[float, str]]:
         lost = v.get("stiffness_lost", -v.get("stiffness_gained", 0.0))
         return {"change of the mode's frequency": (100 * (np.sqrt(max(1 - lost, 0.0)) - 1), "%")} if lost else {}
-    return Problem("levels", ModeModel(lines, base, (), start), (True, True, *(False,) * 6), level_effects(),
+    return Problem("levels", ModeModel(lines, base, (), start), (True, True, *(False,) * 6), level_effects(scatter > settings.static * change),
                    float(np.mean(noise)) / whole, ratios=ratios)
 
 

@@ -223,7 +223,7 @@ def _wave(function: Callable[[np.ndarray], np.ndarray], m: Motion, n: float) -> 
 def _pitches(lines: Lines, few: int = 2) -> list[float]:
     """Periods a unit of position at which what friction and inertia leave is strongest, in the time domain."""
     m, one = lines.motion[0], lines.records[0]
-    step = lines.settings.oversampled * max(1, len(one.force) // 20_000)
+    step = lines.over * max(1, len(one.force) // 20_000)
     q, v = m.q[::step], m.v[::step]
     X = np.column_stack([np.ones_like(q), v, np.sign(v), np.gradient(v), q - m.middle])
     left = m.u[::step] - X @ np.linalg.lstsq(X, m.u[::step], rcond=None)[0]

@@ -40,7 +40,7 @@ class Signals:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Signals of a record at `oversampled` times its sample rate: q, v, and u; middle and r.m.s. of q, r.m.s. of v."""
+    """Signals of a record at a finer sample rate: q, v, and u; middle and r.m.s. of q, r.m.s. of v."""
 
     q: np.ndarray
     v: np.ndarray
@@ -109,7 +109,8 @@ class Lines:
     Attributes
     ----------
     s : (k,) rad/s, times j. fitted, held : data for the likelihood; the blocks' U hold nothing, the model keeps its own
-    inputs by the name of a block. rows : by block, record and segment of each of its lines.
+    inputs by the name of a block. rows : by block, record and segment of each of its lines. over : samples of the
+    motion for each measured one.
 
     Raises
     ------
@@ -141,6 +142,8 @@ class Lines:
             starts, held = self._segments(len(one.force), number if whole else None)
             self.starts.append(starts)
             self.held_out.append(held)
+        top = min(band_Hz[1], 0.45 * rate)
+        self.over = max(2, int(np.ceil(2 * settings.oversampled * top / rate)))
         self.motion = [self._motion(one) for one in self.records]
         self.kept: dict[tuple, tuple[Shape, list[np.ndarray]]] = {}
         self.linear: dict[tuple, tuple[Shape, tuple[float, float]]] = {}
@@ -164,7 +167,7 @@ class Lines:
         return np.array(begins)[keep], np.array(held)[keep]
 
     def _motion(self, one: Signals) -> Motion:
-        over = self.settings.oversampled
+        over = self.over
 
         def smooth(x: np.ndarray) -> np.ndarray:
             if self.smooth_Hz is None or self.smooth_Hz >= 0.49 * self.rate:
@@ -176,8 +179,8 @@ class Lines:
                       float(np.sqrt(np.mean(v ** 2))))
 
     def transform(self, x: np.ndarray, record: int, order: int = 0) -> np.ndarray:
-        """(segments, k, 3) summands of the windowed derivative of a signal at the sample rate, or `oversampled` times
-        it."""
+        """(segments, k, 3) summands of the windowed derivative of a signal at the sample rate, or at the finer one
+        of the motion."""
         over = round(len(x) / len(self.records[record].force))
         starts, length = self.starts[record] * over, self.length * over
         X = np.fft.rfft(np.stack([x[a:a + length] for a in starts]), axis=1) / length

@@ -161,7 +161,10 @@ def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_on
             continue
         laws = [one for one in effects if one.key == own.key]
         found = candidates(rest, explored.data, laws if laws_only else effects, settings)
+        least = 0.5 * settings.not_far_behind * max(c.fall for c in found if c.effects[0][0].key == own.key)
         for c in found[:settings.starts + len(laws)]:
+            if c.fall < least:
+                break
             one = explored.with_effects(rest, c.effects)
             if one is not None and not at_an_edge(one) and one.log_evidence > now.log_evidence + settings.settled:
                 now = one

@@ -18,7 +18,8 @@ class AxisSettings(GapSettings):
     where
         the force is: with a variance for each band the evidence would give the low ones up as noise.
     floor : noise that nobody can exclude, over the response of a band [1]; 80 dB is what good converters have.
-    oversampled : samples of the motion for each measured one, for functions whose harmonics would fold back.
+    oversampled : sample rate of the motion over twice the end of the band [1], for functions whose harmonics would fold
+        back.
     refits : effects that are refitted at each step of the search, the best by the score test; a fit is short.
     pairs : pairs of effects that are fitted at each step, the best by the score test.
     bumps : splines of a function of unknown shape; as many as tell a stop from a cubic spring.
@@ -32,6 +33,11 @@ class AxisSettings(GapSettings):
     right_shape : part of what a free function takes off the power that named effects must take [1]; with less, more
     than
         half of the r.m.s. stays: they are neighbours of the truth.
+    same_shape : modal assurance criterion above which two modes are one [1] (R. Allemang, D. Brown, 1982; usual
+        practice).
+    static : scatter of a response between realisations over its change with the level, from which the change is that of
+        a static law [1]; a cubic one has 0.8 of it, spread over the band and its harmonics, a gain that is set by the
+        level none.
     frequencies : of a stepped sine that a search needs.
     least_angle : travel from which a position may be an angle whose sine bends [rad].
     """
@@ -52,6 +58,8 @@ class AxisSettings(GapSettings):
     repeats: float = 1e-3
     alike: float = 1.0
     right_shape: float = 0.75
+    same_shape: float = 0.9
+    static: float = 0.2
     frequencies: int = 8
     least_angle: float = 1.0
 

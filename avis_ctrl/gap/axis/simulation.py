@@ -55,7 +55,7 @@ def _shaped(one: Effect, p: np.ndarray, motion: Motion) -> np.ndarray:
 def _force(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarray]], record: Signals, rate: float,
            cutoff_Hz: float) -> np.ndarray:
     lines = Lines([record], rate, "force", (0.0, cutoff_Hz), cutoff_Hz, SETTINGS)
-    motion, over = lines.motion[0], SETTINGS.oversampled
+    motion, over = lines.motion[0], lines.over
     found = base["M"] * np.gradient(motion.v, 1 / (over * rate)) + base["Fv"] * motion.v
     for one, p in effects:
         found = found + _shaped(one, p, motion)
