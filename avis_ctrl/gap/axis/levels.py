@@ -149,7 +149,8 @@ def levels(campaign: Campaign, band_Hz: tuple[float, float] | None = None, trans
         raise InputError("expected at least 24 lines in the band around a mode", field="band_Hz", value=band)
     ratio = np.mean(np.abs(change[use]) ** 2, axis=0) / np.mean(np.maximum(variance[use], 1e-300), axis=0)
     i, j = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
-    problem = _problem(low.at(use), high.at(use), int(i), int(j), mode, settings)
+    problem = _problem(low.at(use), high.at(use), int(i), int(j), mode,
+                       sum(r.header.level_V == known[-1] for r in campaign.records) / len(high.inputs), settings)
     whole = float(np.sqrt(np.mean(np.abs(change / size) ** 2)))
     over = float(np.sqrt(np.mean(np.abs(change) ** 2 / variance)))
     notes = (f"From {known[0]:g} V to {known[-1]:g} V the responses change by {100 * whole:.3g} % (r.m.s. over all "
@@ -199,7 +200,7 @@ def _mode(low: FrequencyResponse, high: FrequencyResponse, band: tuple[float, fl
 
 
 def _problem(low: FrequencyResponse, high: FrequencyResponse, i: int, j: int, mode: tuple[float, float],
-             settings: AxisSettings) -> Problem:
+             realisations: float, settings: AxisSettings) -> Problem:
     omega, n = 2 * np.pi * low.frequency_Hz, len(low.frequency_Hz)
     size = float(np.sqrt(np.mean(np.abs(low.value[:, i, j]) ** 2)))
     held = np.arange(n) % 3 == 1
@@ -216,8 +217,8 @@ def _problem(low: FrequencyResponse, high: FrequencyResponse, i: int, j: int, mo
             if out:
                 noise.append(variance[at])
     change = float(np.sqrt(np.mean(np.abs(high.value[:, i, j] - low.value[:, i, j]) ** 2)))
-    # Of one realisation: the response is a mean of as many as there are experiments for each input.
-    scatter = float(np.sqrt(np.mean(np.maximum(high.variance("distortion")[:, i, j], 0.0)) * high.dof / n))
+    # Of one realisation: the response is the mean of them.
+    scatter = float(np.sqrt(np.mean(np.maximum(high.variance("distortion")[:, i, j], 0.0)) * realisations))
     data = {out: Data(tuple(several), (1.0, 2.0)) for out, several in blocks.items()}
     middle = float(np.sqrt(omega[0] * omega[-1]))
     lines = TwoLevels(data[False], data[True], ("fitted high", "held out high"), middle, size, settings)

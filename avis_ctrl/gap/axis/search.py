@@ -128,7 +128,7 @@ def shortlist(found: Sequence[Candidate], left: np.ndarray, settings: AxisSettin
 
 def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress: Progress) -> Fitted:
     """The model with effects that the data ask for. An effect is added where the evidence rises by more than the number
-    of candidates explains, and dropped where others have made it idle; where none is left, each is compared with every
+    of candidates explains and held-out data bear it out, and dropped where others have made it idle; where none is left, each is compared with every
     other in its place, and the search continues if one is better."""
     settings, now, revisions = explored.settings, base, 0
     effects = [one for one in effects if not one.outside]
@@ -144,12 +144,17 @@ def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress
         best = max(tried, key=lambda one: one.log_evidence - (len(one.labels) - len(now.labels)) * price)
         if best is not now:
             best = _without_idle(_revised(best, explored, effects, laws_only=True), explored)
-        if best is now or best.log_evidence <= now.log_evidence:
+        if best is now or best.log_evidence <= now.log_evidence or not _borne_out(best, now, settings):
             revisions += 1
             best = _without_idle(_revised(now, explored, effects, laws_only=False), explored)
             if revisions > settings.revisions or best.labels == now.labels:
                 return best
         now = best
+
+
+def _borne_out(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
+    """Whether held-out data are more probable by one model than by another."""
+    return sum(cells(one, True, settings).values()) > sum(cells(other, True, settings).values())
 
 
 def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_only: bool) -> Fitted:
