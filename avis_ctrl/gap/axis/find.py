@@ -23,6 +23,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.axis.analysis import Problem, analyse
 from avis_ctrl.gap.axis.levels import levels, read_levels
 from avis_ctrl.gap.axis.mass import drive, oscillator, position_of
+from avis_ctrl.gap.axis.model import Effect
 from avis_ctrl.gap.axis.records import Signals
 from avis_ctrl.gap.axis.result import AxisGap
 from avis_ctrl.gap.axis.search import Progress
@@ -37,17 +38,18 @@ PROBLEMS: dict[str, Callable[..., Problem]] = {"drive": drive, "oscillator": osc
 UNITS = {"force": "N", "position": "m", "drive": "N", "coil": "V", "displacement": "m"}
 
 
-def find_axis_gap(kind: str, *, progress: Progress | None = None, **data: Any) -> AxisGap:
+def find_axis_gap(kind: str, *, own: Sequence[Effect] = (), progress: Progress | None = None, **data: Any) -> AxisGap:
     """What a model of one axis lacks, with a probability, or that nothing of the library explains it.
 
     Parameters
     ----------
     kind : "drive", "oscillator", "seismometer", or "levels": a mode at several levels. data : of `mass.drive`,
-    `mass.oscillator`, `seismometer.seismometer`, `levels.levels`.
+    `mass.oscillator`, `seismometer.seismometer`, `levels.levels`. own : effects of the user's own, beside those of the
+    library.
 
     Raises
     ------
-    InputError : an unknown kind, missing or unknown data, arrays that do not fit. ComputationError : data that no model
+    InputError : an unknown kind, an own effect without words or with a name and place of the library, missing or unknown data, arrays that do not fit. ComputationError : data that no model
     of this kind fits.
     """
     if kind not in PROBLEMS:
@@ -59,7 +61,14 @@ def find_axis_gap(kind: str, *, progress: Progress | None = None, **data: Any) -
                          value=sorted(data))
     begun, told = time.perf_counter(), progress or (lambda text: None)
     told("reading and windows")
-    found = analyse(PROBLEMS[kind](**data), told)
+    problem = PROBLEMS[kind](**data)
+    taken = {one.label for one in problem.effects}
+    for one in own:
+        if not (one.name and one.location and one.title and one.parameters) or one.label in taken:
+            raise InputError("expected an effect with name, location, title and parameters, and a name and place that "
+                             "no other has", field="own", value=one.label)
+        taken.add(one.label)
+    found = analyse(replace(problem, effects=[*own, *problem.effects]), told)
     return replace(found, seconds=time.perf_counter() - begun)
 
 

@@ -33,6 +33,10 @@ def predicted(model: Mapping[str, Any], which: str, record: Signals, rate: float
                          field="kind", value=kind)
     scale = Scale(**{**model["scale"], "pitches": tuple(model["scale"]["pitches"])})
     library = {one.label: one for one in (drive_effects if kind == "drive" else oscillator_effects)(scale)}
+    strange = [one["label"] for one in own["effects"] if one["label"] not in library]
+    if strange:
+        raise InputError("expected effects of the library: an effect of the user's own is not in the model file",
+                         field="effects", value=strange)
     effects = [(library[one["label"]], np.array(one["values"])) for one in own["effects"]]
     if kind == "drive":
         return _force(own["base"], effects, record, rate, float(model["cutoff_Hz"]))
