@@ -18,6 +18,7 @@ from avis_ctrl.gap.axis.search import (
     Progress,
     Rival,
     at_an_edge,
+    borne_out,
     odds_against_fit,
     parts,
     rivals,
@@ -29,7 +30,7 @@ from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.result import NamedEffect, sized
 from avis_ctrl.gap.validation import halves, widening
-from avis_ctrl.identification.likelihood import Fitted, log_likelihoods
+from avis_ctrl.identification.likelihood import Fitted
 from avis_ctrl.measurement.gates.finding import Picture, Series
 
 Ratios = Callable[[Mapping[str, float]], Mapping[str, tuple[float, str]]]
@@ -150,9 +151,7 @@ def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float,
         return f"{rival} in its place is as probable"
     if edge := at_an_edge(best):
         return edge
-    held = best.model.lines.held
-    if rest is not None and sum(log_likelihoods(best, held, settings).values()) <= sum(
-            log_likelihoods(rest, held, settings).values()):
+    if rest is not None and not borne_out(best, rest, settings):
         return "held-out data do not bear it out"
     for half in found:
         if half.p_value < settings.law_p_value and half.change > settings.law_change:

@@ -29,7 +29,7 @@ def drive(records: Sequence[Signals], rate: float, cutoff_Hz: float | None = Non
     ------
     InputError : shapes, a record too short, an axis at rest, exchanged columns, a flipped sign.
     """
-    _check(records, ("force", "position"))
+    _check(records, rate, ("force", "position"))
     high = coherent_to(records[0], rate, settings) if band_Hz is None else band_Hz[1]
     cutoff_Hz = high if cutoff_Hz is None else cutoff_Hz
     if not 0 < cutoff_Hz < rate / 2:
@@ -64,7 +64,7 @@ def oscillator(records: Sequence[Signals], rate: float, band_Hz: tuple[float, fl
     InputError : shapes, band, a record too short, exchanged columns, a flipped sign. ComputationError : no oscillator
     fits.
     """
-    _check(records, ("u", "y"))
+    _check(records, rate, ("u", "y"))
     band = (0.005 * rate, 0.4 * rate) if band_Hz is None else band_Hz
     if not 0 <= band[0] < band[1] < rate / 2:
         raise InputError(f"expected low < high between 0 and {rate / 2:g} Hz", field="band_Hz", value=band)
@@ -139,14 +139,16 @@ def require_oriented(fitted, records: Sequence[Signals], names: tuple[str, str],
     if positive and left < settings.no_model:
         return
     turned, sensible = fitted([Signals(one.name, -one.force, one.position) for one in records])
-    if sensible and turned < settings.no_model:
+    turned = turned if sensible else np.inf
+    swapped, sensible = fitted([Signals(one.name, one.position, one.force) for one in records])
+    swapped = swapped if sensible else np.inf
+    if swapped < min(turned, settings.no_model, settings.much_better * left):
+        raise InputError(f"the model leaves {100 * left:.3g} % of these columns and {100 * swapped:.2g} % with input "
+                         "and output exchanged: the columns look exchanged", field=field)
+    if turned < settings.no_model:
         raise InputError("expected a positive mass: with the input's sign turned the model fits "
                          f"({100 * turned:.2g} % are left), so that the sign of one column looks flipped; give it a "
                          "scale of -1", field=field)
-    swapped, sensible = fitted([Signals(one.name, one.position, one.force) for one in records])
-    if sensible and swapped < settings.much_better * min(left, 1.0) and swapped < settings.no_model:
-        raise InputError(f"the model leaves {100 * left:.3g} % of these columns and {100 * swapped:.2g} % with input "
-                         "and output exchanged: the columns look exchanged", field=field)
 
 
 def coherent_to(one: Signals, rate: float, settings: AxisSettings) -> float:
@@ -205,10 +207,13 @@ def position_of(x: np.ndarray, rate: float, output: str, low_Hz: float) -> np.nd
     return np.fft.irfft(X * smooth / s ** order[output], 2 * n)[:n]
 
 
-def _check(records: Sequence[Signals], names: tuple[str, str]) -> None:
+def _check(records: Sequence[Signals], rate: float, names: tuple[str, str]) -> None:
+    if not records or not (np.isfinite(rate) and rate > 0):
+        raise InputError("expected at least one record and a sample rate above zero", field="records, rate", value=rate)
     for one in records:
         for name, x in zip(names, (one.force, one.position), strict=True):
             if x.shape != one.force.shape or x.ndim != 1 or not np.all(np.isfinite(x)):
                 raise InputError(f"expected {len(one.force)} finite samples", field=name, value=x.shape)
+        for name, x in zip(names, (one.force, one.position), strict=True):
             if len(x) < 64 or not np.ptp(x) > 1e-9 * max(float(np.max(np.abs(x))), 1e-300):
                 raise InputError("expected at least 64 samples of a signal that changes", field=name, value=len(x))

@@ -144,7 +144,7 @@ def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress
         best = max(tried, key=lambda one: one.log_evidence - (len(one.labels) - len(now.labels)) * price)
         if best is not now:
             best = _without_idle(_revised(best, explored, effects, laws_only=True), explored)
-        if best is now or best.log_evidence <= now.log_evidence or not _borne_out(best, now, settings):
+        if best is now or best.log_evidence <= now.log_evidence or not borne_out(best, now, settings):
             revisions += 1
             best = _without_idle(_revised(now, explored, effects, laws_only=False), explored)
             if revisions > settings.revisions or best.labels == now.labels:
@@ -152,7 +152,7 @@ def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress
         now = best
 
 
-def _borne_out(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
+def borne_out(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
     """Whether held-out data are more probable by one model than by another."""
     return sum(cells(one, True, settings).values()) > sum(cells(other, True, settings).values())
 
@@ -263,17 +263,18 @@ def odds_against_fit(one: Fitted, other: Fitted, settings: AxisSettings) -> floa
 
 
 def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int, int, bool], float]:
-    """Log-likelihood by segment and octave, of what was fitted or held out."""
+    """Log-likelihood of what was fitted, by segment and octave, or of what was held out, by segment, each with a noise
+    level of its own: one disturbance decides nothing."""
     data = fitted.model.lines.held if held else fitted.model.lines.fitted
     weights, e = unseen(fitted, data, settings) if held else (fitted.weights, fitted.e)
-    rows, e2 = row_table(fitted, data), e ** 2
+    rows, determinant = row_table(fitted, data), np.zeros(len(e))
     for one in weights.paths:
-        e2[one.rows] += weights.log_determinants[one.group] / len(one.rows)
-    octave = np.floor(np.log2(rows.frequency)).astype(int)
-    found: dict[tuple[int, int, bool], float] = {}
-    for segment, band, value in zip(rows.segment, octave, e2, strict=True):
-        found[segment, band, held] = found.get((segment, band, held), 0.0) - 0.5 * float(value)
-    return found
+        determinant[one.rows] = weights.log_determinants[one.group] / len(one.rows)
+    octave = 0 * rows.segment if held else np.floor(np.log2(rows.frequency)).astype(int)
+    places, cell = np.unique(np.stack([rows.segment, octave]), axis=1, return_inverse=True)
+    count, e2, rest = (np.bincount(cell.ravel(), x) for x in (np.ones(len(e)), e ** 2, determinant))
+    left = count * np.log(np.maximum(e2 / count, 1e-300)) if held else e2
+    return {(int(i), int(j), held): float(x) for i, j, x in zip(*places, -0.5 * (left + rest), strict=True)}
 
 
 @dataclass(frozen=True, eq=False)
