@@ -33,8 +33,8 @@ def value(effect):
 # --- oscillator
 
 def oscillator(extra, seed, n=24_576, noise=1e-3, drive=lambda u: u):
-    """u and y of y''/w^2 + 2 zeta y'/w + y + extra(y, y') = drive(u), w = 2 pi 60, zeta 5 %, by Runge-Kutta in steps of a
-    sixteenth sample with the band-limited u at every half step; the level swells and falls twice."""
+    """u and y of y''/w^2 + 2 zeta y'/w + y + extra(y, y') = drive(u), w = 2 pi 60, zeta 5 %, by Runge-Kutta in steps of
+    a sixteenth sample with the band-limited u at every half step; the level swells and falls twice."""
     rng, over = np.random.default_rng(seed), 8
     f = np.fft.rfftfreq(n, 1 / RATE)
     U = np.where((f > 1) & (f < 200), np.exp(2j * np.pi * rng.random(len(f))), 0)
@@ -418,7 +418,8 @@ def test_wrong_columns_are_refused(tmp_path, columns, scale, said):
 
 
 @pytest.mark.parametrize("library", [
-    drive_effects(Scale(2.0, 1.0, 1.0, 1.0, 1.0, 60.0, (50.0,))), oscillator_effects(Scale(2.0, 1.0, 1.0, 1.0, 1.0, 60.0)),
+    drive_effects(Scale(2.0, 1.0, 1.0, 1.0, 1.0, 60.0, (50.0,))),
+    oscillator_effects(Scale(2.0, 1.0, 1.0, 1.0, 1.0, 60.0)),
     sensor_effects(np.geomspace(0.1, 10, 12), ("coil", "displacement")), level_effects(True), level_effects(False)],
     ids=["drive", "oscillator", "seismometer", "static law", "level"])
 def test_effects_say_what_they_are(library):

@@ -52,7 +52,8 @@ def test_emps_lacks_coulomb_friction_and_then_its_symmetry(emps):
     # Viscous friction 166.9 ahead and 240.5 back with two Coulomb frictions (tests of identification): -73.6 N s/m.
     assert size(emps, "viscous_asymmetry", "Fv_ahead_less_back")[0] == pytest.approx(-76, abs=6)
     assert emps.parameters["M"].value == pytest.approx(95.109, rel=0.003)  # published
-    assert emps.parameters["Fv"].value == pytest.approx(203.50, rel=0.01)
+    Fv = emps.parameters["Fv"]
+    assert Fv.value == pytest.approx(203.50, rel=0.02) and abs(Fv.value - 203.50) < 2 * Fv.std
 
 
 def test_emps_gap_on_unseen_data(emps):
@@ -126,8 +127,8 @@ def test_silverbox_neither_more_damping_nor_more_order(silverbox_gap):
 def test_silverbox_named_model_simulates_the_other_half(silverbox, silverbox_gap):
     """Independent of the machine: from rest, u alone, Runge-Kutta in time, on a stretch that no fit has seen."""
     p = {name: q.value for name, q in silverbox_gap.parameters.items()}
-    extra = {"k3": 0.0, "k2": 0.0, "d2": 0.0} | {name: q.value for effect in (*silverbox_gap.effects, *silverbox_gap.traces)
-                                                 for name, q in effect.parameters.items()}
+    both = (*silverbox_gap.effects, *silverbox_gap.traces)
+    extra = {"k3": 0.0, "k2": 0.0, "d2": 0.0} | {name: q.value for one in both for name, q in one.parameters.items()}
     part, over = slice(80_000, 84_000), 8
     u, y = silverbox[0][part], silverbox[1][part]
     fine = signal.resample_poly(u, 2 * over, 1, window=("kaiser", 10.0))
@@ -194,7 +195,8 @@ def test_sm3_laser_is_late_by_a_pure_delay(sm3):
 
 def test_sm3_says_what_else_is_wrong(sm3):
     """The mass is nonlinear, so that no fault of a channel explains all; and one record is bad."""
-    assert sm3.verdict == "partly explained" or sm3.stages[-1].nrmse < 0.01
+    # What remains is the mass's: below 1 % of the response, and yet far above the noise.
+    assert sm3.stages[-1].nrmse < 0.01 and sm3.over_noise > 10
     text = " ".join(sm3.sentences)
     assert "Harmonics of the motion" in text and "record 0_2Hz, displacement" in text
 

@@ -97,7 +97,7 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
             break
     free = unnamed(best, explored, problem.effects)
     told = power(base) - power(best)
-    if not names or free is not None and told < settings.right_shape * (power(base) - power(free)):
+    if not names or (free is not None and told < settings.right_shape * (power(base) - power(free))):
         refused += [replace(one, refused="a function of another shape takes far more") for one in names]
         names, best, free = [], base, unnamed(base, explored, problem.effects)
     return _gap(problem, base, best, free, names, refused, explored, settings)
@@ -191,10 +191,7 @@ def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, name
     traces = tuple(one for one in effects if (one.share or 0.0) < settings.trace)
     stages = _stages(base, best, [*(one.label for one in effects), *outside], explored, problem)
     closed = after <= settings.within_noise * floor or max(after - floor, 0.0) < settings.small ** 2
-    if told:
-        verdict = "explained" if closed else "partly explained"
-    else:
-        verdict = "none" if closed else "unexplained"
+    verdict = ("partly explained", "explained")[closed] if told else ("unexplained", "none")[closed]
     base_values = {name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])),
                                   unit.format(**problem.units)) for k, (name, unit) in enumerate(best.model.base)}
     where = _where(best, problem)

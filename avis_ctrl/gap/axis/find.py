@@ -49,8 +49,8 @@ def find_axis_gap(kind: str, *, own: Sequence[Effect] = (), progress: Progress |
 
     Raises
     ------
-    InputError : an unknown kind, an own effect without words or with a name and place of the library, missing or unknown data, arrays that do not fit. ComputationError : data that no model
-    of this kind fits.
+    InputError : an unknown kind, an own effect without words or with a name and place of the library, missing or
+    unknown data, arrays that do not fit. ComputationError : data that no model of this kind fits.
     """
     if kind not in PROBLEMS:
         raise InputError(f"expected one of {', '.join(PROBLEMS)}", field="kind", value=kind)

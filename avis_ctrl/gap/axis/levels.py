@@ -194,7 +194,8 @@ def _mode(low: FrequencyResponse, high: FrequencyResponse, band: tuple[float, fl
     words = [f"{a.frequency_Hz:.5g} +- {a.frequency_std_Hz:.2g} Hz to {b.frequency_Hz:.5g} +- "
              f"{b.frequency_std_Hz:.2g} Hz ({100 * (b.frequency_Hz / a.frequency_Hz - 1):+.2g} %)"
              for moved, a, b in sorted(found, key=lambda one: one[1].frequency_Hz) if moved > 4]
-    change = np.sum(np.abs((high.value - low.value) / np.sqrt(np.mean(np.abs(low.value) ** 2, axis=0))) ** 2, axis=(1, 2))
+    size = np.sqrt(np.mean(np.abs(low.value) ** 2, axis=0))
+    change = np.sum(np.abs((high.value - low.value) / size) ** 2, axis=(1, 2))
     best = max((a for _, a, _ in found), key=lambda a: change[np.abs(f / a.frequency_Hz - 1) < 2 * a.damping].sum())
     return (best.frequency_Hz, best.damping), (f"Modes move with the level: {'; '.join(words)}.",) if words else ()
 
@@ -234,7 +235,8 @@ def _problem(low: FrequencyResponse, high: FrequencyResponse, i: int, j: int, mo
     def ratios(v: Mapping[str, float]) -> dict[str, tuple[float, str]]:
         lost = v.get("stiffness_lost", -v.get("stiffness_gained", 0.0))
         return {"change of the mode's frequency": (100 * (np.sqrt(max(1 - lost, 0.0)) - 1), "%")} if lost else {}
-    return Problem("levels", ModeModel(lines, base, (), start), (True, True, *(False,) * 6), level_effects(scatter > settings.static * change),
+    return Problem("levels", ModeModel(lines, base, (), start), (True, True, *(False,) * 6),
+                   level_effects(scatter > settings.static * change),
                    float(np.mean(noise)) / whole, ratios=ratios)
 
 

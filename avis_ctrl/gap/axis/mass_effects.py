@@ -46,7 +46,7 @@ class Scale:
 
 def _force(name: str, title: str, separated_by: str, *columns: tuple[str, str, Shape], low: float = -np.inf,
            location: str = "", law: str = "", variable: str = "", shaped_by: Parameter | None = None,
-           seeds: Sequence[float] = ()) -> Effect:
+           seeds: Sequence[float] | np.ndarray = ()) -> Effect:
     """A force that is linear in all of its parameters but one, which shapes it and has seeds of its own."""
     linear = tuple(Parameter(symbol, unit, low) for symbol, unit, _ in columns)
     return Effect(name, location, title, linear if shaped_by is None else (*linear, shaped_by), separated_by,

@@ -127,9 +127,12 @@ def shortlist(found: Sequence[Candidate], left: np.ndarray, settings: AxisSettin
 
 
 def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress: Progress) -> Fitted:
-    """The model with effects that the data ask for. An effect is added where the evidence rises by more than the number
-    of candidates explains and held-out data bear it out, and dropped where others have made it idle; where none is left, each is compared with every
-    other in its place, and the search continues if one is better."""
+    """The model with effects that the data ask for.
+
+    An effect is added where the score rises by more than the number of candidates explains and held-out data bear it
+    out, and dropped where others have made it idle. Where none is left, each is compared with every other in its place,
+    and the search continues if one is better.
+    """
     settings, now, revisions = explored.settings, base, 0
     effects = [one for one in effects if not one.outside]
     price = settings.certain + math.log(len(effects))
@@ -141,15 +144,20 @@ def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress
                 one = explored.with_effects(now, c.effects)
                 if one is not None and not at_an_edge(one):
                     tried.append(one)
-        best = max(tried, key=lambda one: one.log_evidence - (len(one.labels) - len(now.labels)) * price)
+        best = max(tried, key=lambda one: score(one, settings) - (len(one.labels) - len(now.labels)) * price)
         if best is not now:
             best = _without_idle(_revised(best, explored, effects, laws_only=True), explored)
-        if best is now or best.log_evidence <= now.log_evidence or not borne_out(best, now, settings):
+        if best is now or score(best, settings) <= score(now, settings) or not borne_out(best, now, settings):
             revisions += 1
             best = _without_idle(_revised(now, explored, effects, laws_only=False), explored)
             if revisions > settings.revisions or best.labels == now.labels:
                 return best
         now = best
+
+
+def score(one: Fitted, settings: AxisSettings) -> float:
+    """Evidence of what was fitted, and log-likelihood of what was held out."""
+    return one.log_evidence + sum(cells(one, True, settings).values())
 
 
 def borne_out(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
@@ -158,7 +166,7 @@ def borne_out(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
 
 
 def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_only: bool) -> Fitted:
-    """Each effect replaced by another law of it, or by any other, where the evidence rises."""
+    """Each effect replaced by another law of it, or by any other, where the score rises."""
     settings = explored.settings
     for label in now.labels:
         own, rest = next(one for one in now.model.effects if one.label == label), explored.without(now, label)
@@ -171,16 +179,18 @@ def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_on
             if c.fall < least:
                 break
             one = explored.with_effects(rest, c.effects)
-            if one is not None and not at_an_edge(one) and one.log_evidence > now.log_evidence + settings.settled:
+            if one is not None and not at_an_edge(one) and score(one, settings) > score(now,
+                                                                                        settings) + settings.settled:
                 now = one
     return now
 
 
 def _without_idle(now: Fitted, explored: Explored) -> Fitted:
+    settings = explored.settings
     while len(now.labels) > 1:
         rest = [one for label in now.labels if (one := explored.without(now, label)) is not None]
-        best = max(rest, key=lambda one: one.log_evidence, default=None)
-        if best is None or best.log_evidence < now.log_evidence - explored.settings.certain:
+        best = max(rest, key=lambda one: score(one, settings), default=None)
+        if best is None or score(best, settings) < score(now, settings) - settings.certain:
             return now
         now = best
     return now
