@@ -76,7 +76,9 @@ def test_emps_first_half_alone_says_the_same(data):
     gap = find_axis_gap("drive", records=[Signals("half", (mat["vir"] * mat["gtau"])[half], mat["qm"][half])],
                         rate=1000.0)
     assert named(gap)[:2] == [("coulomb_friction", "drive"), ("viscous_asymmetry", "drive")]
-    assert size(gap, "coulomb_friction", "Fc")[0] == pytest.approx(20.39, rel=0.05)
+    # Beside Stribeck friction, which a half of the motion does not tell from rounding.
+    Fc, deviation = size(gap, "coulomb_friction", "Fc")
+    assert Fc == pytest.approx(20.39, rel=0.12) and abs(Fc - 20.39) < 2 * deviation
 
 
 @pytest.mark.parametrize("cutoff", [30.0, 100.0, None])

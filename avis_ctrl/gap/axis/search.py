@@ -273,8 +273,8 @@ def odds_against_fit(one: Fitted, other: Fitted, settings: AxisSettings) -> floa
 
 
 def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int, int, bool], float]:
-    """Log-likelihood of what was fitted, by segment and octave, or of what was held out, by segment, each with a noise
-    level of its own: one disturbance decides nothing."""
+    """Log-likelihood of what was fitted, by segment and octave, or of what was held out, by segment, each of which may
+    be louder than what was fitted: one disturbance decides nothing."""
     data = fitted.model.lines.held if held else fitted.model.lines.fitted
     weights, e = unseen(fitted, data, settings) if held else (fitted.weights, fitted.e)
     rows, determinant = row_table(fitted, data), np.zeros(len(e))
@@ -283,7 +283,8 @@ def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int,
     octave = 0 * rows.segment if held else np.floor(np.log2(rows.frequency)).astype(int)
     places, cell = np.unique(np.stack([rows.segment, octave]), axis=1, return_inverse=True)
     count, e2, rest = (np.bincount(cell.ravel(), x) for x in (np.ones(len(e)), e ** 2, determinant))
-    left = count * np.log(np.maximum(e2 / count, 1e-300)) if held else e2
+    louder = np.maximum(e2 / count, 1.0) if held else np.ones(len(e2))
+    left = e2 / louder + count * np.log(louder)
     return {(int(i), int(j), held): float(x) for i, j, x in zip(*places, -0.5 * (left + rest), strict=True)}
 
 

@@ -44,9 +44,8 @@ class Channels:
     settings: AxisSettings
 
     def of_lines(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) number of a pair, the same for all that are held out, which are few; its place in the order of
-        frequencies."""
-        return self.rows[name] * (name == "fitted"), self.rows[name].astype(float)
+        """(n,) number of a pair, and its place in the order of frequencies."""
+        return self.rows[name], self.rows[name].astype(float)
 
 
 @dataclass(frozen=True, eq=False)
