@@ -14,7 +14,7 @@ from avis_ctrl.gap.detection_limits import detection_limits
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
-from avis_ctrl.gap.next_measurement import between, grows, of_unexplained
+from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
 from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_second_order
 from avis_ctrl.gap.probability import odds_against_fit, probability_of
@@ -25,8 +25,8 @@ from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, search, 
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import left_by, levels, named
 from avis_ctrl.gap.table_model import ActiveEffect
-from avis_ctrl.gap.tolerances import of_effect
-from avis_ctrl.gap.validation import Power, halves, share_of, widening
+from avis_ctrl.gap.tolerances import moved, of_effect
+from avis_ctrl.gap.validation import Power, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
@@ -50,13 +50,16 @@ class Fits:
 
 @dataclass(frozen=True, eq=False)
 class Names:
-    """What is named. updated : the model with it. probability, rivals : by label of its effects. refused : why what was
-    found is not named, in sentences."""
+    """What is named.
+
+    updated : the model with it. probability, rivals : by label of its effects. refused : why an effect is not named, by
+    its label.
+    """
 
     updated: Fitted
     probability: dict[str, float]
     rivals: dict[str, tuple[str, ...]]
-    refused: tuple[str, ...] = ()
+    refused: dict[str, str]
 
 
 def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, float] | None = None,
@@ -124,7 +127,7 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
     """What was found and stands: the more probable of its alternatives, of the same size in both halves of band and
     level, and borne out by held-out records."""
     data, held = (prepared.data(blocks, settings.lines) for blocks in (prepared.fitted, prepared.held_out))
-    best, probability, rivals, refused = fits.best, {}, {}, []
+    best, probability, rivals, refused = fits.best, {}, {}, {}
     for step in fits.steps:
         probability[step.label], rivals[step.label] = probability_of(step, settings)
     for step in fits.steps:
@@ -132,12 +135,12 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
         why = _refusal(fits.best, step, label, probability[label], held, settings)
         if why:
             one = next(effect for effect in fits.best.model.effects if effect.label == label)
-            refused.append(f"it behaves most like {one.effect.said(one.place, one.by_name)}, for which the library has "
-                           "no name" if one.effect.outside else
-                           f"{one.effect.name} comes nearest, but {why}: not named")
+            refused[label] = (f"it behaves most like {one.effect.said(one.place, one.by_name)}, for which the library "
+                              "has no name" if one.effect.outside else
+                              f"{one.effect.name} comes nearest, but {why}: not named")
             best = without_effect(best, label, data, settings) or best
     kept = {label: value for label, value in probability.items() if label in best.labels}
-    return Names(best, kept, {label: rivals[label] for label in kept}, tuple(refused))
+    return Names(best, kept, {label: rivals[label] for label in kept}, refused)
 
 
 def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Data, settings: GapSettings) -> str:
@@ -191,9 +194,8 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     traces = tuple(one for one in found if (one.share or 0.0) < settings.trace)
     excess = after.nrmse ** 2 - noise
     records, shares = every_record(prepared, fits.base.model, updated.model, _sensors(faults))
-    growth = grows(records)
     remainder = Remainder(after.nrmse, after.nrmse / max(after.noise_nrmse, 1e-300), power.share(excess),
-                          None if growth is None else bool(growth[0] > 1 + 2 * growth[1]))
+                          grows_faster(records))
     closed = after.chi2_per_dof <= settings.within_noise or excess <= 0
     small = math.sqrt(max(excess, 0.0)) < settings.small
     verdict = _verdict(told, closed, closed or small, remainder, settings)
@@ -206,13 +208,13 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         progress("how large an effect would have had to be to be seen")
         data = prepared.data(prepared.fitted, settings.lines)
         limits = detection_limits(EvidenceScore(fits.tolerant, data, settings), effects)
-    sentences = (_opening(verdict, told, traces, stages, remainder, after), *names.refused,
+    sentences = (_opening(verdict, told, traces, stages, remainder, after), *names.refused.values(),
                  _remains(remainder, remaining), prepared.noise)
     return Gap(verdict, told, tuple(stages), where if verdict != "none" else (), remaining, after.noise_nrmse, onward,
                fits.base.model, updated.model, _considered(fits, names, prepared, settings), heat_map(before, after),
                tuple(one for one in sentences if one), prepared.halves.how, seed, time.monotonic() - began,
-               updated.covariance_of(updated.model.names), limits, shares, records, faults.raised if closed else (),
-               traces, remainder, _moved(updated))
+               updated.whole_covariance(), limits, shares, records, faults.raised if closed else (),
+               traces, remainder, _moved(updated, settings))
 
 
 def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSettings) -> list[tuple[str, Fitted]]:
@@ -241,8 +243,7 @@ def _sensors(faults) -> dict[str, float] | None:
 
 def _named(one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared,
            settings: GapSettings) -> NamedEffect:
-    covariance = widening(halves(updated, _judged(one), settings), settings) ** 2 * updated.covariance_of(one.names)
-    reported = one.effect.reported(updated.model, one.place, one.by_name, covariance)
+    reported = one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names))
     return NamedEffect(one.effect.name, name_of(one.label)[1], one.effect.title, reported,
                        names.probability[one.label], names.rivals[one.label], label=one.label,
                        share=share_of(updated.model, one.label, prepared.held_out, power, with_it))
@@ -262,10 +263,12 @@ def _verdict(told: Sequence[NamedEffect], closed: bool, small: bool, left: Remai
     return "explained" if closed or left.share <= 1 - settings.explained else "partly explained"
 
 
-def _moved(fitted: Fitted) -> tuple[Tolerance, ...]:
+def _moved(fitted: Fitted, settings: GapSettings) -> tuple[Tolerance, ...]:
     """Every value of the rig file with a tolerance, the most moved first."""
-    known = re_identified(fitted.model.rig).names
-    return fitted.moved([name for name in fitted.priors.names if "@" not in name and name not in known])
+    rig = fitted.model.rig
+    known = re_identified(rig).names
+    names = [name for name in fitted.priors.names if "@" not in name and name not in known]
+    return moved(fitted, names, tolerances_of(rig), settings)
 
 
 def _next(told: Sequence[NamedEffect], fits: Fits, names: Names) -> str | None:
@@ -289,7 +292,8 @@ def _considered(fits: Fits, names: Names, prepared: Prepared, settings: GapSetti
             effect = one.model.effects[-1]
             if effect.effect.outside or label in names.updated.labels:
                 continue
-            reason = implausible(one) or (f"step {number}: log evidence {top - one.log_evidence:.3g} behind")
+            reason = names.refused.get(label) or implausible(one) or (
+                f"step {number}: log evidence {top - one.log_evidence:.3g} behind")
             reported = effect.effect.reported(one.model, effect.place, effect.by_name, one.covariance_of(effect.names))
             chi2 = ModelResidual.of(one.model, thin).chi2_per_dof
             rows.append(Considered(effect.effect.name, name_of(label)[1], chi2,

@@ -122,6 +122,15 @@ def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
     return (float(x[-1]), std) if std < SETTINGS.unsure else None
 
 
+def grows_faster(records: Sequence[RecordGap]) -> bool | None:
+    """Whether the residual beyond noise grows faster than the drives; None where the records do not say."""
+    growth = grows(records)
+    if growth is None:
+        return None
+    power, std = growth
+    return True if power - 2 * std > 1 else False if power + 2 * std < 1 + SETTINGS.within else None
+
+
 def _where(places: Sequence[Where]) -> str:
     """Output and band that hold most of the gap, in words; empty where none stands out."""
     if not places:

@@ -57,9 +57,9 @@ class NamedEffect:
     share: float | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """As the contract has it; no standard deviation, null, of a value that the law fixes."""
+        """As the contract has it."""
         return {"name": self.name, "location": self.location,
-                "parameters": {key: {"value": p.value, "std": p.std if np.isfinite(p.std) else None, "unit": p.unit}
+                "parameters": {key: {"value": p.value, "std": p.std, "unit": p.unit}
                                for key, p in self.parameters.items()},
                 "probability": self.probability, "indistinguishable_from": list(self.indistinguishable_from),
                 **({} if self.share is None else {"share": self.share})}
@@ -243,7 +243,7 @@ class Gap:
             "effects": [one.to_json() for one in self.effects],
             "traces": [one.to_json() for one in self.traces],
             "gap": [{"stage": one.name, "nrmse": one.nrmse, "chi2_per_dof": one.chi2_per_dof} for one in self.stages],
-            "where": _places(self.where if self.verdict != "partly explained" else self.remaining),
+            "where": _places(self.remaining if self.verdict != "none" else ()),
             "remaining": None if self.left is None else {
                 "nrmse": self.left.nrmse, "over_noise": self.left.over_noise, "share": self.left.share,
                 "where": _places(self.remaining), "grows_with_level": self.left.grows_with_level},

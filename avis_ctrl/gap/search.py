@@ -25,8 +25,8 @@ from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.starting_values import HasRicherLaws, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
-from avis_ctrl.gap.tolerances import BEYOND, of_effect, tolerances_behind, within_tolerance
-from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit
+from avis_ctrl.gap.tolerances import BEYOND, held, of_effect, released, tolerances_behind, within_tolerance
+from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit, without_path_errors
 from avis_ctrl.identification.priors import Priors, tolerances_of
 
 Progress = Callable[[str], None]
@@ -96,7 +96,7 @@ def richer_laws(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> li
         last = one.model.effects[-1]
         law = last.effect
         if isinstance(law, HasRicherLaws):
-            whole = fit(one.model, one.priors, one.z, data, one.variances, replace(settings, rounds=0, iterations=0))
+            whole = without_path_errors(one, data, settings)
             found += [Candidate(active(last.effect, one.model, place, values), 0.0, 0.0)
                       for place, values in law.richer(EvidenceScore(whole, data, settings), last)]
     return found
@@ -111,7 +111,7 @@ def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSett
     model = fitted.model.with_effect(one)
     own = _priors_of(one, model, settings)
     z = np.concatenate([_without_tolerances_behind(fitted, one), own.z(np.array(one.values))])
-    return _try(fitted, model, fitted.priors.followed_by(own), z, data, settings)
+    return _try(fitted, model, held(fitted.priors, one, settings).followed_by(own), z, data, settings)
 
 
 def _without_tolerances_behind(fitted: Fitted, one: ActiveEffect) -> np.ndarray:
@@ -124,8 +124,10 @@ def _without_tolerances_behind(fitted: Fitted, one: ActiveEffect) -> np.ndarray:
 def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings) -> Fitted | None:
     """The fit with one effect less."""
     model = fitted.model.without(label)
+    one = next(effect for effect in fitted.model.effects if effect.label == label)
     rows = [fitted.priors.names.index(name) for name in model.names]
-    return _try(fitted, model, fitted.priors.of(model.names), fitted.z[rows], data, settings)
+    priors = released(fitted.priors, one, settings)
+    return _try(fitted, model, priors.of(model.names), fitted.z[rows], data, settings)
 
 
 def _with_known(priors: Priors, known) -> Priors:
@@ -216,12 +218,13 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     if rest is None:
         return step
     quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
+    begun = without_path_errors(rest, data, settings)
     known = {name_of(label) for label in best.labels}
     tried = {step.label: best.bare()}
     for label, fitted in step.tried.items():
         if name_of(label) in known:
             continue
-        one = with_effect(rest, fitted.model.effects[-1], data, quick)
+        one = with_effect(begun, fitted.model.effects[-1], data, quick)
         if one is not None:
             tried[label] = one.bare()
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
@@ -229,17 +232,18 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
 
 def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each) -> Step | None:
     """The effect of the largest evidence; None where none beats the present model."""
-    found = candidates(now, data, effects, settings, each)
-    tried = _tried(now, shortlist(found, settings), data, settings, each)
+    begun = without_path_errors(now, data, settings)
+    found = candidates(begun, data, effects, settings, each)
+    tried = _tried(begun, shortlist(found, settings), data, settings, each)
     if not tried:
         return None
     last = tried
     while last:
-        last = _tried(now, richer_laws(list(last.values()), data, settings), data, settings, each)
+        last = _tried(begun, richer_laws(list(last.values()), data, settings), data, settings, each)
         tried |= {label: one for label, one in last.items()
                   if label not in tried or one.log_evidence > tried[label].log_evidence}
     best = max(tried, key=lambda label: tried[label].log_evidence)
-    tried |= _tried(now, other_laws(found, best, tried), data, settings, each)
+    tried |= _tried(begun, other_laws(found, best, tried), data, settings, each)
     best = max(tried, key=lambda label: tried[label].log_evidence)
     start = tried[best]
     if start.log_evidence - now.log_evidence < settings.certain + math.log(len(found)):

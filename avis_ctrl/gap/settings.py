@@ -21,6 +21,7 @@ class GapSettings(FitSettings):
     beyond_tolerance : prior standard deviation of a value that may be beyond its tolerance, in tolerances: as wide as
         faults of wiring, mounting and data sheets are.
     beyond_least : tolerances by which a value must differ from the rig file's to be beyond its tolerance.
+    held : standard deviation, over its tolerance, of a value that is beyond it [1]: the effect alone has it then.
     effect_sizes : prior standard deviation of an effect's strength, in units of its parameter's size; broad, so that it
         costs some nats and bends nothing.
     shape_spread : prior standard deviation of a parameter that shapes an effect (a frequency), relative to its start.
@@ -50,9 +51,6 @@ class GapSettings(FitSettings):
     law_p_value, law_change : an effect is refuted where its parameters from half of the data (by band, by level) differ
         from the whole with a smaller p-value than this [1] and by more than this share [1]; real elements follow their
         textbook law to some per cent only, which no p-value knows.
-    widened_p_value : p-value of the difference between a half and the whole below which standard deviations are widened
-        to cover it [1]: the usual level, for too narrow an interval does more harm than too wide a one. In simulations
-        with errors that are alike over bands and levels, 1e-4 hardly ever widened where it was needed.
     least_difference : of the variance of a difference between a half and the whole over the whole's, below which it is
         round-off [1].
     most_of_half : variance of a half over the whole's, above which that half says nothing of a direction [1].
@@ -71,9 +69,10 @@ class GapSettings(FitSettings):
     turning_percent: float = 50.0
     beyond_tolerance: float = 20.0
     beyond_least: float = 3.0
+    held: float = 1e-3
     effect_sizes: float = 100.0
     shape_spread: float = 1.0
-    resonance_share: float = 0.1
+    resonance_share: float = 0.5
     refits: int = 8
     starts: int = 4
     first_iterations: int = 4
@@ -93,7 +92,6 @@ class GapSettings(FitSettings):
     minor: float = 0.1
     law_p_value: float = 1e-4
     law_change: float = 0.2
-    widened_p_value: float = 0.05
     least_difference: float = 1e-3
     most_of_half: float = 20.0
     within_noise: float = 1.21

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,7 +11,8 @@ from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.effects.payload import PRODUCTS
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.table_model import ActiveEffect
-from avis_ctrl.identification.priors import Priors
+from avis_ctrl.identification.likelihood import Fitted
+from avis_ctrl.identification.priors import Priors, Tolerance
 from avis_ctrl.rigs.instruments import Tolerances
 
 # Effects that are one value of the rig file gone beyond its tolerance, and the tolerance of each of their parameters,
@@ -38,6 +40,38 @@ def tolerances_behind(effect: ActiveEffect, names: Sequence[str]) -> list[int]:
            "product_of_inertia": (PRODUCTS.get(place, ""),), "geophone_corner": (f"corner.{place}", f"damping.{place}")}
     starts = own.get(effect.effect.name)
     return [k for k, name in enumerate(names) if starts and name.startswith(starts)]
+
+
+def held(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Priors:
+    """Priors beside an effect of `BEYOND`, whose value is the effect's alone: the tolerances behind it hardly move."""
+    return priors.scaled(tolerances_behind(effect, priors.names), settings.held)
+
+
+def released(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Priors:
+    """Priors without an effect of `BEYOND`: the inverse of `held`."""
+    return priors.scaled(tolerances_behind(effect, priors.names), 1 / settings.held)
+
+
+def moved(fitted: Fitted, names: Sequence[str], tolerances: Tolerances, settings: GapSettings) -> tuple[Tolerance, ...]:
+    """How far values of the rig file have moved, the furthest first; those beyond their tolerance as their effects have
+    it."""
+    found = {one.parameter: one for one in fitted.moved(names)}
+    for effect in fitted.model.effects:
+        behind = [fitted.priors.names[k] for k in tolerances_behind(effect, fitted.priors.names)]
+        if not behind:
+            continue
+        priors = released(fitted.priors, effect, settings).of(behind)
+        size = tolerance_of(effect, tolerances)
+        std = np.sqrt(np.diag(fitted.covariance_of(effect.names))) / size
+        none = np.array([p.none for p in effect.parameters])
+        away = np.array(effect.values) - none
+        # The logarithm of a positive value is normal.
+        z = np.array([none[k] * np.log1p(away[k] / none[k]) if priors.positive[k] else away[k]
+                      for k in range(len(behind))]) / size
+        values, slopes = priors.values(z), priors.slopes(z)
+        for k, name in enumerate(behind):
+            found[name] = replace(found[name], value=float(values[k]), std=float(std[k] * slopes[k]), moved=float(z[k]))
+    return tuple(sorted(found.values(), key=lambda one: -abs(one.moved)))
 
 
 def within_tolerance(effect: ActiveEffect, tolerances: Tolerances, settings: GapSettings) -> bool:

@@ -86,13 +86,6 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
     return found
 
 
-def widening(found: Sequence[Half], settings: GapSettings) -> float:
-    """Factor on the standard deviations of an effect's parameters, 1 or more: where halves of the data differ by more
-    than noise, its law is not quite that of the real element, and the parameters are known no better than the halves
-    agree (Birge's ratio; R. T. Birge, Phys. Rev. 40 (1932) 207-227)."""
-    return max([1.0, *(float(np.sqrt(one.chi2 / one.dof)) for one in found if one.p_value < settings.widened_p_value)])
-
-
 def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, list[Group]]]:
     """Halves of the groups: by band, each with half of the information on the parameters, and by level."""
     information: dict[Group, float] = {group: float(np.sum(fitted.J[rows][:, at] ** 2))

@@ -25,14 +25,16 @@ class FitSettings:
         mode's flank takes to change by a factor of two.
     least_error : relative error of every path that nobody can exclude [1], the scale of its prior: cables, threads and
         glue change a response by 0.1 % from day to day.
-    error_weight : degrees of freedom of that prior; two, the least with a finite mean of the precision.
+    error_weight : degrees of freedom of the priors of the variances; two, the least with a finite mean of the
+        precision.
     first_error : relative error of the paths in the first fit [1], before any residual is known.
     climbs : steps up the likelihood of the variances in each estimate.
     rounds, settled : most estimates of the variances, each from the fit before it, and rise of the log-likelihood
         [nats] below which they end: well below what decides between two effects.
     iterations : Gauss-Newton steps between two estimates of the variances.
     first_distortion : distortion in the first fit, over the square of `first_error` [1].
-    least_distortion : distortion that nobody can exclude, over the noise [1]; below it an estimate is round-off.
+    least_distortion : distortion that nobody can exclude, over the noise [1], the scale of its prior: the noise's own
+        estimate leaves as much open.
     least_eigenvalue : of the path errors' covariance over that of the noise, below which a direction is left out [1].
     shortest_step : part of a Gauss-Newton step below which no shorter one is tried [1].
     converged : change of the penalised sum of squares, relative to the number of data, below which a fit has converged.

@@ -16,12 +16,23 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.maximum_likelihood import block_residual, transient_unknowns
 from avis_ctrl.identification.priors import Priors, Tolerance
 from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.identification.weights import Group, Variances, Weights, bands, estimated, path_contributions, weigh
+from avis_ctrl.identification.weights import (
+    Group,
+    Variances,
+    Weights,
+    bands,
+    estimated,
+    log_prior,
+    mean_noise,
+    path_contributions,
+    weigh,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +67,8 @@ class Fitted:
 
     model : at the estimate. priors, z (n,), covariance (n, n) of z. variances : of what is not explained.
     log_evidence : Laplace. log_likelihoods : by level and band; what is in the evidence beside their sum is of priors.
-    iterations : Gauss-Newton steps. weights : of the data. white : residual and Jacobian, whitened by noise and
-    distortion; both empty once only the evidence is of interest (`bare`).
+    iterations : Gauss-Newton steps. bands_per_octave : of the groups. weights : of the data. white : residual and
+    Jacobian, whitened by noise and distortion; both empty once only the evidence is of interest (`bare`).
     """
 
     model: Any
@@ -68,12 +79,13 @@ class Fitted:
     log_evidence: float
     log_likelihoods: Mapping[Group, float]
     iterations: int
+    bands_per_octave: int
     weights: Weights
     white: Evaluated
 
     def bare(self) -> Fitted:
         """Without residual, Jacobian and weights, which take most of the memory."""
-        return replace(self, weights=Weights((), (), {}), white=Evaluated(np.empty(0), np.empty((0, 0)), []))
+        return replace(self, weights=Weights((), (), {}, {}), white=Evaluated(np.empty(0), np.empty((0, 0)), []))
 
     @cached_property
     def e(self) -> np.ndarray:
@@ -88,7 +100,7 @@ class Fitted:
     @property
     def rows(self) -> dict[Group, np.ndarray]:
         """Entries of `e` by level and band."""
-        return {one.group: one.rows for one in self.weights.paths}
+        return dict(self.weights.rows)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -98,29 +110,61 @@ class Fitted:
     def moved(self, names: Sequence[str]) -> tuple[Tolerance, ...]:
         """Of values of the rig file that have a tolerance, the most moved first."""
         units = dict(zip(self.model.names, self.model.units, strict=True))
-        values, std = self.priors.values(self.z), np.sqrt(np.diag(self.covariance)) * self.priors.slopes(self.z)
         at = [self.priors.names.index(name) for name in names]
-        rows = [Tolerance(name, float(values[k]), float(std[k]), float(self.z[k]), units[name])
-                for name, k in zip(names, at, strict=True)]
-        return tuple(sorted(rows, key=lambda one: -abs(one.moved)))
+        values, slopes = self.priors.values(self.z), self.priors.slopes(self.z)
+        std = np.sqrt(np.max([one.diagonal() for one in (self.covariance, *self._by_clusters)], axis=0))
+        found = [Tolerance(name, float(values[k]), float(std[k] * slopes[k]), float(self.z[k]), units[name])
+                 for name, k in zip(names, at, strict=True)]
+        return tuple(sorted(found, key=lambda one: -abs(one.moved)))
 
     def covariance_of(self, names: Sequence[str]) -> np.ndarray:
-        """(k, k) of some parameters in their units; zero for those that are not free."""
+        """(k, k) of some parameters in their units; zero for those that are not free.
+
+        In every direction at least what the model says, and what octaves and levels differ by (`clusters`).
+        """
+        free = [k for k, name in enumerate(names) if name in self.priors.names]
+        rows = [self.priors.names.index(names[k]) for k in free]
+        own = self.covariance[np.ix_(rows, rows)]
+        for robust in self._by_clusters if rows else ():
+            own = covering(own, robust[np.ix_(rows, rows)])
+        found, slopes = np.zeros((len(names), len(names))), self.priors.slopes(self.z)[rows]
+        found[np.ix_(free, free)] = own * slopes * slopes[:, None]
+        return found
+
+    def whole_covariance(self) -> np.ndarray:
+        """(n, n) of all parameters in their units: by the model, times what octaves or levels differ by beyond it, in
+        the mean over all directions, for there are fewer octaves and levels than directions."""
+        ratios = [float(np.mean(np.diag(np.linalg.solve(self.covariance, one)))) for one in self._by_clusters]
         slopes = self.priors.slopes(self.z)
-        rows = [self.priors.names.index(name) if name in self.priors.names else -1 for name in names]
-        return np.pad((self.covariance * slopes) * slopes[:, None], (0, 1))[np.ix_(rows, rows)]
+        return np.asarray(max(1.0, *ratios) * self.covariance * slopes * slopes[:, None])
+
+    @cached_property
+    def _by_clusters(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n, n) covariances of z by what octaves and what levels differ by; the model's own for a fit without its
+        residual, or with one cluster."""
+        if not len(self.white.e):
+            return self.covariance, self.covariance
+
+        def robust(parts: Sequence[Sequence[Group]]) -> np.ndarray:
+            rows = [np.concatenate([self.weights.rows[group] for group in part]) for part in parts]
+            if len(rows) == 1:
+                return self.covariance
+            moves = cluster_moves(self.covariance, self.J, self.e, rows)
+            return np.asarray(self.covariance @ self.covariance + moves.T @ moves)
+        by_octave, by_level = clusterings(list(self.weights.rows), self.bands_per_octave)
+        return np.mean([robust(parts) for parts in by_octave], axis=0), robust(by_level)
 
 
 def first_variances(data: Data, settings: FitSettings) -> Variances:
     """Where nothing is known yet: a relative error of every path, and distortion as a part of it."""
-    path: dict[Group, np.ndarray] = {}
+    path: dict[int, np.ndarray] = {}
     distortion: dict[Group, np.ndarray] = {}
     count: dict[Group, int] = {}
     for block, level in zip(data.blocks, data.levels, strict=True):
         own = bands(block.omega, settings.bands_per_octave)
         for band in np.unique(own):
             at, group = own == band, (level, int(band))
-            path[group] = np.full(block.Y.shape[1], settings.first_error ** 2)
+            path[int(band)] = np.full(block.Y.shape[1], settings.first_error ** 2)
             power = settings.first_error ** 2 * np.sum(np.abs(block.Y[at, :, 0]) ** 2, axis=0)
             distortion[group] = distortion.get(group, 0.0) + settings.first_distortion * power
             count[group] = count.get(group, 0) + int(at.sum())
@@ -169,7 +213,7 @@ def _descent(expand: Callable[[np.ndarray], _Expansion], at: _Expansion, iterati
 def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: FitSettings = SETTINGS
         ) -> Fitted:
     """Alternate Gauss-Newton steps in z with estimates of the variances."""
-    steps, before = 0, -np.inf
+    steps, best, noise = 0, None, mean_noise(data.blocks, data.levels, settings)
     model = model.at(priors.values(z))
     for k in range(settings.rounds + 1):
         paths = [path_contributions(model, block) for block in data.blocks]
@@ -181,14 +225,35 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
             return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e))
         at, more = _descent(expand, expand(z), settings.iterations, settings)
         model, z, steps = at.model, at.z, steps + more
-        reached = -0.5 * (at.whole + weights.log_determinant) + _hyper(variances, settings)
-        if k == settings.rounds or reached - before < settings.settled:
+        reached = -0.5 * (at.whole + weights.log_determinant) + log_prior(variances, noise, settings)
+        rise = reached - best[0] if best else np.inf
+        if rise > 0:
+            best = reached, at, weights, variances
+        if k == settings.rounds or rise < settings.settled:
             break
-        before, variances = reached, estimated(at.now.left, data.blocks, data.levels, paths, variances, settings)
-    H = at.H + np.eye(len(z))
-    log_evidence = reached - _price_of_ends(model, data) - 0.5 * np.linalg.slogdet(H)[1]
+        variances = estimated(at.now.left, data.blocks, data.levels, paths, variances, settings)
+    assert best is not None
+    reached, at, weights, variances = best
+    H = at.H + np.eye(len(at.z))
+    log_evidence = reached - _price_of_ends(at.model, data) - 0.5 * np.linalg.slogdet(H)[1]
     by_group = _by_group(weights, weights.flatten(at.now.e[None])[0])
-    return Fitted(model, priors, z, np.linalg.inv(H), variances, float(log_evidence), by_group, steps, weights, at.now)
+    return Fitted(at.model, priors, at.z, np.linalg.inv(H), variances, float(log_evidence), by_group, steps,
+                  settings.bands_per_octave, weights, at.now)
+
+
+def without_path_errors(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> Fitted:
+    """The fit with path errors at the least there are, so that distortion stands for what is not explained.
+
+    Path errors take what is missing from the model out of the residual, and with it what shows where a missing effect
+    lies. Its evidence does not compare with that of other fits.
+    """
+    paths = [path_contributions(fitted.model, block) for block in data.blocks]
+    path = {band: np.full_like(v, settings.least_error ** 2) for band, v in fitted.variances.path.items()}
+    left = fitted.white.left or [block_residual(fitted.model, block, np.sqrt(2) * np.eye(block.Y.shape[1])[None, None],
+                                                derivative=False)[2].error[:, :, 0] for block in data.blocks]
+    variances = estimated(left, data.blocks, data.levels, paths, Variances(path, fitted.variances.distortion), settings,
+                          hold_path=True)
+    return fit(fitted.model, fitted.priors, fitted.z, data, variances, replace(settings, rounds=0))
 
 
 def _price_of_ends(model: Any, data: Data) -> float:
@@ -215,6 +280,11 @@ class Profile:
         rows = np.concatenate([rows, np.broadcast_to(prior, (len(rows), len(self.fitted.z)))], axis=1)
         return rows - (rows @ self.basis.T) @ self.basis
 
+    @cached_property
+    def _white_basis(self) -> np.ndarray:
+        """(N, n) products with `basis` of whitened rows."""
+        return self.fitted.weights.flatten(self.basis[:, :-len(self.fitted.z)]).T.copy()
+
     def fit(self, model: Any, priors: Priors, z: np.ndarray, iterations: int, at: np.ndarray | None = None
             ) -> tuple[np.ndarray, float]:
         """z (k,) of the added parameters, the free ones of `model`, and the gain of log evidence with them.
@@ -229,17 +299,13 @@ class Profile:
         def expand(z: np.ndarray) -> _Expansion:
             moved = model.at(priors.values(z))
             now = _evaluate(moved, priors, z, self.data, weights)
-            J, e = self.free(now.J), self.free(now.e[None], rest)[0]
-            return _Expansion(moved, z, now, J @ J.T, J @ e, float(e @ e))
+            # The products of the rows that `free` would give.
+            H, g, cost = weights.normal_equations(now.J, now.e)
+            A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e):] @ rest
+            return _Expansion(moved, z, now, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
         end, _ = _descent(expand, expand(z), iterations, self.settings)
         gain = 0.5 * (float(self.e @ self.e) - end.whole - np.linalg.slogdet(end.H + np.eye(len(z)))[1])
         return end.z, gain - _price_of_ends(end.model, self.data) + _price_of_ends(self.fitted.model, self.data)
-
-
-def _hyper(variances: Variances, settings: FitSettings) -> float:
-    """Logarithm of the prior of the path variances, but for a constant."""
-    nu, v0 = settings.error_weight, settings.least_error ** 2
-    return sum(float(np.sum(-(nu / 2 + 1) * np.log(v) - nu * v0 / (2 * v))) for v in variances.path.values())
 
 
 def log_likelihoods(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> dict[Group, float]:
@@ -256,8 +322,8 @@ def unseen(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> tupl
 
 
 def _by_group(weights: Weights, flat: np.ndarray) -> dict[Group, float]:
-    return {one.group: -0.5 * float(flat[one.rows] @ flat[one.rows] + weights.log_determinants[one.group])
-            for one in weights.paths}
+    return {group: -0.5 * float(flat[rows] @ flat[rows] + weights.log_determinants[group])
+            for group, rows in weights.rows.items()}
 
 
 def _evaluate(model: Any, priors: Priors, z: np.ndarray, data: Data, weights: Weights, derivative: bool = True

@@ -27,7 +27,8 @@ HALF_WIDTHS = (None, 16, 24, 36)
 class Unexplained(RecordSource):
     """A record with what the model predicts, from rest at the record's start, taken off y.
 
-    Pieces in order cost one run; a piece out of order starts the prediction anew.
+    Pieces in order cost one run; a piece out of order starts the prediction anew. What was loaded last is kept: local
+    models of several widths load every record again.
     """
 
     def __init__(self, record: RecordSource, model: ResponseModel):
@@ -39,9 +40,15 @@ class Unexplained(RecordSource):
             raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
                              field=f"record {h.name}: sample_rate_Hz")
         self.predictor, self.at = Predictor(model, large_motion=True), 0
+        self.last: tuple[int, int, Record] | None = None
 
     def load(self, start: int = 0, stop: int | None = None) -> Record:
         stop = self.header.samples if stop is None else stop
+        if self.last is None or self.last[:2] != (start, stop):
+            self.last = start, stop, self._predicted(start, stop)
+        return self.last[2]
+
+    def _predicted(self, start: int, stop: int) -> Record:
         if start < self.at:
             self.predictor, self.at = Predictor(self.model, large_motion=True), 0
         piece = self.record.load(self.at, stop)

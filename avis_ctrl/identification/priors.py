@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,12 @@ class Priors:
         rows = [self.names.index(name) for name in names]
         return Priors(tuple(names), *(np.broadcast_to(getattr(self, field), len(self.names))[rows]
                                       for field in _FIELDS))
+
+    def scaled(self, rows: Sequence[int], factor: float) -> Priors:
+        """With some standard deviations times a factor."""
+        sigma = self.sigma.copy()
+        sigma[rows] *= factor
+        return replace(self, sigma=sigma)
 
     def slopes(self, z: np.ndarray) -> np.ndarray:
         """(n,) derivative of the values by z."""

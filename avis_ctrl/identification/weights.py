@@ -1,7 +1,8 @@
 """What a residual is held against: noise, distortion, and relative errors of the paths that nobody has named.
 
-On a line the residual of a record has the covariance N + diag(s) of noise and distortion. Beside it every path from an
-input to a sensor may have a relative error, constant over a band and alike in all records of a level:
+On a line the residual of a record has the covariance N + diag(s) of noise and distortion; s is of a level and band.
+Beside it every path from an input to a sensor may have a relative error, constant over a band and the same in all
+records, for what the linear model misses is the same at every level:
 
     e_c(k) = sum_j eps_cjb G_cj(k) u_j(k) + noise,     eps circular normal, E|eps|^2 = v_cb
 
@@ -27,17 +28,24 @@ Group = tuple[float, int]
 
 @dataclass(frozen=True, eq=False)
 class Variances:
-    """By level [V] and band: path (n_y,) relative variances v, distortion (n_y,) variances s [unit of y^2]."""
+    """path : (n_y,) relative variances v by band. distortion : (n_y,) variances s [unit of y^2] by level [V] and band.
+    """
 
-    path: Mapping[Group, np.ndarray]
+    path: Mapping[int, np.ndarray]
     distortion: Mapping[Group, np.ndarray]
 
-    def of(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
-        """v and s (n_y,) of a level and band, or of the nearest that was fitted."""
-        if group not in self.path:
-            level, band = group
-            group = min(self.path, key=lambda g: (abs(np.log(max(g[0], 1e-9) / max(level, 1e-9))), abs(g[1] - band)))
-        return self.path[group], self.distortion[group]
+    def of_path(self, band: int) -> np.ndarray:
+        """v (n_y,) of a band, or of the nearest that was fitted."""
+        if band in self.path:
+            return self.path[band]
+        return self.path[min(self.path, key=lambda one: abs(one - band))]
+
+    def of_distortion(self, level: float, band: int) -> np.ndarray:
+        """s (n_y,) of a level and band, or of the nearest that was fitted."""
+        if (level, band) in self.distortion:
+            return self.distortion[level, band]
+        return self.distortion[min(self.distortion, key=lambda one: (
+            abs(np.log(max(one[0], 1e-9) / max(level, 1e-9))), abs(one[1] - band)))]
 
 
 def bands(omega: np.ndarray, per_octave: int) -> np.ndarray:
@@ -47,9 +55,8 @@ def bands(omega: np.ndarray, per_octave: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class PathError:
-    """Lines of one level and band: rows (m,) of the stacked real residual, and Q (m, r), lambda (r,) of B B^T."""
+    """Lines of one band: rows (m,) of the stacked real residual, and Q (m, r), lambda (r,) of B B^T."""
 
-    group: Group
     rows: np.ndarray
     Q: np.ndarray
     size: np.ndarray
@@ -59,12 +66,14 @@ class PathError:
 class Weights:
     """Whitening of stacked residuals.
 
-    L : (n, n_y, n_y) a block. paths : of every level and band. log_determinants : of the covariance of the real numbers
-    of each.
+    L : (n, n_y, n_y) a block. paths : of every band. rows : of the stacked real residual, by level and band.
+    log_determinants : of the covariance of the real numbers, by level and band; what the path errors of a band add is
+    divided among its levels by their rows.
     """
 
     L: tuple[np.ndarray, ...]
     paths: tuple[PathError, ...]
+    rows: Mapping[Group, np.ndarray]
     log_determinants: Mapping[Group, float]
 
     @property
@@ -105,7 +114,7 @@ def with_distortion(block: SpectralBlock, level: float, variances: Variances, se
     """The block with noise and distortion as its covariance."""
     assert block.noise is not None
     own = bands(block.omega, settings.bands_per_octave)
-    s = np.array([variances.of((level, int(band)))[1] for band in own])
+    s = np.array([variances.of_distortion(level, int(band)) for band in own])
     return block.with_noise(block.noise[:, 0] + s[:, :, None] * np.eye(s.shape[1]))
 
 
@@ -114,7 +123,7 @@ def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Seque
     """Weights of blocks; paths : (n, n_y, n_in) G_cj u_j of each block by the present model."""
     L, start = [], 0
     determinants: dict[Group, float] = {}
-    members: dict[Group, list[tuple[np.ndarray, np.ndarray]]] = {}
+    members: dict[int, list[tuple[Group, np.ndarray, np.ndarray]]] = {}
     for block, level, path in zip(blocks, levels, paths, strict=True):
         n, n_y, n_in = path.shape
         own = bands(block.omega, settings.bands_per_octave)
@@ -135,13 +144,14 @@ def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Seque
             C = (white[at][:, :, :, None] * path[at][:, None, :, :]).reshape(at.sum() * n_y, n_y * n_in)
             rows = np.concatenate([place[at].ravel(), place[at].ravel() + n * n_y])
             real = np.block([[C.real, -C.imag], [C.imag, C.real]])
-            members.setdefault(group, []).append((rows, real))
+            members.setdefault(int(band), []).append((group, rows, real))
     errors = []
-    for group, parts in members.items():
-        v, _ = variances.of(group)
+    by_group: dict[Group, np.ndarray] = {}
+    for band, parts in members.items():
+        v = variances.of_path(band)
         n_y = len(v)
-        n_in = parts[0][1].shape[1] // (2 * n_y)
-        columns = np.concatenate([part[1] for part in parts])
+        n_in = parts[0][2].shape[1] // (2 * n_y)
+        columns = np.concatenate([real for _, _, real in parts])
         sensor = np.tile(np.repeat(np.arange(n_y), n_in), 2)
         used = np.any(columns != 0, axis=0)
         columns, sensor = columns[:, used], sensor[used]
@@ -149,51 +159,82 @@ def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Seque
         values, vectors = np.linalg.eigh(B.T @ B)
         kept = values > settings.least_eigenvalue
         Q = B @ vectors[:, kept] / np.sqrt(values[kept])
-        errors.append(PathError(group, np.concatenate([part[0] for part in parts]), Q, values[kept]))
-        determinants[group] += float(np.sum(np.log1p(values[kept])))
-    return Weights(tuple(L), tuple(errors), determinants)
+        errors.append(PathError(np.concatenate([rows for _, rows, _ in parts]), Q, values[kept]))
+        for group, rows, _ in parts:
+            by_group[group] = np.concatenate([by_group.get(group, np.empty(0, int)), rows])
+            determinants[group] += float(np.sum(np.log1p(values[kept]))) * len(rows) / len(B)
+    return Weights(tuple(L), tuple(errors), by_group, determinants)
+
+
+def mean_noise(blocks: Sequence[SpectralBlock], levels: Sequence[float], settings: FitSettings
+               ) -> dict[Group, np.ndarray]:
+    """(n_y,) mean variance of the noise by level and band."""
+    found: dict[Group, list[np.ndarray]] = {}
+    for block, level in zip(blocks, levels, strict=True):
+        assert block.noise is not None
+        noise, own = np.real(np.einsum("kii->ki", block.noise[:, 0])), bands(block.omega, settings.bands_per_octave)
+        for band in np.unique(own):
+            found.setdefault((level, int(band)), []).append(noise[own == band])
+    return {group: np.concatenate(parts).mean(axis=0) for group, parts in found.items()}
 
 
 def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], levels: Sequence[float],
-              paths: Sequence[np.ndarray], old: Variances, settings: FitSettings) -> Variances:
+              paths: Sequence[np.ndarray], old: Variances, settings: FitSettings, hold_path: bool = False) -> Variances:
     """The most likely variances of path errors and distortion for residuals left (n, n_y) of each block.
 
-    Sensor by sensor, with the mean noise n of a band: with U diag(lambda) U^H = G G^H of the contributions G (m, n_in)
-    of the inputs on its m lines, the rotated residual y = U^H e has independent parts of variance w = n + s + v lambda.
-    The likelihood is climbed by minorisation-maximisation (H. Zhou, L. Hu, J. Zhou, K. Lange, J. Comput. Graph. Stat.
+    hold_path : those of path errors stay as they are.
+
+    Sensor by sensor and band by band, with the mean noise n_l of a level l, the covariance of the residual e is
+    W = D + v G G^H, D = n_l + s_l on the lines of level l, G (m, k) the contributions of the inputs. With
+
+        K = (G^H inv(D) G + I / v)^-1,   x = K G^H inv(D) e    (covariance and mean of the path errors given e)
+
+    the likelihood is climbed by minorisation-maximisation (H. Zhou, L. Hu, J. Zhou, K. Lange, J. Comput. Graph. Stat.
     28 (2019) 350-361),
 
-        v <- v sqrt((sum lambda |y|^2 / w^2 + nu v0 / 2 v^2) / (sum lambda / w + (nu / 2 + 1) / v)),
+        v <- v sqrt((|x|^2 / v^2 + nu v0 / 2 v^2) / ((k - tr K / v) / v + nu / 2 v)),
 
-    and s likewise without a prior.
+    and s_l likewise. Both have priors of the same kind (`log_prior`).
     """
-    members: dict[Group, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
-    for e, block, level, path in zip(left, blocks, levels, paths, strict=True):
-        assert block.noise is not None
-        noise = np.real(np.einsum("kii->ki", block.noise[:, 0]))
+    noise = mean_noise(blocks, levels, settings)
+    row = {band: k for k, band in enumerate(sorted({band for _, band in noise}))}
+    column = {level: k for k, level in enumerate(sorted({level for level, _ in noise}))}
+    n_y, k = paths[0].shape[1:]
+    shape = len(row), len(column), n_y
+    # Sums over the lines of a band and level: G^H G, G^H e, |e|^2, how many; a level without lines in a band adds none.
+    M, p = np.zeros((*shape, k, k), complex), np.zeros((*shape, k), complex)
+    q, lines, n, s = np.zeros(shape), np.zeros((*shape[:2], 1)), np.ones(shape), np.ones(shape)
+    for e, block, level, G in zip(left, blocks, levels, paths, strict=True):
         own = bands(block.omega, settings.bands_per_octave)
         for band in np.unique(own):
-            at = own == band
-            members.setdefault((level, int(band)), []).append((e[at], path[at], noise[at]))
-    path_variance, distortion = {}, {}
-    nu, v0 = settings.error_weight, settings.least_error ** 2
-    for group, parts in members.items():
-        e, G, noise = (np.concatenate([part[k] for part in parts]) for k in range(3))
-        n = noise.mean(axis=0)[:, None]
-        U, sigma, _ = np.linalg.svd(np.swapaxes(G, 0, 1), full_matrices=False)
-        power = np.abs(np.einsum("ymk,my->yk", U.conj(), e)) ** 2
-        # All directions beside those of the contributions are alike: one entry of mean power stands for them.
-        rest = len(e) - sigma.shape[1]
-        beside = np.maximum(np.sum(np.abs(e) ** 2, axis=0) - power.sum(axis=1), 0.0)[:, None] / max(rest, 1)
-        size = np.pad(sigma ** 2, ((0, 0), (0, 1)))
-        power, count = np.hstack([power, beside]), np.r_[np.ones(sigma.shape[1]), rest]
-        v, s = (one[:, None].copy() for one in old.of(group))
-        for _ in range(settings.climbs):
-            w = n + s + v * size
-            rise = np.sum(size * power / w ** 2, axis=1, keepdims=True) + nu * v0 / (2 * v ** 2)
-            v *= np.sqrt(rise / (np.sum(size / w, axis=1, keepdims=True) + (nu / 2 + 1) / v))
-            s *= np.sqrt(np.sum(count * power / w ** 2, axis=1, keepdims=True)
-                         / np.sum(count / w, axis=1, keepdims=True))
-            s = np.maximum(s, settings.least_distortion * n)
-        path_variance[group], distortion[group] = v[:, 0], s[:, 0]
-    return Variances(path_variance, distortion)
+            at, b, c = own == band, row[int(band)], column[level]
+            M[b, c] += np.swapaxes(G[at].conj(), 0, 1).swapaxes(1, 2) @ np.swapaxes(G[at], 0, 1)
+            p[b, c] += np.einsum("mya,my->ya", G[at].conj(), e[at])
+            q[b, c] += np.sum(np.abs(e[at]) ** 2, axis=0)
+            lines[b, c] += at.sum()
+    for (level, band), value in noise.items():
+        n[row[band], column[level]], s[row[band], column[level]] = value, old.of_distortion(level, band)
+    v = np.array([old.of_path(band) for band in row])
+    half, v0, s0 = settings.error_weight / 2, settings.least_error ** 2, settings.least_distortion * n
+    for _ in range(settings.climbs):
+        d = n + s
+        K = np.linalg.inv(np.sum(M / d[..., None, None], axis=1) + np.eye(k) / v[..., None, None])
+        x = (K @ np.sum(p / d[..., None], axis=1)[..., None])[..., 0]
+        Mx = (M @ x[:, None, :, :, None])[..., 0]
+        power = q + np.real(np.sum(x[:, None].conj() * (Mx - 2 * p), axis=-1))
+        known = np.real(np.sum(np.swapaxes(K, -1, -2)[:, None] * M, axis=(-1, -2)))
+        of_v = (np.sum(np.abs(x) ** 2, axis=-1) + half * v0) / v ** 2
+        of_s = power / d ** 2 + half * s0 / s ** 2
+        v = v if hold_path else v * np.sqrt(of_v / ((k - np.real(np.einsum("byaa->by", K)) / v + half) / v))
+        s = s * np.sqrt(of_s / (lines / d - known / d ** 2 + half / s))
+    return Variances({band: v[b] for band, b in row.items()},
+                     {(level, band): s[row[band], column[level]] for level, band in noise})
+
+
+def log_prior(variances: Variances, noise: Mapping[Group, np.ndarray], settings: FitSettings) -> float:
+    """Logarithm of the priors of the variances, but for a constant: flat in the logarithm, falling off exponentially
+    below the least values. noise : (n_y,) mean variance by level and band (`mean_noise`)."""
+    half = settings.error_weight / 2
+    pairs = [(v, np.full(len(v), settings.least_error ** 2)) for v in variances.path.values()]
+    pairs += [(variances.of_distortion(*group), settings.least_distortion * n) for group, n in noise.items()]
+    return sum(float(np.sum(-half * (np.log(value) + least / value))) for value, least in pairs)

@@ -3,7 +3,9 @@
 Only magnitudes matter for scalar scalings, and log sigma_max(D N D^-1) is convex in log |d| with the gradient
 |u_i|^2 - |v_i|^2 of its singular vectors (Sezginer and Overton, IEEE TAC 35, 1990). So after the semidefinite
 fit of single blocks, all parameters are moved together by linear programs in a trust region, on what counts:
-the peak over frequency of the loop scaled by the realised D(s).
+the peak over frequency of the loop scaled by the realised D(s). Repeated blocks take part with the scalar factors
+of their matrices, which grow before these do: the best scalings at one frequency are not unique, and a fit to them,
+block by block, may cost far more than a common one of the same order.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from avis_ctrl.robust.dscale_fit import fit_magnitude
 from avis_ctrl.robust.dscale_matrix import fit_hermitian
 from avis_ctrl.robust.gamma_descent import free_parameters, parameter_box, parameters, with_parameters
 from avis_ctrl.robust.mu_upper import upper_bound
-from avis_ctrl.robust.scalings import MAX_ORDER, MatrixScaling, ScalarScaling, Scalings
+from avis_ctrl.robust.scalings import MAX_ORDER, MatrixScaling, Part, ScalarScaling, Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 # A fit is refined together with the others afterwards: closer than this its own optimum is not worth looking for.
@@ -53,6 +55,10 @@ class PointwiseScalings:
     @property
     def peak(self) -> float:
         return float(np.max(self.mu))
+
+    def shape(self, k: int) -> np.ndarray:
+        """X of a repeated block without its common size |d|^2 (n_omega, n, n)."""
+        return self.X[k] / np.exp(2 * self.log_d[:, k])[:, None, None]
 
     @property
     def yardstick(self) -> np.ndarray:
@@ -132,8 +138,7 @@ def _measured(points: PointwiseScalings, loop: StateSpace, dense: np.ndarray, re
     """The step with peak and cost between the grid's points too, and where (and with which M) it exceeds theirs."""
     step = _evaluated(points, scalings)
     # Lightly damped roots make the narrowest peaks that scalings can add.
-    roots = np.abs(np.concatenate([np.r_[part.zeros, part.poles] for part in scalings.parts
-                                   if isinstance(part, ScalarScaling)]))
+    roots = np.abs(np.concatenate([np.r_[part.scalar.zeros, part.scalar.poles] for part in scalings.parts]))
     omega = np.concatenate([dense, roots])
     order = np.argsort(omega)
     M = np.concatenate([response, loop.frequency_response(roots)])[order]
@@ -173,7 +178,9 @@ def _grown(points: PointwiseScalings, best: DStep, allowed_cost: float, max_stat
         share = _blame(points, best.scalings)
         if not np.any(share > 0):
             break
-        candidates = (_raised(points, best, np.flatnonzero(share >= part * np.max(share)), max_states, by)
+        candidates = (_raised(points, best, np.flatnonzero(share >= part * np.max(share)), max_states, by, matrices)
+                      # Matrices last: most often their factors are enough, and a factor is refined with all the rest.
+                      for matrices in (False, True)
                       # One more order may not pay where two do: a resonance needs a pair of roots.
                       for part, by in ((0.4, 1), (0.4, 2), (0.999, 1), (0.999, 2)))
         better = next((new for new in candidates if new is not None and new.cost < max(0.9 * best.cost, allowed_cost)),
@@ -211,32 +218,48 @@ def _constants(points: PointwiseScalings) -> Scalings:
     parts = list(Scalings.identity(points.structure).parts)
     for k in range(len(parts) - 1):
         if k in points.X:
-            parts[k] = fit_hermitian(points.omega, points.X[k], 0, weight, MATRIX_FIT_TOLERANCE).scaling
-        else:
-            parts[k] = fit_magnitude(points.omega, np.exp(points.log_d[:, k]), 0, weight).scaling
+            parts[k] = fit_hermitian(points.omega, points.shape(k), 0, weight, MATRIX_FIT_TOLERANCE).scaling
+        d = fit_magnitude(points.omega, np.exp(points.log_d[:, k]), 0, weight).scaling
+        parts[k] = parts[k].with_scalar(d)
     return Scalings(points.structure, tuple(parts))
 
 
-def _raised(points: PointwiseScalings, step: DStep, blocks: np.ndarray, max_states: int, by: int) -> DStep | None:
-    """The step with some blocks refitted at a higher order and everything refined; None where they may not grow."""
+def _raised(points: PointwiseScalings, step: DStep, blocks: np.ndarray, max_states: int, by: int,
+            matrices: bool) -> DStep | None:
+    """The step with some blocks refitted at a higher order and everything refined; None where they may not grow.
+
+    matrices : raise the orders of repeated blocks by matrices of that order, instead of by their scalar factors.
+    """
     scalings = step.scalings
+    if matrices and not any(k in points.X for k in blocks):
+        return None
     for k in blocks:
-        order = scalings.parts[k].order // (points.structure.blocks[k].rows if k in points.X else 1) + by
-        if order > (MAX_ORDER // 2 if k in points.X else MAX_ORDER):
-            return None
-        scalings = scalings.replace(k, _fitted(points, step.scalings, k, order))
+        part = scalings.parts[k]
+        if matrices and isinstance(part, MatrixScaling):
+            order = part.order // points.structure.blocks[k].rows + by
+            if order > MAX_ORDER // 2:
+                return None
+            weight = _sensitivity(points, step.scalings, k)
+            part = fit_hermitian(points.omega, points.X[k], order, weight, MATRIX_FIT_TOLERANCE).scaling
+        else:
+            order = part.scalar.order + by
+            if order > MAX_ORDER:
+                return None
+            part = _fitted(points, step.scalings, k, order)
+        scalings = scalings.replace(k, part)
     if scalings.added_states > max_states:
         return None
     return _evaluated(points, _refined(points, scalings))
 
 
-def _fitted(points: PointwiseScalings, scalings: Scalings, k: int, order: int) -> ScalarScaling | MatrixScaling:
-    """Block k fitted to its best scalings at each frequency, weighted by what a misfit costs."""
-    weight = _sensitivity(points, scalings, k)
-    if k in points.X:
-        return fit_hermitian(points.omega, points.X[k], order, weight, MATRIX_FIT_TOLERANCE).scaling
-    fit = fit_magnitude(points.omega, np.exp(points.log_d[:, k]), order, weight, FIT_TOLERANCE)
-    return fit.scaling.within(band_of(points.omega))
+def _fitted(points: PointwiseScalings, scalings: Scalings, k: int, order: int) -> Part:
+    """Block k with d(s) fitted to its best scalings at each frequency, weighted by what a misfit costs."""
+    part, target = scalings.parts[k], points.log_d[:, k]
+    if isinstance(part, MatrixScaling):
+        size = np.linalg.norm(part.system.frequency_response(points.omega), axis=(1, 2))
+        target = target - np.log(size / np.sqrt(part.system.ninputs))
+    fit = fit_magnitude(points.omega, np.exp(target), order, _sensitivity(points, scalings, k), FIT_TOLERANCE)
+    return part.with_scalar(fit.scaling.within(band_of(points.omega)))
 
 
 def _closeness(points: PointwiseScalings) -> np.ndarray:
@@ -315,10 +338,8 @@ def _linearised(points: PointwiseScalings, scalings: Scalings, kept: int = 3) ->
     places = list(points.structure.slices())
     for k in free_parameters(scalings):
         _, w, z = places[k]
-        part = scalings.parts[k]
-        assert isinstance(part, ScalarScaling)
         slope = np.sum(np.abs(u[:, z]) ** 2, axis=1) - np.sum(np.abs(v[:, w]) ** 2, axis=1)
-        columns.append(slope[:, None] * part.jacobian(points.omega)[at])
+        columns.append(slope[:, None] * scalings.parts[k].scalar.jacobian(points.omega)[at])
     return (log_s - log_ref[:, None])[at, which], np.hstack(columns)
 
 

@@ -72,21 +72,22 @@ class Descent:
 
 
 def free_parameters(scalings: Scalings) -> tuple[int, ...]:
-    """Blocks whose scalar scaling may move: all but the performance block, whose d is one."""
-    return tuple(k for k, part in enumerate(scalings.parts[:-1]) if isinstance(part, ScalarScaling))
+    """Blocks whose scaling, or its scalar factor, may move: all but the performance block, whose d is one."""
+    return tuple(range(len(scalings.parts) - 1))
 
 
 def parameters(scalings: Scalings) -> np.ndarray:
     """theta of all free scalings in a row."""
-    return np.concatenate([scalings.parts[k].theta for k in free_parameters(scalings)])  # type: ignore[union-attr]
+    return np.concatenate([scalings.parts[k].scalar.theta for k in free_parameters(scalings)])
 
 
 def with_parameters(scalings: Scalings, theta: np.ndarray) -> Scalings:
     """The scalings moved to theta."""
     start = 0
     for k in free_parameters(scalings):
-        size = 1 + 2 * scalings.parts[k].order
-        scalings = scalings.replace(k, ScalarScaling(theta[start:start + size]))
+        part = scalings.parts[k]
+        size = part.scalar.theta.size
+        scalings = scalings.replace(k, part.with_scalar(ScalarScaling(theta[start:start + size])))
         start += size
     return scalings
 
@@ -233,9 +234,13 @@ def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[
     """
     problem = ScaledProblem.of(P, nmeas, ncon)
     places = np.geomspace(*band, max(3, int(2 * np.log10(band[1] / band[0]))))[1:-1]
-    free = [k for k in free_parameters(scalings) if scalings.parts[k].order < MAX_ORDER]
+    room = max_states - scalings.added_states
+    free = [k for k in free_parameters(scalings) if scalings.parts[k].scalar.order < MAX_ORDER
+            and scalings.structure.blocks[k].rows + scalings.structure.blocks[k].cols <= room]
+    if not free:
+        return None
     slopes = np.array([_neutral_slopes(problem, scalings, free, place) for place in places])
-    if not slopes.size or np.max(np.abs(slopes)) < 1e-3:
+    if np.max(np.abs(slopes)) < 1e-3:
         return None
     best = np.argmax(np.abs(slopes), axis=0)
     strength = np.abs(slopes[best, range(len(free))])
@@ -243,9 +248,9 @@ def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[
         larger = scalings
         for at, k, size in zip(best, free, strength, strict=True):
             part = scalings.parts[k]
-            if size >= threshold * np.max(strength) and isinstance(part, ScalarScaling):
+            if size >= threshold * np.max(strength):
                 split = -0.02 * np.sign(slopes[at, free.index(k)])
-                larger = larger.replace(k, part.with_neutral_pair(places[at], split))
+                larger = larger.replace(k, part.with_scalar(part.scalar.with_neutral_pair(places[at], split)))
         if larger.added_states <= max_states:
             return larger
     return None
@@ -256,8 +261,7 @@ def _neutral_slopes(problem: ScaledProblem, scalings: Scalings, free: list[int],
     base = scalings
     for k in free:
         part = base.parts[k]
-        assert isinstance(part, ScalarScaling)
-        base = base.replace(k, part.with_neutral_pair(place))
+        base = base.replace(k, part.with_scalar(part.scalar.with_neutral_pair(place)))
     try:
         slope, gamma, of_gamma = _coupling(problem, base, None)
     except ComputationError:
@@ -265,8 +269,7 @@ def _neutral_slopes(problem: ScaledProblem, scalings: Scalings, free: list[int],
     result = np.zeros(len(free))
     for at, k in enumerate(free):
         part = scalings.parts[k]
-        assert isinstance(part, ScalarScaling)
-        moved = base.replace(k, part.with_neutral_pair(place, STEP))
+        moved = base.replace(k, part.with_scalar(part.scalar.with_neutral_pair(place, STEP)))
         result[at] = -slope.along(problem.normal(moved).plant, gamma) / STEP / of_gamma / gamma
     return result
 
@@ -276,8 +279,7 @@ def parameter_box(scalings: Scalings, band: tuple[float, float]) -> list[tuple[f
     box: list[tuple[float, float]] = []
     slow, fast = np.log(band[0]), np.log(band[1])
     for k in free_parameters(scalings):
-        part = scalings.parts[k]
-        assert isinstance(part, ScalarScaling)
+        part = scalings.parts[k].scalar
         box.append((part.theta[0] - np.log(1e6), part.theta[0] + np.log(1e6)))
         for _ in range(2):
             box += [(slow, fast), (np.log(0.05), np.log(50.0))] * (part.order // 2) + [(slow, fast)] * (part.order % 2)

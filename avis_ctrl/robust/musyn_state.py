@@ -14,7 +14,7 @@ from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 FORMAT = "avis-musyn"
-VERSION = 2
+VERSION = 3
 DONE = "done"
 GIVEN = "given"
 NOMINAL = "nominal"

@@ -169,9 +169,15 @@ def _negative_beyond_error(H: np.ndarray, basis: np.ndarray, error: np.ndarray |
         if found is None:
             continue
         X, E = found
-        if la.eigvalsh(X + E)[0] < low or la.eigvalsh(X - E)[-1] > high:
+        if _lowest(X + E) < low or -_lowest(E - X) > high:
             return True
     return False
+
+
+def _lowest(S: np.ndarray) -> float:
+    """Upper bound of the smallest eigenvalue of a symmetric matrix: computed, with the round-off of that."""
+    values = la.eigvalsh(S)
+    return float(values[0] + S.shape[0] * np.finfo(float).eps * max(-values[0], values[-1]))
 
 
 def _schur_eigenvalues(T: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ the plant they leave mu unchanged: mu(N) = mu(D N D^-1) <= sigma_max(D N D^-1).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -59,6 +59,15 @@ class ScalarScaling:
     @property
     def order(self) -> int:
         return (self.theta.size - 1) // 2
+
+    @property
+    def scalar(self) -> ScalarScaling:
+        """The part with free parameters: of a scalar scaling all of it."""
+        return self
+
+    def with_scalar(self, d: ScalarScaling) -> ScalarScaling:
+        """The scaling with that part changed."""
+        return d
 
     @property
     def zeros(self) -> np.ndarray:
@@ -192,32 +201,52 @@ def _section(zeros: np.ndarray, poles: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 @dataclass(frozen=True, eq=False)
 class MatrixScaling:
-    """Square D(s) of a repeated scalar block, as a state space whose zeros and poles are stable."""
+    """Square D(s) = d(s) F(s) of a repeated scalar block; F is a state space with stable zeros and poles.
+
+    Most often a constant F is enough. The factor has few parameters, which are refined together with the scalings of
+    the other blocks.
+    """
 
     system: StateSpace
+    factor: ScalarScaling = field(default_factory=lambda: ScalarScaling.constant(1.0))
 
     def __post_init__(self) -> None:
-        D = self.system
-        if D.ninputs != D.noutputs or np.linalg.matrix_rank(D.D) < D.ninputs:
-            raise InputError("a matrix scaling is square with an invertible direct term", value=D.D.shape)
-        zeros = np.linalg.eigvals(_inverse(D)[0])
-        if not D.is_stable() or np.any(zeros.real >= 0):
-            raise InputError("a matrix scaling needs stable poles and zeros", value=[*D.poles(), *zeros])
+        F = self.system
+        if F.ninputs != F.noutputs or np.linalg.matrix_rank(F.D) < F.ninputs:
+            raise InputError("a matrix scaling is square with an invertible direct term", value=F.D.shape)
+        zeros = np.linalg.eigvals(_inverse(F)[0])
+        if not F.is_stable() or np.any(zeros.real >= 0):
+            raise InputError("a matrix scaling needs stable poles and zeros", value=[*F.poles(), *zeros])
 
     @property
     def order(self) -> int:
-        return self.system.nstates
+        """States of D(s)."""
+        return self.system.nstates + self.system.ninputs * self.factor.order
+
+    @property
+    def scalar(self) -> ScalarScaling:
+        return self.factor
+
+    def with_scalar(self, d: ScalarScaling) -> MatrixScaling:
+        return replace(self, factor=d)
 
     def inverse(self) -> MatrixScaling:
         """D(s)^-1."""
-        return MatrixScaling(StateSpace(*_inverse(self.system)))
+        return MatrixScaling(StateSpace(*_inverse(self.system)), self.factor.inverse())
+
+    def response(self, omega: np.ndarray) -> np.ndarray:
+        """|d| F (n_omega, n, n) at omega [rad/s]: without the phase of the factor, which changes no singular value."""
+        return np.exp(self.factor.log_magnitude(omega))[:, None, None] * self.system.frequency_response(omega)
 
     @property
     def matrices(self) -> Matrices:
-        return self.system.A, self.system.B, self.system.C, self.system.D
+        F, copies = self.system, np.eye(self.system.ninputs)
+        a, b, c, d = (np.kron(one, copies) for one in self.factor.matrices)
+        A = np.block([[a, b @ F.C], [np.zeros((F.nstates, a.shape[0])), F.A]])
+        return A, np.vstack([b @ F.D, F.B]), np.hstack([c, d @ F.C]), d @ F.D
 
     def as_dict(self) -> dict[str, Any]:
-        return {key: getattr(self.system, key).tolist() for key in "ABCD"}
+        return {**{key: getattr(self.system, key).tolist() for key in "ABCD"}, "factor": self.factor.theta.tolist()}
 
 
 def _inverse(system: StateSpace) -> Matrices:
@@ -271,7 +300,7 @@ class Scalings:
         return StateSpace(*self._diagonal(inverse=True))
 
     def response(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """D_z (n_omega, n_z, n_z) and D_w^-1 (n_omega, n_w, n_w) at omega [rad/s], scalar blocks without their phase.
+        """D_z (n_omega, n_z, n_z) and D_w^-1 (n_omega, n_w, n_w) at omega [rad/s], scalar d(s) without their phase.
 
         The phase of a scalar d(s) changes no singular value of D N D^-1.
         """
@@ -280,7 +309,7 @@ class Scalings:
         right = np.zeros((omega.size, self.structure.n_w, self.structure.n_w), complex)
         for (_, w, z), part in zip(self.structure.slices(), self.parts, strict=True):
             if isinstance(part, MatrixScaling):
-                left[:, z, z] = part.system.frequency_response(omega)
+                left[:, z, z] = part.response(omega)
                 right[:, w, w] = np.linalg.inv(left[:, z, z])
             else:
                 d = np.exp(part.log_magnitude(omega))
@@ -324,7 +353,8 @@ class Scalings:
             D = np.array(item["D"], float)
             n = len(item["A"])
             return MatrixScaling(StateSpace(np.reshape(item["A"], (n, n)), np.reshape(item["B"], (n, D.shape[1])),
-                                            np.reshape(item["C"], (D.shape[0], n)), D))
+                                            np.reshape(item["C"], (D.shape[0], n)), D),
+                                 ScalarScaling(np.array(item["factor"])))
         return Scalings(structure, tuple(part(item) for item in items))
 
     def _diagonal(self, inverse: bool) -> Matrices:

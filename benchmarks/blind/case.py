@@ -6,6 +6,7 @@ parent process and from there to the file; it never meets the finder.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import multiprocessing
@@ -84,7 +85,7 @@ def _work(task: Task, to_parent: Connection) -> None:
 
 def _ask(finder: Any, campaign: Campaign, rig: AvisTable, to_parent: Connection) -> Any:
     """The finding, or None after a crash."""
-    forget_peak()
+    memory = PeakMemory()
     cpu, began = cpu_seconds(), time.perf_counter()
     finding, text, kind = None, {}, "answered"
     try:
@@ -94,7 +95,7 @@ def _ask(finder: Any, campaign: Campaign, rig: AvisTable, to_parent: Connection)
     except Exception:
         finding, kind, text = None, "crashed", {"crash": traceback.format_exc()[-LONGEST_TEXT:]}
     to_parent.send((kind, text | {"seconds": time.perf_counter() - began, "cpu_seconds": cpu_seconds() - cpu,
-                                  "memory_MB": peak_MB()}))
+                                  "memory_MB": memory.end_MB()}))
     return finding
 
 
@@ -172,21 +173,65 @@ def cpu_seconds() -> float:
     return sum(one.ru_utime + one.ru_stime for one in both)
 
 
-def forget_peak() -> None:
-    """Restart the count of the most memory held, so that the truth's simulation is not in it (Linux)."""
+class PeakMemory:
+    """The most memory that this process and its children hold together while it is watched, every tenth of a second;
+    of this process alone, the most between, too.
+
+    Pages that forked children share with their parent count once (proportional set size, Linux). Without it, resident
+    sizes are added.
+    """
+
+    def __init__(self) -> None:
+        with contextlib.suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")  # restarts the high-water mark
+        self._most_MB, self._ended = held_MB(), threading.Event()
+        self._watch = threading.Thread(target=self._watched, daemon=True)
+        self._watch.start()
+
+    def _watched(self) -> None:
+        while not self._ended.wait(0.1):
+            self._most_MB = max(self._most_MB, held_MB())
+
+    def end_MB(self) -> float:
+        """[1e6 bytes]."""
+        self._ended.set()
+        self._watch.join()
+        return max(self._most_MB, _high_water_MB())
+
+
+def held_MB() -> float:
+    """By this process and all its children, now."""
     try:
-        Path("/proc/self/clear_refs").write_text("5")
+        return sum(_proportional(pid) for pid in _family(os.getpid())) / 1e6
     except OSError:
-        return  # the peak then holds the simulation too: too high, never too low
+        both = [resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return sum(both) * (1 if sys.platform == "darwin" else 1024) / 1e6
 
 
-def peak_MB() -> float:
-    """The most memory held since `forget_peak`, plus the most that an ended child held [1e6 bytes]."""
-    child = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    unit = 1 if sys.platform == "darwin" else 1024
+def _high_water_MB() -> float:
+    """Of this process; 0 where it is not known."""
     try:
         status = Path("/proc/self/status").read_text()
-        own = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))
-        return (own * 1024 + child * unit) / 1e6
-    except (OSError, StopIteration):
-        return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss + child) * unit / 1e6
+    except OSError:
+        return 0.0
+    return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) * 1024 / 1e6
+
+
+def _family(pid: int) -> list[int]:
+    found = [pid]
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            found += [one for child in (thread / "children").read_text().split() for one in _family(int(child))]
+    return found
+
+
+def _proportional(pid: int) -> int:
+    """Bytes; none for a process that has ended meanwhile."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except (FileNotFoundError, ProcessLookupError):
+        if pid == os.getpid():
+            raise
+        return 0
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+

@@ -145,7 +145,7 @@ class Line(_Part):
     relative_change : by how much the effects change the signals, as the truth counts it; None where unknown.
     answer : what the finder said; None after a crash. crash : the text of the exception, None without one.
     seconds, cpu_seconds : the finder's, by the clock and summed over its processes.
-    memory_MB : the most that the worker held while the finder ran, plus the most that a child of it held.
+    memory_MB : the most that the worker and its children held together while the finder ran, shared pages once.
     simulation_seconds : the truth's.
     unseen : None where it was not asked for, or failed; unseen_error : the text of that exception.
     """

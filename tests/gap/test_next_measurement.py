@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.next_measurement import between, grows, of_unexplained
+from avis_ctrl.gap.next_measurement import between, grows, grows_faster, of_unexplained
 from avis_ctrl.gap.result import RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
@@ -112,3 +112,11 @@ def test_amplitude_counts_only_in_what_differs():
     bent = with_effect(MODEL, "cubic_stiffness", "isolators z", 1e9, 0.0, 0.0, 0.0)
     assert "only one of them" in between("cubic_stiffness", "sensor_gain", bent, with_effect(
         MODEL, "sensor_gain", "Sz1", 1.2))
+
+
+def test_growth_is_stated_where_the_records_say_it():
+    assert grows_faster(records(2.0, 1e4)) is True
+    assert grows_faster(records(0.5, 1e4)) is False
+    assert grows_faster(records(1.0, 1e4)) is False
+    assert grows_faster(records(1.1, 1e4, scatter=0.3)) is None
+    assert grows_faster(records(2.0, 1e4)[:1]) is None

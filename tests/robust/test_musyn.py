@@ -24,7 +24,7 @@ from avis_ctrl.robust.hinf_riccati import find_gamma
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.musyn import musyn
-from avis_ctrl.robust.scalings import ScalarScaling, Scalings
+from avis_ctrl.robust.scalings import MatrixScaling, ScalarScaling, Scalings
 from avis_ctrl.robust.slycot_adapter import mu_upper_slicot
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
 
@@ -140,17 +140,21 @@ def test_real_blocks_are_said_to_be_treated_as_complex_and_both_are_measured():
     assert as_complex.gamma == pytest.approx(result.mu_upper_complex, rel=1e-6)
 
 
-def test_repeated_block_takes_a_matrix_scaling():
-    """One delta acts on two springs: musyn scales it by a 2 x 2 D(s), and the result obeys its own bound."""
+def stiffness_in_halves() -> StateSpace:
+    """The table with the same stiffness error twice: w_k is split in halves, each seeing z_k."""
     P, _ = table()
-    # the same stiffness error twice: w_k is split in halves, each seeing z_k
     n_w = np.zeros((5, 6))
     n_w[0, :2] = 0.5
     n_w[1:, 2:] = np.eye(4)
     n_z = np.zeros((6, 5))
     n_z[:2, 0] = 1.0
     n_z[2:, 1:] = np.eye(4)
-    Q = StateSpace(P.A, P.B @ n_w, n_z @ P.C, n_z @ P.D @ n_w)
+    return StateSpace(P.A, P.B @ n_w, n_z @ P.C, n_z @ P.D @ n_w)
+
+
+def test_repeated_block_takes_a_matrix_scaling():
+    """One delta acts on two springs: musyn scales it by a 2 x 2 D(s), and the result obeys its own bound."""
+    P, Q = table()[0], stiffness_in_halves()
     result = musyn(Q, [ComplexScalar(2), ComplexFull(1, 1)], 1, 1, max_iterations=3)
     plain = musyn(P, [ComplexScalar(1), ComplexFull(1, 1)], 1, 1, max_iterations=3)
     assert result.scalings.parts[0].__class__.__name__ == "MatrixScaling"
@@ -236,12 +240,14 @@ def test_nominal_controller_is_where_large_uncertainty_forbids_the_first_one(lon
     assert judged(nominal) < 0.3 * judged(hinfsyn(P, 1, 1).K)
 
 
-def test_slope_of_gamma_is_its_derivative():
-    """Adjoint Lyapunov formula against differences of the bisected optimum."""
+@pytest.mark.parametrize("blocks", [DISTILLATION_BLOCKS, [ComplexScalar(2)]])
+def test_slope_of_gamma_is_its_derivative(blocks):
+    """Adjoint Lyapunov formula against differences of the bisected optimum, for the factor of a matrix, too."""
     P = distillation()
-    structure = BlockStructure.of(DISTILLATION_BLOCKS).with_performance(2, 2)
+    structure = BlockStructure.of(blocks).with_performance(2, 2)
     d = ScalarScaling.from_roots(1.0, [-0.05, -2.0], [-0.1, -3.0])
-    scalings = Scalings(structure, (d, d, ScalarScaling.constant(1.0)))
+    matrix = MatrixScaling(gain(np.array([[1.0, 0.2], [0.0, 0.8]])), d)
+    scalings = Scalings(structure, (*(matrix if one.repeated else d for one in blocks), ScalarScaling.constant(1.0)))
     problem = ScaledProblem.of(P, 2, 2)
     gamma, slope = gamma_and_gradient(problem, scalings)
     theta, h = parameters(scalings), 1e-4

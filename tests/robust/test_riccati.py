@@ -8,7 +8,7 @@ import scipy.linalg as la
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from avis_ctrl.robust.riccati import ON_AXIS, refined, solve_riccati
+from avis_ctrl.robust.riccati import ON_AXIS, _negative_beyond_error, refined, solve_riccati
 
 
 def residual(A, R, Q, X):
@@ -99,6 +99,21 @@ def test_singular_solution_is_not_called_indefinite():
             inverse = la.inv(T)
             found = solve_riccati(inverse @ A @ T, inverse @ R @ inverse.T, T.T @ Q @ T)
             assert found.X is not None and found.semidefinite == positive
+
+
+def test_round_off_of_eigenvalues_makes_no_solution_indefinite():
+    """X_ij = v_i v_j / (a_i + a_j) is positive definite (Cauchy); its computed eigenvalues need not be positive."""
+    computed = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        a, v = rng.uniform(1, 3, 6), 10.0 ** rng.uniform(-6, 4, 6)
+        X = np.outer(v, v) / (a[:, None] + a)
+        H = np.block([[np.diag(-a), np.zeros((6, 6))], [-np.outer(v, v), np.diag(a)]])
+        assert not _negative_beyond_error(H, np.vstack([np.eye(6), X]))
+        against = np.block([[np.diag(-a), np.zeros((6, 6))], [np.outer(v, v), np.diag(a)]])
+        assert _negative_beyond_error(against, np.vstack([np.eye(6), -X]))
+        computed.append(la.eigvalsh(X)[0])
+    assert min(computed) < 0
 
 
 def test_no_solution_when_the_gain_is_below_the_norm():

@@ -29,7 +29,7 @@ from avis_ctrl.gap.axis.search import (
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.result import NamedEffect, sized
-from avis_ctrl.gap.validation import halves, widening
+from avis_ctrl.gap.validation import Half, halves
 from avis_ctrl.identification.likelihood import Fitted
 from avis_ctrl.measurement.gates.finding import Picture, Series
 
@@ -142,7 +142,13 @@ def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, setti
     found = halves(best, parameters, settings, parts(best, parameters))
     return Name(one, probability, near, _refusal(best, rest, one, probability, found, settings, max(
         others, key=lambda r: r.odds).effect.name if sum(by_key.values()) > nothing else "nothing"),
-                widening(found, settings))
+                _widening(found, settings))
+
+
+def _widening(found: Sequence[Half], settings: AxisSettings) -> float:
+    """Factor on the standard deviations of an effect's parameters, 1 or more: where halves of the data differ by more
+    than noise, they are known no better than the halves agree (R. T. Birge, Phys. Rev. 40 (1932) 207-227)."""
+    return max([1.0, *(float(np.sqrt(one.chi2 / one.dof)) for one in found if one.p_value < settings.widened_p_value)])
 
 
 def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float, found, settings: AxisSettings,

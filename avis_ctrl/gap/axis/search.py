@@ -278,8 +278,8 @@ def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int,
     data = fitted.model.lines.held if held else fitted.model.lines.fitted
     weights, e = unseen(fitted, data, settings) if held else (fitted.weights, fitted.e)
     rows, determinant = row_table(fitted, data), np.zeros(len(e))
-    for one in weights.paths:
-        determinant[one.rows] = weights.log_determinants[one.group] / len(one.rows)
+    for group, at in weights.rows.items():
+        determinant[at] = weights.log_determinants[group] / len(at)
     octave = 0 * rows.segment if held else np.floor(np.log2(rows.frequency)).astype(int)
     places, cell = np.unique(np.stack([rows.segment, octave]), axis=1, return_inverse=True)
     count, e2, rest = (np.bincount(cell.ravel(), x) for x in (np.ones(len(e)), e ** 2, determinant))

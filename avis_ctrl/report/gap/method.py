@@ -30,10 +30,10 @@ def method(gap: Gap) -> Section:
         Paragraph("theta are mass, inertia, stiffness and damping (normal priors of 5 %, damping 20 %), t the "
                   "tolerances of the rig file, a the parameters of effects. x are the states at the ends of the "
                   "record; they are projected out. E are relative errors of every path from a drive to a sensor, "
-                  "constant over a third of an octave and within a level: what has no name. Their variance, and that "
-                  "of an additional noise (distortion), is estimated for each sensor, band and level, and they are "
-                  "integrated out. Standard deviations contain them as far as they are independent from band to band "
-                  "and from level to level; where they are not, the standard deviations are too small."),
+                  "constant over a third of an octave and the same at every level: what has no name. Their variance "
+                  "is estimated for each sensor and band, that of an additional noise (distortion) for each level "
+                  "too, and the path errors are integrated out. Where octaves or levels differ by more than these "
+                  "variances explain, the standard deviations cover it."),
         Paragraph("Evidence. Of a model with certain effects, by Laplace's method, J the penalised sum of squares at "
                   "the estimate, C the covariance of path errors and noise, H the information with priors; the "
                   "constant contains the price of the states at the ends of the records:"),

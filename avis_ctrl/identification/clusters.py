@@ -1,0 +1,57 @@
+"""Standard deviations that hold where residuals are alike within an octave or a level (cluster-robust covariance).
+
+A model that is not quite the real table leaves residuals that are alike over neighbouring lines and bands, or over the
+records of a level. With the residual e, its derivative J and the covariance P of all parameters at the estimate, a
+cluster c of data moves the estimate by
+
+    delta_c = P J_c (I - J_c^T P J_c)^(-1/2) e_c
+
+and V = P^2 + sum_c delta_c delta_c^T is P in the mean where the model holds, whatever the clusters; P^2 is of the
+priors (R. M. Bell, D. F. McCaffrey, Survey Methodology 28 (2002) 169-181, with priors).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from avis_ctrl.identification.weights import Group
+
+
+def cluster_moves(P: np.ndarray, J: np.ndarray, e: np.ndarray, clusters: Sequence[np.ndarray]) -> np.ndarray:
+    """(n_c, n) delta of each cluster.
+
+    P : (n, n) covariance of standardised parameters, inv(J J^T + I). J : (n, N) negative derivative of e (N,).
+    clusters : entries of e of each.
+    """
+    L, found = np.linalg.cholesky(P), []
+    for at in clusters:
+        X = L.T @ J[:, at]
+        size, vectors = np.linalg.eigh(X @ X.T)
+        remaining = np.maximum(1 - size, np.finfo(float).eps)
+        found.append(L @ (vectors @ ((vectors.T @ (X @ e[at])) / np.sqrt(remaining))))
+    return np.array(found)
+
+
+def covering(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """(k, k) covariance of at least A and B in every direction; A positive definite."""
+    L = np.linalg.cholesky(A)
+    ratio, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, B).T))
+    root = L @ (vectors * np.sqrt(np.maximum(ratio, 1.0)))
+    return np.asarray(root @ root.T)
+
+
+def clusterings(groups: Sequence[Group], bands_per_octave: int) -> tuple[list[list[list[Group]]], list[list[Group]]]:
+    """Groups (level, band) that belong together: by octave, once for each band that octaves may begin with; by level.
+    """
+    by_octave = []
+    for first in range(bands_per_octave):
+        octaves: dict[int, list[Group]] = {}
+        for group in groups:
+            octaves.setdefault((group[1] - first) // bands_per_octave, []).append(group)
+        by_octave.append(list(octaves.values()))
+    levels: dict[float, list[Group]] = {}
+    for group in groups:
+        levels.setdefault(group[0], []).append(group)
+    return by_octave, list(levels.values())
