@@ -27,8 +27,8 @@ from avis_ctrl.identification.spectral_block import SpectralBlock
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """Responses as blocks for the likelihood. Outputs are magnitude and phase of each response: Y is 1 + j for the
-    former, 0 for the latter, and the model predicts Y and the logarithm of its own response over the measured one.
+    """Responses as blocks for the likelihood. Outputs are magnitude and phase of each response: Y is 1 + j, and the model
+    predicts Y and the logarithm of its own response over the measured one.
 
     f : (n,) Hz, n even. measured : (n, responses). spread : (pairs,) what the discrepancy is expected to be
     proportional to, by which all outputs are divided. names : of the channels, one or two. rows : pairs by block.
@@ -66,7 +66,7 @@ class SensorModel(AxisModel):
             H = [h * one.channel(s, p) if one.location in (kind, "drive") else h
                  for kind, h in zip(c.names, H, strict=True)]
         found = np.log(np.stack([H[0], *([H[1] / H[0]] if len(H) > 1 else [])], axis=1) / c.measured[rows])
-        parts = np.stack([1 + found.real, found.imag], axis=2).reshape(len(rows), -1)
+        parts = 1 + np.stack([found.real, found.imag], axis=2).reshape(len(rows), -1)
         return (parts[::2] + 1j * parts[1::2]) / c.spread[pairs][:, None]
 
     def contributions(self, block: SpectralBlock) -> np.ndarray:
@@ -125,7 +125,7 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     inner = (pairs % 3 == 1) & (pairs < n // 2 - 1)  # the ends, where effects show most, are fitted
     for name, inside in (("fitted", ~inner), ("held out", inner)):
         at = rows[name] = pairs[inside]
-        Y = np.tile([1 + 1j, 0], len(names)) / spread[at][:, None]
+        Y = np.full(2 * len(names), 1 + 1j) / spread[at][:, None]
         block = SpectralBlock(name, 2 * np.pi * np.sqrt(f[2 * at] * f[2 * at + 1]), np.zeros((len(at), 0, 1)),
                               Y[:, :, None])
         data[name] = Data((block.with_noise(noise[at][:, :, None] * np.eye(2 * len(names))),), (1.0,))
