@@ -159,6 +159,10 @@ def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float,
         return edge
     if rest is not None and not borne_out(best, rest, settings):
         return "held-out data do not bear it out"
+    std = np.sqrt(np.diag(robust(best))) * _widening(found, settings)
+    at = [best.model.names.index(f"{p.name}@{one.label}") for p in one.parameters if p.linear]
+    if all(abs(best.model.values[k]) < settings.apart * std[k] for k in at):
+        return "its size is not certain to differ from zero"
     for half in found:
         if half.p_value < settings.law_p_value and half.change > settings.law_change:
             return f"{half.words} calls for another size, by {100 * half.change:.0f} %"

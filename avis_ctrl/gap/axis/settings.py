@@ -38,6 +38,7 @@ class AxisSettings(GapSettings):
     static : scatter of a response between realisations over its change with the level, from which the change is that of
         a static law [1]; a cubic one has 0.8 of it, spread over the band and its harmonics, a gain that is set by the
         level none.
+    apart : standard deviations, robust and widened, by which an effect's size must differ from zero [1]; the usual two.
     widened_p_value : p-value of the difference between a half of the data and the whole below which standard deviations
         are widened to cover it [1]: the usual level.
     frequencies : of a stepped sine that a search needs.
@@ -62,6 +63,7 @@ class AxisSettings(GapSettings):
     right_shape: float = 0.75
     same_shape: float = 0.9
     static: float = 0.2
+    apart: float = 2.0
     widened_p_value: float = 0.05
     frequencies: int = 8
     least_angle: float = 1.0
