@@ -192,8 +192,11 @@ def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, name
     floor = problem.noise if problem.noise is not None else min(whole, power(free) if free is not None else whole)
     excess = max(before - floor, 1e-300)
     left = max(after - floor, 0.0) / excess
-    shares = {one.effect.label: float(np.clip((power(best.model.without(one.effect.label)) - whole) / excess, 0.0, 1.0))
-              for one in names}
+    shares = {}
+    for one in names:  # of what the others could not take in its place
+        rest = explored.without(best, one.effect.label)
+        alone = power(best.model.without(one.effect.label))
+        shares[one.effect.label] = float(np.clip((min(alone, power(rest) if rest else alone) - whole) / excess, 0.0, 1.0))
     covariance = _widened(best, names, shares, left)
     effects = [_reported(one, best, covariance, shares[one.effect.label], problem) for one in names]
     effects.sort(key=lambda one: -(one.share or 0.0))
