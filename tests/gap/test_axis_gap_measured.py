@@ -188,10 +188,11 @@ def test_sm3_laser_is_late_by_a_pure_delay(sm3):
     assert named(sm3) == [("delay", "displacement")]
     # 2.44 ms from the phases alone in `compare_lags`.
     assert size(sm3, "delay", "delay_s")[0] == pytest.approx(2.44e-3, abs=0.01e-3)
-    # Magnitudes that scatter by 3 % do not rule out a lag, whose phase bends by 0.001 rad at 10 Hz; a mode they do.
-    rest = {one.name: one.probability for one in sm3.runners_up}
-    assert sm3.effects[0].probability > 0.7 > 2 * max(rest.values())
-    assert "mechanical_mode@displacement" not in rest
+    assert sm3.effects[0].probability > 0.9 and not sm3.effects[0].indistinguishable_from
+    # Coil and displacement alike lag by 0.3 ms, which is a trace.
+    assert {one.name for one in sm3.traces} <= {"delay", "first_order_lag"}
+    rest = {one.name: one.probability for one in sm3.runners_up if one.instead_of == "delay@displacement"}
+    assert rest.get("mechanical_mode@displacement", 0.0) < 0.01 and rest.get("first_order_lag@displacement", 0.0) < 0.05
     assert sm3.stages[1].nrmse < 0.5 * sm3.stages[0].nrmse
 
 
@@ -219,9 +220,10 @@ def test_mirror_softens_and_more_is_missing(mirror):
     """The mode about which the responses change most is that at 805 Hz, and no law of one mode holds it all."""
     assert mirror.verdict == "partly explained" and named(mirror)[0] == ("softening", "mode")
     assert all(720 < mirror.where[0][end] < 920 for end in ("from_Hz", "to_Hz"))
-    # Half of the change of the stiffness is that of the frequency, -0.96 %.
-    lost, deviation = size(mirror, "softening", "stiffness_lost")
-    assert 0.0192 - lost < 3 * deviation + 0.0025
+    # A frequency that falls by 0.96 % is a stiffness that falls by 1.92 %, in softening and hysteresis together.
+    lost = sum(e.parameters["stiffness_lost"].value for e in (*mirror.effects, *mirror.traces)
+               if "stiffness_lost" in e.parameters)
+    assert lost == pytest.approx(0.0192, rel=0.03)
     assert mirror.stages[-1].nrmse < 0.1 * mirror.stages[0].nrmse
 
 

@@ -196,7 +196,8 @@ def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, name
     for one in names:  # of what the others could not take in its place
         rest = explored.without(best, one.effect.label)
         alone = power(best.model.without(one.effect.label))
-        shares[one.effect.label] = float(np.clip((min(alone, power(rest) if rest else alone) - whole) / excess, 0.0, 1.0))
+        taken = min(alone, power(rest) if rest else alone) - whole
+        shares[one.effect.label] = float(np.clip(taken / excess, 0.0, 1.0))
     covariance = _widened(best, names, shares, left)
     effects = [_reported(one, best, covariance, shares[one.effect.label], problem) for one in names]
     effects.sort(key=lambda one: -(one.share or 0.0))

@@ -27,8 +27,8 @@ from avis_ctrl.identification.spectral_block import SpectralBlock
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """Responses as blocks for the likelihood. Outputs are magnitude and phase of each response: Y is 1 + j, and the model
-    predicts Y and the logarithm of its own response over the measured one.
+    """Responses as blocks for the likelihood. Outputs are magnitude and phase of each response: Y is 1 + j, and the
+    model predicts Y and the logarithm of its own response over the measured one.
 
     f : (n,) Hz, n even. measured : (n, responses). spread : (pairs,) what the discrepancy is expected to be
     proportional to, by which all outputs are divided. names : of the channels, one or two. rows : pairs by block.
