@@ -192,15 +192,14 @@ def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, name
     floor = problem.noise if problem.noise is not None else min(whole, power(free) if free is not None else whole)
     excess = max(before - floor, 1e-300)
     left = max(after - floor, 0.0) / excess
-    shares = {}
-    for one in names:  # of what the others could not take in its place
-        rest = explored.without(best, one.effect.label)
-        alone = power(best.model.without(one.effect.label))
-        taken = min(alone, power(rest) if rest else alone) - whole
-        shares[one.effect.label] = float(np.clip(taken / excess, 0.0, 1.0))
+    shares, alone = {}, {one.effect.label: power(best.model.without(one.effect.label)) for one in names}
+    for label, left_out in alone.items():  # of what the others could not take in its place
+        rest = explored.without(best, label)
+        taken = min(left_out, power(rest) if rest else left_out) - whole
+        shares[label] = float(np.clip(taken / excess, 0.0, 1.0))
     covariance = _widened(best, names, shares, left)
     effects = [_reported(one, best, covariance, shares[one.effect.label], problem) for one in names]
-    effects.sort(key=lambda one: -(one.share or 0.0))
+    effects.sort(key=lambda one: -alone[one.label])
     told = tuple(one for one in effects if (one.share or 0.0) >= settings.trace)
     traces = tuple(one for one in effects if (one.share or 0.0) < settings.trace)
     stages = _stages(base, best, [*(one.label for one in effects), *outside], explored, problem)
