@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,14 +18,24 @@ def gap_axis(
                                          "CSV per frequency; for levels a folder of u_*mV*.npy and y_*mV*.npy")],
     columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="drive: force, position, "
                                                 "reference; oscillator: u, y; seismometer: drive, coil and/or "
-                                                "displacement; each also t; levels: none")] = None,
+                                                "displacement; each also t; by name, or in CSV by number from 1; "
+                                                "levels: none")] = None,
     scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="factors to SI units")] = None,
     sample_rate_Hz: SAMPLE_RATE = None,
-    band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; for an "
-                                                                "oscillator or for levels")] = None,
-    cutoff_Hz: Annotated[float | None, typer.Option("--cutoff", metavar="HZ", help="low-pass of a drive's data; by "
-                                                    "default as far as force and motion are coherent")] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="folder for gap.json")] = None,
+    band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz, of what is "
+                                                                "fitted; around one mode of a structure")] = None,
+    cutoff_Hz: Annotated[float | None, typer.Option("--cutoff", metavar="HZ", help="low-pass of the motion of which "
+                                                    "a drive's friction is formed; the fit itself runs as far up as "
+                                                    "force and motion are coherent")] = None,
+    output: Annotated[str, typer.Option("--output", metavar="KIND", help="what the column of y or position holds: "
+                                        "position, velocity or acceleration")] = "position",
+    range_s: Annotated[tuple[float, float] | None, typer.Option("--range", metavar="START END", help="s, part of each "
+                                                                "record")] = None,
+    resample_Hz: Annotated[float | None, typer.Option("--resample", metavar="HZ", help="new sample rate")] = None,
+    also: Annotated[list[Path] | None, typer.Option("--also", metavar="RECORD", help="another record of the same axis; "
+                                                    "of several, whole ones are held out")] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="folder for gap.json, reports and the model "
+                                             "that avis predict reads")] = None,
     seed: Annotated[int, typer.Option("--seed", hidden=True, help="has no influence any more")] = 1,
 ) -> None:
     """Name the effect that a model of one axis lacks, with its size, its probability, and the gap before and after.
@@ -36,33 +45,38 @@ def gap_axis(
     from rich.console import Console
 
     from avis_ctrl.cli.console import Progress
-    from avis_ctrl.files import write_whole
-    from avis_ctrl.gap.single_axis import find_axis_gap_in
+    from avis_ctrl.gap.axis import find_axis_gap_in
+    from avis_ctrl.gap.result import sized
+    from avis_ctrl.report import axis_gap_reports
     from avis_ctrl.study.files import output_folder
+    from avis_ctrl.study.gap_axis import MODEL_FILE, write_axis_gap
 
     roles = dict(_pair(part, "--columns") for part in columns.split(",")) if columns else None
     factors = {role: _number(text) for role, text in (_pair(part, "--scale") for part in scale.split(","))} \
         if scale else None
-    options: dict[str, Any] = {} if band_Hz is None else {"band_Hz": band_Hz}
-    options |= {} if cutoff_Hz is None else {"cutoff_Hz": cutoff_Hz}
+    options: dict[str, Any] = {"band_Hz": band_Hz, "cutoff_Hz": cutoff_Hz}
+    options = {name: value for name, value in options.items() if value is not None}
+    reading: dict[str, Any] = {"output": output, "range_s": range_s, "resample_Hz": resample_Hz}
     console = Console(highlight=False)
-    with output_folder(out, ("gap.json",)) if out else nullcontext() as folder:
+    files: list[str] = []
+    with output_folder(out, ("gap.json", "gap.html", "gap.pdf", MODEL_FILE)) if out else nullcontext() as folder:
         with Progress(console) as progress:
-            found = find_axis_gap_in(kind, path, roles, scale=factors, sample_rate_Hz=sample_rate_Hz,
-                                     progress=progress, **options)
+            found = find_axis_gap_in(kind, [path, *(also or ())] if also else path, roles, scale=factors,
+                                     sample_rate_Hz=sample_rate_Hz, progress=progress, **reading, **options)
         if folder:
-            write_whole(folder / "gap.json", json.dumps(found.to_json(), indent=2, allow_nan=False).encode())
+            given = {"kind": kind, "columns": roles, "scale": factors, "sample_rate_Hz": sample_rate_Hz}
+            files = write_axis_gap(folder, found, path.name, {**given, **reading, **options}, axis_gap_reports)
     console.print(f"verdict: {found.verdict}")
     for sentence in found.sentences:
         console.print(sentence, soft_wrap=True, markup=False)
-    for one in (*found.base_parameters, *found.ratios()):
-        console.print(f"{one.name} = {one.value:.6g}{f' +- {one.std:.2g}' if one.std >= 0 else ''} {one.unit}".rstrip())
-    for stage in (*found.stages, *found.references):
+    for name, one in (*found.parameters.items(), *found.ratios.items()):
+        console.print(f"{name} = {sized(one)}", markup=False)
+    for stage in found.stages:
         noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
-        console.print(f"- {stage.stage}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True,
+        console.print(f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True,
                       markup=False)
     if folder:
-        console.print(f"{folder / 'gap.json'}")
+        console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
 
 
 def _pair(text: str, option: str) -> tuple[str, str]:

@@ -97,7 +97,8 @@ def identify(
 
 
 def predict(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="output folder of avis identify or avis gap")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="output folder of avis identify, avis gap or "
+                                           "avis gap-axis")],
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="another campaign of the same rig")],
     out: Annotated[Path, typer.Option("--out", metavar="PRED.h5", help="file to write")],
     effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="file with your own effects, if "
@@ -114,12 +115,21 @@ def predict(
     from avis_ctrl.measurement.campaign import Campaign
     from avis_ctrl.measurement.formats import read_measurements
     from avis_ctrl.study.files import require_other
+    from avis_ctrl.study.gap_axis import is_axis_gap, write_axis_predictions
     from avis_ctrl.study.gap_names import GAP_FILE
     from avis_ctrl.study.prediction_errors import compared, prediction_errors
     from avis_ctrl.study.rig_channels import in_words_of
 
     require_other(out, campaign)
     console = Console(highlight=False)
+    if is_axis_gap(folder):
+        several = write_axis_predictions(folder, [campaign], out)
+        rows = Table("record", "baseline", "updated", title="r.m.s. error relative to what was measured")
+        for name, *both in several:
+            rows.add_row(name, *(f"{100 * one:.3g} %" for one in both))
+        console.print(rows)
+        console.print(f"{out}: {len(several)} records")
+        return
     measured = read_measurements(campaign)
     if not isinstance(measured, Campaign):
         raise InputError("expected records, found frequency responses", file=campaign)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.identification.likelihood import Fitted
-from avis_ctrl.identification.weights import Group
 
 
 def name_of(label: str) -> tuple[str, str]:
@@ -39,7 +39,7 @@ class Step:
             object.__setattr__(self, "label", self.fitted.labels[-1])
 
 
-def odds_against(one: Mapping[Group, float], other: Mapping[Group, float], beside: float = 0.0) -> float:
+def odds_against(one: Mapping[Any, float], other: Mapping[Any, float], beside: float = 0.0) -> float:
     """Odds of another model against one, by how evenly the difference of their log-likelihoods is spread over bands and
     levels (Q. H. Vuong, Econometrica 57 (1989) 307-333).
 

@@ -21,6 +21,7 @@ from avis_ctrl.gap import (
     table_model,
     time_stepping,
 )
+from avis_ctrl.gap.axis import settings as axis
 from avis_ctrl.gap.effects import base, chassis
 from avis_ctrl.gap.signals import converter, hum, noise_level, quiet_lines, record_residual
 
@@ -35,5 +36,5 @@ def tuning_values() -> dict[str, dict[str, Any]]:
         "lines of a record": line_response.SETTINGS, "time stepping": time_stepping.SETTINGS,
         "simulation": simulation.SETTINGS, "realisation": state_space.SETTINGS, "converter": converter.SETTINGS,
         "hum": hum.SETTINGS, "driven lines": record_residual.SETTINGS, "noise level": noise_level.SETTINGS,
-        "quiet lines": quiet_lines.SETTINGS, "chassis": chassis.SETTINGS}
+        "quiet lines": quiet_lines.SETTINGS, "chassis": chassis.SETTINGS, "single axis": axis.SETTINGS}
     return {name: asdict(one) for name, one in parts.items()}

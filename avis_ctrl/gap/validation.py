@@ -53,19 +53,23 @@ class Half:
     change: float
 
 
-def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings) -> list[Half]:
+def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
+           parts: Sequence[tuple[str, np.ndarray]] | None = None) -> list[Half]:
     """An effect's parameters from halves of the data, one Gauss-Newton step from the whole: below and above the band's
     middle by information, and at low and high level.
 
     A parameter that moves with the band or the level refutes its law. Of a true law the difference has the covariance
-    P_half - P (J. A. Hausman, Econometrica 46 (1978) 1251-1271).
+    P_half - P (J. A. Hausman, Econometrica 46 (1978) 1251-1271). parts : other halves, in words and rows of the
+    residual.
     """
     rows = [fitted.priors.names.index(name) for name in names if name in fitted.priors.names]
     slope, values = fitted.priors.slopes(fitted.z)[rows], fitted.priors.values(fitted.z)[rows]
     root = np.linalg.cholesky(fitted.covariance[np.ix_(rows, rows)])
     found = []
-    for words, groups in _parts(fitted, rows):
-        at = np.concatenate([fitted.rows[group] for group in groups])
+    if parts is None:
+        parts = [(words, np.concatenate([fitted.rows[group] for group in groups]))
+                 for words, groups in _parts(fitted, rows)]
+    for words, at in parts:
         J, e = fitted.J[:, at], fitted.e[at]
         P = np.linalg.inv(J @ J.T + np.eye(len(J)))
         step = np.linalg.solve(root, (P @ (J @ e - fitted.z))[rows])

@@ -310,10 +310,15 @@ class Profile:
 
 def log_likelihoods(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> dict[Group, float]:
     """Of records that no fit has seen, by level and band, by the fitted parameters and variances."""
+    return _by_group(*unseen(fitted, data, settings))
+
+
+def unseen(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> tuple[Weights, np.ndarray]:
+    """Weights and (N,) residual of records that no fit has seen, as `Fitted.weights` and `Fitted.e`."""
     paths = [path_contributions(fitted.model, block) for block in data.blocks]
     weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
     own = _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, derivative=False)
-    return _by_group(weights, weights.flatten(own.e[None])[0])
+    return weights, weights.flatten(own.e[None])[0]
 
 
 def _by_group(weights: Weights, flat: np.ndarray) -> dict[Group, float]:

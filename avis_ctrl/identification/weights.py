@@ -101,7 +101,9 @@ class Weights:
 
 
 def path_contributions(model: Any, block: SpectralBlock) -> np.ndarray:
-    """(n, n_y, n_in): what each input of a record contributes to each sensor."""
+    """(n, n_y, n_in): what each input of a record contributes to each sensor, or what a model calls its parts."""
+    if hasattr(model, "contributions"):
+        return np.asarray(model.contributions(block))
     U = np.zeros((*block.U.shape[:2], block.U.shape[1]), complex)
     k = np.arange(block.U.shape[1])
     U[:, k, k] = block.U[:, :, 0]

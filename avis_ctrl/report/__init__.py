@@ -9,6 +9,9 @@ from avis_ctrl.report.content import document
 from avis_ctrl.study.model import DesignResult
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from avis_ctrl.gap.axis.result import AxisGap
     from avis_ctrl.report.gap.finding import Found
     from avis_ctrl.study.identification import Identification
     from avis_ctrl.study.identified_uncertainty import InDesign
@@ -70,4 +73,18 @@ def gap_pdf(found: Found) -> bytes:
     return pdf.render(content(found))
 
 
-__all__ = ["gap_html", "gap_pdf", "identification_html", "identification_pdf", "render_html", "render_pdf"]
+def axis_gap_reports(gap: AxisGap, source: str, provenance: Mapping[str, object]) -> dict[str, bytes]:
+    """gap.html and gap.pdf of one axis, by their names; source : of the measurement.
+
+    Raises
+    ------
+    ComputationError : the typesetter refuses.
+    """
+    from avis_ctrl.report.gap.axis import document as content
+
+    found = content(gap, source, provenance)
+    return {"gap.html": html.render(found), "gap.pdf": pdf.render(found)}
+
+
+__all__ = ["axis_gap_reports", "gap_html", "gap_pdf", "identification_html", "identification_pdf", "render_html",
+           "render_pdf"]

@@ -104,7 +104,7 @@ def _lines(stream: TextIO) -> Iterator[str]:
         yield line
 
 
-def _layout(lines: Iterator[str]) -> Layout:
+def _layout(lines: Iterator[str], numbered: bool = False) -> Layout:
     stated: dict[str, str] = {}
     count, line = 0, ""
     for line in lines:
@@ -122,6 +122,9 @@ def _layout(lines: Iterator[str]) -> Layout:
     if titles and not titles[-1]:  # a separator that ends every line
         titles = titles[:-1]
     if all(_is_number(title.replace(",", ".")) for title in titles):
+        if numbered:  # a file without a header line, whose columns are known by number
+            names = [str(k + 1) for k in range(len(titles))]
+            return Layout(names, [None] * len(names), separator, False, stated, count - 1)
         raise InputError("expected a header line with the names of the columns, found numbers", field=f"line {count}",
                          value=line[:60])
     names, units = [], []
@@ -135,6 +138,12 @@ def _layout(lines: Iterator[str]) -> Layout:
     return Layout(names, units, separator, False, stated, count)
 
 
+def _numbered(columns: Mapped | None) -> bool:
+    """Whether all columns are given by number."""
+    names = [name for role in ("t", "u", "y", "floor") for name in mapped(columns, role) or []]
+    return bool(names) and all(name.isdigit() for name in names)
+
+
 def _is_number(text: str) -> bool:
     try:
         float(text)
@@ -146,6 +155,7 @@ def _is_number(text: str) -> bool:
 def _roles(layout: Layout, columns: Mapped | None, path: Path) -> dict[str, list[str]]:
     """Names of the columns of each role, as the caller mapped them or as they are usually called."""
     titles = {f"{name} [{unit}]": name for name, unit in zip(layout.names, layout.units, strict=True) if unit}
+    titles |= {str(k + 1): name for k, name in enumerate(layout.names) if str(k + 1) not in layout.names}
     if columns is not None:
         roles = {}
         for role in ("t", "u", "y", "floor"):
@@ -177,7 +187,10 @@ def _followed_by_numbers(path: Path, layout: Layout) -> bool:
 def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[Record, list[str], str]:
     with _open(path) as stream:
         lines = _lines(stream)
-        layout = _layout(lines)
+        layout = _layout(lines, _numbered(columns))
+        if layout.names == [str(k + 1) for k in range(len(layout.names))] and _numbered(columns):
+            stream.seek(0)
+            lines = islice(_lines(stream), layout.lines, None)
         roles = _roles(layout, columns, path)
         wanted = [name for names in roles.values() for name in names]
         table = _table(lines, layout, sorted({layout.names.index(name) for name in wanted}))

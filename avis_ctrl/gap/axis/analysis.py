@@ -1,0 +1,361 @@
+"""From a problem to a verdict: search, names, shares, words.
+
+    Problem -> base fit -> search -> names (rivals, halves, held-out data) -> stages and sentences
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.gap.axis.model import AxisModel, Effect, base_priors
+from avis_ctrl.gap.axis.result import AxisGap, AxisStage, RunnerUp
+from avis_ctrl.gap.axis.search import (
+    Explored,
+    Progress,
+    Rival,
+    at_an_edge,
+    borne_out,
+    odds_against_fit,
+    parts,
+    rivals,
+    robust,
+    search,
+    unnamed,
+)
+from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
+from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.result import NamedEffect, sized
+from avis_ctrl.gap.validation import Half, halves
+from avis_ctrl.identification.likelihood import Fitted
+from avis_ctrl.measurement.gates.finding import Picture, Series
+
+Ratios = Callable[[Mapping[str, float]], Mapping[str, tuple[float, str]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A base model at its start, with what may be missing.
+
+    positive : which of the base's parameters are. noise : power of the measured noise of held-out lines over that of
+    the response; None where nothing tells it. units : of {F} and {x}. ratios : of values by name, with units.
+    notes : sentences on the data. plain : the base as a simulation needs it.
+    """
+
+    kind: str
+    model: AxisModel
+    positive: tuple[bool, ...]
+    effects: Sequence[Effect]
+    noise: float | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    ratios: Ratios = lambda values: {}
+    notes: tuple[str, ...] = ()
+    plain: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Name:
+    """What is known of an effect that was found. refused : why it is not named; empty where it is."""
+
+    effect: Effect
+    probability: float
+    rivals: tuple[Rival, ...]
+    refused: str
+    widened: float
+
+
+def analyse(problem: Problem, progress: Progress = lambda text: None, settings: AxisSettings = SETTINGS) -> AxisGap:
+    """What a model lacks, with probabilities.
+
+    Raises
+    ------
+    InputError, ComputationError : as the fit of the base model.
+    """
+    explored = Explored(problem.model.lines.fitted, settings)
+    progress("base model")
+    base = explored.base(problem.model, base_priors(problem.model, problem.positive, settings))
+    best = _first_of_alike(search(base, explored, problem.effects, progress), explored, problem)
+    progress("names")
+    refused: list[Name] = []
+    while True:
+        names = [_name(best, one, explored, problem, settings) for one in best.model.effects if not one.outside]
+        worst = min((one for one in names if one.refused), key=lambda one: one.probability, default=None)
+        better = None if worst else _better_shape(best, explored, problem, settings)
+        if better is not None:
+            best, variable = better
+            wrong = [one for one in names if one.effect.variable == variable]
+            refused += [replace(one, refused=f"another function of the {variable} leaves far less") for one in wrong]
+        else:
+            wrong = [worst] if worst else []
+            refused += wrong
+        for one in wrong:
+            best = explored.without(best, one.effect.label) or base
+        if not wrong:
+            break
+    free = unnamed(best, explored, problem.effects)
+    told = power(base) - power(best)
+    if not names or (free is not None and told < settings.right_shape * (power(base) - power(free))):
+        refused += [replace(one, refused="a function of another shape takes far more") for one in names]
+        names, best, free = [], base, unnamed(base, explored, problem.effects)
+    return _gap(problem, base, best, free, names, refused, explored, settings)
+
+
+def _better_shape(best: Fitted, explored: Explored, problem: Problem, settings: AxisSettings
+                  ) -> tuple[Fitted, str] | None:
+    """With a free function of what a named force is a function of, where that leaves far less: a neighbour of the truth
+    is not the truth."""
+    known = {one.variable for one in best.model.effects if one.outside}
+    for variable in sorted({one.variable for one in best.model.effects if one.variable} - known):
+        free = unnamed(best, explored, [one for one in problem.effects if one.outside and one.variable == variable])
+        if free is not None and power(free) < (1 - settings.right_shape) * power(best):
+            return free, variable
+    return None
+
+
+def _first_of_alike(best: Fitted, explored: Explored, problem: Problem) -> Fitted:
+    """Of effects that predict the same, the one that the library has first."""
+    place = {one.key: k for k, one in reversed(list(enumerate(problem.effects)))}
+    for label in best.labels:
+        own = next(one for one in best.model.effects if one.label == label)
+        same = [r for r in rivals(best, label, explored, problem.effects) if r.same and place[r.effect.key] <
+                place[own.key]]
+        if same:
+            best = min(same, key=lambda r: place[r.effect.key]).fitted
+    return best
+
+
+def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, settings: AxisSettings) -> Name:
+    others = rivals(best, one.label, explored, problem.effects)
+    rest = explored.without(best, one.label)
+    nothing = 0.0 if rest is None else odds_against_fit(best, rest, settings)
+    by_key: dict[str, float] = {}
+    for other in others:
+        if not other.same:
+            by_key[other.effect.key] = max(by_key.get(other.effect.key, 0.0), other.odds)
+    probability = min(1 / (1 + nothing + sum(by_key.values())), settings.most_sure)
+    near = tuple(r for r in others if r.same or r.odds * probability > settings.rival)
+    # What shapes a force is often known from a part of the data alone.
+    parameters = [f"{p.name}@{one.label}" for p in one.parameters if p.linear]
+    found = halves(best, parameters, settings, parts(best, parameters))
+    return Name(one, probability, near, _refusal(best, rest, one, probability, found, settings, max(
+        others, key=lambda r: r.odds).effect.name if sum(by_key.values()) > nothing else "nothing"),
+                _widening(found, settings))
+
+
+def _widening(found: Sequence[Half], settings: AxisSettings) -> float:
+    """Factor on the standard deviations of an effect's parameters, 1 or more: where halves of the data differ by more
+    than noise, they are known no better than the halves agree (R. T. Birge, Phys. Rev. 40 (1932) 207-227)."""
+    return max([1.0, *(float(np.sqrt(one.chi2 / one.dof)) for one in found if one.p_value < settings.widened_p_value)])
+
+
+def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float, found, settings: AxisSettings,
+             rival: str) -> str:
+    if probability < settings.headline:
+        return f"{rival} in its place is as probable"
+    if edge := at_an_edge(best):
+        return edge
+    if rest is not None and not borne_out(best, rest, settings):
+        return "held-out data do not bear it out"
+    std = np.sqrt(np.diag(robust(best))) * _widening(found, settings)
+    at = [best.model.names.index(f"{p.name}@{one.label}") for p in one.parameters if p.linear]
+    if all(abs(best.model.values[k]) < settings.apart * std[k] for k in at):
+        return "its size is not certain to differ from zero"
+    for half in found:
+        if half.p_value < settings.law_p_value and half.change > settings.law_change:
+            return f"{half.words} calls for another size, by {100 * half.change:.0f} %"
+    return ""
+
+
+def power(fitted: Fitted | AxisModel, by_line: bool = False) -> Any:
+    """What a model leaves of the power of held-out data; by_line : (frequency [Hz], power over the whole's)."""
+    model = fitted.model if isinstance(fitted, Fitted) else fitted
+    f, left, whole = [], [], 0.0
+    for block in model.lines.held.blocks:
+        e = np.sum(np.abs(block.Y - model.answer(block, None, False).Y) ** 2, axis=(1, 2))
+        f.append(block.omega / (2 * np.pi))
+        left.append(e)
+        whole += float(np.sum(np.abs(block.Y) ** 2))
+    return (np.concatenate(f), np.concatenate(left) / whole) if by_line else float(sum(map(np.sum, left)) / whole)
+
+
+def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, names: Sequence[Name],
+         refused: Sequence[Name], explored: Explored, settings: AxisSettings) -> AxisGap:
+    outside = [one.label for one in best.model.effects if one.outside]
+    whole = power(best)
+    before, after = power(base), whole
+    for label in outside:
+        rest = explored.without(best, label)
+        after = max(after, power(rest) if rest else before)
+    floor = problem.noise if problem.noise is not None else min(whole, power(free) if free is not None else whole)
+    excess = max(before - floor, 1e-300)
+    left = max(after - floor, 0.0) / excess
+    shares, alone = {}, {one.effect.label: power(best.model.without(one.effect.label)) for one in names}
+    for label, left_out in alone.items():  # of what the others could not take in its place
+        rest = explored.without(best, label)
+        taken = min(left_out, power(rest) if rest else left_out) - whole
+        shares[label] = float(np.clip(taken / excess, 0.0, 1.0))
+    covariance = _widened(best, names, shares, left)
+    effects = [_reported(one, best, covariance, shares[one.effect.label], problem) for one in names]
+    effects.sort(key=lambda one: -alone[one.label])
+    told = tuple(one for one in effects if (one.share or 0.0) >= settings.trace)
+    traces = tuple(one for one in effects if (one.share or 0.0) < settings.trace)
+    stages = _stages(base, best, [*(one.label for one in effects), *outside], explored, problem)
+    closed = after <= settings.within_noise * floor or max(after - floor, 0.0) < settings.small ** 2
+    verdict = ("partly explained", "explained")[closed] if told else ("unexplained", "none")[closed]
+    base_values = {name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])),
+                                  unit.format(**problem.units)) for k, (name, unit) in enumerate(best.model.base)}
+    where = _where(best, problem)
+    onward = next((one.effect.separated_by for one in names if one.rivals), None)
+    unknown = next((one.title for fitted in (best, free) if fitted is not None for one in fitted.model.effects
+                    if one.outside), "")
+    said = _sentences(problem, verdict, told, traces, stages, names, refused, unknown)
+    ups = tuple(RunnerUp(r.effect.key, one.effect.key, min(r.odds * one.probability, settings.most_sure))
+                for one in names for r in one.rivals)
+    return AxisGap(problem.kind, verdict, told, traces, tuple(stages), where, tuple(said), onward, base_values,
+                   _ratios(problem, best, covariance), ups,
+                   None if problem.noise is None else float(np.sqrt(after / max(problem.noise, 1e-300))), left,
+                   _pictures(base, best, stages), {"kind": problem.kind, **problem.plain, "baseline": _plain(base),
+                                                   "updated": _plain(best)})
+
+
+def _widened(best: Fitted, names: Sequence[Name], shares: Mapping[str, float], left: float) -> np.ndarray:
+    """Covariance of all parameters. No law is quite that of the real element: those of an effect are known no better
+    than halves of the data agree, and what remains beyond noise may point along the effect, with a correlation of
+    anything from -1 to 1 (its variance is 1/3)."""
+    factor, beside = np.ones(len(best.model.names)), np.zeros(len(best.model.names))
+    for one in names:
+        for p, value in zip(one.effect.parameters, best.model.of(one.effect), strict=True):
+            k = best.model.names.index(f"{p.name}@{one.effect.label}")
+            factor[k] = one.widened
+            beside[k] = value ** 2 * left / (3 * max(shares[one.effect.label], left, 1e-12))
+    return robust(best) * np.outer(factor, factor) + np.diag(beside)
+
+
+def _reported(one: Name, best: Fitted, covariance: np.ndarray, share: float, problem: Problem) -> NamedEffect:
+    values, effect = best.model.of(one.effect), one.effect
+    rows = [best.model.names.index(f"{p.name}@{effect.label}") for p in effect.parameters]
+    own = covariance[np.ix_(rows, rows)]
+    if effect.derived:
+        found = _propagated(effect.derived, values, own, problem)
+    else:
+        found = {p.name: Reported(float(value), float(np.sqrt(own[k, k])), p.unit.format(**problem.units))
+                 for k, (p, value) in enumerate(zip(effect.parameters, values, strict=True))}
+    return NamedEffect(effect.name, effect.location, effect.title, found, one.probability,
+                       tuple(dict.fromkeys(r.effect.key for r in one.rivals)), effect.label, share=share)
+
+
+def _propagated(function: Callable[[np.ndarray], Mapping[str, tuple[float, str]]], values: np.ndarray,
+                covariance: np.ndarray, problem: Problem) -> dict[str, Reported]:
+    """With standard deviations to first order."""
+    found = {}
+    for name, (value, unit) in function(values).items():
+        slope = np.zeros(len(values))
+        for k in range(len(values)):
+            step = np.zeros(len(values))
+            step[k] = 1e-6 * abs(values[k])
+            if step[k]:
+                slope[k] = (function(values + step)[name][0] - value) / step[k]
+        found[name] = Reported(float(value), float(np.sqrt(slope @ covariance @ slope)), unit.format(**problem.units))
+    return found
+
+
+def _stages(base: Fitted, best: Fitted, labels: Sequence[str], explored: Explored, problem: Problem) -> list[AxisStage]:
+    """Base, then one effect more each, the largest share first."""
+    models, one = [("base", base)], best
+    chain: list[tuple[str, Fitted]] = []
+    for label in reversed(labels):
+        chain.append((label.partition("@")[0], one))
+        rest = explored.without(one, label)
+        if rest is None or len(one.labels) == 1:
+            break
+        one = rest
+    return [AxisStage(name, float(np.sqrt(power(fitted))), None if problem.noise is None else
+                      power(fitted) / max(problem.noise, 1e-300)) for name, fitted in (*models, *chain[::-1])]
+
+
+def _ratios(problem: Problem, best: Fitted, covariance: np.ndarray) -> dict[str, Reported]:
+    names = [name.partition("@")[0] for name in best.model.names]
+    return _propagated(lambda values: problem.ratios(dict(zip(names, values, strict=True))), best.model.values,
+                       covariance, problem)
+
+
+def _plain(fitted: Fitted) -> dict[str, Any]:
+    model = fitted.model
+    return {"base": {name: float(value) for (name, _), value in zip(model.base, model.values, strict=False)},
+            "effects": [{"label": one.label, "values": model.of(one).tolist()} for one in model.effects
+                        if not one.outside]}
+
+
+def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
+    """The octaves that together hold at least half of what remains, largest first."""
+    f, left = power(best, by_line=True)
+    octave = np.floor(np.log2(np.maximum(f, 1e-3))).astype(int)
+    found: list[dict[str, Any]] = []
+    for k in sorted(np.unique(octave), key=lambda k: -float(left[octave == k].sum())):
+        inside = octave == k
+        share = float(left[inside].sum() / max(left.sum(), 1e-300))
+        found.append({"from_Hz": float(f[inside].min()), "to_Hz": float(f[inside].max()),
+                      "input": problem.units.get("input", ""), "output": problem.units.get("output", ""),
+                      "share": share})
+        if sum(one["share"] for one in found) >= 0.5:
+            break
+    return tuple(found)
+
+
+def _pictures(base: Fitted, best: Fitted, stages: Sequence[AxisStage]) -> tuple[Picture, ...]:
+    at = np.arange(len(stages), dtype=float)
+    ladder = Picture("Gap on held-out data", "stage", "error over measured [%]",
+                     (Series("left", at, np.array([100 * one.nrmse for one in stages]), "bars"),), (), "linear", "log",
+                     tuple(one.name for one in stages))
+    series = []
+    for name, fitted in (("base", base), ("updated", best)):
+        f, left = power(fitted, by_line=True)
+        lines = np.unique(np.round(f, 9))
+        lines = lines[lines > 0]
+        series.append(Series(name, lines, np.array([np.sqrt(np.mean(left[np.round(f, 9) == one])) for one in lines]),
+                             "points" if len(lines) < 40 else "line"))
+    return ladder, Picture("What each model leaves on held-out data", "frequency [Hz]", "r.m.s. on a line, relative",
+                           tuple(series), (), "log", "log")
+
+
+def percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
+
+
+def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], traces: Sequence[NamedEffect],
+               stages: Sequence[AxisStage], names: Sequence[Name], refused: Sequence[Name], unknown: str) -> list[str]:
+    first, last = percent(stages[0].nrmse), percent(stages[-1].nrmse)
+    if verdict == "none":
+        said = [f"Nothing is missing that these data can show: the model leaves {last} of held-out data."]
+    elif verdict == "unexplained":
+        said = [f"The base model leaves {first} of held-out data, more than noise, and no effect of the library "
+                "accounts for it: unexplained."]
+    else:
+        said = [f"The model lacks {'; and '.join(one.in_words() for one in told)}; with that the gap on held-out data "
+                f"falls from {first} to {last}{', and more is missing' * (verdict != 'explained')}."]
+    if traces:
+        said.append("Traces, below 1 % of the gap: " + "; ".join(
+            f"{one.name} ({', '.join(f'{key} {sized(p)}' for key, p in one.parameters.items())})"
+            for one in traces) + ".")
+    for one in names:
+        delay = one.effect.name == "delay" and next(p for e in (*told, *traces) if e.label == one.effect.label
+                                                    for p in e.parameters.values()).value < 0
+        if delay:
+            said.append("The delay is negative: the motion comes before the force, so that the force was logged late, "
+                        "or the motion early.")
+        if one.rivals and one.effect.separated_by:
+            said.append(f"{one.effect.name}: these data cannot tell it from "
+                        f"{' or '.join(dict.fromkeys(r.effect.title for r in one.rivals))}; what would: "
+                        f"{one.effect.separated_by}.")
+    if stages[-1].chi2_per_dof is None:
+        said.append("Nothing in these data repeats, so that the noise is not measured.")
+    else:
+        said.append(f"What remains of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured "
+                    "noise.")
+    if unknown:
+        said.append(f"What remains behaves most like {unknown}, for which the library has no name.")
+    lost = {one.effect.name: f"{one.effect.name} comes near, but {one.refused}" for one in refused}
+    return [*said, *problem.notes, *(f"Not named: {'; '.join(lost.values())}." for _ in [lost] if lost)]

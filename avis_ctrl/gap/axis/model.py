@@ -1,0 +1,250 @@
+"""A mass with what may be missing from it, as the likelihood of the table takes a model.
+
+With R = M s^2 q + d s q + k q + forces and Z = M s^2 + d s + k + inner dynamics, P the path from force to mass:
+
+    drive:  F = F_measured - (P F - R)/P       oscillator:  q = q_measured + (P F - R)/Z
+
+This is R / P and P F / Z but for what a window spills, which P F - R holds exactly. Both are linear in the forces'
+coefficients.
+The linear part of a force, alpha q + beta v at the level of the record, belongs to Z as well: without it the force
+would predict the noise of the very q that it is computed from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.gap.axis.records import Lines, Shape
+from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
+from avis_ctrl.identification.priors import Priors
+from avis_ctrl.identification.spectral_block import SpectralBlock
+
+Curve = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """unit : with {F} and {x} for those of force and position. A linear one begins at zero; another one, positive,
+    where the effect's seeds begin, within its range. step : relative, of the derivative by one that shapes a force: a
+    force with an edge changes evenly over it."""
+
+    name: str
+    unit: str
+    low: float = -np.inf
+    high: float = np.inf
+    linear: bool = True
+    step: float = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """What a model of one axis may lack.
+
+    name, location : as reported. title : what is missing, in words. separated_by : the measurement that tells it from
+    effects that predict the same. shapes : forces, functions of the motion, one for each of the first parameters; the
+    others, which are not linear, shape all of them. variable : "position", "velocity" or "input", where the force is a
+    function of it alone: a free function of the same then judges its shape.
+    dynamics : (s, p) added to Z. path : (s, p) factor of the path from force to mass. channel : (s, p) factor of one
+    channel of a sensor. seeds : values where a fit may begin. law : variant of the effect. outside : a function without
+    a name, which stands for whatever the library does not hold. derived : what is reported in the place of the
+    parameters. implausible : (p) why physics forbids values; empty where it does not.
+    """
+
+    name: str
+    location: str
+    title: str
+    parameters: tuple[Parameter, ...]
+    separated_by: str = ""
+    shapes: tuple[Shape, ...] = ()
+    dynamics: Curve | None = None
+    path: Curve | None = None
+    channel: Curve | None = None
+    seeds: tuple[tuple[float, ...], ...] = ()
+    law: str = ""
+    variable: str = ""
+    outside: bool = False
+    derived: Callable[[np.ndarray], dict[str, tuple[float, str]]] | None = None
+    implausible: Callable[[np.ndarray], str] | None = None
+
+    @property
+    def label(self) -> str:
+        return f"{self.name}@{self.location}" + (f"/{self.law}" if self.law else "")
+
+    @property
+    def key(self) -> str:
+        return f"{self.name}@{self.location}"
+
+    def begins(self) -> list[np.ndarray]:
+        return [np.array(one) for one in self.seeds] or [np.zeros(len(self.parameters))]
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Y (n, n_y, 1) and its derivatives dY (p, n, n_y, 1)."""
+
+    Y: np.ndarray
+    dY: np.ndarray
+
+
+def split(values: np.ndarray, effects: Sequence[Effect], base: int) -> list[np.ndarray]:
+    """Values of each effect."""
+    found, at = [], base
+    for one in effects:
+        found.append(values[at:at + len(one.parameters)])
+        at += len(one.parameters)
+    return found
+
+
+def slopes(curve: Curve, s: np.ndarray, p: np.ndarray) -> list[np.ndarray]:
+    """Derivative of a curve by each of its parameters, by central differences."""
+    found = []
+    for j in range(len(p)):
+        h = np.zeros(len(p))
+        h[j] = 1e-5 * abs(p[j]) or 1e-6 / float(np.max(np.abs(s)))
+        found.append((curve(s, p + h) - curve(s, p - h)) / (2 * h[j]))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class AxisModel:
+    """base : names and units of the base model's parameters, the first one positive."""
+
+    lines: Any
+    base: tuple[tuple[str, str], ...]
+    effects: tuple[Effect, ...]
+    values: np.ndarray
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (*(name for name, _ in self.base), *(f"{p.name}@{one.label}" for one in self.effects
+                                                    for p in one.parameters))
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return (*(unit for _, unit in self.base), *(p.unit for one in self.effects for p in one.parameters))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(one.label for one in self.effects)
+
+    def of(self, effect: Effect) -> np.ndarray:
+        """Values of an effect."""
+        return split(self.values, self.effects, len(self.base))[self.effects.index(effect)]
+
+    def at(self, values: np.ndarray) -> AxisModel:
+        if not np.all(np.isfinite(values)):
+            raise InputError("expected finite values", field="values")
+        return replace(self, values=np.asarray(values, float))
+
+    def with_effect(self, one: Effect, values: np.ndarray) -> AxisModel:
+        return replace(self, effects=(*self.effects, one), values=np.concatenate([self.values, values]))
+
+    def without(self, label: str) -> AxisModel:
+        parts = split(self.values, self.effects, len(self.base))
+        kept = [k for k, one in enumerate(self.effects) if one.label != label]
+        return replace(self, effects=tuple(self.effects[k] for k in kept),
+                       values=np.concatenate([self.values[:len(self.base)], *(parts[k] for k in kept)]))
+
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
+        raise NotImplementedError
+
+    def contributions(self, block: SpectralBlock) -> np.ndarray:
+        """(n, n_y, 1): what may have a relative error that is constant over a band: the whole prediction. What no law
+        of a force holds exactly is distortion."""
+        return self.answer(block, None, False).Y
+
+    def columns(self, block: SpectralBlock, derivative: bool = True) -> np.ndarray:
+        return self.answer(block, None, derivative).dY
+
+
+@dataclass(frozen=True, eq=False)
+class MassModel(AxisModel):
+    """M, d and, of an oscillator, k; see the module."""
+
+    lines: Lines
+
+    def _force(self, one: Effect, p: np.ndarray, block: SpectralBlock) -> tuple[np.ndarray, np.ndarray]:
+        """(shapes, n, 3) of an effect on the lines of a block, and their linear parts (shapes, n)."""
+        by = tuple(map(float, p[len(one.shapes):]))
+        own = np.array([self.lines.pick(self.lines.of(shape, by), block.name) for shape in one.shapes])
+        if self.lines.solves_for == "force" or one.location == "input":
+            return own, np.zeros(own.shape[:2])
+        return own, np.array([alpha + 1j * beta * block.omega for alpha, beta in (self.lines.linear_part(shape, by)
+                                                                                  for shape in one.shapes)])
+
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
+        n, s, around = len(self.base), 1j * block.omega, self.lines.around(block.omega)
+        A, V, Q, F = (self.lines.pick(one, block.name) for one in (self.lines.A, self.lines.V, self.lines.Q,
+                                                                   self.lines.F))
+        regressors, several = (A, V, Q)[:n], split(self.values, self.effects, n)
+        Z = sum(x * s ** (2 - k) for k, x in enumerate(self.values[:n]))
+        R = sum(x * one for x, one in zip(self.values, regressors, strict=False))
+        P = np.ones(around.shape, complex)
+        for one, p in zip(self.effects, several, strict=True):
+            if one.shapes:
+                own, linear = self._force(one, p, block)
+                R, Z = R + np.tensordot(p[:len(own)], own, 1), Z + p[:len(own)] @ linear
+            if one.dynamics:
+                Z, R = Z + one.dynamics(s, p), R + one.dynamics(around, p) * Q
+            if one.path:
+                P = P * one.path(around, p)
+        drive, f = self.lines.solves_for == "force", np.sum(P * F - R, axis=1)
+        D = -P[:, 1] if drive else Z
+        Y = (F if drive else Q).sum(axis=1) + f / D
+        if not derivative:
+            return Answer(Y[:, None, None], np.empty((0, len(s), 1, 1)))
+
+        def force(column: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
+            return -column.sum(axis=1) / D - (0.0 if drive else f / D ** 2 * z)
+        dY = [force(one, s ** (2 - k)) for k, one in enumerate(regressors)]
+        for one, p in zip(self.effects, several, strict=True):
+            c = p[:len(one.shapes)]
+            if one.shapes:
+                dY += [force(*both) for both in zip(*self._force(one, p, block), strict=True)]
+            for h in np.diag(p * [q.step for q in one.parameters])[len(c):] if one.shapes else ():
+                up, down = (self._force(one, p + step, block) for step in (h, -h))
+                dY.append(force(*(np.tensordot(c, a - b, 1) / (2 * h.sum()) for a, b in zip(up, down, strict=True))))
+            if one.dynamics:
+                dY += [force(slope * Q, z) for slope, z in zip(slopes(one.dynamics, around, p),
+                                                              slopes(one.dynamics, s, p), strict=True)]
+            if one.path:
+                dP = [P / one.path(around, p) * slope for slope in slopes(one.path, around, p)]
+                dY += [np.sum(slope * F, axis=1) / D + (f / D ** 2 * slope[:, 1] if drive else 0.0) for slope in dP]
+        return Answer(Y[:, None, None], np.array(dY)[:, :, None, None])
+
+
+def base_priors(model: AxisModel, positive: Sequence[bool], settings: AxisSettings = SETTINGS) -> Priors:
+    """Of the base model's parameters, so wide that they bend nothing: a factor of e, or as much as the whole
+    response."""
+    v = model.values[:len(model.base)]
+    size = sizes(model, list(range(len(v))))
+    up = np.asarray(positive, bool)
+    return Priors(tuple(name for name, _ in model.base), np.where(up, v, 0.0),
+                  np.where(up, settings.shape_spread, size), up)
+
+
+def sizes(model: AxisModel, at: Sequence[int]) -> np.ndarray:
+    """Values of parameters that change the prediction by as much as the whole response, r.m.s. over fitted lines."""
+    power, total = np.zeros(len(at)), 0
+    for block in model.lines.fitted.blocks:
+        dY = model.columns(block)[list(at)]
+        scale = float(np.sqrt(np.mean(np.abs(block.Y) ** 2)))
+        power += np.sum(np.abs(dY / scale) ** 2, axis=(1, 2, 3))
+        total += block.Y.size
+    return 1 / np.sqrt(np.maximum(power / total, 1e-300))
+
+
+def effect_priors(model: AxisModel, settings: AxisSettings = SETTINGS) -> Priors:
+    """Of the last effect of a model, at its start."""
+    one = model.effects[-1]
+    n = len(one.parameters)
+    start, linear = model.values[-n:], np.array([p.linear for p in one.parameters], bool)
+    size = sizes(model, list(range(len(model.values) - n, len(model.values))))
+    return Priors(tuple(f"{p.name}@{one.label}" for p in one.parameters), np.where(linear, 0.0, start),
+                  np.where(linear, size, settings.shape_spread), ~linear, np.array([p.low for p in one.parameters]),
+                  np.array([p.high for p in one.parameters]))

@@ -1,0 +1,334 @@
+"""Which effects the data ask for: score tests of single effects and pairs, refits, evidence; then each is left out and
+replaced by every other.
+
+Every set of effects is fitted once (`Explored`), by the likelihood of the table. The order in which effects are found
+has no influence on what is named.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from avis_ctrl.errors import AvisError
+from avis_ctrl.gap.axis.model import AxisModel, Effect, effect_priors
+from avis_ctrl.gap.axis.settings import AxisSettings
+from avis_ctrl.gap.probability import odds_against
+from avis_ctrl.gap.score import reduction
+from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, unseen
+from avis_ctrl.identification.maximum_likelihood import as_real, whitened
+from avis_ctrl.identification.single_axis.fit import not_below
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Effects with the values where a fit begins, what the score test says they take off the sum of squares, and their
+    whitened directions (k, N) that the present model lacks."""
+
+    effects: tuple[tuple[Effect, np.ndarray], ...]
+    fall: float
+    directions: np.ndarray
+
+
+@dataclass(eq=False)
+class Explored:
+    """Fits by the set of their effects' labels; the order in which effects are found has no influence."""
+
+    data: Data
+    settings: AxisSettings
+    fits: dict[frozenset[str], Fitted | None] = field(default_factory=dict)
+
+    def base(self, model: AxisModel, priors) -> Fitted:
+        found = fit(model, priors, priors.z(model.values), self.data, first_variances(self.data, self.settings),
+                    self.settings)
+        self.fits[frozenset()] = found
+        return found
+
+    def with_effects(self, now: Fitted, added: Sequence[tuple[Effect, np.ndarray]]) -> Fitted | None:
+        """The fit with some effects more; None where it came to no end."""
+        labels = frozenset((*now.labels, *(one.label for one, _ in added)))
+        if labels not in self.fits:
+            model, priors, z = now.model, now.priors, now.z
+            for one, values in added:
+                model = model.with_effect(one, values)
+                own = effect_priors(model, self.settings)
+                priors, z = priors.followed_by(own), np.concatenate([z, own.z(values)])
+            self.fits[labels] = self._try(model, priors, z, now)
+        return self.fits[labels]
+
+    def without(self, now: Fitted, label: str) -> Fitted | None:
+        labels = frozenset(now.labels) - {label}
+        if labels not in self.fits:
+            model = now.model.without(label)
+            rows = [now.priors.names.index(name) for name in model.names]
+            self.fits[labels] = self._try(model, now.priors.of(model.names), now.z[rows], now)
+        return self.fits[labels]
+
+    def _try(self, model: AxisModel, priors, z: np.ndarray, like: Fitted) -> Fitted | None:
+        try:
+            with np.errstate(all="ignore"):
+                return fit(model, priors, z, self.data, like.variances, self.settings)
+        except (AvisError, np.linalg.LinAlgError, FloatingPointError):
+            return None
+
+
+def candidates(now: Fitted, data: Data, effects: Sequence[Effect], settings: AxisSettings) -> list[Candidate]:
+    """Every effect that the model has not, at its best seed, the largest fall first."""
+    J, e = now.J, now.e
+    Q = np.linalg.qr(J.T)[0]
+    left, taken, found = e - Q @ (Q.T @ e), {one.key for one in now.model.effects}, []
+    for one in effects:
+        if one.key in taken:
+            continue
+        best = None
+        for seed in one.begins():
+            C = directions(now, data, one, seed)
+            C = C - (C @ Q) @ Q.T
+            fall = reduction(C @ C.T, C @ left).chi2
+            if best is None or fall > best.fall:
+                best = Candidate(((one, seed),), fall, C)
+        if best is not None:
+            found.append(best)
+    return sorted(found, key=lambda c: -c.fall)
+
+
+def directions(now: Fitted, data: Data, one: Effect, seed: np.ndarray) -> np.ndarray:
+    """(k, N) whitened changes of the prediction by an effect's parameters at its seed."""
+    model = now.model.with_effect(one, seed)
+    rows = []
+    for block, L in zip(data.blocks, now.weights.L, strict=True):
+        dY = model.columns(block)[-len(seed):]
+        rows.append(as_real(whitened(L[:, None], dY)))
+    C = now.weights.flatten(np.concatenate(rows, axis=1))
+    linear = np.array([p.linear for p in one.parameters], bool)
+    return C[linear | (not linear.any())]
+
+
+def shortlist(found: Sequence[Candidate], left: np.ndarray, settings: AxisSettings) -> list[Candidate]:
+    """The best single effects, and the best pairs that take more than their parts."""
+    singles = [c for c in found if c.fall > 2 * settings.certain]
+    one_law: dict[str, Candidate] = {}
+    for c in found:
+        one_law.setdefault(c.effects[0][0].key, c)
+    pairs = []
+    for a, b in combinations(one_law.values(), 2):
+        C = np.vstack([a.directions, b.directions])
+        fall = reduction(C @ C.T, C @ left).chi2
+        if fall > a.fall + b.fall + 2 * settings.certain:
+            pairs.append(Candidate((*a.effects, *b.effects), fall, C))
+    pairs.sort(key=lambda c: -c.fall)
+    return [*singles[:settings.refits], *pairs[:settings.pairs]]
+
+
+def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress: Progress) -> Fitted:
+    """The model with effects that the data ask for.
+
+    An effect is added where the score rises by more than the number of candidates explains and held-out data bear it
+    out, and dropped where others have made it idle. Where none is left, each is compared with every other in its place,
+    and the search continues if one is better.
+    """
+    settings, now, revisions = explored.settings, base, 0
+    effects = [one for one in effects if not one.outside]
+    price = settings.certain + math.log(len(effects))
+    while True:
+        progress(f"candidates beside {', '.join(now.labels) or 'the base model'}")
+        tried = [now]
+        if len(now.labels) < settings.longest:
+            for c in shortlist(candidates(now, explored.data, effects, settings), now.e, settings):
+                one = explored.with_effects(now, c.effects)
+                if one is not None and not at_an_edge(one):
+                    tried.append(one)
+        best = max(tried, key=lambda one: score(one, settings) - (len(one.labels) - len(now.labels)) * price)
+        if best is not now:
+            best = _without_idle(_revised(best, explored, effects, laws_only=True), explored)
+        if best is now or score(best, settings) <= score(now, settings) or not borne_out(best, now, settings):
+            revisions += 1
+            best = _without_idle(_revised(now, explored, effects, laws_only=False), explored)
+            if revisions > settings.revisions or best.labels == now.labels:
+                return best
+        now = best
+
+
+def score(one: Fitted, settings: AxisSettings) -> float:
+    """Evidence of what was fitted, and log-likelihood of what was held out."""
+    return one.log_evidence + sum(cells(one, True, settings).values())
+
+
+def borne_out(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
+    """Whether held-out data are more probable by one model than by another."""
+    return sum(cells(one, True, settings).values()) > sum(cells(other, True, settings).values())
+
+
+def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_only: bool) -> Fitted:
+    """Each effect replaced by another law of it, or by any other, where the score rises."""
+    settings = explored.settings
+    for label in now.labels:
+        own, rest = next(one for one in now.model.effects if one.label == label), explored.without(now, label)
+        if rest is None:
+            continue
+        laws = [one for one in effects if one.key == own.key]
+        found = candidates(rest, explored.data, laws if laws_only else effects, settings)
+        least = 0.5 * settings.not_far_behind * max(c.fall for c in found if c.effects[0][0].key == own.key)
+        for c in found[:settings.starts + len(laws)]:
+            if c.fall < least:
+                break
+            one = explored.with_effects(rest, c.effects)
+            if one is not None and not at_an_edge(one) and score(one, settings) > score(now,
+                                                                                        settings) + settings.settled:
+                now = one
+    return now
+
+
+def _without_idle(now: Fitted, explored: Explored) -> Fitted:
+    settings = explored.settings
+    while len(now.labels) > 1:
+        rest = [one for label in now.labels if (one := explored.without(now, label)) is not None]
+        best = max(rest, key=lambda one: score(one, settings), default=None)
+        if best is None or score(best, settings) < score(now, settings) - settings.certain:
+            return now
+        now = best
+    return now
+
+
+def at_an_edge(fitted: Fitted) -> str:
+    """In words, a parameter of an effect at the end of its range, or beyond what physics allows; empty where none
+    is."""
+    for one in fitted.model.effects:
+        if one.implausible and (reason := one.implausible(fitted.model.of(one))):
+            return reason
+        for p, value in zip(one.parameters, fitted.model.of(one), strict=True):
+            if value <= p.low or value >= p.high:
+                return f"{p.name} of {one.name} ends at {value:.3g} {p.unit}, the limit of its range"
+    return ""
+
+
+def unnamed(now: Fitted, explored: Explored, effects: Sequence[Effect]) -> Fitted | None:
+    """The best model with a function that has no name beside what is named; None where none is called for."""
+    settings, tried = explored.settings, []
+    others = [one for one in effects if one.outside]
+    for c in candidates(now, explored.data, others, settings):
+        one = explored.with_effects(now, c.effects)
+        if one is not None:
+            tried.append(one)
+    best = max(tried, key=lambda one: one.log_evidence, default=None)
+    price = settings.certain + math.log(max(len(others), 1) * settings.outside_odds)
+    return best if best is not None and best.log_evidence > now.log_evidence + price else None
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """Another effect in the place of one: the fit, its odds, and whether it predicts the same."""
+
+    effect: Effect
+    fitted: Fitted
+    odds: float
+    same: bool
+
+
+def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effect]) -> list[Rival]:
+    """What could stand in the place of an effect, beside all others."""
+    settings = explored.settings
+    rest = explored.without(best, label)
+    if rest is None:
+        return []
+    own = next(one for one in best.model.effects if one.label == label)
+    found = candidates(rest, explored.data, [one for one in effects if not one.outside], settings)
+    mine = next((c for c in found if c.effects[0][0].label == label), None)
+    least = 0.5 * mine.fall if mine is not None else 0.0
+    known: list[Rival] = []
+    for c in found[:2 * settings.refits]:
+        effect = c.effects[0][0]
+        if effect.key == own.key or c.fall < settings.not_far_behind * least:
+            continue
+        one = explored.with_effects(rest, c.effects)
+        if one is None or at_an_edge(one):
+            continue
+        known.append(Rival(effect, one, odds_against_fit(best, one, settings), alike(best, one, settings)))
+    return sorted(known, key=lambda r: -r.odds)
+
+
+def alike(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
+    """Whether two models predict the same within the data: were one of them true, the other would be behind by less
+    than
+    that in log-likelihood [nats] on average."""
+    left = one.white.e - other.white.e
+    return bool(0.5 * left @ left < settings.alike)
+
+
+def odds_against_fit(one: Fitted, other: Fitted, settings: AxisSettings) -> float:
+    """Of another fit against one: by the evidence of what was fitted and the likelihood of what was held out, or by how
+    evenly both are spread over segments and octaves, whichever is larger: what is left of a real record is no white
+    noise."""
+    mine, theirs = cells(one, False, settings), cells(other, False, settings)
+    beside = one.log_evidence - other.log_evidence - sum(mine.values()) + sum(theirs.values())
+    mine, theirs = mine | cells(one, True, settings), theirs | cells(other, True, settings)
+    ahead = sum(mine.values()) - sum(theirs.values()) + beside
+    return max(math.exp(-min(max(ahead, -50.0), 50.0)), odds_against(mine, theirs, beside))
+
+
+def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int, int, bool], float]:
+    """Log-likelihood of what was fitted, by segment and octave, or of what was held out, by segment, each of which may
+    be louder than what was fitted: one disturbance decides nothing."""
+    data = fitted.model.lines.held if held else fitted.model.lines.fitted
+    weights, e = unseen(fitted, data, settings) if held else (fitted.weights, fitted.e)
+    rows, determinant = row_table(fitted, data), np.zeros(len(e))
+    for group, at in weights.rows.items():
+        determinant[at] = weights.log_determinants[group] / len(at)
+    octave = 0 * rows.segment if held else np.floor(np.log2(rows.frequency)).astype(int)
+    places, cell = np.unique(np.stack([rows.segment, octave]), axis=1, return_inverse=True)
+    count, e2, rest = (np.bincount(cell.ravel(), x) for x in (np.ones(len(e)), e ** 2, determinant))
+    louder = np.maximum(e2 / count, 1.0) if held else np.ones(len(e2))
+    left = e2 / louder + count * np.log(louder)
+    return {(int(i), int(j), held): float(x) for i, j, x in zip(*places, -0.5 * (left + rest), strict=True)}
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Of each real number of the stacked residual: frequency [rad/s], segment, begin [s], loudness."""
+
+    frequency: np.ndarray
+    segment: np.ndarray
+    when: np.ndarray
+    level: np.ndarray
+
+
+def row_table(fitted: Fitted, data: Data) -> Rows:
+    columns: list[list[np.ndarray]] = [[], [], [], []]
+    for block, level in zip(data.blocks, data.levels, strict=True):
+        segment, when = fitted.model.lines.of_lines(block.name)
+        for column, values in zip(columns, (block.omega, segment, when, np.full(len(when), level)), strict=True):
+            column.append(np.tile(np.repeat(values, block.Y.shape[1]), 2))
+    return Rows(*(np.concatenate(column) for column in columns))
+
+
+def parts(fitted: Fitted, names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
+    """Halves of the data by band, time and level, each with half of the information on some parameters."""
+    rows = row_table(fitted, fitted.model.lines.fitted)
+    information = np.sum(fitted.J[[fitted.priors.names.index(name) for name in names]] ** 2, axis=0)
+    found = []
+    for values, words in ((rows.frequency, ("the lower part of the band", "the upper part of the band")),
+                          (rows.when, ("the first half of the record", "the second half of the record")),
+                          (rows.level, ("low levels", "high levels"))):
+        order = np.argsort(values, kind="stable")
+        middle = values[order][np.searchsorted(np.cumsum(information[order]), information.sum() / 2)]
+        below = values <= middle
+        if below.any() and not below.all():
+            found += [(words[0], np.flatnonzero(below)), (words[1], np.flatnonzero(~below))]
+    return found
+
+
+def robust(fitted: Fitted) -> np.ndarray:
+    """Covariance of the values of all parameters, with the scores summed over each segment (K. Liang, S. Zeger,
+    Biometrika 73 (1986) 13): whatever correlation there is inside a segment counts. Not below that of the fit."""
+    segment, slope = row_table(fitted, fitted.model.lines.fitted).segment, fitted.priors.slopes(fitted.z)
+    groups = np.unique(segment)
+    scores = np.array([fitted.J[:, segment == one] @ fitted.e[segment == one] - fitted.z / len(groups)
+                       for one in groups])
+    P, few = fitted.covariance, len(groups) / max(len(groups) - 1, 1)
+    return not_below(few * P @ (scores.T @ scores) @ P, P) * np.outer(slope, slope)

@@ -1,0 +1,215 @@
+"""A seismometer channel: coil and displacement of one second-order mass, and what one of them may lack.
+
+The data are the first channel over the drive, and the second channel over the first, in which the mass itself cancels:
+a fault of one channel shows there far below what the mass's own nonlinearity leaves in each response. Logarithms of
+magnitudes and phases are apart, each with its own discrepancy: a laser that counts too little leaves the phase alone.
+They are real; two neighbouring frequencies make one complex number for the likelihood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.gap.axis.analysis import Problem
+from avis_ctrl.gap.axis.model import Answer, AxisModel, Effect, Parameter, split
+from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
+from avis_ctrl.identification.likelihood import Data
+from avis_ctrl.identification.single_axis.lag import LARGEST_MODE_DAMPING
+from avis_ctrl.identification.single_axis.seismometer import Responses, fit_seismometer, response
+from avis_ctrl.identification.single_axis.sine import SineRecord
+from avis_ctrl.identification.spectral_block import SpectralBlock
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """Responses as blocks for the likelihood. Outputs are magnitude and phase of each response: Y is 1 + j, and the
+    model predicts Y and the logarithm of its own response over the measured one.
+
+    f : (n,) Hz, n even. measured : (n, responses). spread : (pairs,) what the discrepancy is expected to be
+    proportional to, by which all outputs are divided. names : of the channels, one or two. rows : pairs by block.
+    """
+
+    f: np.ndarray
+    measured: np.ndarray
+    spread: np.ndarray
+    names: tuple[str, ...]
+    fitted: Data
+    held: Data
+    rows: dict[str, np.ndarray]
+    settings: AxisSettings
+
+    def of_lines(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) number of a pair, and its place in the order of frequencies."""
+        return self.rows[name], self.rows[name].astype(float)
+
+
+@dataclass(frozen=True, eq=False)
+class SensorModel(AxisModel):
+    """A mass on a spring, read by its coil and by a displacement sensor."""
+
+    lines: Channels
+
+    def _predicted(self, pairs: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """(pairs, outputs)"""
+        c, base = self.lines, len(self.base)
+        rows = (2 * pairs[:, None] + np.arange(2)).ravel()
+        s = 2j * np.pi * c.f[rows]
+        model = response(c.f[rows], tuple(name for name, _ in self.base), values[:base])
+        H = [np.asarray(model[kind], complex) for kind in c.names]
+        for one, p in zip(self.effects, split(values, self.effects, base), strict=True):
+            assert one.channel is not None
+            H = [h * one.channel(s, p) if one.location in (kind, "drive") else h
+                 for kind, h in zip(c.names, H, strict=True)]
+        found = np.log(np.stack([H[0], *([H[1] / H[0]] if len(H) > 1 else [])], axis=1) / c.measured[rows])
+        parts = 1 + np.stack([found.real, found.imag], axis=2).reshape(len(rows), -1)
+        return (parts[::2] + 1j * parts[1::2]) / c.spread[pairs][:, None]
+
+    def contributions(self, block: SpectralBlock) -> np.ndarray:
+        return np.zeros((*block.Y.shape[:2], 1))  # what is constant over the band is a gain, which is free
+
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
+        rows = self.lines.rows[block.name]
+        Y = self._predicted(rows, self.values)
+        if not derivative:
+            return Answer(Y[:, :, None], np.empty((0, *Y.shape, 1)))
+        low, dY = 1e-7 / float(self.lines.f[-1]), []
+        for k in range(len(self.values)):
+            h = np.zeros(len(self.values))
+            h[k] = max(1e-5 * abs(self.values[k]), low if k >= len(self.base) else 0.0)
+            dY.append((self._predicted(rows, self.values + h) - self._predicted(rows, self.values - h)) / (2 * h[k]))
+        return Answer(Y[:, :, None], np.array(dY)[..., None])
+
+
+def seismometer(responses: Responses, distortion: np.ndarray | None = None, ratio_variance: np.ndarray | None = None,
+                settings: AxisSettings = SETTINGS) -> Problem:
+    """A seismometer on a calibration coil.
+
+    Parameters
+    ----------
+    responses : coil, displacement or both over the drive. distortion : (n,) r.m.s. of harmonics over the first, of the
+    motion itself; zero where it is not known: what they carry, the fundamental lacks. ratio_variance : (n,) relative
+    E|error|^2 of the second channel over the first; the sum of both variances where it is not known.
+
+    Raises
+    ------
+    InputError : shapes, few frequencies, a ground response. ComputationError : no seismometer fits.
+    """
+    f = np.asarray(responses.frequency_Hz, float)
+    n, least = len(f), settings.frequencies
+    if n < least or "ground" in responses.value:
+        raise InputError(f"expected coil, displacement or both at {least} frequencies or more", field="responses",
+                         value=(n, sorted(responses.value)))
+    names = tuple(kind for kind in ("coil", "displacement") if kind in responses.value)
+    h = np.zeros(n) if distortion is None else np.asarray(distortion, float).ravel()
+    if h.shape != (n,) or not np.all(np.isfinite(h)) or np.any(h < 0):
+        raise InputError(f"expected {n} finite numbers, none negative", field="distortion", value=h.shape)
+    start = fit_seismometer(responses, delay=False)
+    H = [np.asarray(responses.value[kind], complex) for kind in names]
+    relative = {kind: np.asarray(responses.variance[kind]) / np.abs(responses.value[kind]) ** 2 for kind in names}
+    both = sum(relative.values()) if ratio_variance is None else np.asarray(ratio_variance)
+    n -= n % 2
+    measured = np.stack([H[0], *([H[1] / H[0]] if len(H) > 1 else [])], axis=1)[:n]
+    measured_noise, noise = (np.repeat(np.maximum(one[::2] + one[1::2], settings.floor ** 2), 2, axis=1)
+                             for one in (np.stack([relative[names[0]] + harmonic, *([both] if len(H) > 1 else [])],
+                                                  axis=1)[:n] / 2 for harmonic in (0.0, h ** 2)))
+    # A mass that is not linear scatters by as much as its harmonics carry, beside what is alike at all frequencies.
+    spread = np.sqrt(1 + (h[:n] / max(float(np.median(h)), 1e-12)) ** 2)
+    spread = np.sqrt(spread[::2] * spread[1::2])
+    measured_noise, noise = measured_noise / spread[:, None] ** 2, noise / spread[:, None] ** 2
+    # The least of all pairs: what else there is, the estimated discrepancy holds, which is alike in all of them.
+    noise = np.broadcast_to(noise.min(axis=0), noise.shape)
+    pairs, rows, data = np.arange(n // 2), {}, {}
+    inner = (pairs % 3 == 1) & (pairs < n // 2 - 1)  # the ends, where effects show most, are fitted
+    for name, inside in (("fitted", ~inner), ("held out", inner)):
+        at = rows[name] = pairs[inside]
+        Y = np.full(2 * len(names), 1 + 1j) / spread[at][:, None]
+        block = SpectralBlock(name, 2 * np.pi * np.sqrt(f[2 * at] * f[2 * at + 1]), np.zeros((len(at), 0, 1)),
+                              Y[:, :, None])
+        data[name] = Data((block.with_noise(noise[at][:, :, None] * np.eye(2 * len(names))),), (1.0,))
+    lines = Channels(f, measured, spread, names, data["fitted"], data["held out"], rows, settings)
+    units = dict(zip(start.names, start.information.units, strict=True))
+    model = SensorModel(lines, tuple(units.items()), (), np.asarray(start.values, float))
+    positive = tuple(name in ("corner_Hz", "damping") for name in start.names)
+    notes = () if not np.any(h) else (
+        f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the mass itself "
+        "is nonlinear, which no effect of a channel holds.",)
+    outputs = " and ".join(names)
+    power = float(np.sum(np.abs(data["held out"].blocks[0].Y) ** 2))
+    return Problem("seismometer", model, positive, sensor_effects(f, names),
+                   float(np.sum(measured_noise[rows["held out"]])) / power,
+                   {"F": "", "x": "", "input": "drive", "output": outputs}, notes=notes)
+
+
+HIGHER = "higher frequencies: the phase of a delay stays proportional to them, that of a pole bends"
+
+
+def sensor_effects(f: np.ndarray, channels: Sequence[str]) -> list[Effect]:
+    """The library: a delay, a lag, a mode, a high-pass of one channel or of all, and crosstalk."""
+    top, low, found = float(f[-1]), float(f[0]), []
+    longest = 0.45 / top
+
+    def mode(p: np.ndarray) -> dict[str, tuple[float, str]]:
+        w = 1 / np.sqrt(max(p[1], 1e-300))
+        return {"frequency_Hz": (w / (2 * np.pi), "Hz"), "damping": (p[0] * w / 2, "1")}
+
+    def heavy(p: np.ndarray) -> str:
+        # A mode of damping 0.87 has the phase of a delay to fourth order, and a mount has not.
+        damping = mode(p)["damping"][0]
+        return f"a mount with a damping of {damping:.2g} is none" if damping > LARGEST_MODE_DAMPING else ""
+    for place in ("drive", *reversed(channels)) if len(channels) > 1 else channels:
+        what = f"of the {place}"
+        found += [
+            # No channel is early; the drive's column may have been logged late.
+            Effect("delay", place, f"a pure delay {what}", (
+                Parameter("delay_s", "s", -longest if place == "drive" else 0.0, longest),), HIGHER,
+                   channel=lambda s, p: np.exp(-s * p[0])),
+            Effect("first_order_lag", place, f"a first-order lag {what}",
+                   (Parameter("time_constant_s", "s", 0.0, longest),), HIGHER, channel=lambda s, p: 1 / (1 + s * p[0])),
+            Effect("mechanical_mode", place, f"a mechanical mode {what}", (
+                Parameter("lag_s", "s", 0.0),
+                Parameter("inverse_square_s2", "s^2", 0.0, (2 * np.pi * 1.05 * top) ** -2)),
+                "frequencies up to the mode, where the magnitude rises",
+                channel=lambda s, p: 1 / (1 + p[0] * s + p[1] * s ** 2), derived=mode, implausible=heavy),
+            Effect("highpass", place, f"a first-order high-pass (AC coupling) {what}",
+                   (Parameter("corner_Hz", "Hz", 0.0, 10 * low),), "lower frequencies",
+                   channel=lambda s, p: s / (s + 2 * np.pi * p[0]))]
+    if "displacement" in channels:
+        found.append(Effect("crosstalk", "displacement", "a share of the velocity in the displacement channel",
+                            (Parameter("share_s", "s", -longest, longest),), "the magnitude at higher frequencies",
+                            channel=lambda s, p: 1 + s * p[0]))
+    z = 1 / (2 * np.pi * np.sqrt(low * top))
+    found.append(Effect("other_dynamics", "drive", "other dynamics of the mass itself",
+                        tuple(Parameter(f"c{k}", "1") for k in range(4)), channel=lambda s, p: 1 + sum(
+                            c * (s * z) ** (k + 1) for k, c in enumerate(p)) / (1 + np.abs(s * z) ** 4), outside=True))
+    return found
+
+
+def of_sines(records: Sequence[SineRecord], measured: Sequence[str], driven: str) -> dict[str, Any]:
+    """Arguments of `seismometer` from sine records by frequency.
+
+    Raises
+    ------
+    ComputationError : too few frequencies.
+    """
+    used = [r for k, r in enumerate(records) if k == 0 or r.frequency_Hz > 1.001 * records[k - 1].frequency_Hz]
+    if len(used) < SETTINGS.frequencies:
+        raise ComputationError("too few sine records", measured=f"{len(used)} usable frequencies",
+                               cause="records refused or columns mapped wrongly",
+                               next_step=f"map the columns; give at least {SETTINGS.frequencies} frequencies")
+    pairs = {role: [record.ratio(role, driven) for record in used] for role in measured}
+    responses = Responses(np.array([record.frequency_Hz for record in used]),
+                          {role: np.array([H for H, _ in pair]) for role, pair in pairs.items()},
+                          {role: np.array([v for _, v in pair]) for role, pair in pairs.items()})
+    at = [used[0].channels.index(role) for role in measured]
+    # What every channel shows is the motion's; what one alone shows is its own noise or hum.
+    seen = np.array([min(float(np.sqrt(np.sum(record.harmonics[j] ** 2))) for j in at) for record in used])
+    found: dict[str, Any] = {"responses": responses, "distortion": seen}
+    if {"coil", "displacement"} <= set(measured):
+        ratio = [record.ratio("displacement", "coil") for record in used]
+        found["ratio_variance"] = np.array([v / abs(H) ** 2 for H, v in ratio])
+    return found

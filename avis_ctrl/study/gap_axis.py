@@ -1,0 +1,93 @@
+"""Files of `avis gap-axis`: gap.json, reports and the model, and what that predicts of other records."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import avis_ctrl
+from avis_ctrl.errors import InputError
+from avis_ctrl.files import write_together
+from avis_ctrl.gap.axis.find import Reading, signals_in
+from avis_ctrl.gap.axis.result import AxisGap
+from avis_ctrl.gap.axis.settings import SETTINGS
+from avis_ctrl.gap.axis.simulation import predicted
+from avis_ctrl.measurement.formats.hdf5_writing import replacing
+
+MODEL_FILE = "axis_model.json"
+
+
+def write_axis_gap(folder: Path, gap: AxisGap, source: str, options: dict[str, Any],
+                   reports: Callable[[AxisGap, str, dict[str, Any]], Mapping[str, bytes]]) -> list[str]:
+    """gap.json, what `reports` makes of gap, source and provenance (`avis_ctrl.report.axis_gap_reports`: gap.html,
+    gap.pdf) and, of a drive or an oscillator, axis_model.json; their names."""
+    made = {"avis_ctrl": avis_ctrl.__version__, "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "measurement": source, "inputs_sha256": hashlib.sha256(json.dumps(options, sort_keys=True, default=str
+                                                                              ).encode()).hexdigest(),
+            "options": options, "settings": asdict(SETTINGS)}
+    files = {"gap.json": _json({**gap.to_json(), "provenance": made}), **reports(gap, source, made)}
+    if "reading" in gap.model:
+        files[MODEL_FILE] = _json({"format": "avis-axis-model", "version": 1, **gap.model})
+    write_together(folder, files)
+    return list(files)
+
+
+def _json(plain: Any) -> bytes:
+    return json.dumps(plain, indent=2, allow_nan=False, default=str).encode()
+
+
+def is_axis_gap(folder: Path) -> bool:
+    """Whether a folder holds the output of `avis gap-axis`."""
+    try:
+        return json.loads((folder / "gap.json").read_text(encoding="utf-8")).get("format") == "avis-gap-axis"
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
+def write_axis_predictions(folder: Path, paths: Sequence[Path], out: Path) -> list[tuple[str, float, float]]:
+    """/records/NAME/y_baseline and y_updated; name and relative r.m.s. error of each, the start of the record apart.
+
+    The force of a drive is predicted from its motion, the motion of an oscillator from its input and the measured state
+    at the begin.
+
+    Raises
+    ------
+    InputError : a folder without a model, records that do not fit. ComputationError : a motion that diverges.
+    """
+    try:
+        model = json.loads((folder / MODEL_FILE).read_text(encoding="utf-8"))
+        if model.get("format") != "avis-axis-model":
+            raise ValueError("another format")
+        reading = Reading(**{**model["reading"], "range_s": None})
+    except FileNotFoundError:
+        raise InputError("expected the model of a drive or an oscillator: other kinds are responses, which predict no "
+                         "record", file=folder / MODEL_FILE) from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"expected a model as avis gap-axis writes it: {error}".splitlines()[0],
+                         file=folder / MODEL_FILE) from None
+    kind = model["kind"]
+    records, rate = signals_in(kind, paths, reading)
+    if abs(rate / model["rate_Hz"] - 1) > 1e-3:
+        raise InputError(f"expected records of {model['rate_Hz']:g} Hz, as the model's", field="sample_rate_Hz",
+        value=rate)
+    errors = []
+    with replacing(out) as file:
+        file.attrs.update({"format": "avis-prediction", "version": 1, "kind": kind})
+        for one in records:
+            group, left = file.require_group(f"records/{one.name}"), []
+            group.attrs["sample_rate_Hz"] = rate
+            measured = one.force if kind == "drive" else one.position
+            settled = slice(len(measured) // 20, len(measured) - len(measured) // 100)
+            for which in ("baseline", "updated"):
+                y = predicted(model, which, one, rate)
+                group.create_dataset(f"y_{which}", data=y)
+                left.append(float(np.std((y - measured)[settled]) / np.std(measured[settled])))
+            errors.append((one.name, left[0], left[1]))
+    return errors
