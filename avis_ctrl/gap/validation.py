@@ -44,13 +44,18 @@ def share_of(model: TableModel, label: str, blocks: Sequence[SpectralBlock], pow
 class Half:
     """An effect's parameters by half of the data.
 
-    words : the half. p_value : of the largest difference of one parameter from the whole, all parameters considered.
-    change : the largest relative change of those that differ significantly; 0 without any.
+    words : the half. chi2, dof : of the difference from the whole, and its degrees of freedom. change : the largest
+    relative change of a parameter that differs significantly by itself; 0 without any.
     """
 
     words: str
-    p_value: float
+    chi2: float
+    dof: int
     change: float
+
+    @property
+    def p_value(self) -> float:
+        return float(stats.chi2.sf(self.chi2, self.dof))
 
 
 def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
@@ -77,11 +82,13 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
         half = np.linalg.solve(root, np.linalg.solve(root, P[np.ix_(rows, rows)]).T)
         size, V = np.linalg.eigh((half + half.T) / 2)
         known = (size > 1 + settings.least_difference) & (size < settings.most_of_half)
-        into = root @ V[:, known]
-        difference, variance = into @ (V.T @ step)[known], into ** 2 @ (size[known] - 1)
+        into, along = root @ V[:, known], (V.T @ step)[known]
+        chi2 = float(np.sum(along ** 2 / (size[known] - 1)))
+        difference, variance = into @ along, into ** 2 @ (size[known] - 1)
         p = np.minimum(len(rows) * stats.chi2.sf(difference ** 2 / np.maximum(variance, 1e-300), 1), 1.0)
         change = np.abs(difference * slope) / np.maximum(np.abs(values), 1e-300)
-        found.append(Half(words, float(p.min()), float(change.max(initial=0.0, where=p < settings.law_p_value))))
+        found.append(Half(words, chi2, max(int(known.sum()), 1),
+                          float(change.max(initial=0.0, where=p < settings.law_p_value))))
     return found
 
 

@@ -48,7 +48,7 @@ def covering(A: np.ndarray, B: np.ndarray) -> np.ndarray:
 def clusterings(groups: Sequence[Group], bands_per_octave: int) -> tuple[list[list[list[Group]]], list[list[Group]]]:
     """Groups (level, band) that belong together: by octave, once for each band that octaves may begin with; by level.
     """
-    by_octave = []
+    by_octave, bands_per_octave = [], max(bands_per_octave, 1)
     for first in range(bands_per_octave):
         octaves: dict[int, list[Group]] = {}
         for group in groups:

@@ -164,7 +164,7 @@ def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float,
     if all(abs(best.model.values[k]) < settings.apart * std[k] for k in at):
         return "its size is not certain to differ from zero"
     for half in found:
-        if half.p_value < settings.law_p_value and half.change > settings.law_change:
+        if half.change > settings.law_change:
             return f"{half.words} calls for another size, by {100 * half.change:.0f} %"
     return ""
 

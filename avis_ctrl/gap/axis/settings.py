@@ -15,8 +15,7 @@ class AxisSettings(GapSettings):
     segments : half-overlapping windows of a span; three give a span's middle the same weight as its ends.
     lines_per_band : lines of a segment in a third of an octave; more make the fit longer and hardly better.
     bands_per_octave : of the discrepancy; none, one variance for all lines. What laws of friction leave is largest
-    where
-        the force is: with a variance for each band the evidence would give the low ones up as noise.
+        where the force is: with a variance for each band the evidence would give the low ones up as noise.
     floor : noise that nobody can exclude, over the response of a band [1]; 80 dB is what good converters have.
     oversampled : sample rate of the motion over twice the end of the band [1], for functions whose harmonics would fold
         back.
@@ -31,8 +30,7 @@ class AxisSettings(GapSettings):
     repeats : change of the motion from one repetition to the next, over its r.m.s., up to which it repeats [1].
     alike : mean difference of log-likelihood below which two effects are one for the data [nats].
     right_shape : part of what a free function takes off the power that named effects must take [1]; with less, more
-    than
-        half of the r.m.s. stays: they are neighbours of the truth.
+        than half of the r.m.s. stays: they are neighbours of the truth.
     same_shape : modal assurance criterion above which two modes are one [1] (R. Allemang, D. Brown, 1982; usual
         practice).
     static : scatter of a response between realisations over its change with the level, from which the change is that of
@@ -48,7 +46,7 @@ class AxisSettings(GapSettings):
     spans: int = 6
     segments: int = 3
     lines_per_band: int = 24
-    bands_per_octave: float = 0.0  # type: ignore[assignment]
+    bands_per_octave: int = 0
     floor: float = 1e-4
     oversampled: int = 4
     refits: int = 12
