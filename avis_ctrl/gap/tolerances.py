@@ -39,7 +39,7 @@ def tolerances_behind(effect: ActiveEffect, names: Sequence[str]) -> list[int]:
            "sensor_misalignment": (f"direction.{place}.",), "com_offset": ("com_",),
            "product_of_inertia": (PRODUCTS.get(place, ""),), "geophone_corner": (f"corner.{place}", f"damping.{place}")}
     starts = own.get(effect.effect.name)
-    return [k for k, name in enumerate(names) if starts and name.startswith(starts)]
+    return [k for k, name in enumerate(names) if starts and name.startswith(starts) and "@" not in name]
 
 
 def held(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Priors:

@@ -13,9 +13,10 @@ from scipy.optimize import minimize
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.model_files import model_from_dict, model_to_dict
 from avis_ctrl.gap.probability import odds_against
+from avis_ctrl.gap.search import with_effect, without_effect
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.gap.tolerances import tolerances_behind, within_tolerance
+from avis_ctrl.gap.tolerances import moved, tolerances_behind, within_tolerance
 from avis_ctrl.gap.validation import halves
 from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
 from avis_ctrl.identification.likelihood import Data, first_variances, fit
@@ -277,6 +278,37 @@ def test_what_is_beyond_a_tolerance_and_the_tolerance_behind_it():
         assert [priors.names[k] for k in tolerances_behind(near, priors.names)] == behind
         assert within_tolerance(near, TOLERANCES, GapSettings())
         assert not within_tolerance(near.at([v + 0.1 * max(abs(v), 10) for v in none]), TOLERANCES, GapSettings())
+
+
+@pytest.mark.parametrize(("name", "place", "values", "expected"), [
+    ("com_offset", "payload", [0.004, 0.0, -0.002], {"com_x": (None, 4.0), "com_z": (None, -2.0)}),
+    ("sensor_gain", "Sz1", [1.05], {"sensor.Sz1": (1.05, np.log(1.05) / 0.01)}),
+    ("product_of_inertia", "Jxz", [0.8], {"J13": (None, 4.0)}),
+    ("sensor_misalignment", "Sz1", [2.0, -1.0], {"direction.Sz1.x": (None, np.radians(2) / 0.005),
+                                                 "direction.Sz1.y": (None, -np.radians(1) / 0.005)}),
+    ("geophone_corner", "Sy1", None, {"corner.Sy1": (None, np.log(1.1) / 0.01), "damping.Sy1": (None, 0.0)}),
+])
+def test_values_beyond_their_tolerance_have_moved_as_their_effect_says(name, place, values, expected):
+    """The effect has all of the value: its tolerance is held, and released without it."""
+    settings = GapSettings(rounds=0, iterations=0)
+    one = active(library()[name], TableModel(bare()), place)
+    one = one.at([1.1 * one.values[0], one.values[1]] if values is None else values)
+    priors = with_tolerances(bare(), TOLERANCES, settings)
+    before = fit(TableModel(bare(priors.names)), priors, np.zeros(len(priors.names)),
+                 data := Data((block(bare(), 5, 30),), (0.2,)), first_variances(data, settings), settings)
+    fitted = with_effect(before, one, data, settings)
+    assert fitted is not None
+    rest = without_effect(fitted, one.label, data, settings)
+    assert rest is not None
+    assert_allclose(rest.priors.sigma, priors.sigma, rtol=1e-12)
+    found = {row.parameter: row for row in moved(fitted, list(priors.names), TOLERANCES, settings)}
+    nominal = dict(zip(priors.names, priors.mean, strict=True))
+    for parameter, (factor, tolerances_moved) in expected.items():
+        assert found[parameter].moved == pytest.approx(tolerances_moved, abs=1e-9)
+        if factor is not None:
+            assert found[parameter].value == pytest.approx(factor * nominal[parameter], rel=1e-9)
+    assert sum(abs(row.moved) > 1e-9 for row in found.values()) == sum(z != 0 for _, z in expected.values())
+    assert len(found) == len(priors.names)
 
 
 def test_a_channel_knows_its_mount_wherever_it_is_listed():
