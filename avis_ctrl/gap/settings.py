@@ -18,8 +18,8 @@ class GapSettings(FitSettings):
         them, and they hang on a geometry known to some per cent.
     turning_percent : the same of the share of the rotation that turns the axes of motors and sensors [%], which a rig
         file does not state.
-    beyond_tolerance : prior standard deviation of a value that may be beyond its tolerance, in tolerances: as wide as
-        faults of wiring, mounting and data sheets are.
+    beyond_tolerance : prior standard deviation of a value that may be beyond its tolerance, in tolerances: a gain 10 %
+        off, a sensor tilted by 3 degrees, a centre of mass by 10 mm; what is further off shows all the same.
     beyond_least : tolerances by which a value must differ from the rig file's to be beyond its tolerance.
     held : standard deviation, over its tolerance, of a value that is beyond it [1]: the effect alone has it then.
     effect_sizes : prior standard deviation of an effect's strength, in units of its parameter's size; broad, so that it
@@ -40,7 +40,7 @@ class GapSettings(FitSettings):
     revisions : how often an effect may be replaced by a rival that is better beside what was found after it; twice, for
         a pair that was named wrong both times.
     certain : gain of log evidence [nats] that a name needs beside the logarithm of the number of candidates: odds of
-        a hundred.
+        fifty, for one false name in fifty campaigns at most.
     outside_odds : how many times as probable an effect of the library is beforehand as one that has no name in it [1].
     rival : probability from which another name cannot be ruled out [1]; one in twenty.
     sure : probability up to which an effect is compared with its rivals again, beside what was found after it [1].
@@ -67,7 +67,7 @@ class GapSettings(FitSettings):
     repairs: int = 3
     second_order_percent: float = 20.0
     turning_percent: float = 50.0
-    beyond_tolerance: float = 20.0
+    beyond_tolerance: float = 10.0
     beyond_least: float = 3.0
     held: float = 1e-3
     effect_sizes: float = 100.0
@@ -82,7 +82,7 @@ class GapSettings(FitSettings):
     quick_iterations: int = 4
     longest: int = 5
     revisions: int = 2
-    certain: float = 4.6
+    certain: float = 3.9
     outside_odds: float = 10.0
     rival: float = 0.05
     sure: float = 0.9
