@@ -159,7 +159,7 @@ def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Dat
         return "held-out records do not bear it out"
     for half in halves(best, _judged(one), settings):
         if half.change > settings.law_change:
-            return f"{half.words} alone would have one of its parameters {100 * half.change:.0f} % elsewhere"
+            return f"{half.words} puts one of its parameters {100 * half.change:.0f} % elsewhere"
     return ""
 
 
