@@ -46,7 +46,7 @@ class SignalFaults:
         if self.noise is None:
             return ()
         known = {one.channel for one in self.converter}
-        return tuple(one.channel for one in self.noise.raised if one.channel not in known)
+        return tuple(name for name in self.noise.raised if name not in known)
 
 
 def converter_faults(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, ...]:
