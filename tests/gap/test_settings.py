@@ -17,9 +17,9 @@ from avis_ctrl.gap.tuning_values import tuning_values
 FOLDER = Path(avis_ctrl.gap.__file__).parent
 FILES = sorted(path for path in FOLDER.rglob("*.py") if "single_axis" not in path.parts)
 # What no tuning can change: physics, mathematics, names, tables.
-NO_TUNING = {"ALL", "BEYOND", "BY_PHYSICS", "COUNTS", "FILES", "FLOOR", "FORMAT", "GRAVITY",
+NO_TUNING = {"ADDED", "ALL", "BEYOND", "BY_PHYSICS", "COUNTS", "FILES", "FLOOR", "FORMAT", "GRAVITY",
              "HANN_COST", "HANN_SHARED", "MAINS_HZ", "MOUNT", "PRODUCTS", "SETTINGS", "SYMMETRIC", "TOGETHER",
-             "VERDICTS", "VERSION", "WAYS", "_AT_REST", "_ELSEWHERE", "_FAULTS", "_MADE", "_NOTES"}
+             "VERDICTS", "VERSION", "WAYS", "_AT_REST", "_ELSEWHERE", "_MADE", "_NOTES"}
 
 
 def constants(path: Path) -> set[str]:

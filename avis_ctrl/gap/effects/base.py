@@ -17,7 +17,7 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -131,14 +131,14 @@ class Effect(ABC):
     outside : of `effects.unnamed`, refitted beside the library and never named.
     """
 
-    name: ClassVar[str]
-    title: ClassVar[str]
-    looks_like: ClassVar[str]
-    nonlinear: ClassVar[bool] = False
-    strength: ClassVar[str] = ""
-    holds_states: ClassVar[bool] = False
-    resonant: ClassVar[bool] = False
-    outside: ClassVar[bool] = False
+    name: str
+    title: str
+    looks_like: str
+    nonlinear: bool = False
+    strength: str = ""
+    holds_states: bool = False
+    resonant: bool = False
+    outside: bool = False
 
     def places(self, model: Table) -> tuple[str, ...]:
         """Where it can act on this table; empty where it cannot."""

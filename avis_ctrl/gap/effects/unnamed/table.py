@@ -18,6 +18,7 @@ class QuadraticStiffness(UnnamedFault):
 
     name = "quadratic_stiffness"
     title = "mounts of unlike stiffness up and down"
+    words = "vertical mounts with a term in the square of their deflection"
     nonlinear = True
     strength = "k2_N_per_m2"
 
@@ -33,15 +34,13 @@ class QuadraticStiffness(UnnamedFault):
         up = record.vertical
         return -values["k2_N_per_m2"] * (record.deflection[:, up] ** 2 @ record.rows[up])
 
-    def said(self, place: str, values: Mapping[str, float]) -> str:
-        return "vertical mounts with a term in the square of their deflection"
-
 
 class QuadraticDrag(UnnamedFault):
     """Force -c |v| v on the payload at the table's centre, v its velocity against the chassis: air."""
 
     name = "quadratic_drag"
     title = "drag in proportion to the square of velocity"
+    words = "drag on the payload in proportion to the square of velocity"
     nonlinear = True
     strength = "drag_Ns2_per_m2"
 
@@ -58,15 +57,13 @@ class QuadraticDrag(UnnamedFault):
         force[:, :3] = -values["drag_Ns2_per_m2"] * np.linalg.norm(v[:, :3], axis=1, keepdims=True) * v[:, :3]
         return force
 
-    def said(self, place: str, values: Mapping[str, float]) -> str:
-        return "drag on the payload in proportion to the square of velocity"
-
 
 class Gyroscope(UnnamedFault):
     """Moment h x w of a rotor with angular momentum h on the payload: s W, W skew-symmetric, on the rotations."""
 
     name = "gyroscope"
     title = "a rotor on the payload"
+    words = "a rotor on the payload (moments at right angles to its tilting)"
 
     def places(self, model: Table) -> tuple[str, ...]:
         return ("payload",)
@@ -81,6 +78,3 @@ class Gyroscope(UnnamedFault):
         W[3:, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         Z = ops.s[:, None, None] * W
         ops.extra = Z if ops.extra is None else ops.extra + Z
-
-    def said(self, place: str, values: Mapping[str, float]) -> str:
-        return "a rotor on the payload (moments at right angles to its tilting)"
