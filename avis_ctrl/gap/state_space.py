@@ -156,12 +156,7 @@ def impedance(table: ReducedTable, K: np.ndarray, h: StateSpace, of: str = "r") 
     push[:table.n] = -V * sizes
     if not len(sizes):
         return gain(np.zeros(table.shape))
-    parts = append(*(h.renamed([f"u{k}"], [f"y{k}"]) for k in range(len(sizes))))
-    return _plain(parts.scaled(push, read))
-
-
-def _plain(system: StateSpace) -> StateSpace:
-    return StateSpace(system.A, system.B, system.C, system.D)
+    return append(*[h] * len(sizes)).scaled(push, read)
 
 
 def _static(table: ReducedTable, K: np.ndarray, C: np.ndarray | None = None) -> StateSpace:
@@ -235,7 +230,7 @@ def _surge(table: ReducedTable, place: str, values: Mapping[str, float]) -> Stat
         outer = np.outer(g, g)
         D[:table.n, table.r], D[:table.n, table.v] = -(a - 1) * k * outer, -a * c * outer
         total = total + StateSpace(A, B, C, D)
-    return _plain(total)
+    return total
 
 
 def _leveling(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
@@ -282,7 +277,7 @@ def _oscillator(table: ReducedTable, place: str, values: Mapping[str, float]) ->
         poles = np.roots([1.0, 2 * zeta * w, w ** 2])
         h = cascade([0.0, -w / (2 * zeta)], poles, 2 * zeta * w * mass)
         total = total + impedance(table, g.T @ g, h, "v")
-    return _plain(total)
+    return total
 
 
 def _flexible(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
