@@ -12,7 +12,7 @@ The chassis follows the floor displacement w through H_w and recoils with B: zer
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -77,7 +77,6 @@ class AddedCoordinate:
     at_sensors: np.ndarray
 
 
-@dataclass(eq=False)
 class Operators:
     """Of a rig on lines omega (n,) rad/s, open to be changed by effects.
 
@@ -96,42 +95,26 @@ class Operators:
     added : coordinates beside the six. recoil, follow : (n, 6, 6) B and (n, 6, 3) H_w, None for a stiff floor.
     """
 
-    base: ResponseModel
-    omega: np.ndarray
-    s: np.ndarray = field(init=False)
-    mounts: MountGeometry = field(init=False)
-    stiffness_factor: np.ndarray = field(init=False)
-    damping_factor: np.ndarray = field(init=False)
-    internal_omega: np.ndarray = field(init=False)
-    internal_damping: np.ndarray = field(init=False)
-    payload_share: np.ndarray = field(init=False)
     extra: np.ndarray | None = None
     extra_floor: np.ndarray | None = None
-    rows: np.ndarray = field(init=False)
-    sense: np.ndarray = field(init=False)
-    sensor_gain: np.ndarray = field(init=False)
-    drive: np.ndarray = field(init=False)
-    delay_s: float = field(init=False)
-    amplifier_corner_Hz: float | None = field(init=False)
-    added: list[AddedCoordinate] = field(default_factory=list)
     recoil: np.ndarray | None = None
     follow: np.ndarray | None = None
-    inner: list[np.ndarray] = field(default_factory=list)
-    decays: list[np.ndarray] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
-        base = self.base
-        self.s = 1j * self.omega
+    def __init__(self, base: ResponseModel, omega: np.ndarray):
+        self.base, self.omega, self.s = base, omega, 1j * omega
         self.mounts = mount_geometry(base.rig)
         n_g = len(self.mounts.names)
         self.stiffness_factor, self.damping_factor = np.ones((1, n_g), complex), np.ones((1, n_g), complex)
         self.internal_omega, self.internal_damping = np.full(n_g, np.inf), np.zeros(n_g)
         self.payload_share = np.full(n_g, 0.5)
-        self.rows = base.matrices.R[None]
-        self.sense = chain_response(base, self.omega).copy()
+        self.rows: np.ndarray = base.matrices.R[None]
+        self.sense = chain_response(base, omega).copy()
         self.sensor_gain = np.ones(len(base.sensors.names))
-        self.drive = np.ones((1, len(base.actuators)), complex)
+        self.drive: np.ndarray = np.ones((1, len(base.actuators)), complex)
         self.delay_s, self.amplifier_corner_Hz = base.delay_s, base.amplifier_corner_Hz
+        self.added: list[AddedCoordinate] = []
+        self.inner: list[np.ndarray] = []
+        self.decays: list[np.ndarray] = []
 
     def sensor(self, name: str) -> int:
         return self.base.sensors.names.index(name)

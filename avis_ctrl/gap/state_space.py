@@ -10,7 +10,7 @@ velocity along each sensor. All parts are passive impedances or poles and zeros 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +20,7 @@ from scipy.optimize import nnls
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.attached import elements
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
+from avis_ctrl.gap.effects.base import Values
 from avis_ctrl.gap.effects.cable import tie
 from avis_ctrl.gap.effects.chassis import of_chassis
 from avis_ctrl.gap.effects.flexible_mode import modes, shape_rows
@@ -130,7 +131,7 @@ class ReducedTable:
         return self.n + self.n_y, 3 * self.n + self.n_u
 
 
-Addition = Callable[[ReducedTable, str, Mapping[str, float]], StateSpace]
+Addition = Callable[[ReducedTable, str, Values], StateSpace]
 
 
 def addition(table: ReducedTable, one: ActiveEffect) -> StateSpace | None:
@@ -168,14 +169,14 @@ def _static(table: ReducedTable, K: np.ndarray, C: np.ndarray | None = None) -> 
     return gain(D)
 
 
-def _relaxation(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _relaxation(table: ReducedTable, place: str, values: Values) -> StateSpace:
     up = table.mounts.along("z")
     G, k = table.G[up], table.mounts.stiffness[up]
     h = cascade([0.0], [-2 * np.pi * values["corner_Hz"]], values["stiffness_ratio"])
     return impedance(table, G.T @ (k[:, None] * G), h)
 
 
-def _structural(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _structural(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """The causal law, for the complex constant too: no causal system has that."""
     G, k = table.G, table.mounts.stiffness
     rest, branches = ladder(2 / np.pi * np.arctan(values["loss_factor"]))
@@ -207,7 +208,7 @@ def ladder(power: float) -> tuple[float, list[tuple[float, float]]]:
     return float(found[0]), [(float(a), float(b)) for a, b in zip(w, found[1:], strict=True) if b > 0]
 
 
-def _surge(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _surge(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """A mass in every vertical mount: r_m = its displacement against the chassis, v_m its velocity.
 
     r_m' = v_m - v_c,  m v_m' = a k (r - r_m) + a c (v - v_m) - b k r_m - b c (v_m - v_c), and beside the mount itself
@@ -233,7 +234,7 @@ def _surge(table: ReducedTable, place: str, values: Mapping[str, float]) -> Stat
     return total
 
 
-def _leveling(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _leveling(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """Payload against chassis, as the valves feel it."""
     own = np.flatnonzero(table.mounts.along("z"))[:LIBRARY.leveled]
     G, k = table.G[own], table.mounts.stiffness[own] * shares(values)
@@ -244,32 +245,32 @@ def _leveling(table: ReducedTable, place: str, values: Mapping[str, float]) -> S
     return impedance(table, G.T @ (k[:, None] * G), cascade([], poles, size))
 
 
-def _friction(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _friction(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """Far below the slip: a spring at every motor."""
     at_actuators, _ = shape_rows(table.model.rig, table.model.actuators, table.model.sensors.names)
     G = at_actuators @ table.G
     return _static(table, G.T @ (contacts(values)[:, None] * G))
 
 
-def _drift(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _drift(table: ReducedTable, place: str, values: Values) -> StateSpace:
     G, k = table.G, table.mounts.stiffness
     return _static(table, drift_at(table.model, values, table.when) * G.T @ (k[:, None] * G))
 
 
-def drift_at(model: TableModel, values: Mapping[str, float], when: float) -> float:
+def drift_at(model: TableModel, values: Values, when: float) -> float:
     """Change of stiffness over that of the model's rig at a moment -0.5 .. 0.5 of the campaign, by a drift's law."""
     begin, end = next((one.campaign_s for one in model.motion.values()), (0.0, 1.0))
     through = float(drifted(np.array(when + 0.5), values.get("time_constant_s", 0.0) / (end - begin)))
     return values["relative_change"] * drift_over_stiffness(model) * through
 
 
-def _cable(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _cable(table: ReducedTable, place: str, values: Values) -> StateSpace:
     K = tie(values)
     G = table.rows(point_map(place_of(values)))
     return _static(table, G.T @ K @ G, values["damping_s"] * G.T @ K @ G)
 
 
-def _oscillator(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _oscillator(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """m s (2 z w s + w^2)/(s^2 + 2 z w s + w^2) on the velocity of its place, along each of its directions."""
     total, zeta = gain(np.zeros(table.shape)), values["damping"]
     for row, mass, frequency in elements(place, values):
@@ -280,7 +281,7 @@ def _oscillator(table: ReducedTable, place: str, values: Mapping[str, float]) ->
     return total
 
 
-def _flexible(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _flexible(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """Coordinates e of the modes and their velocities; the mounts and motors push them, and they deflect the mounts."""
     own = [mode for mode in modes(values) if np.any(mode[2])]
     if not own:
@@ -300,7 +301,7 @@ def _flexible(table: ReducedTable, place: str, values: Mapping[str, float]) -> S
     return StateSpace(A, B, C, np.zeros(table.shape))
 
 
-def _nothing(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _nothing(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """Vanishes as the amplitude does."""
     return gain(np.zeros(table.shape))
 
@@ -312,7 +313,7 @@ _MADE: dict[str, Addition] = {
     "actuator_saturation": _nothing}
 
 
-def chassis(table: ReducedTable, values: Mapping[str, float], floor: list[str], accelerations: list[str],
+def chassis(table: ReducedTable, values: Values, floor: list[str], accelerations: list[str],
             moves: list[str]) -> StateSpace:
     """Velocity of a chassis on a soft base, from that of the floor and the acceleration of the payload.
 

@@ -9,7 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.base import Effect, EffectParameter
+from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.operators import Assembled, Operators, assemble
 from avis_ctrl.gap.record_motion import RecordMotion
@@ -372,21 +372,14 @@ def inseparable_parameters(model: TableModel) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(base.names[k] for k in group.members) for group in found.groups)
 
 
-def _added(one: ActiveEffect, record: RecordMotion, omega: np.ndarray) -> tuple[np.ndarray | None, ...]:
-    """What an effect adds to a record on its lines: volts (n, n_u, 1) beside the commanded ones, force (n, 6, 1),
-    displacement that the sensors read (n, n_y, 1), and outputs (n, n_y, 1); None for nothing."""
+def _added(one: ActiveEffect, record: RecordMotion, omega: np.ndarray) -> Added:
+    """What an effect adds to a record on its lines, (n, channels, 1) each; of readings the displacement."""
     if not one.effect.nonlinear:
-        return None, None, None, None
-    effect, values = one.effect, one.by_name
-    volts = effect.volts_spectrum(record, one.place, values, omega)
-    if volts is not None:
-        # Several may change the volts: each adds what it changes.
-        volts = volts - record.kept("volts", omega, lambda: record.volts)
-    reading = effect.reading_spectrum(record, one.place, values, omega)
-    found = (volts, effect.force_spectrum(record, one.place, values, omega),
-             None if reading is None else -reading / (omega ** 2)[:, None],
-             effect.output_spectrum(record, one.place, values, omega))
-    return tuple(None if each is None else each[:, :, None] for each in found)
+        return Added()
+    found = one.effect.spectra(record, one.place, one.by_name, omega)
+    if found.reading is not None:
+        found = found._replace(reading=-found.reading / (omega ** 2)[:, None])
+    return Added(*(None if each is None else each[:, :, None] for each in found))
 
 
 def _sum(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, differs_from_zero, register
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, Values, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import about, at_points, peaks, positions, project, unit_matrices
 from avis_ctrl.gap.effects.line_of_action import best_direction, foot, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
@@ -58,7 +58,7 @@ class AttachedOscillator(AtPoint):
         across = [one for one in self.position() if len(variant) > 1 or one.name != f"{variant}_m"]
         return (own, frequency, damping, *across)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         for row, mass, frequency in elements(place, values):
             Z = mass * sprung(ops.s, frequency, values["damping"])
             ops.add_impedance(Z[:, None], row[None])
@@ -92,7 +92,7 @@ class AttachedOscillator(AtPoint):
         along[others] = pair
         return [("payload/axes", tuple(map(float, (mass, *along, values["damping"], *point))))]
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         names = [name for name in values if name.startswith("along_")] or ["mass_kg"]
         if not differs_from_zero(values, std, names):
             return "a sprung mass that the data do not distinguish from zero"
@@ -100,8 +100,7 @@ class AttachedOscillator(AtPoint):
             return f"a line of action that passes {LIBRARY.reach_m:g} m from the table"
         return ""
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """Of one direction: mass, direction, and the point nearest to the geometric centre on the line of action, for
         along that line a place makes no difference."""
         found = super().reported(model, place, values, covariance)
@@ -113,7 +112,7 @@ class AttachedOscillator(AtPoint):
                 **line}
 
 
-def elements(place: str, values: Mapping[str, float]) -> list[tuple[np.ndarray, float, float]]:
+def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]]:
     """(row over q (6,), mass, frequency in Hz) along each direction in which the mass can move."""
     variant, rows = place.partition("/")[2], point_map(place_of(values))
     if variant == "oblique":

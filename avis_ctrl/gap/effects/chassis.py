@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, differs_from_zero, register
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, Values, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.mounts import has_mounts
 from avis_ctrl.gap.effects.sensors import receptance
@@ -269,11 +269,11 @@ class BaseCompliance(Effect):
             values += [*(at[way] for way in ways[3:]), *np.clip(radii, 0.1, 3.0).tolist(), -0.3, 0.0]
         return [Seed(tuple(float(v) for v in values), took.chi2, 2 * len(best))]
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         return "" if differs_from_zero(values, std, ["mass_kg"]) else (
             "a chassis so heavy that the data do not distinguish it from a fixed one")
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         mass, damping, stiffness = of_chassis(values)
         s = ops.s[:, None, None]
         tied = stiffness + s * damping
@@ -288,7 +288,7 @@ class BaseCompliance(Effect):
         ops.recoil, ops.follow = B, H
 
 
-def of_chassis(values: Mapping[str, float]) -> np.ndarray:
+def of_chassis(values: Values) -> np.ndarray:
     """(3, 6, 6) mass, damping and stiffness of a chassis on its base, in the payload's coordinates about the table's
     centre; nothing in those in which it does not move."""
     ways = [way for way in WAYS if f"{way}_Hz" in values]

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from numba import njit
 
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, differs_from_zero, register
+from avis_ctrl.gap.effects.base import (
+    Added,
+    Effect,
+    EffectParameter,
+    Reported,
+    Table,
+    Values,
+    differs_from_zero,
+    register,
+)
 from avis_ctrl.gap.operators import Operators, mount_geometry
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Score
@@ -49,7 +56,7 @@ class MountRelaxation(_OfMounts):
                 EffectParameter("corner_Hz", "Hz", "above which the branch acts", 0.0, 0.02, 300.0, 1.0, False,
                                 (0.3, 0.8, 1.5, 2.5, 4.0, 7.0, 15.0, 40.0)))
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         x = ops.s / (2 * np.pi * values["corner_Hz"])
         branch = values["stiffness_ratio"] * x / (1 + x)
         ops.stiffness_factor = ops.stiffness_factor + branch[:, None] * vertical(ops)
@@ -76,7 +83,7 @@ class StructuralDamping(_OfMounts):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("loss_factor", "1", "loss factor of the mounts", 0.0, 0.0, 1.0, 0.05),)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         eta = values["loss_factor"]
         if place.endswith("complex"):
             factor = np.full(len(ops.s), 1 + 1j * eta)
@@ -125,18 +132,17 @@ class MountSurge(_OfMounts):
                 found.append(Seed(tuple(begin), took.chi2, len(parameters), len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         return "" if differs_from_zero(values, std, ["frequency_Hz"]) else (
             "a resonance whose frequency the data do not determine")
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         up = vertical(ops)
         ops.internal_omega[up] = surge_omega(values)
         ops.payload_share = np.where(up, values["payload_share"], ops.payload_share)
         ops.internal_damping = np.where(up, values["damping_ratio"], ops.internal_damping)
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """Means over the mounts. Their standard deviations include the scatter of the mounts, which one value for all
         of them does not describe; that of the mass follows from frequency, payload_share and scatter, with the mean
         stiffness taken as exact."""
@@ -158,12 +164,12 @@ def _of_mean(values: np.ndarray) -> float:
     return float(np.var(values, ddof=1) / len(values)) if len(values) > 1 else 0.0
 
 
-def surge_omega(values: Mapping[str, float]) -> np.ndarray:
+def surge_omega(values: Values) -> np.ndarray:
     """(mounts,) rad/s of the resonance inside each."""
     return 2 * np.pi * values["frequency_Hz"] * shares(values)
 
 
-def shares(values: Mapping[str, float]) -> np.ndarray:
+def shares(values: Values) -> np.ndarray:
     """(m,) of each mount or contact over their mean, from the values uneven_ .. of all but the last."""
     uneven = [value for name, value in values.items() if name.startswith("uneven_")]
     return 1 + np.array([*uneven, -sum(uneven)])
@@ -199,11 +205,11 @@ class LevelingLoop(_OfMounts):
         return (rate, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, *LIBRARY.valve_Hz,
                                       1.0, False, (0.1, 0.3, 1.0, 3.0), True))
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         slow = values.get("valve_corner_Hz", np.inf) < 1.001 * LIBRARY.valve_Hz[0]
         return "valves so slow that the loop does not level" if slow else ""
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         ratio = 2 * np.pi * values["rate_Hz"] / ops.s
         if "valve_corner_Hz" in values:
             ratio = ratio / (1 + ops.s / (2 * np.pi * values["valve_corner_Hz"]))
@@ -216,8 +222,7 @@ class LevelingLoop(_OfMounts):
         if "valve_corner_Hz" in values:
             ops.decays.append(rows / (ops.s + 2 * np.pi * values["valve_corner_Hz"])[:, None, None])
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """With the mean force by displacement and second over the leveled mounts, at their stiffness as fitted."""
         found = super().reported(model, place, values, covariance)
         rate, g = found["rate_Hz"], mount_geometry(model.rig)
@@ -249,20 +254,19 @@ class CubicStiffness(_OfMounts):
                 *(EffectParameter(f"uneven_{i}", "1", f"that of mount {i} over the mean, less one", 0.0, -0.9, 0.9, 0.1,
                                   False, (0.0,), True) for i in range(1, int(np.sum(vertical(model))))))
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         return stiffened(record.deflection[:, record.vertical] ** 3, record, values)
 
-    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         """As `force`, from the spectra of the cubes."""
         cubes = record.kept(self.name, omega, lambda: record.deflection[:, record.vertical] ** 3)
-        return stiffened(cubes, record, values)
+        return Added(force=stiffened(cubes, record, values))
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         return "mounts that soften with amplitude" if values["k3_N_per_m3"] < 0 else ""
 
 
-def stiffened(cubes: np.ndarray, record: RecordMotion, values: Mapping[str, float]) -> np.ndarray:
+def stiffened(cubes: np.ndarray, record: RecordMotion, values: Values) -> np.ndarray:
     """(n, 6) generalized force on the payload by cubes of the mounts' deflections, (n, m), in time or on lines."""
     return -cubes @ (values["k3_N_per_m3"] * shares(values)[:, None] * record.rows[record.vertical])
 
@@ -305,17 +309,15 @@ class ContactFriction(Effect):
                                   0.0, -0.9, 0.9, 0.1, False, (0.0,), True)
                   for name in model.actuators[:-1]))
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         return pushed(slipping(record, values["slip_m"]), record, values)
 
-    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         """As `force`, interpolated between slips."""
         f = record.interpolated(self.name, values["slip_m"], omega, lambda slip: slipping(record, slip))
-        return pushed(f, record, values)
+        return Added(force=pushed(f, record, values))
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         k, slip = values["stiffness_N_per_m"], values["slip_m"]
         slope = np.array([slip, k])
         variance = float(slope @ covariance[:2, :2] @ slope)
@@ -323,7 +325,7 @@ class ContactFriction(Effect):
                 **super().reported(model, place, values, covariance)}
 
 
-def contacts(values: Mapping[str, float]) -> np.ndarray:
+def contacts(values: Values) -> np.ndarray:
     """(m,) N/m: stiffness of each contact, in the order of the actuators."""
     return values["stiffness_N_per_m"] * shares(values)
 
@@ -333,7 +335,7 @@ def slipping(record: RecordMotion, slip: float) -> np.ndarray:
     return dahl(np.ascontiguousarray(record.deflection[:, record.driven_rows]), slip)
 
 
-def pushed(f: np.ndarray, record: RecordMotion, values: Mapping[str, float]) -> np.ndarray:
+def pushed(f: np.ndarray, record: RecordMotion, values: Values) -> np.ndarray:
     """(n, 6) generalized force on the payload by friction over stiffness, (n, m), in time or on lines."""
     return -f @ (contacts(values)[:, None] * record.rows[record.driven_rows])
 
@@ -381,14 +383,13 @@ class StiffnessDrift(Effect):
         return (change, EffectParameter("time_constant_s", "s", "of the approach to the end", 0.0, 0.01 * T, 10 * T, T,
                                         False, (0.1 * T, 0.3 * T, T), True))
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         begin, end = record.campaign_s
         through = drifted((record.time_s - begin) / (end - begin), values.get("time_constant_s", 0.0) / (end - begin))
         push = record.deflection * record.stiffness * through[:, None]
         return -values["relative_change"] * (push @ record.rows)
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         found = super().reported(model, place, values, covariance)
         # The model's change is of the stiffness that the record's motion was found with; a person's is of what the
         # table's stiffness was at the beginning.

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Table
+from avis_ctrl.gap.effects.base import Added, EffectParameter, Table, Values
 from avis_ctrl.gap.effects.mounts import largest_rms
 from avis_ctrl.gap.effects.unnamed.base import FirstOrder, at, by_volts, motion, pairs
 from avis_ctrl.gap.record_motion import RecordMotion
@@ -60,10 +60,9 @@ class AddedVolts(AddedSignal):
     def channels(self, record: RecordMotion) -> tuple[str, ...]:
         return record.actuators
 
-    def volts_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         (strength,) = values.values()
-        return record.kept("volts", omega, lambda: record.volts) + strength * self.unit(record, place, omega)
+        return Added(volts=strength * self.unit(record, place, omega))
 
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
         return (by_volts(part) @ self.unit(motion(part), place, part.block.omega)[:, :, None])[None]
@@ -75,10 +74,9 @@ class AddedOutput(AddedSignal):
     def channels(self, record: RecordMotion) -> tuple[str, ...]:
         return record.sensors
 
-    def output_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                        ) -> np.ndarray | None:
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         (strength,) = values.values()
-        return strength * self.unit(record, place, omega)
+        return Added(output=strength * self.unit(record, place, omega))
 
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
         return self.unit(motion(part), place, part.block.omega)[None, :, :, None]
@@ -101,13 +99,11 @@ class DriveCrosstalk(AddedVolts):
 class DeadZone(AddedVolts):
     """No force within +-w, sign(u) (|u| - w) beyond: u less u clipped at w."""
 
-    def volts_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
-        w = values["half_width_V"]
-        k = slice(None) if place == ALL else slice(record.actuators.index(place), record.actuators.index(place) + 1)
-        plain = np.array(record.kept("volts", omega, lambda: record.volts))
-        plain[:, k] -= record.spectrum(np.clip(record.volts[:, k], -w, w), omega)
-        return plain
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
+        w, k = values["half_width_V"], [place in (ALL, name) for name in record.actuators]
+        beside = np.zeros((len(omega), len(k)), complex)
+        beside[:, k] = -record.spectrum(np.clip(record.volts[:, k], -w, w), omega)
+        return Added(volts=beside)
 
 
 def largest_volts(model: Table) -> float:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, Values
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Part, Score
 from avis_ctrl.gap.starting_values import Seed
@@ -20,7 +19,7 @@ class UnnamedFault(Effect):
     looks_like = "what the library has no name for"
     words: str
 
-    def said(self, place: str, values: Mapping[str, float]) -> str:
+    def said(self, place: str, values: Values) -> str:
         into, _, source = place.partition("/")
         return self.words.format(place=place, into=into, source=source, **values)
 
@@ -59,7 +58,7 @@ class Late(FirstOrder):
         return (EffectParameter("delay_s", "s", f"delay of this {what} beside the others", 0.0, 0.0, 0.1, 1e-3),
                 EffectParameter("time_constant_s", "s", f"first-order lag of this {what} alone", 0.0, 0.0, 0.3, 1e-3))
 
-    def factor(self, s: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
+    def factor(self, s: np.ndarray, values: Values) -> np.ndarray:
         return np.exp(-s * values["delay_s"]) / (1 + s * values["time_constant_s"])
 
     def seeds(self, score: Score, place: str) -> list[Seed]:

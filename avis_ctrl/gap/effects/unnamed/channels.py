@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Table
+from avis_ctrl.gap.effects.base import EffectParameter, Table, Values
 from avis_ctrl.gap.effects.sensors import receptance
 from avis_ctrl.gap.effects.unnamed.base import FirstOrder, Late, by_volts, pairs
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.score import Part
 
 
-def mix(ops: Operators, into: str, shares: Mapping[str, float]) -> None:
+def mix(ops: Operators, into: str, shares: Values) -> None:
     """Shares of other sensors' signals in one."""
     j, gain = ops.sensor(into), ops.base.sensors.sensitivity * ops.sensor_gain
     rows = np.array(ops.rows)
@@ -48,7 +46,7 @@ class SensorCrosstalk(FirstOrder):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("share", "1", "share of the other's signal", 0.0, -2.0, 2.0, 0.01),)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         into, source = place.split("/")
         mix(ops, into, {source: values["share"]})
 
@@ -71,7 +69,7 @@ class SensorCrosstalkOfAll(FirstOrder):
         return tuple(EffectParameter(f"share_of_{name}", "1", f"share of {name}'s signal", 0.0, -2.0, 2.0, 0.01)
                      for name in model.sensors.names if name != place)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         mix(ops, place, {name.removeprefix("share_of_"): share for name, share in values.items()})
 
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
@@ -89,7 +87,7 @@ class SensorLate(Late):
     def places(self, model: Table) -> tuple[str, ...]:
         return model.sensors.names
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         ops.sense[:, ops.sensor(place)] *= self.factor(ops.s, values)
 
     def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
@@ -105,7 +103,7 @@ class MotorLate(Late):
     def places(self, model: Table) -> tuple[str, ...]:
         return model.actuators
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         drive = np.array(np.broadcast_to(ops.drive, (len(ops.omega), ops.drive.shape[1])))
         drive[:, ops.actuator(place)] *= self.factor(ops.s, values)
         ops.drive = drive
@@ -132,7 +130,7 @@ class SensorResonance(FirstOrder):
                                 tuple(np.geomspace(8.0, 90.0, 10))),
                 EffectParameter("damping", "1", "its damping ratio", 0.0, 1e-3, 1.0, 0.02, False, (0.05,), True))
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         shape = ops.s ** 2 * receptance(ops.s, values["frequency_Hz"], values["damping"])
         ops.sense[:, ops.sensor(place)] *= 1 + values["share"] * shape
 

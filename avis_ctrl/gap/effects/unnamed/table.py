@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Table
+from avis_ctrl.gap.effects.base import EffectParameter, Table, Values
 from avis_ctrl.gap.effects.mounts import has_mounts, largest_rms
 from avis_ctrl.gap.effects.unnamed.base import UnnamedFault
 from avis_ctrl.gap.operators import Operators, mount_geometry
@@ -30,7 +28,7 @@ class QuadraticStiffness(UnnamedFault):
         return (EffectParameter("k2_N_per_m2", "N/m^2", "quadratic stiffness of each mount", 0.0, -1e4 * size,
                                 1e4 * size, size),)
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         up = record.vertical
         return -values["k2_N_per_m2"] * (record.deflection[:, up] ** 2 @ record.rows[up])
 
@@ -51,7 +49,7 @@ class QuadraticDrag(UnnamedFault):
         size = 10.0 / max(largest_rms(model) * 10.0, 1e-9)
         return (EffectParameter("drag_Ns2_per_m2", "N s^2/m^2", "of the payload", 0.0, -1e4 * size, 1e4 * size, size),)
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         v = np.gradient(record.deflection @ np.linalg.pinv(record.rows).T, 1 / record.sample_rate_Hz, axis=0)
         force = np.zeros_like(v)
         force[:, :3] = -values["drag_Ns2_per_m2"] * np.linalg.norm(v[:, :3], axis=1, keepdims=True) * v[:, :3]
@@ -72,7 +70,7 @@ class Gyroscope(UnnamedFault):
         return tuple(EffectParameter(f"h{axis}_Nms", "N m s", f"angular momentum about {axis}", 0.0, -1e6, 1e6, 1.0)
                      for axis in "xyz")
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         x, y, z = (values[f"h{axis}_Nms"] for axis in "xyz")
         W = np.zeros((6, 6))
         W[3:, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
