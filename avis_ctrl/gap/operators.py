@@ -12,14 +12,13 @@ The chassis follows the floor displacement w through H_w and recoils with B: zer
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.identification.response import N_Q, ResponseModel
-from avis_ctrl.identification.sampling import hold
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import point_map
 
@@ -32,7 +31,6 @@ class MountGeometry:
     """
 
     names: tuple[str, ...]
-    position: np.ndarray
     payload: np.ndarray
     chassis: np.ndarray
     stiffness: np.ndarray
@@ -43,22 +41,17 @@ class MountGeometry:
     @staticmethod
     def of(rig: Rig) -> MountGeometry:
         """Of a rig whose mounts have parameters of their own along the earth axes; any other keeps all as the rest."""
-        body = rig.mounted_body()
         if "isolator1.k_z" not in rig.parameters():
             eom = rig.equations_of_motion()
             none = np.zeros((0, 6))
-            return MountGeometry((), np.zeros((0, 3)), none, none, np.zeros(0), np.zeros(0), eom.K, eom.C)
-        names, rows, below, k, c, place = [], [], [], [], [], []
-        for mount in body.mounts:
-            G, G_c = point_map(mount.position), point_map(mount.chassis_point)
-            for a, axis in enumerate("xyz"):
-                names.append(f"{mount.name}.{axis}")
-                place.append(mount.position)
-                rows.append(G[a])
-                below.append(G_c[a])
-                k.append(mount.stiffness[a, a])
-                c.append(mount.damping[a, a])
-        return MountGeometry(tuple(names), np.array(place), np.array(rows), np.array(below), np.array(k), np.array(c),
+            return MountGeometry((), none, none, np.zeros(0), np.zeros(0), eom.K, eom.C)
+        body = rig.mounted_body()
+        mounts = body.mounts
+        return MountGeometry(tuple(f"{mount.name}.{axis}" for mount in mounts for axis in "xyz"),
+                             np.concatenate([point_map(mount.position) for mount in mounts]),
+                             np.concatenate([point_map(mount.chassis_point) for mount in mounts]),
+                             np.concatenate([np.diag(mount.stiffness) for mount in mounts]),
+                             np.concatenate([np.diag(mount.damping) for mount in mounts]),
                              np.array(body.stiffness), np.array(body.damping))
 
     def along(self, axis: str) -> np.ndarray:
@@ -143,14 +136,8 @@ class Operators:
         key = ("volts", base.period_s, self.delay_s, _sensors_of(base), corner, *_of(self.omega))
         known = _kept.get(key)
         if known is None:
-            if base.period_s:
-                a = hold(self.omega, base.period_s, self.delay_s)
-                folded = base.sensors.folded(self.omega, base.period_s, self.delay_s, corner)
-            else:
-                a, folded = np.exp(-1j * self.omega * self.delay_s), np.zeros((len(self.omega), 1), complex)
-            if corner:
-                a = a / (1 + self.s / (2 * np.pi * corner))
-            known = _keep(key, (a, folded))
+            a, folded = replace(base, delay_s=self.delay_s, amplifier_corner_Hz=corner).drive(self.omega)
+            known = _keep(key, (a[:, 0, 0], folded[:, :, 0]))
         return known
 
 

@@ -163,18 +163,9 @@ class FrictionForce(WindowForce):
         self.last = self.record.deflection[stop - 1, self.record.driven_rows].copy()
 
 
-@dataclass(frozen=True, eq=False)
-class Marched:
-    """z (samples, c), the force (samples, 6) that it makes, and iterations a window at most."""
-
-    z: np.ndarray
-    force: np.ndarray
-    iterations: int
-
-
 def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,
-          beyond: np.ndarray | float = 0.0) -> Marched:
-    """Solve z = free + h * f(z) from rest.
+          beyond: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """z (samples, c) of z = free + h * f(z) from rest, and the force (samples, 6) that it makes.
 
     Parameters
     ----------
@@ -186,9 +177,8 @@ def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEff
     ComputationError : a motion that grows without bound.
     """
     forces = [(FrictionForce if type(one.effect) is ContactFriction else WindowForce)(one, record) for one in effects]
-    beyond = np.broadcast_to(beyond, (len(free), len(by_force.shape)))
     z, W, samples = free.copy(), by_force.window, len(free)
-    total, most, largest = np.zeros((samples, N_Q)), 0, float(np.max(np.abs(record.deflection), initial=0.0))
+    total, largest = np.zeros((samples, N_Q)), float(np.max(np.abs(record.deflection), initial=0.0))
     for start in range(0, samples, W):
         stop = min(start + W, samples)
         if start:
@@ -202,11 +192,10 @@ def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEff
                 break
         else:
             raise _without_bound(effects, record, start)
-        z[start:stop], total[start:stop], iterations = done
-        most = max(most, iterations)
+        z[start:stop], total[start:stop] = done
         for force in forces:
             force.accept(start, stop)
-    return Marched(z, total, most)
+    return z, total
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,9 +210,9 @@ class _Window:
     stop: int
     tolerance: float
 
-    def solve(self, free: np.ndarray, piece: int) -> tuple[np.ndarray, np.ndarray, int] | None:
-        """z, the force on it, and iterations of the worst piece; None where the fixed point does not contract."""
-        length, most = self.stop - self.start, 0
+    def solve(self, free: np.ndarray, piece: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """z and the force on it; None where the fixed point does not contract."""
+        length = self.stop - self.start
         push = np.zeros((length, N_Q))
         z = free
         for a in range(0, length, piece):
@@ -244,8 +233,7 @@ class _Window:
                     return None
             else:
                 return None
-            most = max(most, iteration)
-        return z, push, most
+        return z, push
 
     def _force(self, here: slice) -> np.ndarray:
         """(samples, 6) of all effects."""
