@@ -166,17 +166,13 @@ class Score:
         self.basis = Vt[s > SETTINGS.least_singular * s[0]]
         self.e = self.e - self.basis.T @ (self.basis @ self.e)
 
-    @property
-    def numbers(self) -> int:
-        return len(self.e)
-
     @cached_property
     def chi2(self) -> float:
         return float(self.e @ self.e)
 
     @cached_property
     def dof(self) -> int:
-        return self.numbers - len(self.basis) - sum(part.transient.shape[-1] for part in self.parts)
+        return len(self.e) - len(self.basis) - sum(part.transient.shape[-1] for part in self.parts)
 
     def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
         """(k, N) of one (k, n, n_y, m) a block, projected."""

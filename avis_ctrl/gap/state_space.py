@@ -24,7 +24,7 @@ from avis_ctrl.gap.effects.base import Values
 from avis_ctrl.gap.effects.cable import tie
 from avis_ctrl.gap.effects.chassis import of_chassis
 from avis_ctrl.gap.effects.flexible_mode import modes, shape_rows
-from avis_ctrl.gap.effects.mounts import contacts, drift_over_stiffness, drifted, shares, surge_omega
+from avis_ctrl.gap.effects.mounts import campaign_clock, contacts, drift_over_stiffness, drifted, shares, surge_omega
 from avis_ctrl.gap.effects.payload import place_of
 from avis_ctrl.gap.operators import MountGeometry, mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
@@ -259,7 +259,7 @@ def _drift(table: ReducedTable, place: str, values: Values) -> StateSpace:
 
 def drift_at(model: TableModel, values: Values, when: float) -> float:
     """Change of stiffness over that of the model's rig at a moment -0.5 .. 0.5 of the campaign, by a drift's law."""
-    begin, end = next((one.campaign_s for one in model.motion.values()), (0.0, 1.0))
+    begin, end = campaign_clock(model)
     through = float(drifted(np.array(when + 0.5), values.get("time_constant_s", 0.0) / (end - begin)))
     return values["relative_change"] * drift_over_stiffness(model) * through
 

@@ -32,11 +32,9 @@ class AttachedOscillator(AtPoint):
     name = "attached_oscillator"
     title = "a sprung mass on the payload"
     looks_like = "a pair of peak and dip at its own frequency, in every channel that moves its place"
+    at = ("payload/oblique", "payload/axes")
     holds_states = True
     resonant = True
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("payload/oblique", "payload/axes")
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         mass = model.rig.mounted_body().mass
@@ -124,15 +122,10 @@ def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]
              values[f"frequency_{axis}_Hz" if variant == "axes" else "frequency_Hz"]) for axis in axes]
 
 
-def oscillator(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
-    """Force of a sprung mass over the force of the same mass fixed, (n,)."""
-    w = 2 * np.pi * frequency_Hz
-    return (2 * damping * w * s + w ** 2) / second_order(s, frequency_Hz, damping)
-
-
 def sprung(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
     """Dynamic stiffness of a sprung mass of 1 kg, (n,)."""
-    return s ** 2 * oscillator(s, frequency_Hz, damping)
+    w = 2 * np.pi * frequency_Hz
+    return s ** 2 * ((2 * damping * w * s + w ** 2) / second_order(s, frequency_Hz, damping))
 
 
 def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:

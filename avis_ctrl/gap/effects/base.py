@@ -139,6 +139,7 @@ class Effect(ABC):
     Attributes
     ----------
     name : of the contract. title : in words, for a sentence. looks_like : what it does to responses.
+    at : where it can act, for one whose `places` do not depend on the table.
     nonlinear : depends on amplitude or time; acts through `volts` or `force`.
     strength : the parameter to which `force` is in proportion, empty where to none.
     holds_states : has resonances of its own, whose states at the ends of a record are to be found with its transient.
@@ -149,6 +150,7 @@ class Effect(ABC):
     name: str
     title: str
     looks_like: str
+    at: tuple[str, ...] = ()
     nonlinear: bool = False
     strength: str = ""
     holds_states: bool = False
@@ -157,7 +159,7 @@ class Effect(ABC):
 
     def places(self, model: Table) -> tuple[str, ...]:
         """Where it can act on this table; empty where it cannot."""
-        raise NotImplementedError
+        return self.at
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         """Its parameters there."""

@@ -26,9 +26,7 @@ class CableStiffness(AtPoint):
     name = "cable_stiffness"
     title = "a cable or hose ties the payload to ground"
     looks_like = "stiffness at a place and height where no mount is: it shifts and couples the lowest resonances"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("payload/axes", "payload/oblique")
+    at = ("payload/axes", "payload/oblique")
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 0.02 * float(np.mean(np.diag(model.base.matrices.K)[:3])) / 4  # of one mount of four, on any rig

@@ -11,9 +11,9 @@ from typing import cast
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, Values, differs_from_zero, register
+from avis_ctrl.gap.effects.base import EffectParameter, Table, Values, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import recoils
-from avis_ctrl.gap.effects.mounts import has_mounts
+from avis_ctrl.gap.effects.mounts import OfMounts
 from avis_ctrl.gap.effects.sensors import receptance
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.score import Score, reduction
@@ -98,7 +98,7 @@ SETTINGS = ChassisSettings()
 
 
 @register
-class BaseCompliance(Effect):
+class BaseCompliance(OfMounts):
     """The chassis, a rigid body on something soft: it recoils from mounts and motors, and filters the floor.
 
     c = B (f_mounts + (s C_b + K_b) w), B = inv(s^2 M_c + s C_b + K_b), each along its own axis (translation), or with
@@ -108,11 +108,9 @@ class BaseCompliance(Effect):
     name = "base_compliance"
     title = "the chassis stands on something soft and recoils"
     looks_like = "one more resonance in every channel, and less floor motion above it"
+    at = ("chassis/translation", "chassis/rocking")
     holds_states = True
     resonant = True
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("chassis/translation", "chassis/rocking") if has_mounts(model) else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         m = model.rig.mounted_body().mass

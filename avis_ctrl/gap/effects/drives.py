@@ -36,9 +36,7 @@ class ActuatorLag(Effect):
     name = "actuator_lag"
     title = "the current amplifiers lag, first order"
     looks_like = "phase lag that grows with frequency, the same in every channel, with a loss of gain"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("actuators",)
+    at = ("actuators",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("time_constant_s", "s", "time constant of the amplifiers", 0.0, 0.0, 0.3, 1e-3),)
@@ -65,9 +63,7 @@ class LoopDelay(Effect):
     name = "loop_delay"
     title = "a delay of transport or computing beyond the nominal one"
     looks_like = "phase lag in proportion to frequency, the same in every channel, without loss of gain"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("loop",)
+    at = ("loop",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("extra_delay_s", "s", "delay beyond that of the rig file", 0.0, 0.0, 0.2, 1e-3),)
@@ -87,10 +83,8 @@ class ActuatorSaturation(Effect):
     name = "actuator_saturation"
     title = "the drives clip below their nominal limit"
     looks_like = "less response than expected in records at high level only, and harmonics of the input"
+    at = ("actuators",)
     nonlinear = True
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("actuators",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         peaks = [float(np.max(np.abs(one.volts))) for one in model.motion.values()] or [model.rig.drive_limit_V]

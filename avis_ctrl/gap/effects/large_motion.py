@@ -17,10 +17,8 @@ class LargeMotion(Effect):
     name = "large_motion"
     title = "second-order terms of large rotations"
     looks_like = "a residual that grows with the square of the level, at low frequency first"
+    at = ("payload",)
     nonlinear = True
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("payload",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         # Little room beyond 0 and 1, and a size above it: a gap of another origin must not lead a fit astray here.

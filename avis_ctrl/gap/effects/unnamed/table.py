@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Table, Values
-from avis_ctrl.gap.effects.mounts import has_mounts, largest_rms
+from avis_ctrl.gap.effects.mounts import OfMounts, largest_rms
 from avis_ctrl.gap.effects.unnamed.base import UnnamedFault
 from avis_ctrl.gap.operators import Operators, mount_geometry
 from avis_ctrl.gap.record_motion import RecordMotion
 
 
-class QuadraticStiffness(UnnamedFault):
+class QuadraticStiffness(UnnamedFault, OfMounts):
     """Force -k2 d^2 at every vertical mount: an air spring is stiffer in than out."""
 
     name = "quadratic_stiffness"
@@ -19,9 +19,6 @@ class QuadraticStiffness(UnnamedFault):
     words = "vertical mounts with a term in the square of their deflection"
     nonlinear = True
     strength = "k2_N_per_m2"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("isolators z",) if has_mounts(model) else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model)
@@ -33,17 +30,15 @@ class QuadraticStiffness(UnnamedFault):
         return -values["k2_N_per_m2"] * (record.deflection[:, up] ** 2 @ record.rows[up])
 
 
-class QuadraticDrag(UnnamedFault):
+class QuadraticDrag(UnnamedFault, OfMounts):
     """Force -c |v| v on the payload at the table's centre, v its velocity against the chassis: air."""
 
     name = "quadratic_drag"
     title = "drag in proportion to the square of velocity"
     words = "drag on the payload in proportion to the square of velocity"
+    at = ("payload",)
     nonlinear = True
     strength = "drag_Ns2_per_m2"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("payload",) if has_mounts(model) else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 10.0 / max(largest_rms(model) * 10.0, 1e-9)
@@ -62,9 +57,7 @@ class Gyroscope(UnnamedFault):
     name = "gyroscope"
     title = "a rotor on the payload"
     words = "a rotor on the payload (moments at right angles to its tilting)"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("payload",)
+    at = ("payload",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return tuple(EffectParameter(f"h{axis}_Nms", "N m s", f"angular momentum about {axis}", 0.0, -1e6, 1e6, 1.0)
