@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol, cast
+from typing import cast
 
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.campaign_spectra import Halves, all_silent
+from avis_ctrl.gap.campaign_spectra import all_silent
 from avis_ctrl.gap.power_shares import power_shares
+from avis_ctrl.gap.preparation import Prepared
 from avis_ctrl.gap.result import HeatMap, PowerShares, RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction_error import PredictionError, prediction_error
@@ -38,19 +39,6 @@ class ResidualSettings:
 
 
 SETTINGS = ResidualSettings()
-
-
-class Spectra(Protocol):
-    """Blocks of the fitted and of the held-out records."""
-
-    @property
-    def halves(self) -> Halves: ...
-
-    @property
-    def fitted(self) -> Sequence[SpectralBlock]: ...
-
-    @property
-    def held_out(self) -> Sequence[SpectralBlock]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +148,7 @@ def _ratios(left: ModelResidual, edges: np.ndarray) -> np.ndarray:
     return found
 
 
-def every_record(prepared: Spectra, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
+def every_record(prepared: Prepared, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
            ) -> tuple[tuple[RecordGap, ...], tuple[PowerShares, ...]]:
     """What the models leave of each record, fitted ones too, and what accounts for the outputs' power;
     on `shown_lines` of each record."""

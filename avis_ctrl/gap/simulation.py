@@ -90,19 +90,6 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
     return _with_forces(model, lines, replace(record, volts=acting), x, floor, pushing)
 
 
-def _large_rotations(weak: Sequence[ActiveEffect], record: RecordMotion, model: TableModel
-                     ) -> tuple[np.ndarray, np.ndarray]:
-    """Force (samples, 6) on the payload, and acceleration (samples, n_y) read beside its own."""
-    known = with_large_motion({"": record}, model)[""]
-    force, reading = np.zeros((len(record.volts), N_Q)), np.zeros((len(record.volts), len(model.sensors.names)))
-    for one in weak:
-        pushed = one.effect.force(known, one.place, one.by_name)
-        seen = one.effect.reading(known, one.place, one.by_name)
-        force = force if pushed is None else force + pushed
-        reading = reading if seen is None else reading + seen
-    return force, reading
-
-
 def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
     u = np.asarray(u, float)
     if u.ndim != 2 or u.shape[1] != len(model.actuators) or len(u) < 2:
@@ -137,11 +124,11 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x
     """March, then let the forces act over the whole record. What enters the next pass: what a response before its
     cause leaves (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
     marching = [one for one in effects if not isinstance(one.effect, LargeMotion)]
-    weak = [one for one in effects if isinstance(one.effect, LargeMotion)]
+    weak = next((one for one in effects if isinstance(one.effect, LargeMotion)), None)
     by_force = _force_response(lines, model.matrices.M)
     # Free motion in coordinates of the response: any that give the deflection.
     to_z, n = np.linalg.pinv(by_force.shape), len(record.volts)
-    defect, reading = float("nan"), np.zeros((n, len(model.sensors.names)))
+    defect, reading = float("nan"), None
     slow, correction, size = np.zeros((n, N_Q)), np.zeros((n, by_force.shape.shape[1])), 0.0
     linear = lines.deflection(x, floor)
     for _ in range(SETTINGS.most_passes):
@@ -154,14 +141,16 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x
             z, push = march(by_force, z_free + correction, marching, record, in_time - z_free @ by_force.shape.T)
             left = z_free + lines.in_time(by_force.whole(push)) - z
         if weak:
-            more, reading = _large_rotations(weak, record, model)
+            known = with_large_motion({"": record}, model)[""]
+            more = np.asarray(weak.effect.force(known, weak.place, weak.by_name))
+            reading = weak.effect.reading(known, weak.place, weak.by_name)
             missing, slow = lines.in_time(by_force.whole(more - slow)), more
         size = float(np.sqrt(np.mean(record.deflection ** 2))) or 1.0
         defect = float(np.sqrt(np.mean(((left + missing) @ by_force.shape.T) ** 2))) / size
         if defect <= SETTINGS.defect:
             z = by_force.whole(push + slow)
             y = lines.sensed(x + z[:, :by_force.n_x], record.volts, floor)
-            if weak:
+            if reading is not None:
                 y += lines.read_beside(reading)
             return Simulated(lines.in_time(y), lines.in_time(linear + z @ by_force.shape.T), defect)
         if not np.isfinite(defect):

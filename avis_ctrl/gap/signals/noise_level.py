@@ -96,22 +96,24 @@ class FloorLevel:
     clear: bool
 
     @property
-    def ground_motion(self) -> bool:
-        """The floor moves clearly more than the rig file says, and it is the floor."""
-        return self.significant and self.clear and self.foreign <= SETTINGS.foreign
+    def parameters(self) -> dict[str, Estimate]:
+        """"velocity_rms" (mean over directions) and "velocity_rms_x" ... [m/s] in 0.5-60 Hz."""
+        return {"velocity_rms": self.mean_rms} | {f"velocity_rms_{axis}": one for axis, one in self.rms.items()}
 
+    @property
+    def confidence(self) -> float:
+        """1 - p, p a bound on the chance that estimates of a floor that is at ambient come out as high."""
+        chance = 5 * float(norm.sf(_excess(self.ambient, self.mean_rms, self.mean_seen, self.seen)))
+        return 1 - min(chance, 1.0)
 
-@dataclass(frozen=True, eq=False)
-class GroundMotionFinding:
-    """Unmeasured floor motion clearly above ambient.
-
-    parameters : "velocity_rms" (mean over directions) and "velocity_rms_x" ... [m/s] in 0.5-60 Hz.
-    confidence : 1 - p, p a bound on the chance that estimates of a floor that is at ambient come out as high.
-    """
-
-    parameters: dict[str, Estimate]
-    confidence: float
-    sentence: str
+    @property
+    def sentence(self) -> str:
+        m, seen = self.mean_rms, self.mean_seen
+        each = ", ".join(f"{axis} {1e6 * one.value:.3g}" for axis, one in self.rms.items())
+        return (f"The floor, not measured, moves with {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
+                f" ({each}), {m.value / self.ambient:.3g} times the rig file's ambient {1e6 * self.ambient:.3g} um/s;"
+                f" {1e6 * seen.value:.3g} +- {1e6 * seen.std:.2g} um/s of it are seen up to "
+                f"{min(self.seen_to_Hz.values()):.3g} Hz, the rest is a power law carried on.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +126,13 @@ class NoiseLevels:
 
     floor: FloorLevel | None
     sensors: dict[str, Estimate]
-    ground_motion: GroundMotionFinding | None
     raised: tuple[str, ...]
+
+    @property
+    def ground_motion(self) -> FloorLevel | None:
+        """The floor where it moves clearly more than the rig file says, and it is the floor."""
+        floor = self.floor
+        return floor if floor and floor.significant and floor.clear and floor.foreign <= SETTINGS.foreign else None
 
 
 def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, rig: Rig, hum: HumFinding | None = None,
@@ -166,8 +173,7 @@ def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, 
                           None if masks is None else [masks[k] for k in unknown])
         D = np.array([sensors[name].value ** 2 for name in first.y_names])
         floor = _floor(low, floor_response, D, ambient.floor_velocity_rms_m_per_s, rate)
-    made = None if floor is None or not floor.ground_motion else _ground_motion(floor)
-    return NoiseLevels(floor, sensors, made, raised)
+    return NoiseLevels(floor, sensors, raised)
 
 
 def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str) -> dict[str, Estimate]:
@@ -339,16 +345,3 @@ def _tail(f: np.ndarray, S: np.ndarray, std: np.ndarray, end: float) -> tuple[fl
     tail = a * integral
     mean = float(weight @ tail)
     return mean, float(np.sqrt(weight @ (a_var * scale * integral ** 2 + (tail - mean) ** 2)))
-
-
-def _ground_motion(floor: FloorLevel) -> GroundMotionFinding:
-    each = ", ".join(f"{axis} {1e6 * one.value:.3g}" for axis, one in floor.rms.items())
-    m, seen, ratio = floor.mean_rms, floor.mean_seen, floor.mean_rms.value / floor.ambient
-    end = min(floor.seen_to_Hz.values())
-    sentence = (f"The floor, not measured, moves with {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
-                f" ({each}), {ratio:.3g} times the rig file's ambient {1e6 * floor.ambient:.3g} um/s;"
-                f" {1e6 * seen.value:.3g} +- {1e6 * seen.std:.2g} um/s of it are seen up to {end:.3g} Hz, the rest is a"
-                " power law carried on.")
-    parameters = {"velocity_rms": m} | {f"velocity_rms_{axis}": one for axis, one in floor.rms.items()}
-    chance = 5 * float(norm.sf(_excess(floor.ambient, m, seen, floor.seen)))
-    return GroundMotionFinding(parameters, 1 - min(chance, 1.0), sentence)
