@@ -14,7 +14,7 @@ import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.operators import Assembled, assemble
+from avis_ctrl.gap.operators import Assembled
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.response import N_Q
 
@@ -159,12 +159,12 @@ def _formed(model: TableModel, samples: int, padded: int, sample_rate_Hz: float)
     omega[0] = SETTINGS.lowest_line * spacing
     made: dict[str, np.ndarray] = {}
     for k in range(0, n, SETTINGS.chunk):
-        for name, part in _lines(assemble(model.operators(omega[k:k + SETTINGS.chunk]))).items():
+        for name, part in _lines(Assembled(model.operators(omega[k:k + SETTINGS.chunk]))).items():
             if name not in made:
                 made[name] = np.empty((n if len(part) > 1 else 1, *part.shape[1:]), part.dtype)
             made[name][k:k + SETTINGS.chunk] = part
     mat = model.matrices
-    first = assemble(model.operators(omega[:1]), invert=False)
+    first = Assembled(model.operators(omega[:1]))
     gain = (first.ops.base.sensors.sensitivity * first.ops.sensor_gain)[:, None]
     alias_map = gain * (mat.R @ np.linalg.inv(mat.M) @ mat.T)
     return LineResponse(samples, padded, sample_rate_Hz, omega, made["compliance"], made["rows"], made["sense"],

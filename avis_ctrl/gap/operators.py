@@ -185,28 +185,43 @@ def mount_geometry(rig: Rig) -> MountGeometry:
     return found
 
 
-@dataclass(frozen=True, eq=False)
 class Assembled:
     """The table as `Operators` left it, ready for its response.
 
-    D (n, n_q, n_q) and its inverse, empty where it was not asked for; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp,
-    slope_pf (n, n_g): the slopes are derivatives by the mount's stiffness k; by its c both are s damping_factor.
-    T (n_q, n_u) N/V, without the factors of the drives.
+    D (n, n_q, n_q) and its inverse; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp, slope_pf (n, n_g): the slopes are
+    derivatives by the mount's stiffness k; by its c both are s damping_factor. T (n_q, n_u) N/V, without the factors of
+    the drives.
     """
 
-    ops: Operators
-    D: np.ndarray
-    inverse: np.ndarray
-    M: np.ndarray
-    G: np.ndarray
-    z_pp: np.ndarray
-    z_pf: np.ndarray
-    slope_pp: np.ndarray
-    slope_pf: np.ndarray
-    T: np.ndarray
-    rows: np.ndarray
-    hold: np.ndarray
-    folded: np.ndarray
+    def __init__(self, ops: Operators):
+        base, mounts, s = ops.base, ops.mounts, ops.s[:, None]
+        self.ops, mat = ops, base.matrices
+        self.slope_pp, self.slope_pf = _with_internal_mass(s, ops)
+        around = s * mounts.damping * ops.damping_factor
+        self.z_pp, self.z_pf = mounts.stiffness * self.slope_pp + around, mounts.stiffness * self.slope_pf + around
+        T, rows, G = mat.T.astype(complex), ops.rows, mounts.payload
+        if ops.added:
+            G = np.hstack([G, np.array([one.at_mounts for one in ops.added]).T])
+            constants = np.linalg.norm(mat.T[:3], axis=0)  # N/V: a motor's force along its own axis
+            T = np.vstack([T, np.array([one.at_actuators for one in ops.added]) * constants])
+            shapes = np.array([one.at_sensors for one in ops.added]).T[None]
+            rows = np.concatenate([rows, np.broadcast_to(shapes, (len(rows), *shapes.shape[1:]))], axis=2)
+        n_q, M, S = G.shape[1], mat.M, s[:, :, None]
+        outer = (G[:, :, None] * G[:, None, :]).reshape(len(G), n_q * n_q)
+        D = (self.z_pp @ outer).reshape(-1, n_q, n_q)
+        D[:, :N_Q, :N_Q] += S ** 2 * M + mounts.rest_K + S * mounts.rest_C
+        if ops.extra is not None:
+            D[:, :N_Q, :N_Q] += ops.extra
+        for k, one in enumerate(ops.added):
+            D[:, N_Q + k, N_Q + k] += one.stiffness
+        if ops.recoil is not None:
+            D[:, :, :N_Q] += (G.T @ (self.z_pf[:, :, None] * (mounts.chassis @ ops.recoil))) @ ops.borne(M)
+        self.D, self.M, self.G, self.T, self.rows = D, M, G, T, rows
+        self.hold, self.folded = ops.volts()
+
+    @cached_property
+    def inverse(self) -> np.ndarray:
+        return np.linalg.inv(self.D)
 
     @property
     def n_q(self) -> int:
@@ -287,38 +302,6 @@ class Assembled:
             if inner is not None and inner.size:
                 moved = moved + self._chassis_states(inner)
         return moved
-
-
-def assemble(ops: Operators, invert: bool = True) -> Assembled:
-    """Form D, and invert it where asked for."""
-    base, mounts, s = ops.base, ops.mounts, ops.s[:, None]
-    slope_pp, slope_pf = _with_internal_mass(s, ops)
-    around = s * mounts.damping * ops.damping_factor
-    z_pp, z_pf = mounts.stiffness * slope_pp + around, mounts.stiffness * slope_pf + around
-    mat = base.matrices
-    T, rows = mat.T.astype(complex), ops.rows
-    G = mounts.payload
-    if ops.added:
-        G = np.hstack([G, np.array([one.at_mounts for one in ops.added]).T])
-        constants = np.linalg.norm(mat.T[:3], axis=0)  # N/V: a motor's force along its own axis
-        T = np.vstack([T, np.array([one.at_actuators for one in ops.added]) * constants])
-        shapes = np.array([one.at_sensors for one in ops.added]).T[None]
-        rows = np.concatenate([rows, np.broadcast_to(shapes, (len(rows), *shapes.shape[1:]))], axis=2)
-    n_q, M = G.shape[1], mat.M
-    D = np.zeros((len(s), n_q, n_q), complex)
-    outer = (G[:, :, None] * G[:, None, :]).reshape(len(G), n_q * n_q)
-    D += (z_pp @ outer).reshape(-1, n_q, n_q)
-    S = s[:, :, None]
-    D[:, :N_Q, :N_Q] += S ** 2 * M + mounts.rest_K + S * mounts.rest_C
-    if ops.extra is not None:
-        D[:, :N_Q, :N_Q] += ops.extra
-    for k, one in enumerate(ops.added):
-        D[:, N_Q + k, N_Q + k] += one.stiffness
-    if ops.recoil is not None:
-        D[:, :, :N_Q] += (G.T @ (z_pf[:, :, None] * (mounts.chassis @ ops.recoil))) @ ops.borne(M)
-    hold, folded = ops.volts()
-    inverse = np.linalg.inv(D) if invert else np.empty(0)
-    return Assembled(ops, D, inverse, M, G, z_pp, z_pf, slope_pp, slope_pf, T, rows, hold, folded)
 
 
 def _with_internal_mass(s: np.ndarray, ops: Operators) -> tuple[np.ndarray, np.ndarray]:

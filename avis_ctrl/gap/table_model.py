@@ -11,7 +11,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.operators import Assembled, Operators, assemble
+from avis_ctrl.gap.operators import Assembled, Operators
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_response import MOUNT, Acting, AtMotion, TableResponse, gain_of
 from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, SensorModel, kept_lines
@@ -236,7 +236,7 @@ class TableModel:
     @kept_lines
     def assembled(self, omega: np.ndarray) -> Assembled:
         """On lines omega."""
-        return assemble(self.operators(omega))
+        return Assembled(self.operators(omega))
 
     def response(self, omega: np.ndarray) -> np.ndarray:
         """G, (n, n_y, n_u + 3), as `ResponseModel.response`; effects that depend on amplitude left out."""
@@ -357,7 +357,7 @@ class TableModel:
             ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]
             others, k = [self._with_effect_parameter(row - n, end) for end in ends], self._free[row - n][0]
             effect = self.effects[k].effect
-            tables = [] if effect.nonlinear else [assemble(one.operators(omega), invert=False) for one in others]
+            tables = [] if effect.nonlinear else [Assembled(one.operators(omega)) for one in others]
             found.append((effect, [one.effects[k] for one in others], ends[0] - ends[1], tables))
         return found
 

@@ -16,7 +16,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
 from avis_ctrl.gap.effects.base import Effect, EffectParameter
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.operators import assemble
+from avis_ctrl.gap.operators import Assembled
 from avis_ctrl.gap.realisation import realise, sufficient_order, with_effects
 from avis_ctrl.gap.state_space import SETTINGS, ReducedTable, impedance, ladder
 from avis_ctrl.gap.table_model import TableModel, active
@@ -118,7 +118,7 @@ def test_locked_coordinates_are_rows_and_columns_left_out(plain, one):
     model, keep = with_one(plain, *one), ("z", "phi_x")
     omega = 2 * np.pi * np.geomspace(0.5, 80.0, 40)
     system = with_effects(uncertain_rig(model.effective.rig, [], keep).system, model, keep)
-    made = assemble(model.operators(omega), invert=False)
+    made = Assembled(model.operators(omega))
     kept = [COORDINATES.index(name) for name in keep]
     edge = np.array([1.0, model.rig.edge_m])
     if made.ops.recoil is not None:  # what the chassis feels of coordinates that are locked is the wall's
@@ -141,7 +141,7 @@ def assemble_with_mass(model: TableModel, omega: np.ndarray, M: np.ndarray, kept
     ops.recoil = np.zeros_like(ops.recoil)
     ops.recoil[own] = held
     ops.recoil = ops.recoil @ M @ np.linalg.inv(rigid)
-    return assemble(ops, invert=False)
+    return Assembled(ops)
 
 
 def test_friction_at_rest_is_stiffness_of_the_driven_mounts(rig, plain):
