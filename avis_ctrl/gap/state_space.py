@@ -301,16 +301,10 @@ def _flexible(table: ReducedTable, place: str, values: Values) -> StateSpace:
     return StateSpace(A, B, C, np.zeros(table.shape))
 
 
-def _nothing(table: ReducedTable, place: str, values: Values) -> StateSpace:
-    """Vanishes as the amplitude does."""
-    return gain(np.zeros(table.shape))
-
-
 _MADE: dict[str, Addition] = {
     "mount_relaxation": _relaxation, "structural_damping": _structural, "mount_surge": _surge,
     "leveling_loop": _leveling, "contact_friction": _friction, "stiffness_drift": _drift, "cable_stiffness": _cable,
-    "attached_oscillator": _oscillator, "payload_flexible_mode": _flexible, "cubic_stiffness": _nothing,
-    "actuator_saturation": _nothing}
+    "attached_oscillator": _oscillator, "payload_flexible_mode": _flexible}
 
 
 def chassis(table: ReducedTable, values: Values, floor: list[str], accelerations: list[str],
