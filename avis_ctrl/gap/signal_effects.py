@@ -5,13 +5,11 @@ They are no classes of the library (`effects.library`) and have no part in a sco
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.motion_estimate import clock_of
 from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.result import NamedEffect
@@ -19,7 +17,7 @@ from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
 from avis_ctrl.gap.signals.hum import HumFinding, subtract
 from avis_ctrl.gap.signals.noise_level import NoiseLevels, noise_levels
-from avis_ctrl.gap.signals.record_residual import Estimate, RecordResidual, record_residuals
+from avis_ctrl.gap.signals.record_residual import RecordResidual, record_residuals
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction import model_inputs
@@ -99,19 +97,15 @@ def named(faults: SignalFaults, settings: GapSettings) -> list[NamedEffect]:
                                  f"the converter of {one.channel} is coarser than the rig file says"
                                  if one.kind == "resolution" else
                                  f"the converter of {one.channel} clips below its nominal range",
-                                 _reported(one.parameters), min(one.confidence, settings.most_sure),
+                                 one.parameters, min(one.confidence, settings.most_sure),
                                  confirmation=one.sentence))
     if faults.hum is not None:
         found.append(NamedEffect("mains_hum", "geophones", f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics "
-                                 f"in {', '.join(faults.hum.channels)}", _reported(faults.hum.parameters),
+                                 f"in {', '.join(faults.hum.channels)}", faults.hum.parameters,
                                  min(faults.hum.confidence, settings.most_sure), confirmation=faults.hum.sentence))
     motion = faults.noise.ground_motion if faults.noise is not None else None
     if motion is not None:
         found.append(NamedEffect("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured",
-                                 _reported(motion.parameters), min(motion.confidence, settings.most_sure),
+                                 motion.parameters, min(motion.confidence, settings.most_sure),
                                  confirmation=motion.sentence))
     return found
-
-
-def _reported(parameters: Mapping[str, Estimate]) -> dict[str, Reported]:
-    return {name: Reported(float(p.value), float(p.std), p.unit) for name, p in parameters.items()}

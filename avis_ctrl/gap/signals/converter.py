@@ -23,7 +23,7 @@ import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.signals.record_residual import Estimate
+from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.clipping import repeated_extreme
 from avis_ctrl.rigs.converter import Converter
@@ -77,7 +77,7 @@ class ConverterFinding:
 
     channel: str
     kind: Literal["resolution", "clipping"]
-    parameters: dict[str, Estimate]
+    parameters: dict[str, Reported]
     confidence: float
     sentence: str
 
@@ -155,7 +155,7 @@ def _resolution(name: str, of: Sequence[_Samples], nominal: Converter, level: fl
     value, std = step.q * lsb, step.std * lsb
     bits = np.log2(2 * nominal.range_V / value)
     return ConverterFinding(
-        name, "resolution", {"resolution_V": Estimate(value, std, "V")}, 1 - min(1.0, step.p),
+        name, "resolution", {"resolution_V": Reported(value, std, "V")}, 1 - min(1.0, step.p),
         f"Sensor {name} is converted in steps of {1e3 * value:.4g} +- {1e3 * std:.2g} mV, {step.q:.3g} times the"
         f" {1e3 * lsb:.4g} mV of the rig file: {bits:.2f} instead of {nominal.bits} bits over its range.")
 
@@ -247,7 +247,7 @@ def _clipping(name: str, of: Sequence[_Samples], nominal: Converter, lsb: float,
             continue
         top, width, p, where = made
         std = max(lsb / np.sqrt(12.0), width / np.sqrt(12.0))
-        parameters[f"clip_{end}_V"] = Estimate(sign * top, std, "V")
+        parameters[f"clip_{end}_V"] = Reported(sign * top, std, "V")
         p_all = max(p_all, 4 * p)
         count += sum(where.values())
         records |= set(where)

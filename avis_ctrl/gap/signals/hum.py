@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, stats
 
-from avis_ctrl.gap.signals.record_residual import Estimate, RecordResidual, check_common
+from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.signals.record_residual import RecordResidual, check_common
 
 MAINS_HZ = (50.0, 60.0)
 # int w^2 t^2 dt / (int w t^2 dt)^2 of a Hann window over the same of none: 28.1 / 12.
@@ -58,7 +59,7 @@ class HumLine:
 
     channel: str
     harmonic: int
-    amplitude: Estimate
+    amplitude: Reported
     ratio: float
 
 
@@ -73,9 +74,9 @@ class HumFinding:
     """
 
     nominal_Hz: float
-    frequency_Hz: Estimate
+    frequency_Hz: Reported
     lines: tuple[HumLine, ...]
-    parameters: dict[str, Estimate]
+    parameters: dict[str, Reported]
     confidence: float
     sentence: str
 
@@ -231,7 +232,7 @@ def _spread(one: RecordResidual, f: float) -> np.ndarray:
     return 2 * np.mean(np.abs(one.E[near]) ** 2, axis=0) / one.header.samples
 
 
-def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> Estimate:
+def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> Reported:
     """f0 by least squares of all lines that stand out, amplitudes and phases free in each record.
 
     Its variance is that of a sine in white noise of the local level, var(2 pi f) = 12 v / (A T)^2 with v the variance
@@ -261,7 +262,7 @@ def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> 
         # The window's mean is 1/2; s is the variance of either part of the amplitude.
         A2 = (4 * abs(np.mean(c * np.exp(-2j * np.pi * k * shift * t)))) ** 2
         information += (2 * np.pi * k * duration) ** 2 * max(A2 - 2 * s, 0.0) / s / 12 / HANN_COST
-    return Estimate(start + shift, float(1 / np.sqrt(max(information, 1e-30))), "Hz")
+    return Reported(start + shift, float(1 / np.sqrt(max(information, 1e-30))), "Hz")
 
 
 def _lines(left: Sequence[RecordResidual], f0: float, hits: np.ndarray, ratio: np.ndarray) -> tuple[HumLine, ...]:
@@ -278,12 +279,12 @@ def _lines(left: Sequence[RecordResidual], f0: float, hits: np.ndarray, ratio: n
         weight += 1 / v
     for k, j in hits:
         i = ks.index(int(k) + 1)
-        size = Estimate(float(np.sqrt(max(power[i, j] / weight[i, j], 0.0))), float(1 / np.sqrt(weight[i, j])), unit)
+        size = Reported(float(np.sqrt(max(power[i, j] / weight[i, j], 0.0))), float(1 / np.sqrt(weight[i, j])), unit)
         found.append(HumLine(names[j], int(k) + 1, size, float(ratio[k, j])))
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
 
 
-def _finding(left: Sequence[RecordResidual], nominal: float, frequency: Estimate, lines: tuple[HumLine, ...],
+def _finding(left: Sequence[RecordResidual], nominal: float, frequency: Reported, lines: tuple[HumLine, ...],
              chance: float, unit: str) -> HumFinding:
     largest = lines[0]
     names = left[0].header.y_names

@@ -24,10 +24,11 @@ import numpy as np
 from scipy.stats import norm
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.signals.converter import nominal_converter
 from avis_ctrl.gap.signals.hum import HumFinding, polluted
 from avis_ctrl.gap.signals.quiet_lines import QuietLines, quiet_lines
-from avis_ctrl.gap.signals.record_residual import HANN_SHARED, Estimate, RecordResidual, check_common
+from avis_ctrl.gap.signals.record_residual import HANN_SHARED, RecordResidual, check_common
 from avis_ctrl.rigs.rig import Rig
 
 FloorResponse = Callable[[np.ndarray], np.ndarray]
@@ -85,18 +86,18 @@ class FloorLevel:
     clear, significant : whether the floor is above ambient clearly, and beyond doubt of statistics.
     """
 
-    rms: dict[str, Estimate]
-    seen: dict[str, Estimate]
+    rms: dict[str, Reported]
+    seen: dict[str, Reported]
     seen_to_Hz: dict[str, float]
-    mean_rms: Estimate
-    mean_seen: Estimate
+    mean_rms: Reported
+    mean_seen: Reported
     ambient: float
     foreign: float
     significant: bool
     clear: bool
 
     @property
-    def parameters(self) -> dict[str, Estimate]:
+    def parameters(self) -> dict[str, Reported]:
         """"velocity_rms" (mean over directions) and "velocity_rms_x" ... [m/s] in 0.5-60 Hz."""
         return {"velocity_rms": self.mean_rms} | {f"velocity_rms_{axis}": one for axis, one in self.rms.items()}
 
@@ -125,7 +126,7 @@ class NoiseLevels:
     """
 
     floor: FloorLevel | None
-    sensors: dict[str, Estimate]
+    sensors: dict[str, Reported]
     raised: tuple[str, ...]
 
     @property
@@ -176,7 +177,7 @@ def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, 
     return NoiseLevels(floor, sensors, raised)
 
 
-def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str) -> dict[str, Estimate]:
+def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str) -> dict[str, Reported]:
     """Of the records at the lowest level: distortion and misfit raise what others show."""
     some = [one for one in high if len(one.left)]
     least = min(one.level for one in some)
@@ -185,7 +186,7 @@ def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str)
     weight = np.concatenate([one.left for one in quiet])
     rms = np.sqrt(weight @ power / weight.sum())
     std = rms / 2 * np.sqrt(HANN_SHARED / weight.sum())
-    return {name: Estimate(float(a), float(s), unit) for name, a, s in zip(names, rms, std, strict=True)}
+    return {name: Reported(float(a), float(s), unit) for name, a, s in zip(names, rms, std, strict=True)}
 
 
 def _floor(low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarray, ambient: float, rate: float
@@ -306,14 +307,14 @@ def _level(S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarra
         tail, tail_std = _tail(centre[:m], S[:m, j], std[:m, j], edges[m])
         all2[j], all_v[j] = seen2[j] + tail, seen_v[j] + tail_std ** 2
 
-    def root(square: float, variance: float) -> Estimate:
+    def root(square: float, variance: float) -> Reported:
         rms = np.sqrt(max(square, 1e-30))
-        return Estimate(float(rms), float(np.sqrt(variance) / (2 * rms)), "m/s")
+        return Reported(float(rms), float(np.sqrt(variance) / (2 * rms)), "m/s")
     rms = {axis: root(all2[j], all_v[j]) for j, axis in enumerate("xyz")}
     seen = {axis: root(seen2[j], seen_v[j]) for j, axis in enumerate("xyz")}
     mean, mean_seen = root(all2.mean(), all_v.sum() / 9), root(seen2.mean(), seen_v.sum() / 9)
 
-    def above(one: Estimate, factor: float) -> bool:
+    def above(one: Reported, factor: float) -> bool:
         return one.value > factor * ambient and one.value - SETTINGS.significant * one.std > ambient
     significant = _excess(ambient, mean, mean_seen, seen) > SETTINGS.significant
     clear = (any(above(one, SETTINGS.seen_factor) for one in (mean_seen, *seen.values()))
@@ -321,7 +322,7 @@ def _level(S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarra
     return FloorLevel(rms, seen, ends, mean, mean_seen, ambient, foreign, significant, clear)
 
 
-def _excess(ambient: float, mean: Estimate, mean_seen: Estimate, seen: dict[str, Estimate]) -> float:
+def _excess(ambient: float, mean: Reported, mean_seen: Reported, seen: dict[str, Reported]) -> float:
     """Standard errors by which the highest of these five estimates is above ambient."""
     return max((one.value - ambient) / max(one.std, 1e-30) for one in (mean, mean_seen, *seen.values()))
 
