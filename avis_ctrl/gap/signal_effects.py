@@ -16,7 +16,7 @@ from avis_ctrl.gap.result import NamedEffect
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
 from avis_ctrl.gap.signals.hum import HumFinding, subtract
-from avis_ctrl.gap.signals.noise_level import NoiseLevels, noise_levels
+from avis_ctrl.gap.signals.noise_level import FloorLevel, NoiseLevels, noise_levels
 from avis_ctrl.gap.signals.record_residual import RecordResidual, record_residuals
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel
@@ -91,21 +91,15 @@ def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[RecordResidual,
 
 def named(faults: SignalFaults, settings: GapSettings) -> list[NamedEffect]:
     """Effects of the library that the signals show."""
-    found = []
-    for one in faults.converter:
-        found.append(NamedEffect("sensor_quantisation", one.channel,
-                                 f"the converter of {one.channel} is coarser than the rig file says"
-                                 if one.kind == "resolution" else
-                                 f"the converter of {one.channel} clips below its nominal range",
-                                 one.parameters, min(one.confidence, settings.most_sure),
-                                 confirmation=one.sentence))
+    rows: list[tuple[str, str, str, ConverterFinding | HumFinding | FloorLevel]] = [
+        ("sensor_quantisation", one.channel, f"the converter of {one.channel} is coarser than the rig file says"
+         if one.kind == "resolution" else f"the converter of {one.channel} clips below its nominal range", one)
+        for one in faults.converter]
     if faults.hum is not None:
-        found.append(NamedEffect("mains_hum", "geophones", f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics "
-                                 f"in {', '.join(faults.hum.channels)}", faults.hum.parameters,
-                                 min(faults.hum.confidence, settings.most_sure), confirmation=faults.hum.sentence))
-    motion = faults.noise.ground_motion if faults.noise is not None else None
-    if motion is not None:
-        found.append(NamedEffect("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured",
-                                 motion.parameters, min(motion.confidence, settings.most_sure),
-                                 confirmation=motion.sentence))
-    return found
+        rows.append(("mains_hum", "geophones", f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics in "
+                     f"{', '.join(faults.hum.channels)}", faults.hum))
+    if faults.noise is not None and faults.noise.ground_motion is not None:
+        rows.append(("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured",
+                     faults.noise.ground_motion))
+    return [NamedEffect(name, place, title, one.parameters, min(one.confidence, settings.most_sure),
+                        confirmation=one.sentence) for name, place, title, one in rows]

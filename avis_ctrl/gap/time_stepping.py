@@ -179,6 +179,36 @@ def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEff
     forces = [(FrictionForce if type(one.effect) is ContactFriction else WindowForce)(one, record) for one in effects]
     z, W, samples = free.copy(), by_force.window, len(free)
     total, largest = np.zeros((samples, N_Q)), float(np.max(np.abs(record.deflection), initial=0.0))
+
+    def forced(start: int, here: slice) -> np.ndarray:
+        """(samples, 6) of all effects; the state of one that is not local is that of the window's start."""
+        found = np.zeros((here.stop - here.start, N_Q))
+        for force in forces:
+            found += (force(here.start, here.stop) if force.local else
+                      force(start, here.stop)[here.start - start:])
+        return found
+
+    def solved(start: int, stop: int, piece: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """z and the force on it in a window, piece after piece; None where the fixed point does not contract."""
+        push, moved = np.zeros((stop - start, N_Q)), z[start:stop]
+        for a in range(0, stop - start, piece):
+            b = min(a + piece, stop - start)
+            here, before = slice(start + a, start + b), None
+            for iteration in range(1, SETTINGS.most_iterations + 1):
+                moved = z[start:stop] + by_force.within(push[:b], stop - start)
+                deflection = moved[a:b] @ by_force.shape.T + beyond[here]
+                change = np.inf if before is None else float(np.max(np.abs(deflection - before)))
+                record.deflection[here] = before = deflection
+                if change <= SETTINGS.tolerance * largest:
+                    break
+                if not change < np.inf and iteration > 1:
+                    return None
+                push[a:b] = forced(start, here)
+                if not np.max(np.abs(push[a:b])) < 1e12:
+                    return None
+            else:
+                return None
+        return moved, push
     for start in range(0, samples, W):
         stop = min(start + W, samples)
         if start:
@@ -186,64 +216,13 @@ def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEff
             B = W << level
             end = min(start + B, samples)
             z[start:end] += by_force.after(total[start - B:start], level)[:end - start]
-        window = _Window(by_force, record, forces, beyond, start, stop, SETTINGS.tolerance * largest)
-        for piece in SETTINGS.pieces:
-            if (done := window.solve(z[start:stop], max(W // piece, 1))) is not None:
-                break
-        else:
+        done = next(filter(None, (solved(start, stop, max(W // piece, 1)) for piece in SETTINGS.pieces)), None)
+        if done is None:
             raise _without_bound(effects, record, start)
         z[start:stop], total[start:stop] = done
         for force in forces:
             force.accept(start, stop)
     return z, total
-
-
-@dataclass(frozen=True, eq=False)
-class _Window:
-    """Samples start .. stop, solved whole or in pieces one after the other."""
-
-    by_force: ForceResponse
-    record: RecordMotion
-    forces: Sequence[WindowForce]
-    beyond: np.ndarray
-    start: int
-    stop: int
-    tolerance: float
-
-    def solve(self, free: np.ndarray, piece: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """z and the force on it; None where the fixed point does not contract."""
-        length = self.stop - self.start
-        push = np.zeros((length, N_Q))
-        z = free
-        for a in range(0, length, piece):
-            b = min(a + piece, length)
-            here = slice(self.start + a, self.start + b)
-            before = None
-            for iteration in range(1, SETTINGS.most_iterations + 1):
-                z = free + self.by_force.within(push[:b], length)
-                deflection = z[a:b] @ self.by_force.shape.T + self.beyond[here]
-                change = np.inf if before is None else float(np.max(np.abs(deflection - before)))
-                self.record.deflection[here] = before = deflection
-                if change <= self.tolerance:
-                    break
-                if not change < np.inf and iteration > 1:
-                    return None
-                push[a:b] = self._force(here)
-                if not np.max(np.abs(push[a:b])) < 1e12:
-                    return None
-            else:
-                return None
-        return z, push
-
-    def _force(self, here: slice) -> np.ndarray:
-        """(samples, 6) of all effects."""
-        found = np.zeros((here.stop - here.start, N_Q))
-        for force in self.forces:
-            if force.local:
-                found += force(here.start, here.stop)
-            else:  # its state is that of the window's start
-                found += force(self.start, here.stop)[here.start - self.start:]
-        return found
 
 
 def _without_bound(effects: Sequence[ActiveEffect], record: RecordMotion, start: int) -> ComputationError:
