@@ -158,10 +158,8 @@ def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> li
     """Three frequencies at once: all triples at every place of the grid, then finer about the best places."""
     points, zeta = positions(parameters), 0.05
     frequencies = np.array([f for f in sorted({*parameters[1].grid, *peaks(score)}) if f > 2.0])
-    kept = np.concatenate([unit_matrices(score, partial(sprung, frequency_Hz=f, damping=zeta)).astype(np.float32)
-                           for f in frequencies])
-    n = len(frequencies)
-    G, b = (kept @ kept.T).astype(float).reshape(n, 21, n, 21), (kept @ score.e.astype(np.float32)).reshape(n, 21)
+    G, b = _at_frequencies(score, frequencies, zeta)
+    G, n = G.astype(float), len(frequencies)
 
     def at(point: np.ndarray) -> tuple[float, float, list[int], np.ndarray]:
         rows = at_points(point[None], "xyz")[0]
@@ -184,10 +182,7 @@ def _along_the_others(score: Score, damping: float, frequencies: Sequence[float]
                       ) -> tuple[tuple[float, float], np.ndarray]:
     """Frequencies along two axes, and the point (3,), that take most together. Their masses are left free: effects
     without a name have taken part of their response."""
-    kept = np.concatenate([unit_matrices(score, partial(sprung, frequency_Hz=f, damping=damping)) for f in frequencies],
-                          dtype=np.float32)
-    n = len(frequencies)
-    G, b = (kept @ kept.T).reshape(n, 21, n, 21), (kept @ score.e.astype(np.float32)).reshape(n, 21)
+    G, b = _at_frequencies(score, frequencies, damping)
     best = -np.inf, (0, 0), points[0]
     for rows, point in zip(at_points(points, axes), points, strict=True):
         H, g = np.einsum("ap,fpgq,bq->afbg", rows, G, rows, optimize=True), rows @ b.T
@@ -198,6 +193,15 @@ def _along_the_others(score: Score, damping: float, frequencies: Sequence[float]
         k, j = np.unravel_index(int(np.argmax(fall)), fall.shape)
         best = max(best, (float(fall[k, j]), (int(k), int(j)), point), key=lambda found: found[0])
     return (frequencies[best[1][0]], frequencies[best[1][1]]), best[2]
+
+
+def _at_frequencies(score: Score, frequencies: Sequence[float] | np.ndarray, damping: float
+                    ) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 21, n, 21) and (n, 21): Gram matrix of the unit matrices at each frequency, and product with the residual."""
+    kept = np.concatenate([unit_matrices(score, partial(sprung, frequency_Hz=f, damping=damping)) for f in frequencies],
+                          dtype=np.float32)
+    n = len(frequencies)
+    return (kept @ kept.T).reshape(n, 21, n, 21), (kept @ score.e.astype(np.float32)).reshape(n, 21)
 
 
 def _best_triple(G: np.ndarray, b: np.ndarray) -> tuple[float, float, list[int]]:

@@ -52,7 +52,7 @@ class CableStiffness(AtPoint):
         """Over a grid of places, finer about the best: the direction and stiffness that take most, or those along the
         axes, none negative."""
         parameters = self.parameters(score.model, place)
-        G, b = project(score, lambda s: np.ones_like(s))
+        G, b = project(score, np.ones_like, "spring")
         of = _along_one if place.endswith("oblique") else _along_axes
         found = of(G, b, positions(parameters), parameters[0].high)
         for halving in range(1, SETTINGS.halvings + 1) if found else ():
