@@ -199,13 +199,8 @@ def _require_answer(model: TableModel) -> None:
                          value=[f"{one.label} {one.by_name}" for one in model.effects])
 
 
-def known_effects() -> dict[str, Effect]:
-    """The library, and what belongs to every model."""
-    return {**library(), LargeMotion.name: LargeMotion()}
-
-
 def _effect(model: TableModel, one: EffectFile, field: str) -> ActiveEffect:
-    known = known_effects()
+    known: dict[str, Effect] = {**library(), LargeMotion.name: LargeMotion()}
     if one.name not in known:
         raise InputError(f"expected one of {', '.join(known)}; an effect of your own by --effects FILE.py",
                          field=f"{field}.name", value=one.name)

@@ -90,7 +90,6 @@ def places(left: ModelResidual) -> tuple[Where, ...]:
     for low, high in pairwise(edges):
         for k, output in enumerate(left.outputs):
             power, lines, found = 0.0, 0, np.zeros(model_inputs)
-            noise_dof = np.inf
             for e in left.errors:
                 f = e.block.omega / (2 * np.pi)
                 band = (f >= low) & (f < high)
@@ -99,16 +98,16 @@ def places(left: ModelResidual) -> tuple[Where, ...]:
                 U = e.block.U[band, :, 0]
                 power += float(np.sum(np.abs(error) ** 2))
                 lines += len(error)
-                noise_dof = min(noise_dof, e.block.dof)
                 strength = np.sum(np.abs(U) ** 2, axis=0)
                 along = np.abs(np.sum(error[:, None] * np.conj(U), axis=0)) ** 2
                 found += np.divide(along, strength, out=np.zeros(model_inputs), where=strength > 0)
             if lines:
-                rows.append((low, high, output, power, lines, found, noise_dof))
+                rows.append((low, high, output, power, lines, found))
+    dof = min(e.block.dof for e in left.errors)
     count = max(len(rows), 1)
-    excess_all = sum(max(power - lines, 0.0) for *_, power, lines, _, _ in rows) or 1.0
+    excess_all = sum(max(power - lines, 0.0) for *_, power, lines, _ in rows) or 1.0
     made = []
-    for low, high, output, power, lines, found, dof in rows:
+    for low, high, output, power, lines, found in rows:
         ratio = power / lines
         # At most a third of the records is held out: the noise of a band is known from twice as many lines or more.
         known = min(dof * max(lines / 60, 1), max(dof, 2 * lines))

@@ -18,13 +18,11 @@ import numpy as np
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
-from avis_ctrl.gap.motion_estimate import motion_of, mount_rows, with_large_motion
+from avis_ctrl.gap.motion_estimate import mount_rows, with_large_motion
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.gap.time_stepping import ForceResponse, march
 from avis_ctrl.identification.response import N_Q
-
-__all__ = ["Simulated", "motion_of", "simulate"]
 
 
 @dataclass(frozen=True)

@@ -179,17 +179,15 @@ def _relaxation(table: ReducedTable, place: str, values: Values) -> StateSpace:
 def _structural(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """The causal law, for the complex constant too: no causal system has that."""
     G, k = table.G, table.mounts.stiffness
-    rest, branches = ladder(2 / np.pi * np.arctan(values["loss_factor"]))
-    corners = np.array([w for w, _ in branches])
-    ratios = np.array([ratio for _, ratio in branches])
+    rest, corners, ratios = ladder(2 / np.pi * np.arctan(values["loss_factor"]))
     # rest - 1 + sum of ratio s/(s + w) = rest - 1 + sum(ratio) - sum of ratio w/(s + w)
     h = StateSpace(-np.diag(corners), np.sqrt(corners)[:, None], -(ratios * np.sqrt(corners))[None],
                    np.array([[rest - 1 + ratios.sum()]]))
     return impedance(table, G.T @ (k[:, None] * G), h)
 
 
-def ladder(power: float) -> tuple[float, list[tuple[float, float]]]:
-    """(s/w_ref)^power as rest + sum of ratio s/(s + w), all ratios positive: (rest, [(w, ratio)]).
+def ladder(power: float) -> tuple[float, np.ndarray, np.ndarray]:
+    """(s/w_ref)^power as rest + sum of ratio s/(s + w), all ratios positive: (rest, w (n,), ratio (n,)).
 
     As few branches, evenly spaced in log w within and beyond the band, as keep the error below `ladder_error` in
     `ladder_Hz`. Positive ratios make it passive.
@@ -198,14 +196,15 @@ def ladder(power: float) -> tuple[float, list[tuple[float, float]]]:
     s = 2j * np.pi * f
     wanted = (s / (2 * np.pi * LIBRARY.loss_Hz)) ** power
     if power == 0:
-        return 1.0, []
+        return 1.0, np.zeros(0), np.zeros(0)
     for count, reach in ((count, reach) for count in range(2, 24) for reach in (3.0, 10.0, 30.0)):
         w = 2 * np.pi * np.geomspace(SETTINGS.ladder_Hz[0] / reach, SETTINGS.ladder_Hz[1] * reach, count)
         basis = np.column_stack([np.ones(len(s)), s[:, None] / (s[:, None] + w)]) / wanted[:, None]
         found, _ = nnls(np.vstack([basis.real, basis.imag]), np.concatenate([np.ones(len(s)), np.zeros(len(s))]))
         if np.max(np.abs(basis @ found - 1)) < SETTINGS.ladder_error:
             break
-    return float(found[0]), [(float(a), float(b)) for a, b in zip(w, found[1:], strict=True) if b > 0]
+    used = found[1:] > 0
+    return float(found[0]), w[used], found[1:][used]
 
 
 def _surge(table: ReducedTable, place: str, values: Values) -> StateSpace:

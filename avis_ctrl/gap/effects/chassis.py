@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
+from operator import attrgetter
 from typing import cast
 
 import numpy as np
@@ -151,7 +152,7 @@ class BaseCompliance(OfMounts):
         reached = self._followed(score.model, place, starts, [*relative, blocks], wide)
         if steep and starts and (reached is None or reached.chi2 > SETTINGS.converged * reached.dof):
             straight = self._followed(score.model, place, starts, [blocks], False)
-            reached = min((one for one in (reached, straight) if one is not None), key=_chi2, default=None)
+            reached = min((one for one in (reached, straight) if one is not None), key=attrgetter("chi2"), default=None)
         if reached is None:
             return own
         if wide and reached.chi2 - reached.dof < SETTINGS.followed * (few - reached.dof):
@@ -181,12 +182,12 @@ class BaseCompliance(OfMounts):
         made: list[LikelihoodFit] = []
         for most, iterations in SETTINGS.tried_by_fractions if later else SETTINGS.tried:
             fits = [_short_fit(one, first, iterations) for one in trials[:most]]
-            made = sorted((one for one in fits if one is not None), key=_chi2)
+            made = sorted((one for one in fits if one is not None), key=attrgetter("chi2"))
             trials = [cast(TableModel, one.model) for one in made]
         enough = SETTINGS.negligible * gap if later else SETTINGS.explained * noise
         for one in made[:SETTINGS.followed_fits] if wide else []:
             if one.chi2 - noise < SETTINGS.followed * gap and made[0].chi2 > enough:
-                made = sorted([*made, self._one_by_one(one, place, first, noise, enough)], key=_chi2)
+                made = sorted([*made, self._one_by_one(one, place, first, noise, enough)], key=attrgetter("chi2"))
         reached = made[0] if made else None
         for then in later:
             reached = reached and _short_fit(cast(TableModel, reached.model), then, SETTINGS.later_iterations)
@@ -336,10 +337,6 @@ def _elsewhere(one: ActiveEffect) -> Iterator[tuple[float, ...]]:
 
 def _effect(found: LikelihoodFit) -> ActiveEffect:
     return cast(TableModel, found.model).effects[-1]
-
-
-def _chi2(one: LikelihoodFit) -> float:
-    return one.chi2
 
 
 def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock], iterations: int) -> LikelihoodFit | None:
