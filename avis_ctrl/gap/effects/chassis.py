@@ -290,17 +290,12 @@ class BaseCompliance(OfMounts):
 def of_chassis(values: Values) -> np.ndarray:
     """(3, 6, 6) mass, damping and stiffness of a chassis on its base, in the payload's coordinates about the table's
     centre; nothing in those in which it does not move."""
-    ways = [way for way in WAYS if f"{way}_Hz" in values]
-    n = len(ways)
-    radii = [1.0 if len(way) == 1 else values[f"gyration_{way[1]}_m"] for way in ways]
+    radii = [1.0, 1.0, 1.0, *(values.get(f"gyration_{axis}_m", 0.0) for axis in "xyz")]
     inertia = values["mass_kg"] * np.square(radii)
-    w = 2 * np.pi * np.array([values[f"{way}_Hz"] for way in ways])
+    w = 2 * np.pi * np.array([values.get(f"{way}_Hz", 0.0) for way in WAYS])
     found = np.zeros((3, 6, 6))
-    if n == 3:
-        found[:, range(3), range(3)] = inertia, 2 * values["damping"] * inertia * w, inertia * w ** 2
-        return found
-    centre = np.array([0.0, 0.0, values["centre_z_m"]])
-    G, below = point_map(centre), point_map(centre + np.array([0.0, 0.0, values["base_z_m"]]))
+    centre = np.array([0.0, 0.0, values.get("centre_z_m", 0.0)])
+    G, below = point_map(centre), point_map(centre + np.array([0.0, 0.0, values.get("base_z_m", 0.0)]))
     each = (inertia, 2 * values["damping"] * inertia * w, inertia * w ** 2)
     for which, place, one in zip(found, (G, below, below), each, strict=True):
         which += place.T @ np.diag(one[:3]) @ place
