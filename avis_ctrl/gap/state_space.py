@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.optimize import nnls
@@ -26,9 +25,8 @@ from avis_ctrl.gap.effects.chassis import of_chassis
 from avis_ctrl.gap.effects.flexible_mode import modes, shape_rows
 from avis_ctrl.gap.effects.mounts import campaign_clock, contacts, drift_over_stiffness, drifted, shares, surge_omega
 from avis_ctrl.gap.effects.payload import place_of
-from avis_ctrl.gap.operators import MountGeometry, mount_geometry
+from avis_ctrl.gap.operators import mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-from avis_ctrl.identification.response import Matrices
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.rigid_body import COORDINATES, point_map
@@ -53,82 +51,28 @@ class RealisationSettings:
 SETTINGS = RealisationSettings()
 
 
-@dataclass(frozen=True, eq=False)
 class ReducedTable:
     """What an addition needs to know of a model in its kept coordinates.
 
     model : with its effects. keep : coordinates that move. when : -0.5 .. 0.5 through the campaign.
+    G (n_g, n) deflection of every mount; inertia (n, n) mass matrix; r, v, v_c, u : columns of the inputs of an
+    addition; shape : its outputs and inputs.
     """
 
-    model: TableModel
-    keep: tuple[str, ...]
-    when: float = 0.0
-
-    @cached_property
-    def kept(self) -> list[int]:
-        return [COORDINATES.index(name) for name in self.keep]
-
-    @cached_property
-    def scale(self) -> np.ndarray:
-        """(n,) from kept coordinates, rotations at the edge [m], to q."""
-        edge = self.model.rig.edge_m
-        return np.array([1 / edge if name.startswith("phi") else 1.0 for name in self.keep])
-
-    @property
-    def matrices(self) -> Matrices:
-        return self.model.matrices
-
-    @cached_property
-    def mounts(self) -> MountGeometry:
-        return mount_geometry(self.model.effective.rig)
+    def __init__(self, model: TableModel, keep: tuple[str, ...], when: float = 0.0):
+        self.model, self.keep, self.when = model, keep, when
+        self.matrices, self.mounts = model.matrices, mount_geometry(model.effective.rig)
+        self.n, self.n_y, n_u = len(keep), len(model.sensors.names), len(model.actuators)
+        self.r, self.v, self.v_c = (slice(k * self.n, (k + 1) * self.n) for k in range(3))
+        self.u = slice(3 * self.n, 3 * self.n + n_u)
+        self.shape = self.n + self.n_y, 3 * self.n + n_u
+        self.G, self.inertia = self.rows(self.mounts.payload), self.rows(self.rows(self.matrices.M).T)
 
     def rows(self, of_q: np.ndarray) -> np.ndarray:
-        """(m, n) rows by kept coordinates from rows (m, 6) by q."""
-        return np.atleast_2d(of_q)[:, self.kept] * self.scale
+        """(m, n) rows by kept coordinates, rotations as displacements of the edge [m], from rows (m, 6) by q."""
+        scale = [1 / self.model.rig.edge_m if name.startswith("phi") else 1.0 for name in self.keep]
+        return np.atleast_2d(of_q)[:, [COORDINATES.index(name) for name in self.keep]] * scale
 
-    @property
-    def G(self) -> np.ndarray:
-        """(n_g, n) deflection of every mount."""
-        return self.rows(self.mounts.payload)
-
-    @property
-    def inertia(self) -> np.ndarray:
-        """(n, n) mass matrix."""
-        return self.rows(self.rows(self.matrices.M).T)
-
-    @property
-    def n(self) -> int:
-        return len(self.keep)
-
-    @property
-    def n_y(self) -> int:
-        return len(self.model.sensors.names)
-
-    @property
-    def n_u(self) -> int:
-        return len(self.model.actuators)
-
-    # Columns of the inputs of an addition.
-    @property
-    def r(self) -> slice:
-        return slice(0, self.n)
-
-    @property
-    def v(self) -> slice:
-        return slice(self.n, 2 * self.n)
-
-    @property
-    def v_c(self) -> slice:
-        return slice(2 * self.n, 3 * self.n)
-
-    @property
-    def u(self) -> slice:
-        return slice(3 * self.n, 3 * self.n + self.n_u)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Outputs and inputs of an addition."""
-        return self.n + self.n_y, 3 * self.n + self.n_u
 
 
 Addition = Callable[[ReducedTable, str, Values], StateSpace]
