@@ -17,7 +17,7 @@ from avis_ctrl.gap.table_response import MOUNT, Acting, AtMotion, TableResponse,
 from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, SensorModel, kept_lines
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.structure import structural_null_space, structure_of
-from avis_ctrl.rigs.rig import Parameter, Rig
+from avis_ctrl.rigs.rig import Rig
 
 
 @dataclass(frozen=True)
@@ -163,13 +163,6 @@ class TableModel:
         low, high = (self.nominal or self.base).bounds()
         own = [self.effects[k].parameters[j] for k, j in self._free]
         return np.concatenate([low, [one.low for one in own]]), np.concatenate([high, [one.high for one in own]])
-
-    def all_parameters(self) -> dict[str, Parameter]:
-        found = self.base.all_parameters()
-        for one in self.effects:
-            for name, parameter, value in zip(one.names, one.parameters, one.values, strict=True):
-                found[name] = Parameter(value, parameter.unit, parameter.description)
-        return found
 
     def at(self, theta: Sequence[float] | np.ndarray) -> TableModel:
         """The model with its free parameters at theta. Raises InputError where no rig has them."""
