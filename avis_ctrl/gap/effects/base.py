@@ -7,7 +7,7 @@ To add one, write a class and register it:
         name = "eddy_brake"
         ...
 
-`change` acts on the table line by line; an effect that depends on amplitude or time gives `volts` or `force`
+`change` acts on the table line by line; an effect that depends on amplitude or time gives `volts`, `force` or `reading`
 instead, from the record's motion in time. Parameters marked `linear` vanish at `none`: the effect is nearly linear
 in them there, which the score test and the starting values use; the others shape it (a frequency, a damping).
 """
