@@ -14,7 +14,7 @@ import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.operators import Assembled, assemble
+from avis_ctrl.gap.operators import Assembled
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.response import N_Q
 
@@ -41,7 +41,6 @@ class RecordLineSettings:
 SETTINGS = RecordLineSettings()
 
 
-@dataclass(frozen=True, eq=False)
 class LineResponse:
     """The table on lines of a padded record.
 
@@ -58,24 +57,26 @@ class LineResponse:
     T : (n_q, n_u). G, G_c : (n_g, n_q) and (n_g, 6), deflection by x and chassis.
     """
 
-    samples: int
-    padded: int
-    sample_rate_Hz: float
-    omega: np.ndarray
-    compliance: np.ndarray
-    rows: np.ndarray
-    sense: np.ndarray
-    volts: np.ndarray
-    alias: np.ndarray
-    alias_drive: np.ndarray
-    alias_map: np.ndarray
-    against: np.ndarray
-    floor: np.ndarray
-    chassis: np.ndarray
-    recoil: np.ndarray | None
-    T: np.ndarray
-    G: np.ndarray
-    G_c: np.ndarray
+    def __init__(self, model: TableModel, samples: int, padded: int, sample_rate_Hz: float):
+        self.samples, self.padded, self.sample_rate_Hz = samples, padded, sample_rate_Hz
+        spacing = 2 * np.pi * sample_rate_Hz / padded
+        n = min(padded // 2 + 1, int(SETTINGS.highest_Hz * padded / sample_rate_Hz) + 1)
+        self.omega = spacing * np.arange(n)
+        self.omega[0] = SETTINGS.lowest_line * spacing
+        made: dict[str, np.ndarray] = {}
+        for k in range(0, n, SETTINGS.chunk):
+            for name, part in _lines(Assembled(model.operators(self.omega[k:k + SETTINGS.chunk]))).items():
+                if name not in made:
+                    made[name] = np.empty((n if len(part) > 1 else 1, *part.shape[1:]), part.dtype)
+                made[name][k:k + SETTINGS.chunk] = part
+        self.compliance, self.rows, self.sense = made["compliance"], made["rows"], made["sense"]
+        self.volts, self.alias, self.alias_drive = made["volts"], made["alias"], made["alias_drive"]
+        self.floor, self.chassis, self.recoil = made["floor"], made["chassis"], made.get("recoil")
+        first, mat = Assembled(model.operators(self.omega[:1])), model.matrices
+        gain = (first.ops.base.sensors.sensitivity * first.ops.sensor_gain)[:, None]
+        self.alias_map = gain * (mat.R @ np.linalg.inv(mat.M) @ mat.T)
+        self.against = mat.R * first.ops.base.sensors.relative[:, None]
+        self.T, self.G, self.G_c = first.T.real, first.G, first.ops.mounts.chassis
 
     def spectrum(self, samples: np.ndarray) -> np.ndarray:
         """(n, m) of (samples, m) from rest."""
@@ -141,7 +142,7 @@ def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> Lin
                          value=sample_rate_Hz)
     padded = scipy.fft.next_fast_len(max(2 * samples, samples + int(np.ceil(SETTINGS.quiet_s * sample_rate_Hz))), True)
     _kept.clear()  # first, so that two never lie in memory
-    found = _formed(model, samples, padded, sample_rate_Hz)
+    found = LineResponse(model, samples, padded, sample_rate_Hz)
     _kept.append((model, samples, sample_rate_Hz, found))
     return found
 
@@ -150,27 +151,6 @@ def _same(one: TableModel, other: TableModel) -> bool:
     """Whether two models are made of the very same parts."""
     return (one.base is other.base and len(one.effects) == len(other.effects)
             and all(a is b for a, b in zip(one.effects, other.effects, strict=True)))
-
-
-def _formed(model: TableModel, samples: int, padded: int, sample_rate_Hz: float) -> LineResponse:
-    spacing = 2 * np.pi * sample_rate_Hz / padded
-    n = min(padded // 2 + 1, int(SETTINGS.highest_Hz * padded / sample_rate_Hz) + 1)
-    omega = spacing * np.arange(n)
-    omega[0] = SETTINGS.lowest_line * spacing
-    made: dict[str, np.ndarray] = {}
-    for k in range(0, n, SETTINGS.chunk):
-        for name, part in _lines(assemble(model.operators(omega[k:k + SETTINGS.chunk]))).items():
-            if name not in made:
-                made[name] = np.empty((n if len(part) > 1 else 1, *part.shape[1:]), part.dtype)
-            made[name][k:k + SETTINGS.chunk] = part
-    mat = model.matrices
-    first = assemble(model.operators(omega[:1]), invert=False)
-    gain = (first.ops.base.sensors.sensitivity * first.ops.sensor_gain)[:, None]
-    alias_map = gain * (mat.R @ np.linalg.inv(mat.M) @ mat.T)
-    return LineResponse(samples, padded, sample_rate_Hz, omega, made["compliance"], made["rows"], made["sense"],
-                        made["volts"], made["alias"], made["alias_drive"], alias_map,
-                        mat.R * first.ops.base.sensors.relative[:, None], made["floor"], made["chassis"],
-                        made.get("recoil"), first.T.real, first.G, first.ops.mounts.chassis)
 
 
 def _lines(made: Assembled) -> dict[str, np.ndarray]:

@@ -20,6 +20,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.effects.library import library
+from avis_ctrl.gap.effects.mounts import campaign_clock
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.response import ResponseModel, sensor_model
 from avis_ctrl.rigs.avis import INERTIA
@@ -86,7 +87,7 @@ def model_to_dict(model: TableModel) -> dict[str, Any]:
         "suspensions": {name: list(own) for name, own in base.sensors.detuned.items()},
         "effects": [{"name": one.effect.name, "place": one.place,
                      "values": {name: float(value) for name, value in one.by_name.items()}} for one in model.effects],
-        "campaign_s": list(campaign_clock(model))}
+        "campaign_s": [float(one) for one in campaign_clock(model)]}
 
 
 def _rig_text(rig: Rig) -> tuple[str, dict[str, float]]:
@@ -103,13 +104,6 @@ def _rig_text(rig: Rig) -> tuple[str, dict[str, float]]:
         text = rig_toml(rig.with_parameters(round_body))
         rig_from(tomllib.loads(text), loaded)
         return text, values
-
-
-def campaign_clock(model: TableModel) -> tuple[float, float]:
-    """First and last time [s] of the campaign that a model was found from; (0, 1) where it knows no record."""
-    for record in model.motion.values():
-        return float(record.campaign_s[0]), float(record.campaign_s[1])
-    return 0.0, 1.0
 
 
 def model_from_dict(content: Mapping[str, Any]) -> tuple[TableModel, tuple[float, float]]:
@@ -205,13 +199,8 @@ def _require_answer(model: TableModel) -> None:
                          value=[f"{one.label} {one.by_name}" for one in model.effects])
 
 
-def known_effects() -> dict[str, Effect]:
-    """The library, and what belongs to every model."""
-    return {**library(), LargeMotion.name: LargeMotion()}
-
-
 def _effect(model: TableModel, one: EffectFile, field: str) -> ActiveEffect:
-    known = known_effects()
+    known: dict[str, Effect] = {**library(), LargeMotion.name: LargeMotion()}
     if one.name not in known:
         raise InputError(f"expected one of {', '.join(known)}; an effect of your own by --effects FILE.py",
                          field=f"{field}.name", value=one.name)

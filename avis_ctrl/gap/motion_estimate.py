@@ -103,17 +103,12 @@ def mount_rows(model: TableModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     return mounts.payload, mounts.stiffness, mounts.along("z"), np.array(rows, int)
 
 
-def limited_inputs(model: TableModel, record: Record) -> tuple[np.ndarray, np.ndarray | None]:
-    """u (samples, n_u) within the drives' limit and floor, in the model's order."""
-    u, floor = model_inputs(model.base, record)
-    limit = model.rig.limits_of(model.actuators)
-    return np.clip(u, -limit, limit), floor
-
-
 def _in_time(record: Record, linear: TableModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Volts (samples, n_u), deflection (samples, n_g), and y (samples, n_y) where all of it was measured."""
     h = record.header
-    u, floor = limited_inputs(linear, record)
+    u, floor = model_inputs(linear.base, record)
+    limit = linear.rig.limits_of(linear.actuators)
+    u = np.clip(u, -limit, limit)
     lines = line_response(linear, h.samples, h.sample_rate_Hz)
     x = lines.motion(lines.drive(u, floor))
     deflection = lines.in_time(lines.deflection(x, floor))

@@ -12,14 +12,13 @@ The chassis follows the floor displacement w through H_w and recoils with B: zer
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.identification.response import N_Q, ResponseModel
-from avis_ctrl.identification.sampling import hold
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import point_map
 
@@ -32,7 +31,6 @@ class MountGeometry:
     """
 
     names: tuple[str, ...]
-    position: np.ndarray
     payload: np.ndarray
     chassis: np.ndarray
     stiffness: np.ndarray
@@ -43,22 +41,17 @@ class MountGeometry:
     @staticmethod
     def of(rig: Rig) -> MountGeometry:
         """Of a rig whose mounts have parameters of their own along the earth axes; any other keeps all as the rest."""
-        body = rig.mounted_body()
         if "isolator1.k_z" not in rig.parameters():
             eom = rig.equations_of_motion()
             none = np.zeros((0, 6))
-            return MountGeometry((), np.zeros((0, 3)), none, none, np.zeros(0), np.zeros(0), eom.K, eom.C)
-        names, rows, below, k, c, place = [], [], [], [], [], []
-        for mount in body.mounts:
-            G, G_c = point_map(mount.position), point_map(mount.chassis_point)
-            for a, axis in enumerate("xyz"):
-                names.append(f"{mount.name}.{axis}")
-                place.append(mount.position)
-                rows.append(G[a])
-                below.append(G_c[a])
-                k.append(mount.stiffness[a, a])
-                c.append(mount.damping[a, a])
-        return MountGeometry(tuple(names), np.array(place), np.array(rows), np.array(below), np.array(k), np.array(c),
+            return MountGeometry((), none, none, np.zeros(0), np.zeros(0), eom.K, eom.C)
+        body = rig.mounted_body()
+        mounts = body.mounts
+        return MountGeometry(tuple(f"{mount.name}.{axis}" for mount in mounts for axis in "xyz"),
+                             np.concatenate([point_map(mount.position) for mount in mounts]),
+                             np.concatenate([point_map(mount.chassis_point) for mount in mounts]),
+                             np.concatenate([np.diag(mount.stiffness) for mount in mounts]),
+                             np.concatenate([np.diag(mount.damping) for mount in mounts]),
                              np.array(body.stiffness), np.array(body.damping))
 
     def along(self, axis: str) -> np.ndarray:
@@ -77,7 +70,6 @@ class AddedCoordinate:
     at_sensors: np.ndarray
 
 
-@dataclass(eq=False)
 class Operators:
     """Of a rig on lines omega (n,) rad/s, open to be changed by effects.
 
@@ -96,42 +88,26 @@ class Operators:
     added : coordinates beside the six. recoil, follow : (n, 6, 6) B and (n, 6, 3) H_w, None for a stiff floor.
     """
 
-    base: ResponseModel
-    omega: np.ndarray
-    s: np.ndarray = field(init=False)
-    mounts: MountGeometry = field(init=False)
-    stiffness_factor: np.ndarray = field(init=False)
-    damping_factor: np.ndarray = field(init=False)
-    internal_omega: np.ndarray = field(init=False)
-    internal_damping: np.ndarray = field(init=False)
-    payload_share: np.ndarray = field(init=False)
     extra: np.ndarray | None = None
     extra_floor: np.ndarray | None = None
-    rows: np.ndarray = field(init=False)
-    sense: np.ndarray = field(init=False)
-    sensor_gain: np.ndarray = field(init=False)
-    drive: np.ndarray = field(init=False)
-    delay_s: float = field(init=False)
-    amplifier_corner_Hz: float | None = field(init=False)
-    added: list[AddedCoordinate] = field(default_factory=list)
     recoil: np.ndarray | None = None
     follow: np.ndarray | None = None
-    inner: list[np.ndarray] = field(default_factory=list)
-    decays: list[np.ndarray] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
-        base = self.base
-        self.s = 1j * self.omega
+    def __init__(self, base: ResponseModel, omega: np.ndarray):
+        self.base, self.omega, self.s = base, omega, 1j * omega
         self.mounts = mount_geometry(base.rig)
         n_g = len(self.mounts.names)
         self.stiffness_factor, self.damping_factor = np.ones((1, n_g), complex), np.ones((1, n_g), complex)
         self.internal_omega, self.internal_damping = np.full(n_g, np.inf), np.zeros(n_g)
         self.payload_share = np.full(n_g, 0.5)
-        self.rows = base.matrices.R[None]
-        self.sense = chain_response(base, self.omega).copy()
+        self.rows: np.ndarray = base.matrices.R[None]
+        self.sense = chain_response(base, omega).copy()
         self.sensor_gain = np.ones(len(base.sensors.names))
-        self.drive = np.ones((1, len(base.actuators)), complex)
+        self.drive: np.ndarray = np.ones((1, len(base.actuators)), complex)
         self.delay_s, self.amplifier_corner_Hz = base.delay_s, base.amplifier_corner_Hz
+        self.added: list[AddedCoordinate] = []
+        self.inner: list[np.ndarray] = []
+        self.decays: list[np.ndarray] = []
 
     def sensor(self, name: str) -> int:
         return self.base.sensors.names.index(name)
@@ -160,14 +136,8 @@ class Operators:
         key = ("volts", base.period_s, self.delay_s, _sensors_of(base), corner, *_of(self.omega))
         known = _kept.get(key)
         if known is None:
-            if base.period_s:
-                a = hold(self.omega, base.period_s, self.delay_s)
-                folded = base.sensors.folded(self.omega, base.period_s, self.delay_s, corner)
-            else:
-                a, folded = np.exp(-1j * self.omega * self.delay_s), np.zeros((len(self.omega), 1), complex)
-            if corner:
-                a = a / (1 + self.s / (2 * np.pi * corner))
-            known = _keep(key, (a, folded))
+            a, folded = replace(base, delay_s=self.delay_s, amplifier_corner_Hz=corner).drive(self.omega)
+            known = _keep(key, (a[:, 0, 0], folded[:, :, 0]))
         return known
 
 
@@ -215,28 +185,43 @@ def mount_geometry(rig: Rig) -> MountGeometry:
     return found
 
 
-@dataclass(frozen=True, eq=False)
 class Assembled:
     """The table as `Operators` left it, ready for its response.
 
-    D (n, n_q, n_q) and its inverse, empty where it was not asked for; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp,
-    slope_pf (n, n_g): the slopes are derivatives by the mount's stiffness k; by its c both are s damping_factor.
-    T (n_q, n_u) N/V, without the factors of the drives.
+    D (n, n_q, n_q) and its inverse; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp, slope_pf (n, n_g): the slopes are
+    derivatives by the mount's stiffness k; by its c both are s damping_factor. T (n_q, n_u) N/V, without the factors of
+    the drives.
     """
 
-    ops: Operators
-    D: np.ndarray
-    inverse: np.ndarray
-    M: np.ndarray
-    G: np.ndarray
-    z_pp: np.ndarray
-    z_pf: np.ndarray
-    slope_pp: np.ndarray
-    slope_pf: np.ndarray
-    T: np.ndarray
-    rows: np.ndarray
-    hold: np.ndarray
-    folded: np.ndarray
+    def __init__(self, ops: Operators):
+        base, mounts, s = ops.base, ops.mounts, ops.s[:, None]
+        self.ops, mat = ops, base.matrices
+        self.slope_pp, self.slope_pf = _with_internal_mass(s, ops)
+        around = s * mounts.damping * ops.damping_factor
+        self.z_pp, self.z_pf = mounts.stiffness * self.slope_pp + around, mounts.stiffness * self.slope_pf + around
+        T, rows, G = mat.T.astype(complex), ops.rows, mounts.payload
+        if ops.added:
+            G = np.hstack([G, np.array([one.at_mounts for one in ops.added]).T])
+            constants = np.linalg.norm(mat.T[:3], axis=0)  # N/V: a motor's force along its own axis
+            T = np.vstack([T, np.array([one.at_actuators for one in ops.added]) * constants])
+            shapes = np.array([one.at_sensors for one in ops.added]).T[None]
+            rows = np.concatenate([rows, np.broadcast_to(shapes, (len(rows), *shapes.shape[1:]))], axis=2)
+        n_q, M, S = G.shape[1], mat.M, s[:, :, None]
+        outer = (G[:, :, None] * G[:, None, :]).reshape(len(G), n_q * n_q)
+        D = (self.z_pp @ outer).reshape(-1, n_q, n_q)
+        D[:, :N_Q, :N_Q] += S ** 2 * M + mounts.rest_K + S * mounts.rest_C
+        if ops.extra is not None:
+            D[:, :N_Q, :N_Q] += ops.extra
+        for k, one in enumerate(ops.added):
+            D[:, N_Q + k, N_Q + k] += one.stiffness
+        if ops.recoil is not None:
+            D[:, :, :N_Q] += (G.T @ (self.z_pf[:, :, None] * (mounts.chassis @ ops.recoil))) @ ops.borne(M)
+        self.D, self.M, self.G, self.T, self.rows = D, M, G, T, rows
+        self.hold, self.folded = ops.volts()
+
+    @cached_property
+    def inverse(self) -> np.ndarray:
+        return np.linalg.inv(self.D)
 
     @property
     def n_q(self) -> int:
@@ -317,38 +302,6 @@ class Assembled:
             if inner is not None and inner.size:
                 moved = moved + self._chassis_states(inner)
         return moved
-
-
-def assemble(ops: Operators, invert: bool = True) -> Assembled:
-    """Form D, and invert it where asked for."""
-    base, mounts, s = ops.base, ops.mounts, ops.s[:, None]
-    slope_pp, slope_pf = _with_internal_mass(s, ops)
-    around = s * mounts.damping * ops.damping_factor
-    z_pp, z_pf = mounts.stiffness * slope_pp + around, mounts.stiffness * slope_pf + around
-    mat = base.matrices
-    T, rows = mat.T.astype(complex), ops.rows
-    G = mounts.payload
-    if ops.added:
-        G = np.hstack([G, np.array([one.at_mounts for one in ops.added]).T])
-        constants = np.linalg.norm(mat.T[:3], axis=0)  # N/V: a motor's force along its own axis
-        T = np.vstack([T, np.array([one.at_actuators for one in ops.added]) * constants])
-        shapes = np.array([one.at_sensors for one in ops.added]).T[None]
-        rows = np.concatenate([rows, np.broadcast_to(shapes, (len(rows), *shapes.shape[1:]))], axis=2)
-    n_q, M = G.shape[1], mat.M
-    D = np.zeros((len(s), n_q, n_q), complex)
-    outer = (G[:, :, None] * G[:, None, :]).reshape(len(G), n_q * n_q)
-    D += (z_pp @ outer).reshape(-1, n_q, n_q)
-    S = s[:, :, None]
-    D[:, :N_Q, :N_Q] += S ** 2 * M + mounts.rest_K + S * mounts.rest_C
-    if ops.extra is not None:
-        D[:, :N_Q, :N_Q] += ops.extra
-    for k, one in enumerate(ops.added):
-        D[:, N_Q + k, N_Q + k] += one.stiffness
-    if ops.recoil is not None:
-        D[:, :, :N_Q] += (G.T @ (z_pf[:, :, None] * (mounts.chassis @ ops.recoil))) @ ops.borne(M)
-    hold, folded = ops.volts()
-    inverse = np.linalg.inv(D) if invert else np.empty(0)
-    return Assembled(ops, D, inverse, M, G, z_pp, z_pf, slope_pp, slope_pf, T, rows, hold, folded)
 
 
 def _with_internal_mass(s: np.ndarray, ops: Operators) -> tuple[np.ndarray, np.ndarray]:

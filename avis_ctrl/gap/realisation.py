@@ -141,9 +141,8 @@ def _additions(table: ReducedTable, names: list[str]) -> StateSpace:
         if made is not None:
             total = total + made
     inputs = [f"{a}_rel" for a in names] + [f"{a}_dot" for a in names] + [f"chassis_{a}_dot" for a in names]
-    return StateSpace(total.A, total.B, total.C, total.D, 0.0,
-                      (*inputs, *(f"acting_{name}" for name in table.model.actuators)),
-                      (*(f"added_{a}" for a in names), *(f"bent_{name}" for name in table.model.sensors.names)))
+    return total.renamed([*inputs, *(f"acting_{name}" for name in table.model.actuators)],
+                         [*(f"added_{a}" for a in names), *(f"bent_{name}" for name in table.model.sensors.names)])
 
 
 def _drives(model: TableModel) -> list[StateSpace]:
@@ -168,19 +167,16 @@ def _sensors(table: ReducedTable, names: list[str]) -> StateSpace:
     ops = _changed_by(model, "sensor_gain", "sensor_misalignment")
     nominal, seen = table.rows(table.matrices.R), table.rows(ops.rows[0].real)
     tilt = _tilt_rows(table)
-    filters = append(*(one.renamed([f"a{k}"], [f"b{k}"])
-                       for k, one in enumerate(_sensor_filters(model, ops.sensor_gain))))
+    filters = append(*_sensor_filters(model, ops.sensor_gain))
     sees = filters.scaled(1.0, np.hstack([seen, np.eye(n_y)]))
     total = sees + gain(np.hstack([-nominal, np.zeros((n_y, n_y))]))
+    feels = gain(np.zeros((n_y, n + n_y)))
     if np.any(tilt):
         feels = filters.scaled(1.0, np.hstack([tilt, np.zeros((n_y, n_y))]))
-    else:
-        feels = gain(np.zeros((n_y, n + n_y)))
-    both = append(_numbered(total, "d"), _numbered(feels, "t")).scaled(1.0, np.vstack([np.eye(n + n_y)] * 2))
+    both = append(total, feels).scaled(1.0, np.vstack([np.eye(n + n_y)] * 2))
     sensors = model.sensors.names
-    return StateSpace(both.A, both.B, both.C, both.D, 0.0,
-                      (*(f"{a}_dot" for a in names), *(f"bent_{name}" for name in sensors)),
-                      (*(f"deviation_{name}" for name in sensors), *(f"tilt_{name}" for name in sensors)))
+    return both.renamed([*(f"{a}_dot" for a in names), *(f"bent_{name}" for name in sensors)],
+                        [*(f"deviation_{name}" for name in sensors), *(f"tilt_{name}" for name in sensors)])
 
 
 def _changed_by(model: TableModel, *names: str) -> Operators:
@@ -190,12 +186,6 @@ def _changed_by(model: TableModel, *names: str) -> Operators:
         if one.effect.name in names:
             one.effect.change(ops, one.place, one.by_name)
     return ops
-
-
-def _numbered(system: StateSpace, tag: str) -> StateSpace:
-    return StateSpace(system.A, system.B, system.C, system.D, 0.0,
-                      tuple(f"{tag}u{k}" for k in range(system.ninputs)),
-                      tuple(f"{tag}y{k}" for k in range(system.noutputs)))
 
 
 def _tilt_rows(table: ReducedTable) -> np.ndarray:
@@ -310,25 +300,20 @@ def _chains(table: ReducedTable, names: list[str]) -> StateSpace:
     """Velocities, deviations and gravity's share to the sensors' own unit; the two zeros at rest cancel s^-2."""
     model, n_y = table.model, table.n_y
     nominal, chain = table.rows(table.matrices.R), model.sensors.chain
-    tilt = tilt_filter(list(np.roots(model.sensors.transient_poles[::-1]))) if chain is not None else gain([[0.0]])
     if chain is None and np.any(_tilt_rows(table)):
         raise InputError("expected sensors with a high-pass: ideal ones would integrate gravity twice",
                          field="tilt_coupling", value=GRAVITY)
-    S = model.sensors.sensitivity
-    motion = append(*((chain if chain is not None else gain([[1.0]])).renamed([f"a{k}"], [f"b{k}"])
-                      for k in range(n_y))).scaled(np.diag(S), np.hstack([nominal, np.eye(n_y), np.zeros((n_y, n_y))]))
-    felt = append(*(tilt.renamed([f"a{k}"], [f"b{k}"]) for k in range(n_y))).scaled(
-        np.diag(S), np.hstack([np.zeros((n_y, len(names) + n_y)), np.eye(n_y)]))
-    total = motion + felt
+    S, tilt = np.diag(model.sensors.sensitivity), gain([[0.0]])
+    if chain is None:
+        chain = gain([[1.0]])
+    else:
+        # Without the zeros at rest: from the rate of acceleration to what the chain makes of it.
+        tilt = cascade([], list(np.roots(model.sensors.transient_poles[::-1])), 1.0)
+    motion = append(*[chain] * n_y).scaled(S, np.hstack([nominal, np.eye(n_y), np.zeros((n_y, n_y))]))
+    felt = append(*[tilt] * n_y).scaled(S, np.hstack([np.zeros((n_y, len(names) + n_y)), np.eye(n_y)]))
     sensors = model.sensors.names
-    return StateSpace(total.A, total.B, total.C, total.D, 0.0,
-                      (*(f"{a}_dot" for a in names), *(f"deviation_{k}" for k in sensors),
-                       *(f"tilt_{k}" for k in sensors)), tuple(sensors))
-
-
-def tilt_filter(poles: Sequence[complex]) -> StateSpace:
-    """A chain's poles without its two zeros at rest: from the rate of acceleration to what the chain makes of it."""
-    return cascade([], list(poles), 1.0)
+    return (motion + felt).renamed([*(f"{a}_dot" for a in names), *(f"deviation_{k}" for k in sensors),
+                                    *(f"tilt_{k}" for k in sensors)], sensors)
 
 
 def _without_aliases(model: TableModel, omega: np.ndarray) -> np.ndarray:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol, cast
+from typing import cast
 
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.gap.campaign_spectra import Halves, all_silent
+from avis_ctrl.gap.campaign_spectra import all_silent
 from avis_ctrl.gap.power_shares import power_shares
+from avis_ctrl.gap.preparation import Prepared
 from avis_ctrl.gap.result import HeatMap, PowerShares, RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction_error import PredictionError, prediction_error
@@ -38,19 +39,6 @@ class ResidualSettings:
 
 
 SETTINGS = ResidualSettings()
-
-
-class Spectra(Protocol):
-    """Blocks of the fitted and of the held-out records."""
-
-    @property
-    def halves(self) -> Halves: ...
-
-    @property
-    def fitted(self) -> Sequence[SpectralBlock]: ...
-
-    @property
-    def held_out(self) -> Sequence[SpectralBlock]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +90,6 @@ def places(left: ModelResidual) -> tuple[Where, ...]:
     for low, high in pairwise(edges):
         for k, output in enumerate(left.outputs):
             power, lines, found = 0.0, 0, np.zeros(model_inputs)
-            noise_dof = np.inf
             for e in left.errors:
                 f = e.block.omega / (2 * np.pi)
                 band = (f >= low) & (f < high)
@@ -111,16 +98,16 @@ def places(left: ModelResidual) -> tuple[Where, ...]:
                 U = e.block.U[band, :, 0]
                 power += float(np.sum(np.abs(error) ** 2))
                 lines += len(error)
-                noise_dof = min(noise_dof, e.block.dof)
                 strength = np.sum(np.abs(U) ** 2, axis=0)
                 along = np.abs(np.sum(error[:, None] * np.conj(U), axis=0)) ** 2
                 found += np.divide(along, strength, out=np.zeros(model_inputs), where=strength > 0)
             if lines:
-                rows.append((low, high, output, power, lines, found, noise_dof))
+                rows.append((low, high, output, power, lines, found))
+    dof = min(e.block.dof for e in left.errors)
     count = max(len(rows), 1)
-    excess_all = sum(max(power - lines, 0.0) for *_, power, lines, _, _ in rows) or 1.0
+    excess_all = sum(max(power - lines, 0.0) for *_, power, lines, _ in rows) or 1.0
     made = []
-    for low, high, output, power, lines, found, dof in rows:
+    for low, high, output, power, lines, found in rows:
         ratio = power / lines
         # At most a third of the records is held out: the noise of a band is known from twice as many lines or more.
         known = min(dof * max(lines / 60, 1), max(dof, 2 * lines))
@@ -160,7 +147,7 @@ def _ratios(left: ModelResidual, edges: np.ndarray) -> np.ndarray:
     return found
 
 
-def every_record(prepared: Spectra, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
+def every_record(prepared: Prepared, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
            ) -> tuple[tuple[RecordGap, ...], tuple[PowerShares, ...]]:
     """What the models leave of each record, fitted ones too, and what accounts for the outputs' power;
     on `shown_lines` of each record."""

@@ -19,7 +19,7 @@ from typing import cast
 
 import numpy as np
 
-from avis_ctrl.gap.operators import assemble
+from avis_ctrl.gap.operators import Assembled
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.gap.table_response import Acting, AtMotion, TableResponse
 from avis_ctrl.identification.fit_settings import SETTINGS as FIT_SETTINGS
@@ -133,7 +133,7 @@ class Part:
 
     def side(self, model: TableModel) -> AtMotion:
         """What a model near by misses of the motion of this one."""
-        return AtMotion(assemble(model.operators(self.block.omega), invert=False), self._acting(model), self.response.x)
+        return AtMotion(Assembled(model.operators(self.block.omega)), self._acting(model), self.response.x)
 
     def by_impedance(self, dynamic: np.ndarray) -> np.ndarray:
         """(21, n, n_y, m): y by each symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""
@@ -166,17 +166,13 @@ class Score:
         self.basis = Vt[s > SETTINGS.least_singular * s[0]]
         self.e = self.e - self.basis.T @ (self.basis @ self.e)
 
-    @property
-    def numbers(self) -> int:
-        return len(self.e)
-
     @cached_property
     def chi2(self) -> float:
         return float(self.e @ self.e)
 
     @cached_property
     def dof(self) -> int:
-        return self.numbers - len(self.basis) - sum(part.transient.shape[-1] for part in self.parts)
+        return len(self.e) - len(self.basis) - sum(part.transient.shape[-1] for part in self.parts)
 
     def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
         """(k, N) of one (k, n, n_y, m) a block, projected."""

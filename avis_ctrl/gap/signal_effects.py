@@ -5,21 +5,19 @@ They are no classes of the library (`effects.library`) and have no part in a sco
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.motion_estimate import clock_of
 from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.result import NamedEffect
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
 from avis_ctrl.gap.signals.hum import HumFinding, subtract
-from avis_ctrl.gap.signals.noise_level import NoiseLevels, noise_levels
-from avis_ctrl.gap.signals.record_residual import Estimate, RecordResidual, record_residuals
+from avis_ctrl.gap.signals.noise_level import FloorLevel, NoiseLevels, noise_levels
+from avis_ctrl.gap.signals.record_residual import RecordResidual, record_residuals
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction import model_inputs
@@ -46,7 +44,7 @@ class SignalFaults:
         if self.noise is None:
             return ()
         known = {one.channel for one in self.converter}
-        return tuple(one.channel for one in self.noise.raised if one.channel not in known)
+        return tuple(name for name in self.noise.raised if name not in known)
 
 
 def converter_faults(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, ...]:
@@ -93,25 +91,15 @@ def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[RecordResidual,
 
 def named(faults: SignalFaults, settings: GapSettings) -> list[NamedEffect]:
     """Effects of the library that the signals show."""
-    found = []
-    for one in faults.converter:
-        found.append(NamedEffect("sensor_quantisation", one.channel,
-                                 f"the converter of {one.channel} is coarser than the rig file says"
-                                 if one.kind == "resolution" else
-                                 f"the converter of {one.channel} clips below its nominal range",
-                                 _reported(one.parameters), min(one.confidence, settings.most_sure),
-                                 confirmation=one.sentence))
+    rows: list[tuple[str, str, str, ConverterFinding | HumFinding | FloorLevel]] = [
+        ("sensor_quantisation", one.channel, f"the converter of {one.channel} is coarser than the rig file says"
+         if one.kind == "resolution" else f"the converter of {one.channel} clips below its nominal range", one)
+        for one in faults.converter]
     if faults.hum is not None:
-        found.append(NamedEffect("mains_hum", "geophones", f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics "
-                                 f"in {', '.join(faults.hum.channels)}", _reported(faults.hum.parameters),
-                                 min(faults.hum.confidence, settings.most_sure), confirmation=faults.hum.sentence))
-    motion = faults.noise.ground_motion if faults.noise is not None else None
-    if motion is not None:
-        found.append(NamedEffect("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured",
-                                 _reported(motion.parameters), min(motion.confidence, settings.most_sure),
-                                 confirmation=motion.sentence))
-    return found
-
-
-def _reported(parameters: Mapping[str, Estimate]) -> dict[str, Reported]:
-    return {name: Reported(float(p.value), float(p.std), p.unit) for name, p in parameters.items()}
+        rows.append(("mains_hum", "geophones", f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics in "
+                     f"{', '.join(faults.hum.channels)}", faults.hum))
+    if faults.noise is not None and faults.noise.ground_motion is not None:
+        rows.append(("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured",
+                     faults.noise.ground_motion))
+    return [NamedEffect(name, place, title, one.parameters, min(one.confidence, settings.most_sure),
+                        confirmation=one.sentence) for name, place, title, one in rows]

@@ -18,13 +18,11 @@ import numpy as np
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
-from avis_ctrl.gap.motion_estimate import motion_of, mount_rows, with_large_motion
+from avis_ctrl.gap.motion_estimate import mount_rows, with_large_motion
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.gap.time_stepping import ForceResponse, march
 from avis_ctrl.identification.response import N_Q
-
-__all__ = ["Simulated", "motion_of", "simulate"]
 
 
 @dataclass(frozen=True)
@@ -46,13 +44,11 @@ SETTINGS = SimulationSettings()
 class Simulated:
     """y (samples, n_y) in the model's unit and order; deflection (samples, n_g) m of the mounts.
 
-    passes : over the record, 0 where nothing depends on amplitude or time. defect : r.m.s. of d - d_0 - h * f(d), over
-    that of d.
+    defect : r.m.s. of d - d_0 - h * f(d), over that of d.
     """
 
     y: np.ndarray
     deflection: np.ndarray
-    passes: int = 0
     defect: float = 0.0
 
 
@@ -86,28 +82,10 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
         if acting is not u:
             x = lines.motion(lines.drive(acting, floor))
             record.deflection[:] = lines.in_time(lines.deflection(x, floor))
-    still = with_large_motion({"": record}, model)[""] if _has_large_motion(effects) else record
-    pushing = [one for one in effects if one.effect.force(still, one.place, one.by_name) is not None]
+    pushing = [one for one in effects if one.effect.force(record, one.place, one.by_name) is not None]
     if not pushing or not len(lines.G):  # a rig without mounts of its own has no motion by which forces could act
         return Simulated(lines.in_time(lines.sensed(x, acting, floor)), lines.in_time(lines.deflection(x, floor)))
     return _with_forces(model, lines, replace(record, volts=acting), x, floor, pushing)
-
-
-def _large_rotations(weak: Sequence[ActiveEffect], record: RecordMotion, model: TableModel
-                     ) -> tuple[np.ndarray, np.ndarray]:
-    """Force (samples, 6) on the payload, and acceleration (samples, n_y) read beside its own."""
-    known = with_large_motion({"": record}, model)[""]
-    force, reading = np.zeros((len(record.volts), N_Q)), np.zeros((len(record.volts), len(model.sensors.names)))
-    for one in weak:
-        pushed = one.effect.force(known, one.place, one.by_name)
-        seen = one.effect.reading(known, one.place, one.by_name)
-        force = force if pushed is None else force + pushed
-        reading = reading if seen is None else reading + seen
-    return force, reading
-
-
-def _has_large_motion(effects: Sequence[ActiveEffect]) -> bool:
-    return any(isinstance(one.effect, LargeMotion) for one in effects)
 
 
 def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
@@ -144,39 +122,40 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x
     """March, then let the forces act over the whole record. What enters the next pass: what a response before its
     cause leaves (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
     marching = [one for one in effects if not isinstance(one.effect, LargeMotion)]
-    weak = [one for one in effects if isinstance(one.effect, LargeMotion)]
+    weak = next((one for one in effects if isinstance(one.effect, LargeMotion)), None)
     by_force = _force_response(lines, model.matrices.M)
     # Free motion in coordinates of the response: any that give the deflection.
     to_z, n = np.linalg.pinv(by_force.shape), len(record.volts)
-    defect, reading = float("nan"), np.zeros((n, len(model.sensors.names)))
+    defect, reading = float("nan"), None
     slow, correction, size = np.zeros((n, N_Q)), np.zeros((n, by_force.shape.shape[1])), 0.0
     linear = lines.deflection(x, floor)
-    for passes in range(1, SETTINGS.most_passes + 1):
+    for _ in range(SETTINGS.most_passes):
         free = linear + by_force.whole(slow) @ by_force.shape.T
         in_time = lines.in_time(free)
         z_free = in_time @ to_z.T
         record.deflection[:] = in_time
         push, left, missing = np.zeros((n, N_Q)), np.zeros_like(correction), np.zeros_like(correction)
         if marching:
-            marched = march(by_force, z_free + correction, marching, record, in_time - z_free @ by_force.shape.T)
-            push = marched.force
-            left = z_free + lines.in_time(by_force.whole(push)) - marched.z
+            z, push = march(by_force, z_free + correction, marching, record, in_time - z_free @ by_force.shape.T)
+            left = z_free + lines.in_time(by_force.whole(push)) - z
         if weak:
-            more, reading = _large_rotations(weak, record, model)
+            known = with_large_motion({"": record}, model)[""]
+            more = np.asarray(weak.effect.force(known, weak.place, weak.by_name))
+            reading = weak.effect.reading(known, weak.place, weak.by_name)
             missing, slow = lines.in_time(by_force.whole(more - slow)), more
         size = float(np.sqrt(np.mean(record.deflection ** 2))) or 1.0
         defect = float(np.sqrt(np.mean(((left + missing) @ by_force.shape.T) ** 2))) / size
         if defect <= SETTINGS.defect:
             z = by_force.whole(push + slow)
             y = lines.sensed(x + z[:, :by_force.n_x], record.volts, floor)
-            if weak:
+            if reading is not None:
                 y += lines.read_beside(reading)
-            return Simulated(lines.in_time(y), lines.in_time(linear + z @ by_force.shape.T), passes, defect)
+            return Simulated(lines.in_time(y), lines.in_time(linear + z @ by_force.shape.T), defect)
         if not np.isfinite(defect):
             break
         correction = correction + left
     raise ComputationError("the forces of " + ", ".join(one.label for one in effects) + " do not settle",
                            measured=f"the equation of motion leaves {defect:.2g} of the deflection after "
-                                    f"{passes} passes, deflection {size:.3g} m r.m.s.",
+                                    f"{SETTINGS.most_passes} passes at most, deflection {size:.3g} m r.m.s.",
                            cause="rotations that are not small, or a force that depends on what comes later",
                            next_step="a lower level, or leave the effect out of the simulation")

@@ -10,9 +10,8 @@ velocity along each sensor. All parts are passive impedances or poles and zeros 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.optimize import nnls
@@ -20,14 +19,14 @@ from scipy.optimize import nnls
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.attached import elements
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
+from avis_ctrl.gap.effects.base import Values
 from avis_ctrl.gap.effects.cable import tie
 from avis_ctrl.gap.effects.chassis import of_chassis
 from avis_ctrl.gap.effects.flexible_mode import modes, shape_rows
-from avis_ctrl.gap.effects.mounts import contacts, drift_over_stiffness, drifted, shares, surge_omega
+from avis_ctrl.gap.effects.mounts import campaign_clock, contacts, drift_over_stiffness, drifted, shares, surge_omega
 from avis_ctrl.gap.effects.payload import place_of
-from avis_ctrl.gap.operators import MountGeometry, mount_geometry
+from avis_ctrl.gap.operators import mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-from avis_ctrl.identification.response import Matrices
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.rigid_body import COORDINATES, point_map
@@ -52,85 +51,31 @@ class RealisationSettings:
 SETTINGS = RealisationSettings()
 
 
-@dataclass(frozen=True, eq=False)
 class ReducedTable:
     """What an addition needs to know of a model in its kept coordinates.
 
     model : with its effects. keep : coordinates that move. when : -0.5 .. 0.5 through the campaign.
+    G (n_g, n) deflection of every mount; inertia (n, n) mass matrix; r, v, v_c, u : columns of the inputs of an
+    addition; shape : its outputs and inputs.
     """
 
-    model: TableModel
-    keep: tuple[str, ...]
-    when: float = 0.0
-
-    @cached_property
-    def kept(self) -> list[int]:
-        return [COORDINATES.index(name) for name in self.keep]
-
-    @cached_property
-    def scale(self) -> np.ndarray:
-        """(n,) from kept coordinates, rotations at the edge [m], to q."""
-        edge = self.model.rig.edge_m
-        return np.array([1 / edge if name.startswith("phi") else 1.0 for name in self.keep])
-
-    @property
-    def matrices(self) -> Matrices:
-        return self.model.matrices
-
-    @cached_property
-    def mounts(self) -> MountGeometry:
-        return mount_geometry(self.model.effective.rig)
+    def __init__(self, model: TableModel, keep: tuple[str, ...], when: float = 0.0):
+        self.model, self.keep, self.when = model, keep, when
+        self.matrices, self.mounts = model.matrices, mount_geometry(model.effective.rig)
+        self.n, self.n_y, n_u = len(keep), len(model.sensors.names), len(model.actuators)
+        self.r, self.v, self.v_c = (slice(k * self.n, (k + 1) * self.n) for k in range(3))
+        self.u = slice(3 * self.n, 3 * self.n + n_u)
+        self.shape = self.n + self.n_y, 3 * self.n + n_u
+        self.G, self.inertia = self.rows(self.mounts.payload), self.rows(self.rows(self.matrices.M).T)
 
     def rows(self, of_q: np.ndarray) -> np.ndarray:
-        """(m, n) rows by kept coordinates from rows (m, 6) by q."""
-        return np.atleast_2d(of_q)[:, self.kept] * self.scale
-
-    @property
-    def G(self) -> np.ndarray:
-        """(n_g, n) deflection of every mount."""
-        return self.rows(self.mounts.payload)
-
-    @property
-    def inertia(self) -> np.ndarray:
-        """(n, n) mass matrix."""
-        return self.rows(self.rows(self.matrices.M).T)
-
-    @property
-    def n(self) -> int:
-        return len(self.keep)
-
-    @property
-    def n_y(self) -> int:
-        return len(self.model.sensors.names)
-
-    @property
-    def n_u(self) -> int:
-        return len(self.model.actuators)
-
-    # Columns of the inputs of an addition.
-    @property
-    def r(self) -> slice:
-        return slice(0, self.n)
-
-    @property
-    def v(self) -> slice:
-        return slice(self.n, 2 * self.n)
-
-    @property
-    def v_c(self) -> slice:
-        return slice(2 * self.n, 3 * self.n)
-
-    @property
-    def u(self) -> slice:
-        return slice(3 * self.n, 3 * self.n + self.n_u)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Outputs and inputs of an addition."""
-        return self.n + self.n_y, 3 * self.n + self.n_u
+        """(m, n) rows by kept coordinates, rotations as displacements of the edge [m], from rows (m, 6) by q."""
+        scale = [1 / self.model.rig.edge_m if name.startswith("phi") else 1.0 for name in self.keep]
+        return np.atleast_2d(of_q)[:, [COORDINATES.index(name) for name in self.keep]] * scale
 
 
-Addition = Callable[[ReducedTable, str, Mapping[str, float]], StateSpace]
+
+Addition = Callable[[ReducedTable, str, Values], StateSpace]
 
 
 def addition(table: ReducedTable, one: ActiveEffect) -> StateSpace | None:
@@ -156,12 +101,7 @@ def impedance(table: ReducedTable, K: np.ndarray, h: StateSpace, of: str = "r") 
     push[:table.n] = -V * sizes
     if not len(sizes):
         return gain(np.zeros(table.shape))
-    parts = append(*(h.renamed([f"u{k}"], [f"y{k}"]) for k in range(len(sizes))))
-    return _plain(parts.scaled(push, read))
-
-
-def _plain(system: StateSpace) -> StateSpace:
-    return StateSpace(system.A, system.B, system.C, system.D)
+    return append(*[h] * len(sizes)).scaled(push, read)
 
 
 def _static(table: ReducedTable, K: np.ndarray, C: np.ndarray | None = None) -> StateSpace:
@@ -173,27 +113,25 @@ def _static(table: ReducedTable, K: np.ndarray, C: np.ndarray | None = None) -> 
     return gain(D)
 
 
-def _relaxation(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _relaxation(table: ReducedTable, place: str, values: Values) -> StateSpace:
     up = table.mounts.along("z")
     G, k = table.G[up], table.mounts.stiffness[up]
     h = cascade([0.0], [-2 * np.pi * values["corner_Hz"]], values["stiffness_ratio"])
     return impedance(table, G.T @ (k[:, None] * G), h)
 
 
-def _structural(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _structural(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """The causal law, for the complex constant too: no causal system has that."""
     G, k = table.G, table.mounts.stiffness
-    rest, branches = ladder(2 / np.pi * np.arctan(values["loss_factor"]))
-    corners = np.array([w for w, _ in branches])
-    ratios = np.array([ratio for _, ratio in branches])
+    rest, corners, ratios = ladder(2 / np.pi * np.arctan(values["loss_factor"]))
     # rest - 1 + sum of ratio s/(s + w) = rest - 1 + sum(ratio) - sum of ratio w/(s + w)
     h = StateSpace(-np.diag(corners), np.sqrt(corners)[:, None], -(ratios * np.sqrt(corners))[None],
                    np.array([[rest - 1 + ratios.sum()]]))
     return impedance(table, G.T @ (k[:, None] * G), h)
 
 
-def ladder(power: float) -> tuple[float, list[tuple[float, float]]]:
-    """(s/w_ref)^power as rest + sum of ratio s/(s + w), all ratios positive: (rest, [(w, ratio)]).
+def ladder(power: float) -> tuple[float, np.ndarray, np.ndarray]:
+    """(s/w_ref)^power as rest + sum of ratio s/(s + w), all ratios positive: (rest, w (n,), ratio (n,)).
 
     As few branches, evenly spaced in log w within and beyond the band, as keep the error below `ladder_error` in
     `ladder_Hz`. Positive ratios make it passive.
@@ -202,17 +140,18 @@ def ladder(power: float) -> tuple[float, list[tuple[float, float]]]:
     s = 2j * np.pi * f
     wanted = (s / (2 * np.pi * LIBRARY.loss_Hz)) ** power
     if power == 0:
-        return 1.0, []
+        return 1.0, np.zeros(0), np.zeros(0)
     for count, reach in ((count, reach) for count in range(2, 24) for reach in (3.0, 10.0, 30.0)):
         w = 2 * np.pi * np.geomspace(SETTINGS.ladder_Hz[0] / reach, SETTINGS.ladder_Hz[1] * reach, count)
         basis = np.column_stack([np.ones(len(s)), s[:, None] / (s[:, None] + w)]) / wanted[:, None]
         found, _ = nnls(np.vstack([basis.real, basis.imag]), np.concatenate([np.ones(len(s)), np.zeros(len(s))]))
         if np.max(np.abs(basis @ found - 1)) < SETTINGS.ladder_error:
             break
-    return float(found[0]), [(float(a), float(b)) for a, b in zip(w, found[1:], strict=True) if b > 0]
+    used = found[1:] > 0
+    return float(found[0]), w[used], found[1:][used]
 
 
-def _surge(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _surge(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """A mass in every vertical mount: r_m = its displacement against the chassis, v_m its velocity.
 
     r_m' = v_m - v_c,  m v_m' = a k (r - r_m) + a c (v - v_m) - b k r_m - b c (v_m - v_c), and beside the mount itself
@@ -235,10 +174,10 @@ def _surge(table: ReducedTable, place: str, values: Mapping[str, float]) -> Stat
         outer = np.outer(g, g)
         D[:table.n, table.r], D[:table.n, table.v] = -(a - 1) * k * outer, -a * c * outer
         total = total + StateSpace(A, B, C, D)
-    return _plain(total)
+    return total
 
 
-def _leveling(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _leveling(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """Payload against chassis, as the valves feel it."""
     own = np.flatnonzero(table.mounts.along("z"))[:LIBRARY.leveled]
     G, k = table.G[own], table.mounts.stiffness[own] * shares(values)
@@ -249,32 +188,32 @@ def _leveling(table: ReducedTable, place: str, values: Mapping[str, float]) -> S
     return impedance(table, G.T @ (k[:, None] * G), cascade([], poles, size))
 
 
-def _friction(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _friction(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """Far below the slip: a spring at every motor."""
     at_actuators, _ = shape_rows(table.model.rig, table.model.actuators, table.model.sensors.names)
     G = at_actuators @ table.G
     return _static(table, G.T @ (contacts(values)[:, None] * G))
 
 
-def _drift(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _drift(table: ReducedTable, place: str, values: Values) -> StateSpace:
     G, k = table.G, table.mounts.stiffness
     return _static(table, drift_at(table.model, values, table.when) * G.T @ (k[:, None] * G))
 
 
-def drift_at(model: TableModel, values: Mapping[str, float], when: float) -> float:
+def drift_at(model: TableModel, values: Values, when: float) -> float:
     """Change of stiffness over that of the model's rig at a moment -0.5 .. 0.5 of the campaign, by a drift's law."""
-    begin, end = next((one.campaign_s for one in model.motion.values()), (0.0, 1.0))
+    begin, end = campaign_clock(model)
     through = float(drifted(np.array(when + 0.5), values.get("time_constant_s", 0.0) / (end - begin)))
     return values["relative_change"] * drift_over_stiffness(model) * through
 
 
-def _cable(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _cable(table: ReducedTable, place: str, values: Values) -> StateSpace:
     K = tie(values)
     G = table.rows(point_map(place_of(values)))
     return _static(table, G.T @ K @ G, values["damping_s"] * G.T @ K @ G)
 
 
-def _oscillator(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _oscillator(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """m s (2 z w s + w^2)/(s^2 + 2 z w s + w^2) on the velocity of its place, along each of its directions."""
     total, zeta = gain(np.zeros(table.shape)), values["damping"]
     for row, mass, frequency in elements(place, values):
@@ -282,10 +221,10 @@ def _oscillator(table: ReducedTable, place: str, values: Mapping[str, float]) ->
         poles = np.roots([1.0, 2 * zeta * w, w ** 2])
         h = cascade([0.0, -w / (2 * zeta)], poles, 2 * zeta * w * mass)
         total = total + impedance(table, g.T @ g, h, "v")
-    return _plain(total)
+    return total
 
 
-def _flexible(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
+def _flexible(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """Coordinates e of the modes and their velocities; the mounts and motors push them, and they deflect the mounts."""
     own = [mode for mode in modes(values) if np.any(mode[2])]
     if not own:
@@ -305,19 +244,13 @@ def _flexible(table: ReducedTable, place: str, values: Mapping[str, float]) -> S
     return StateSpace(A, B, C, np.zeros(table.shape))
 
 
-def _nothing(table: ReducedTable, place: str, values: Mapping[str, float]) -> StateSpace:
-    """Vanishes as the amplitude does."""
-    return gain(np.zeros(table.shape))
-
-
 _MADE: dict[str, Addition] = {
     "mount_relaxation": _relaxation, "structural_damping": _structural, "mount_surge": _surge,
     "leveling_loop": _leveling, "contact_friction": _friction, "stiffness_drift": _drift, "cable_stiffness": _cable,
-    "attached_oscillator": _oscillator, "payload_flexible_mode": _flexible, "cubic_stiffness": _nothing,
-    "actuator_saturation": _nothing}
+    "attached_oscillator": _oscillator, "payload_flexible_mode": _flexible}
 
 
-def chassis(table: ReducedTable, values: Mapping[str, float], floor: list[str], accelerations: list[str],
+def chassis(table: ReducedTable, values: Values, floor: list[str], accelerations: list[str],
             moves: list[str]) -> StateSpace:
     """Velocity of a chassis on a soft base, from that of the floor and the acceleration of the payload.
 

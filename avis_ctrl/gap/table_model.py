@@ -9,15 +9,15 @@ from functools import cached_property, partial
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.base import Effect, EffectParameter
+from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.operators import Assembled, Operators, assemble
+from avis_ctrl.gap.operators import Assembled, Operators
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_response import MOUNT, Acting, AtMotion, TableResponse, gain_of
 from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, SensorModel, kept_lines
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.structure import structural_null_space, structure_of
-from avis_ctrl.rigs.rig import Parameter, Rig
+from avis_ctrl.rigs.rig import Rig
 
 
 @dataclass(frozen=True)
@@ -164,13 +164,6 @@ class TableModel:
         own = [self.effects[k].parameters[j] for k, j in self._free]
         return np.concatenate([low, [one.low for one in own]]), np.concatenate([high, [one.high for one in own]])
 
-    def all_parameters(self) -> dict[str, Parameter]:
-        found = self.base.all_parameters()
-        for one in self.effects:
-            for name, parameter, value in zip(one.names, one.parameters, one.values, strict=True):
-                found[name] = Parameter(value, parameter.unit, parameter.description)
-        return found
-
     def at(self, theta: Sequence[float] | np.ndarray) -> TableModel:
         """The model with its free parameters at theta. Raises InputError where no rig has them."""
         theta = np.asarray(theta, float)
@@ -236,7 +229,7 @@ class TableModel:
     @kept_lines
     def assembled(self, omega: np.ndarray) -> Assembled:
         """On lines omega."""
-        return assemble(self.operators(omega))
+        return Assembled(self.operators(omega))
 
     def response(self, omega: np.ndarray) -> np.ndarray:
         """G, (n, n_y, n_u + 3), as `ResponseModel.response`; effects that depend on amplitude left out."""
@@ -357,7 +350,7 @@ class TableModel:
             ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]
             others, k = [self._with_effect_parameter(row - n, end) for end in ends], self._free[row - n][0]
             effect = self.effects[k].effect
-            tables = [] if effect.nonlinear else [assemble(one.operators(omega), invert=False) for one in others]
+            tables = [] if effect.nonlinear else [Assembled(one.operators(omega)) for one in others]
             found.append((effect, [one.effects[k] for one in others], ends[0] - ends[1], tables))
         return found
 
@@ -372,21 +365,14 @@ def inseparable_parameters(model: TableModel) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(base.names[k] for k in group.members) for group in found.groups)
 
 
-def _added(one: ActiveEffect, record: RecordMotion, omega: np.ndarray) -> tuple[np.ndarray | None, ...]:
-    """What an effect adds to a record on its lines: volts (n, n_u, 1) beside the commanded ones, force (n, 6, 1),
-    displacement that the sensors read (n, n_y, 1), and outputs (n, n_y, 1); None for nothing."""
+def _added(one: ActiveEffect, record: RecordMotion, omega: np.ndarray) -> Added:
+    """What an effect adds to a record on its lines, (n, channels, 1) each; of readings the displacement."""
     if not one.effect.nonlinear:
-        return None, None, None, None
-    effect, values = one.effect, one.by_name
-    volts = effect.volts_spectrum(record, one.place, values, omega)
-    if volts is not None:
-        # Several may change the volts: each adds what it changes.
-        volts = volts - record.kept("volts", omega, lambda: record.volts)
-    reading = effect.reading_spectrum(record, one.place, values, omega)
-    found = (volts, effect.force_spectrum(record, one.place, values, omega),
-             None if reading is None else -reading / (omega ** 2)[:, None],
-             effect.output_spectrum(record, one.place, values, omega))
-    return tuple(None if each is None else each[:, :, None] for each in found)
+        return Added()
+    found = one.effect.spectra(record, one.place, one.by_name, omega)
+    if found.reading is not None:
+        found = found._replace(reading=-found.reading / (omega ** 2)[:, None])
+    return Added(*(None if each is None else each[:, :, None] for each in found))
 
 
 def _sum(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:

@@ -29,68 +29,63 @@ class Acting:
     inner: np.ndarray | None = None
 
 
-class AtMotion:
-    """Y that an assembled table would read of a motion x, and the force that is missing for that motion."""
-
-    def __init__(self, made: Assembled, acting: Acting, x: np.ndarray):
-        drive = _Forces(made, acting)
-        self.push = drive.total - made.D @ x
-        self.Y = _read(made, x, drive)
-
-
-class _Forces:
-    """Forces (n, n_q, m) on an assembled table."""
-
-    def __init__(self, made: Assembled, acting: Acting):
-        U, force = acting.U, acting.force
-        ops, n_u = made.ops, len(made.ops.base.actuators)
-        s = ops.s[:, None, None]
-        commanded = U[:, :n_u]
-        self.volts = made.volts[:, :, None] * commanded
-        self.w = U[:, n_u:n_u + 3] / s
-        self.folded, self.alias = commanded * ops.drive[:, :, None], made.folded[:, :, None]
-        self.driven = bool(np.any(self.folded))
-        total = made.T @ self.volts if self.driven else np.zeros((len(s), made.n_q, U.shape[2]), complex)
-        if np.any(self.w):
-            total = total + made.floor_force(self.w)
-        if U.shape[1] > n_u + 3:
-            total[:, :N_Q] += U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
-        if force is not None:
-            total[:, :N_Q] += force
-        if acting.inner is not None and acting.inner.size:
-            total += (made.forces_of_states @ acting.inner)[:, :, None]
-        self.total, self.reading, self.output = total, acting.reading, acting.output
-
-
 def gain_of(made: Assembled) -> np.ndarray:
     return (made.ops.base.sensors.sensitivity * made.ops.sensor_gain)[:, None]
 
 
-def _read(made: Assembled, x: np.ndarray, drive: _Forces) -> np.ndarray:
-    """(n, n_y, m) of a motion x; aliases pass the chain far above its corners."""
-    mat = made.ops.base.matrices
-    moved = made.rows @ x
-    if np.any(against := made.ops.base.sensors.relative):
-        moved = moved - (against[:, None] * mat.R) @ made.chassis(x, drive.w)
-    if drive.reading is not None:
-        moved = moved + drive.reading
-    seen = made.ops.sense[:, :, None] * moved
-    if drive.driven:
-        seen += drive.alias * ((mat.R @ np.linalg.inv(mat.M) @ mat.T) @ drive.folded)
-    Y = gain_of(made) * seen
-    return Y if drive.output is None else Y + drive.output
+class DrivenTable:
+    """Forces (n, n_q, m) on an assembled table, and what it reads of a motion."""
+
+    def __init__(self, made: Assembled, acting: Acting):
+        self.made, self.acting, self.gain = made, acting, gain_of(made)
+        U, ops, n_u = acting.U, made.ops, len(made.ops.base.actuators)
+        self.s = s = ops.s[:, None, None]
+        commanded = U[:, :n_u]
+        self.volts = made.volts[:, :, None] * commanded
+        self.w = U[:, n_u:n_u + 3] / s
+        self.folded, self.alias = commanded * ops.drive[:, :, None], made.folded[:, :, None]
+        self.sense, self.is_driven = ops.sense[:, :, None], bool(np.any(self.folded))
+        total = made.T @ self.volts if self.is_driven else np.zeros((len(s), made.n_q, U.shape[2]), complex)
+        if np.any(self.w):
+            total = total + made.floor_force(self.w)
+        if U.shape[1] > n_u + 3:
+            total[:, :N_Q] += U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
+        if acting.force is not None:
+            total[:, :N_Q] += acting.force
+        if acting.inner is not None and acting.inner.size:
+            total += (made.forces_of_states @ acting.inner)[:, :, None]
+        self.total = total
+
+    def read(self, x: np.ndarray) -> np.ndarray:
+        """(n, n_y, m) of a motion x; aliases pass the chain far above its corners."""
+        mat = self.made.ops.base.matrices
+        moved = self.made.rows @ x
+        if np.any(against := self.made.ops.base.sensors.relative):
+            moved = moved - (against[:, None] * mat.R) @ self.made.chassis(x, self.w)
+        if self.acting.reading is not None:
+            moved = moved + self.acting.reading
+        seen = self.sense * moved
+        if self.is_driven:
+            seen += self.alias * ((mat.R @ np.linalg.inv(mat.M) @ mat.T) @ self.folded)
+        Y = self.gain * seen
+        return Y if self.acting.output is None else Y + self.acting.output
 
 
-class TableResponse:
+class AtMotion(DrivenTable):
+    """Y that an assembled table would read of a motion x, and the force that is missing for that motion."""
+
+    def __init__(self, made: Assembled, acting: Acting, x: np.ndarray):
+        super().__init__(made, acting)
+        self.push, self.Y = self.total - made.D @ x, self.read(x)
+
+
+class TableResponse(DrivenTable):
     """Response of an assembled table."""
 
     def __init__(self, made: Assembled, acting: Acting):
-        ops, drive = made.ops, _Forces(made, acting)
-        self.made, self.acting, self.s, self.inner = made, acting, ops.s[:, None, None], acting.inner
-        self.volts, self.w, self.folded, self.alias = drive.volts, drive.w, drive.folded, drive.alias
-        self.x = made.inverse @ drive.total
-        self.sense, self.gain = ops.sense[:, :, None], gain_of(made)
-        self.Y = _read(made, self.x, drive)
+        super().__init__(made, acting)
+        self.x = made.inverse @ self.total
+        self.Y = self.read(self.x)
 
     @cached_property
     def left(self) -> np.ndarray:
@@ -113,7 +108,7 @@ class TableResponse:
                             self.gain * self.alias, made.hold[:, None, None], self.folded, self.x[:, :N_Q],
                             made.follow(self.w), made.chassis(self.x, self.w), self.Y)
         dY = operands.derivative(model.names, d, more)
-        moved = ops.mounts.chassis @ made.chassis(self.x, self.w, self.inner)
+        moved = ops.mounts.chassis @ made.chassis(self.x, self.w, self.acting.inner)
         rows = {name: k for k, name in enumerate(ops.mounts.names)}
         for kind in "kc":
             found = [(j, rows[f"isolator{match[1]}.{match[3]}"]) for j, name in enumerate(model.names)

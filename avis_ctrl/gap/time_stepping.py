@@ -163,18 +163,9 @@ class FrictionForce(WindowForce):
         self.last = self.record.deflection[stop - 1, self.record.driven_rows].copy()
 
 
-@dataclass(frozen=True, eq=False)
-class Marched:
-    """z (samples, c), the force (samples, 6) that it makes, and iterations a window at most."""
-
-    z: np.ndarray
-    force: np.ndarray
-    iterations: int
-
-
 def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,
-          beyond: np.ndarray | float = 0.0) -> Marched:
-    """Solve z = free + h * f(z) from rest.
+          beyond: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """z (samples, c) of z = free + h * f(z) from rest, and the force (samples, 6) that it makes.
 
     Parameters
     ----------
@@ -186,9 +177,38 @@ def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEff
     ComputationError : a motion that grows without bound.
     """
     forces = [(FrictionForce if type(one.effect) is ContactFriction else WindowForce)(one, record) for one in effects]
-    beyond = np.broadcast_to(beyond, (len(free), len(by_force.shape)))
     z, W, samples = free.copy(), by_force.window, len(free)
-    total, most, largest = np.zeros((samples, N_Q)), 0, float(np.max(np.abs(record.deflection), initial=0.0))
+    total, largest = np.zeros((samples, N_Q)), float(np.max(np.abs(record.deflection), initial=0.0))
+
+    def forced(start: int, here: slice) -> np.ndarray:
+        """(samples, 6) of all effects; the state of one that is not local is that of the window's start."""
+        found = np.zeros((here.stop - here.start, N_Q))
+        for force in forces:
+            found += (force(here.start, here.stop) if force.local else
+                      force(start, here.stop)[here.start - start:])
+        return found
+
+    def solved(start: int, stop: int, piece: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """z and the force on it in a window, piece after piece; None where the fixed point does not contract."""
+        push, moved = np.zeros((stop - start, N_Q)), z[start:stop]
+        for a in range(0, stop - start, piece):
+            b = min(a + piece, stop - start)
+            here, before = slice(start + a, start + b), None
+            for iteration in range(1, SETTINGS.most_iterations + 1):
+                moved = z[start:stop] + by_force.within(push[:b], stop - start)
+                deflection = moved[a:b] @ by_force.shape.T + beyond[here]
+                change = np.inf if before is None else float(np.max(np.abs(deflection - before)))
+                record.deflection[here] = before = deflection
+                if change <= SETTINGS.tolerance * largest:
+                    break
+                if not change < np.inf and iteration > 1:
+                    return None
+                push[a:b] = forced(start, here)
+                if not np.max(np.abs(push[a:b])) < 1e12:
+                    return None
+            else:
+                return None
+        return moved, push
     for start in range(0, samples, W):
         stop = min(start + W, samples)
         if start:
@@ -196,66 +216,13 @@ def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEff
             B = W << level
             end = min(start + B, samples)
             z[start:end] += by_force.after(total[start - B:start], level)[:end - start]
-        window = _Window(by_force, record, forces, beyond, start, stop, SETTINGS.tolerance * largest)
-        for piece in SETTINGS.pieces:
-            if (done := window.solve(z[start:stop], max(W // piece, 1))) is not None:
-                break
-        else:
+        done = next(filter(None, (solved(start, stop, max(W // piece, 1)) for piece in SETTINGS.pieces)), None)
+        if done is None:
             raise _without_bound(effects, record, start)
-        z[start:stop], total[start:stop], iterations = done
-        most = max(most, iterations)
+        z[start:stop], total[start:stop] = done
         for force in forces:
             force.accept(start, stop)
-    return Marched(z, total, most)
-
-
-@dataclass(frozen=True, eq=False)
-class _Window:
-    """Samples start .. stop, solved whole or in pieces one after the other."""
-
-    by_force: ForceResponse
-    record: RecordMotion
-    forces: Sequence[WindowForce]
-    beyond: np.ndarray
-    start: int
-    stop: int
-    tolerance: float
-
-    def solve(self, free: np.ndarray, piece: int) -> tuple[np.ndarray, np.ndarray, int] | None:
-        """z, the force on it, and iterations of the worst piece; None where the fixed point does not contract."""
-        length, most = self.stop - self.start, 0
-        push = np.zeros((length, N_Q))
-        z = free
-        for a in range(0, length, piece):
-            b = min(a + piece, length)
-            here = slice(self.start + a, self.start + b)
-            before = None
-            for iteration in range(1, SETTINGS.most_iterations + 1):
-                z = free + self.by_force.within(push[:b], length)
-                deflection = z[a:b] @ self.by_force.shape.T + self.beyond[here]
-                change = np.inf if before is None else float(np.max(np.abs(deflection - before)))
-                self.record.deflection[here] = before = deflection
-                if change <= self.tolerance:
-                    break
-                if not change < np.inf and iteration > 1:
-                    return None
-                push[a:b] = self._force(here)
-                if not np.max(np.abs(push[a:b])) < 1e12:
-                    return None
-            else:
-                return None
-            most = max(most, iteration)
-        return z, push, most
-
-    def _force(self, here: slice) -> np.ndarray:
-        """(samples, 6) of all effects."""
-        found = np.zeros((here.stop - here.start, N_Q))
-        for force in self.forces:
-            if force.local:
-                found += force(here.start, here.stop)
-            else:  # its state is that of the window's start
-                found += force(self.start, here.stop)[here.start - self.start:]
-        return found
+    return z, total
 
 
 def _without_bound(effects: Sequence[ActiveEffect], record: RecordMotion, start: int) -> ComputationError:

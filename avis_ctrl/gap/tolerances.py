@@ -15,31 +15,30 @@ from avis_ctrl.identification.likelihood import Fitted
 from avis_ctrl.identification.priors import Priors, Tolerance
 from avis_ctrl.rigs.instruments import Tolerances
 
-# Effects that are one value of the rig file gone beyond its tolerance, and the tolerance of each of their parameters,
-# in its unit; of a geophone's corner and damping ratio relative to them.
-BEYOND: Mapping[str, Callable[[Tolerances], tuple[float, ...]]] = {
-    "sensor_gain": lambda t: (t.sensor_gain_percent / 100,),
-    "actuator_gain": lambda t: (t.actuator_gain_percent / 100,),
-    "sensor_misalignment": lambda t: (float(np.degrees(t.direction_rad)),) * 2,
-    "com_offset": lambda t: (t.centre_of_mass_m,) * 3, "product_of_inertia": lambda t: (t.product_of_inertia_kgm2,),
-    "geophone_corner": lambda t: (t.sensor_corner_percent / 100, t.sensor_damping_percent / 100)}
+# Effects that are one value of the rig file gone beyond its tolerance: the tolerance of each of their parameters, in
+# its unit (of a geophone's corner and damping ratio relative to them), and how the names of these tolerances begin.
+BEYOND: Mapping[str, tuple[Callable[[Tolerances], tuple[float, ...]], tuple[str, ...]]] = {
+    "sensor_gain": (lambda t: (t.sensor_gain_percent / 100,), ("sensor.{place}",)),
+    "actuator_gain": (lambda t: (t.actuator_gain_percent / 100,), ("actuator.{place}",)),
+    "sensor_misalignment": (lambda t: (float(np.degrees(t.direction_rad)),) * 2, ("direction.{place}.",)),
+    "com_offset": (lambda t: (t.centre_of_mass_m,) * 3, ("com_",)),
+    "product_of_inertia": (lambda t: (t.product_of_inertia_kgm2,), ("{product}",)),
+    "geophone_corner": (lambda t: (t.sensor_corner_percent / 100, t.sensor_damping_percent / 100),
+                        ("corner.{place}", "damping.{place}"))}
 
 
 def tolerance_of(effect: ActiveEffect, tolerances: Tolerances) -> np.ndarray:
     """(n,) of the parameters of an effect of `BEYOND`, in their units."""
-    relative = np.array(BEYOND[effect.effect.name](tolerances))
+    relative = np.array(BEYOND[effect.effect.name][0](tolerances))
     of = np.array([p.none for p in effect.parameters]) if effect.effect.name == "geophone_corner" else 1.0
     return relative * of
 
 
 def tolerances_behind(effect: ActiveEffect, names: Sequence[str]) -> list[int]:
     """Indices of the tolerances of the values that an effect of `BEYOND` takes further."""
-    place = effect.place
-    own = {"sensor_gain": (f"sensor.{place}",), "actuator_gain": (f"actuator.{place}",),
-           "sensor_misalignment": (f"direction.{place}.",), "com_offset": ("com_",),
-           "product_of_inertia": (PRODUCTS.get(place, ""),), "geophone_corner": (f"corner.{place}", f"damping.{place}")}
-    starts = own.get(effect.effect.name)
-    return [k for k, name in enumerate(names) if starts and name.startswith(starts) and "@" not in name]
+    _, starts = BEYOND.get(effect.effect.name, (None, ()))
+    own = tuple(start.format(place=effect.place, product=PRODUCTS.get(effect.place)) for start in starts)
+    return [k for k, name in enumerate(names) if name.startswith(own) and "@" not in name]
 
 
 def held(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Priors:

@@ -528,21 +528,21 @@ class ResponseModel:
     def _delay_derivative(self, omega, volts, mat, inverse, out, Minv) -> np.ndarray:
         """Of the continuous term exactly; aliases by a difference, for they are small, with a kink at whole samples."""
         s, step = 1j * omega[:, None, None], 1e-4 * (self.period_s or 1e-3)
-        a, _ = self._drive(omega)
+        a, _ = self.drive(omega)
         earlier, later = max(self.delay_s - step, 0.0), self.delay_s + step
-        slope = (replace(self, delay_s=later)._drive(omega)[1]
-                 - replace(self, delay_s=earlier)._drive(omega)[1]) / (later - earlier)
+        slope = (replace(self, delay_s=later).drive(omega)[1]
+                 - replace(self, delay_s=earlier).drive(omega)[1]) / (later - earlier)
         moved = out * (mat.R @ inverse @ mat.T @ (-s * a * volts)) + slope * (mat.R @ Minv @ mat.T @ volts)
         return self.sensors.sensitivity[:, None] * moved
 
     @kept_lines
     def _lines(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """`_drive`, inv(D) (n, 6, 6), and the chains of the sensors (n, n_y, 1)."""
+        """`drive`, inv(D) (n, 6, 6), and the chains of the sensors (n, n_y, 1)."""
         s, mat = 1j * omega[:, None, None], self.matrices
         inverse = np.linalg.inv(mat.K + s * mat.C + s ** 2 * mat.M)
-        return *self._drive(omega), inverse, self.sensors.sense(omega)[:, :, None]
+        return *self.drive(omega), inverse, self.sensors.sense(omega)[:, :, None]
 
-    def _drive(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def drive(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Voltage commanded to force divided by T (n, 1, 1), and the aliases of each sensor (n, n_y, 1)."""
         corner = self.amplifier_corner_Hz
         if self.period_s:

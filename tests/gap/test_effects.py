@@ -10,7 +10,7 @@ from assembled_table import Assembly, mount_map
 from noise_fit import fitted, reported
 
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.operators import assemble
+from avis_ctrl.gap.operators import Assembled
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
@@ -41,7 +41,7 @@ def agree(model, assembly, rtol=1e-9):
 
 def dynamic_stiffness(model, f):
     """(n, 6, 6) at rest floor."""
-    return assemble(model.operators(2 * np.pi * np.atleast_1d(np.asarray(f, float)))).D
+    return Assembled(model.operators(2 * np.pi * np.atleast_1d(np.asarray(f, float)))).D
 
 
 def added_stiffness(name, place, values, f, model=BARE):
@@ -231,7 +231,7 @@ def test_base_compliance_is_a_second_body(place):
 def test_momentum_is_conserved_far_above_the_resonance_of_the_base():
     """Without outer force payload and chassis move against each other, in inverse proportion to their masses."""
     model = on_chassis("chassis/translation", x_Hz=2.0, y_Hz=2.0, z_Hz=2.0, damping=1e-3)
-    made = assemble(model.operators(2 * np.pi * np.array([2000.0])))
+    made = Assembled(model.operators(2 * np.pi * np.array([2000.0])))
     x = made.inverse @ np.asarray(made.T[:, :1])[None]
     moved = made.chassis(x, np.zeros((1, 3, 1)))
     np.testing.assert_allclose(RIG.mass * x[0, :3] + 900.0 * moved[0, :3], 0, atol=1e-5 * RIG.mass * np.abs(x).max())
@@ -339,7 +339,7 @@ def test_passive_at_every_frequency(name, place, values):
     ("payload_flexible_mode", "payload", [25.0, 0.01, *np.linspace(-0.02, 0.03, 12)])])
 def test_reciprocity(name, place, values):
     """Whatever has no rotor and no feedback answers alike when force and displacement change places."""
-    made = assemble(with_effect(name, place, values).operators(OMEGA))
+    made = Assembled(with_effect(name, place, values).operators(OMEGA))
     inverse = made.inverse
     if name == "base_compliance":  # forces between chassis and payload move these against each other
         inverse = inverse - made.chassis(inverse, np.zeros((len(OMEGA), 3, 6)))

@@ -15,7 +15,8 @@ from avis_ctrl.cli.identify import predict as predict_command
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.model_files import campaign_clock, model_from_dict, model_to_dict, read_model
+from avis_ctrl.gap.effects.mounts import campaign_clock
+from avis_ctrl.gap.model_files import model_from_dict, model_to_dict, read_model
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.result import Gap, NamedEffect, Reported, Stage, Where
 from avis_ctrl.gap.simulation import simulate

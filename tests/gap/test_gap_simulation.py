@@ -11,7 +11,8 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.effects.base import Effect, EffectParameter
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.simulation import motion_of, simulate
+from avis_ctrl.gap.motion_estimate import motion_of
+from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
 from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction import Predictor

@@ -75,8 +75,8 @@ def test_what_the_model_lacks_is_no_ground_motion(kind, wrong):
 @pytest.mark.parametrize("kind", KINDS)
 def test_noise_of_one_sensor_is_raised_and_is_no_effect_of_the_floor(kind):
     found = levels(*drawn(4, kind, noise_V=np.array([1, 1, 1, 1, 1, 2.0]) * 1e-3))
-    assert [one.channel for one in found.raised] == ["Sz3"] and found.ground_motion is None
-    value = found.raised[0].parameters["noise_rms_V"]
+    assert found.raised == ("Sz3",) and found.ground_motion is None
+    value = found.sensors["Sz3"]
     assert abs(value.value - np.hypot(2e-3, LSB / np.sqrt(12))) < 4.5 * value.std
 
 
@@ -109,7 +109,7 @@ def test_a_coarse_converter_is_not_noise_of_the_sensor():
         z[:, 0] = 8 * LSB * np.floor(y[:, 0] / (8 * LSB) + 0.5)
         return z
     campaign, predicted = drawn(6, "noise", adc=adc)
-    assert [one.channel for one in levels(campaign, predicted).raised] == ["Sy1"]
+    assert levels(campaign, predicted).raised == ("Sy1",)
     assert levels(campaign, predicted, steps_V={"Sy1": 8 * LSB}).raised == ()
 
 
@@ -128,7 +128,7 @@ def test_quiet_lines_are_unbiased(kind):
     for band, narrow in (((1.0, 30.0), True), ((100.0, 400.0), False)):
         for one in quiet_lines(only, band, narrow):
             mean, lines = one.power.mean(), one.power.size
-            assert abs(mean - 1) < 6 / np.sqrt(lines), (one.record, narrow, mean)
+            assert abs(mean - 1) < 6 / np.sqrt(lines), (narrow, mean)
 
 
 def test_what_cannot_be_judged_is_refused():

@@ -12,7 +12,7 @@ from truth.cases import draw_case, rig, simulate_case
 
 from avis_ctrl.gap.analysis import analyse
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.operators import assemble
+from avis_ctrl.gap.operators import Assembled
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.starting_values import seeds
 from avis_ctrl.gap.table_model import TableModel, active
@@ -32,7 +32,7 @@ def with_effect(name: str, place: str, values: list[float]) -> TableModel:
 def test_a_push_on_the_mass_inside_a_mount():
     """Against the table with the four masses as coordinates of their own."""
     f, share, zeta, uneven = 17.0, 0.4, 0.05, np.array([0.02, -0.01, 0.03, -0.04])
-    made = assemble(with_effect("mount_surge", "isolators z", [f, share, zeta, *uneven[:3]]).operators(OMEGA))
+    made = Assembled(with_effect("mount_surge", "isolators z", [f, share, zeta, *uneven[:3]]).operators(OMEGA))
     mounts, s = made.ops.mounts, 1j * OMEGA[:, None]
     up = mounts.along("z")
     G, k, c, w = mounts.payload[up], mounts.stiffness[up], mounts.damping[up], 2 * np.pi * f * (1 + uneven)
@@ -54,7 +54,7 @@ def test_a_push_on_the_mass_inside_a_mount():
 def test_a_push_on_the_chassis(place, values):
     """Against payload and chassis as two bodies: what the payload's momentum gains the chassis loses."""
     model = with_effect("base_compliance", place, values)
-    made = assemble(model.operators(OMEGA))
+    made = Assembled(model.operators(OMEGA))
     moves, S = made.ops.recoil, 1j * OMEGA[:, None, None]
     ways = np.flatnonzero(np.any(moves, axis=(0, 1)))
     G, under = made.G, made.ops.mounts.chassis[:, ways]
@@ -77,8 +77,8 @@ def test_a_chassis_bears_what_hangs_on_the_payload_and_what_holds_it():
     m, f, zeta, at = 20.0, 12.0, 0.05, [0.3, 0.2, 0.1]
     oscillator = active(library()["attached_oscillator"], model, "payload/z", [m, f, zeta, *at[:2]])
     cable = active(library()["cable_stiffness"], model, "payload/axes", [2e4, 1e4, 3e4, 1e-3, *at])
-    alone = assemble(model.operators(OMEGA))
-    made = assemble(model.with_effect(oscillator).with_effect(cable).operators(OMEGA))
+    alone = Assembled(model.operators(OMEGA))
+    made = Assembled(model.with_effect(oscillator).with_effect(cable).operators(OMEGA))
     s, w = 1j * OMEGA[:, None, None], 2 * np.pi * f
     g = point_map(np.array(at))
     k = m * (w ** 2 + 2 * zeta * w * s)

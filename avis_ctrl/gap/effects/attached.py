@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, differs_from_zero, register
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, Values, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import about, at_points, peaks, positions, project, unit_matrices
 from avis_ctrl.gap.effects.line_of_action import best_direction, foot, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
@@ -32,11 +32,9 @@ class AttachedOscillator(AtPoint):
     name = "attached_oscillator"
     title = "a sprung mass on the payload"
     looks_like = "a pair of peak and dip at its own frequency, in every channel that moves its place"
+    at = ("payload/oblique", "payload/axes")
     holds_states = True
     resonant = True
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("payload/oblique", "payload/axes")
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         mass = model.rig.mounted_body().mass
@@ -58,7 +56,7 @@ class AttachedOscillator(AtPoint):
         across = [one for one in self.position() if len(variant) > 1 or one.name != f"{variant}_m"]
         return (own, frequency, damping, *across)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         for row, mass, frequency in elements(place, values):
             Z = mass * sprung(ops.s, frequency, values["damping"])
             ops.add_impedance(Z[:, None], row[None])
@@ -92,7 +90,7 @@ class AttachedOscillator(AtPoint):
         along[others] = pair
         return [("payload/axes", tuple(map(float, (mass, *along, values["damping"], *point))))]
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         names = [name for name in values if name.startswith("along_")] or ["mass_kg"]
         if not differs_from_zero(values, std, names):
             return "a sprung mass that the data do not distinguish from zero"
@@ -100,8 +98,7 @@ class AttachedOscillator(AtPoint):
             return f"a line of action that passes {LIBRARY.reach_m:g} m from the table"
         return ""
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """Of one direction: mass, direction, and the point nearest to the geometric centre on the line of action, for
         along that line a place makes no difference."""
         found = super().reported(model, place, values, covariance)
@@ -113,7 +110,7 @@ class AttachedOscillator(AtPoint):
                 **line}
 
 
-def elements(place: str, values: Mapping[str, float]) -> list[tuple[np.ndarray, float, float]]:
+def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]]:
     """(row over q (6,), mass, frequency in Hz) along each direction in which the mass can move."""
     variant, rows = place.partition("/")[2], point_map(place_of(values))
     if variant == "oblique":
@@ -125,15 +122,10 @@ def elements(place: str, values: Mapping[str, float]) -> list[tuple[np.ndarray, 
              values[f"frequency_{axis}_Hz" if variant == "axes" else "frequency_Hz"]) for axis in axes]
 
 
-def oscillator(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
-    """Force of a sprung mass over the force of the same mass fixed, (n,)."""
-    w = 2 * np.pi * frequency_Hz
-    return (2 * damping * w * s + w ** 2) / second_order(s, frequency_Hz, damping)
-
-
 def sprung(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
     """Dynamic stiffness of a sprung mass of 1 kg, (n,)."""
-    return s ** 2 * oscillator(s, frequency_Hz, damping)
+    w = 2 * np.pi * frequency_Hz
+    return s ** 2 * ((2 * damping * w * s + w ** 2) / second_order(s, frequency_Hz, damping))
 
 
 def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:
@@ -166,10 +158,8 @@ def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> li
     """Three frequencies at once: all triples at every place of the grid, then finer about the best places."""
     points, zeta = positions(parameters), 0.05
     frequencies = np.array([f for f in sorted({*parameters[1].grid, *peaks(score)}) if f > 2.0])
-    kept = np.concatenate([unit_matrices(score, partial(sprung, frequency_Hz=f, damping=zeta)).astype(np.float32)
-                           for f in frequencies])
-    n = len(frequencies)
-    G, b = (kept @ kept.T).astype(float).reshape(n, 21, n, 21), (kept @ score.e.astype(np.float32)).reshape(n, 21)
+    G, b = _at_frequencies(score, frequencies, zeta)
+    G, n = G.astype(float), len(frequencies)
 
     def at(point: np.ndarray) -> tuple[float, float, list[int], np.ndarray]:
         rows = at_points(point[None], "xyz")[0]
@@ -192,10 +182,7 @@ def _along_the_others(score: Score, damping: float, frequencies: Sequence[float]
                       ) -> tuple[tuple[float, float], np.ndarray]:
     """Frequencies along two axes, and the point (3,), that take most together. Their masses are left free: effects
     without a name have taken part of their response."""
-    kept = np.concatenate([unit_matrices(score, partial(sprung, frequency_Hz=f, damping=damping)) for f in frequencies],
-                          dtype=np.float32)
-    n = len(frequencies)
-    G, b = (kept @ kept.T).reshape(n, 21, n, 21), (kept @ score.e.astype(np.float32)).reshape(n, 21)
+    G, b = _at_frequencies(score, frequencies, damping)
     best = -np.inf, (0, 0), points[0]
     for rows, point in zip(at_points(points, axes), points, strict=True):
         H, g = np.einsum("ap,fpgq,bq->afbg", rows, G, rows, optimize=True), rows @ b.T
@@ -206,6 +193,15 @@ def _along_the_others(score: Score, damping: float, frequencies: Sequence[float]
         k, j = np.unravel_index(int(np.argmax(fall)), fall.shape)
         best = max(best, (float(fall[k, j]), (int(k), int(j)), point), key=lambda found: found[0])
     return (frequencies[best[1][0]], frequencies[best[1][1]]), best[2]
+
+
+def _at_frequencies(score: Score, frequencies: Sequence[float] | np.ndarray, damping: float
+                    ) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 21, n, 21) and (n, 21): Gram matrix of the unit matrices at each frequency, and product with the residual."""
+    kept = np.concatenate([unit_matrices(score, partial(sprung, frequency_Hz=f, damping=damping)) for f in frequencies],
+                          dtype=np.float32)
+    n = len(frequencies)
+    return (kept @ kept.T).reshape(n, 21, n, 21), (kept @ score.e.astype(np.float32)).reshape(n, 21)
 
 
 def _best_triple(G: np.ndarray, b: np.ndarray) -> tuple[float, float, list[int]]:

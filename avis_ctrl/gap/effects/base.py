@@ -7,7 +7,7 @@ To add one, write a class and register it:
         name = "eddy_brake"
         ...
 
-`change` acts on the table line by line; an effect that depends on amplitude or time gives `volts` or `force`
+`change` acts on the table line by line; an effect that depends on amplitude or time gives `volts`, `force` or `reading`
 instead, from the record's motion in time. Parameters marked `linear` vanish at `none`: the effect is nearly linear
 in them there, which the score test and the starting values use; the others shape it (a frequency, a damping).
 """
@@ -17,15 +17,19 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
-from avis_ctrl.identification.response import ResponseModel, SensorModel
-from avis_ctrl.rigs.rig import Rig
+
+if TYPE_CHECKING:
+    # The table that an effect acts on: the model without it, which is made of effects itself.
+    from avis_ctrl.gap.table_model import TableModel as Table
+else:
+    Table = object
 
 
 @dataclass(frozen=True)
@@ -52,35 +56,8 @@ class LibrarySettings:
 
 
 SETTINGS = LibrarySettings()
-
-
-class Table(Protocol):
-    """What an effect uses of the table that it acts on: the model without it (`gap.table_model.TableModel`).
-
-    base : the rig and its free parameters. effective : the same with what other effects set of the rig's parameters.
-    motion : records in time, by name.
-    """
-
-    @property
-    def base(self) -> ResponseModel: ...
-
-    @property
-    def effective(self) -> ResponseModel: ...
-
-    @property
-    def motion(self) -> Mapping[str, RecordMotion]: ...
-
-    @property
-    def rig(self) -> Rig: ...
-
-    @property
-    def sensors(self) -> SensorModel: ...
-
-    @property
-    def actuators(self) -> tuple[str, ...]: ...
-
-    @property
-    def delay_s(self) -> float: ...
+# Of parameters by name.
+Values = Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -113,7 +90,20 @@ class Reported:
     unit: str
 
 
-def differs_from_zero(values: Mapping[str, float], std: Mapping[str, float], names: Iterable[str]) -> bool:
+class Added(NamedTuple):
+    """What an effect adds to a record on its lines, (n, channels) each, None for nothing.
+
+    volts : beside the commanded ones. force : generalised, on the payload. reading : acceleration along the sensors
+    beside the payload's own. output : beside what the sensors read, in the unit of y.
+    """
+
+    volts: np.ndarray | None = None
+    force: np.ndarray | None = None
+    reading: np.ndarray | None = None
+    output: np.ndarray | None = None
+
+
+def differs_from_zero(values: Values, std: Values, names: Iterable[str]) -> bool:
     """Whether any of these parameters is more than three of its standard deviations from zero."""
     return any(abs(values[name]) > 3 * std[name] for name in names)
 
@@ -124,6 +114,7 @@ class Effect(ABC):
     Attributes
     ----------
     name : of the contract. title : in words, for a sentence. looks_like : what it does to responses.
+    at : where it can act, for one whose `places` do not depend on the table.
     nonlinear : depends on amplitude or time; acts through `volts` or `force`.
     strength : the parameter to which `force` is in proportion, empty where to none.
     holds_states : has resonances of its own, whose states at the ends of a record are to be found with its transient.
@@ -131,73 +122,62 @@ class Effect(ABC):
     outside : of `effects.unnamed`, refitted beside the library and never named.
     """
 
-    name: ClassVar[str]
-    title: ClassVar[str]
-    looks_like: ClassVar[str]
-    nonlinear: ClassVar[bool] = False
-    strength: ClassVar[str] = ""
-    holds_states: ClassVar[bool] = False
-    resonant: ClassVar[bool] = False
-    outside: ClassVar[bool] = False
+    name: str
+    title: str
+    looks_like: str
+    at: tuple[str, ...] = ()
+    nonlinear: bool = False
+    strength: str = ""
+    holds_states: bool = False
+    resonant: bool = False
+    outside: bool = False
 
     def places(self, model: Table) -> tuple[str, ...]:
         """Where it can act on this table; empty where it cannot."""
-        raise NotImplementedError
+        return self.at
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         """Its parameters there."""
         raise NotImplementedError
 
-    def rig_changes(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, float]:
+    def rig_changes(self, model: Table, place: str, values: Values) -> dict[str, float]:
         """Parameters of the rig that it sets."""
         return {}
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         """Act on the table line by line."""
         return None
 
-    def volts(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def volts(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         """(samples, n_u) commanded volts that act, None where they are as commanded."""
         return None
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         """(samples, 6) generalised force on the payload, None for none."""
         return None
 
-    def reading(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def reading(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         """(samples, n_y) acceleration along the sensors beside the payload's own, None for none."""
         return None
 
-    def said(self, place: str, values: Mapping[str, float]) -> str:
+    def said(self, place: str, values: Values) -> str:
         """In words, with its place, for a sentence."""
         return f"{self.title} ({place})"
 
-    def volts_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
-        """(n, n_u) of `volts` on lines omega."""
-        volts = self.volts(record, place, values)
-        return None if volts is None else record.spectrum(volts, omega)
-
-    def output_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                        ) -> np.ndarray | None:
-        """(n, n_y) that the outputs hold beside what the sensors read, in the unit of y; None for none."""
-        return None
-
-    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
-        """(n, 6) of `force` on lines omega; where that is in proportion to `strength`, the one of a unit is kept."""
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
+        """What it adds to a record on lines omega; of a force in proportion to `strength`, that of a unit is kept."""
+        def on_lines(samples: np.ndarray | None) -> np.ndarray | None:
+            return None if samples is None else record.spectrum(samples, omega)
+        volts = on_lines(self.volts(record, place, values))
+        if volts is not None:
+            volts = volts - record.kept("volts", omega, lambda: record.volts)
         if self.strength:
             unit = {**values, self.strength: 1.0}
-            return values[self.strength] * record.kept(f"{self.name} {unit}", omega,
-                                                       lambda: np.asarray(self.force(record, place, unit)))
-        force = self.force(record, place, values)
-        return None if force is None else record.spectrum(force, omega)
-
-    def reading_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                         ) -> np.ndarray | None:
-        """(n, n_y) of `reading` on lines omega."""
-        reading = self.reading(record, place, values)
-        return None if reading is None else record.spectrum(reading, omega)
+            force: np.ndarray | None = values[self.strength] * record.kept(
+                f"{self.name} {unit}", omega, lambda: np.asarray(self.force(record, place, unit)))
+        else:
+            force = on_lines(self.force(record, place, values))
+        return Added(volts, force, on_lines(self.reading(record, place, values)))
 
     def starts(self, model: Table, place: str) -> Sequence[np.ndarray]:
         """Starts of the search: (n_parameters,) each, shape parameters on their grid and the linear ones at none."""
@@ -208,16 +188,15 @@ class Effect(ABC):
             points = [np.append(point, value) for point in points for value in values]
         return points
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         """Why physics forbids these values, empty where it does not."""
         return ""
 
-    def priors(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    def priors(self, model: Table, place: str, values: Values) -> dict[str, tuple[float, float]]:
         """(mean, standard deviation) by name of parameters that records need not determine, from values near by."""
         return {}
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """Parameters as a person reads them; by default as they are."""
         return {one.name: Reported(values[one.name], float(np.sqrt(max(covariance[k, k], 0.0))), one.unit)
                 for k, one in enumerate(self.parameters(model, place))}

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, differs_from_zero, register
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, Values, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import about, at_points, positions, project
 from avis_ctrl.gap.effects.line_of_action import best_direction, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
@@ -27,9 +26,7 @@ class CableStiffness(AtPoint):
     name = "cable_stiffness"
     title = "a cable or hose ties the payload to ground"
     looks_like = "stiffness at a place and height where no mount is: it shifts and couples the lowest resonances"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("payload/axes", "payload/oblique")
+    at = ("payload/axes", "payload/oblique")
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 0.02 * float(np.mean(np.diag(model.base.matrices.K)[:3])) / 4  # of one mount of four, on any rig
@@ -45,7 +42,7 @@ class CableStiffness(AtPoint):
                                       True),
                 *(replace(one, optional=True) for one in self.position()))
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         k, V = np.linalg.eigh(tie(values))
         rows = V.T @ point_map(place_of(values))
         Z = k * (1 + ops.s * values["damping_s"])[:, None]
@@ -55,7 +52,7 @@ class CableStiffness(AtPoint):
         """Over a grid of places, finer about the best: the direction and stiffness that take most, or those along the
         axes, none negative."""
         parameters = self.parameters(score.model, place)
-        G, b = project(score, lambda s: np.ones_like(s))
+        G, b = project(score, np.ones_like, "spring")
         of = _along_one if place.endswith("oblique") else _along_axes
         found = of(G, b, positions(parameters), parameters[0].high)
         for halving in range(1, SETTINGS.halvings + 1) if found else ():
@@ -63,13 +60,12 @@ class CableStiffness(AtPoint):
             found = sorted(found + of(G, b, near, parameters[0].high), key=lambda seed: -seed.chi2)
         return found
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         names = [name for name in values if name.startswith(("along_", "k_"))]
         return "" if differs_from_zero(values, std, names) else (
             "a cable whose stiffness the data do not distinguish from zero")
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """Of one direction: stiffness, direction, and the foot of the line of action; else the largest stiffness before
         all others."""
         found = super().reported(model, place, values, covariance)
@@ -95,7 +91,7 @@ def _along_axes(G: np.ndarray, b: np.ndarray, points: np.ndarray, most: float) -
     return sorted(found, key=lambda seed: -seed.chi2)
 
 
-def tie(values: Mapping[str, float]) -> np.ndarray:
+def tie(values: Values) -> np.ndarray:
     """(3, 3) N/m: stiffness of a cable from its values by name."""
     if "along_x" in values:
         a = np.array([values[f"along_{axis}"] for axis in "xyz"])

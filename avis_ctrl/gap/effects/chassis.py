@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
+from operator import attrgetter
 from typing import cast
 
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, differs_from_zero, register
+from avis_ctrl.gap.effects.base import EffectParameter, Table, Values, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import recoils
-from avis_ctrl.gap.effects.mounts import has_mounts
+from avis_ctrl.gap.effects.mounts import OfMounts
 from avis_ctrl.gap.effects.sensors import receptance
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.score import Score, reduction
@@ -98,7 +99,7 @@ SETTINGS = ChassisSettings()
 
 
 @register
-class BaseCompliance(Effect):
+class BaseCompliance(OfMounts):
     """The chassis, a rigid body on something soft: it recoils from mounts and motors, and filters the floor.
 
     c = B (f_mounts + (s C_b + K_b) w), B = inv(s^2 M_c + s C_b + K_b), each along its own axis (translation), or with
@@ -108,11 +109,9 @@ class BaseCompliance(Effect):
     name = "base_compliance"
     title = "the chassis stands on something soft and recoils"
     looks_like = "one more resonance in every channel, and less floor motion above it"
+    at = ("chassis/translation", "chassis/rocking")
     holds_states = True
     resonant = True
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("chassis/translation", "chassis/rocking") if has_mounts(model) else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         m = model.rig.mounted_body().mass
@@ -153,7 +152,7 @@ class BaseCompliance(Effect):
         reached = self._followed(score.model, place, starts, [*relative, blocks], wide)
         if steep and starts and (reached is None or reached.chi2 > SETTINGS.converged * reached.dof):
             straight = self._followed(score.model, place, starts, [blocks], False)
-            reached = min((one for one in (reached, straight) if one is not None), key=_chi2, default=None)
+            reached = min((one for one in (reached, straight) if one is not None), key=attrgetter("chi2"), default=None)
         if reached is None:
             return own
         if wide and reached.chi2 - reached.dof < SETTINGS.followed * (few - reached.dof):
@@ -183,12 +182,12 @@ class BaseCompliance(Effect):
         made: list[LikelihoodFit] = []
         for most, iterations in SETTINGS.tried_by_fractions if later else SETTINGS.tried:
             fits = [_short_fit(one, first, iterations) for one in trials[:most]]
-            made = sorted((one for one in fits if one is not None), key=_chi2)
+            made = sorted((one for one in fits if one is not None), key=attrgetter("chi2"))
             trials = [cast(TableModel, one.model) for one in made]
         enough = SETTINGS.negligible * gap if later else SETTINGS.explained * noise
         for one in made[:SETTINGS.followed_fits] if wide else []:
             if one.chi2 - noise < SETTINGS.followed * gap and made[0].chi2 > enough:
-                made = sorted([*made, self._one_by_one(one, place, first, noise, enough)], key=_chi2)
+                made = sorted([*made, self._one_by_one(one, place, first, noise, enough)], key=attrgetter("chi2"))
         reached = made[0] if made else None
         for then in later:
             reached = reached and _short_fit(cast(TableModel, reached.model), then, SETTINGS.later_iterations)
@@ -269,11 +268,11 @@ class BaseCompliance(Effect):
             values += [*(at[way] for way in ways[3:]), *np.clip(radii, 0.1, 3.0).tolist(), -0.3, 0.0]
         return [Seed(tuple(float(v) for v in values), took.chi2, 2 * len(best))]
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         return "" if differs_from_zero(values, std, ["mass_kg"]) else (
             "a chassis so heavy that the data do not distinguish it from a fixed one")
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         mass, damping, stiffness = of_chassis(values)
         s = ops.s[:, None, None]
         tied = stiffness + s * damping
@@ -288,20 +287,15 @@ class BaseCompliance(Effect):
         ops.recoil, ops.follow = B, H
 
 
-def of_chassis(values: Mapping[str, float]) -> np.ndarray:
+def of_chassis(values: Values) -> np.ndarray:
     """(3, 6, 6) mass, damping and stiffness of a chassis on its base, in the payload's coordinates about the table's
     centre; nothing in those in which it does not move."""
-    ways = [way for way in WAYS if f"{way}_Hz" in values]
-    n = len(ways)
-    radii = [1.0 if len(way) == 1 else values[f"gyration_{way[1]}_m"] for way in ways]
+    radii = [1.0, 1.0, 1.0, *(values.get(f"gyration_{axis}_m", 0.0) for axis in "xyz")]
     inertia = values["mass_kg"] * np.square(radii)
-    w = 2 * np.pi * np.array([values[f"{way}_Hz"] for way in ways])
+    w = 2 * np.pi * np.array([values.get(f"{way}_Hz", 0.0) for way in WAYS])
     found = np.zeros((3, 6, 6))
-    if n == 3:
-        found[:, range(3), range(3)] = inertia, 2 * values["damping"] * inertia * w, inertia * w ** 2
-        return found
-    centre = np.array([0.0, 0.0, values["centre_z_m"]])
-    G, below = point_map(centre), point_map(centre + np.array([0.0, 0.0, values["base_z_m"]]))
+    centre = np.array([0.0, 0.0, values.get("centre_z_m", 0.0)])
+    G, below = point_map(centre), point_map(centre + np.array([0.0, 0.0, values.get("base_z_m", 0.0)]))
     each = (inertia, 2 * values["damping"] * inertia * w, inertia * w ** 2)
     for which, place, one in zip(found, (G, below, below), each, strict=True):
         which += place.T @ np.diag(one[:3]) @ place
@@ -338,10 +332,6 @@ def _elsewhere(one: ActiveEffect) -> Iterator[tuple[float, ...]]:
 
 def _effect(found: LikelihoodFit) -> ActiveEffect:
     return cast(TableModel, found.model).effects[-1]
-
-
-def _chi2(one: LikelihoodFit) -> float:
-    return one.chi2
 
 
 def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock], iterations: int) -> LikelihoodFit | None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, register
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, Values, register
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
 
@@ -25,7 +23,7 @@ class ActuatorGain(Effect):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("gain", "1", "force constant over that of the rig file", 1.0, 0.05, 10.0, 1.0),)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         drive = ops.drive.copy()
         drive[:, ops.actuator(place)] *= values["gain"]
         ops.drive = drive
@@ -38,22 +36,19 @@ class ActuatorLag(Effect):
     name = "actuator_lag"
     title = "the current amplifiers lag, first order"
     looks_like = "phase lag that grows with frequency, the same in every channel, with a loss of gain"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("actuators",)
+    at = ("actuators",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("time_constant_s", "s", "time constant of the amplifiers", 0.0, 0.0, 0.3, 1e-3),)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         tau = values["time_constant_s"]
         if tau > 1e-9 and ops.amplifier_corner_Hz is None:
             ops.amplifier_corner_Hz = 1 / (2 * np.pi * tau)
         elif tau > 1e-9:  # behind the lag that the model has already
             ops.drive = ops.drive / (1 + ops.s * tau)[:, None]
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         tau, std = values["time_constant_s"], float(np.sqrt(max(covariance[0, 0], 0.0)))
         found = {"time_constant_s": Reported(tau, std, "s")}
         if tau <= 1e-9:  # at its bound there is no corner
@@ -68,18 +63,15 @@ class LoopDelay(Effect):
     name = "loop_delay"
     title = "a delay of transport or computing beyond the nominal one"
     looks_like = "phase lag in proportion to frequency, the same in every channel, without loss of gain"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("loop",)
+    at = ("loop",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("extra_delay_s", "s", "delay beyond that of the rig file", 0.0, 0.0, 0.2, 1e-3),)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         ops.delay_s = ops.delay_s + values["extra_delay_s"]
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         extra, std = values["extra_delay_s"], float(np.sqrt(max(covariance[0, 0], 0.0)))
         return {"extra_delay_s": Reported(extra, std, "s"), "delay_s": Reported(model.delay_s + extra, std, "s")}
 
@@ -91,10 +83,8 @@ class ActuatorSaturation(Effect):
     name = "actuator_saturation"
     title = "the drives clip below their nominal limit"
     looks_like = "less response than expected in records at high level only, and harmonics of the input"
+    at = ("actuators",)
     nonlinear = True
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("actuators",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         peaks = [float(np.max(np.abs(one.volts))) for one in model.motion.values()] or [model.rig.drive_limit_V]
@@ -103,5 +93,5 @@ class ActuatorSaturation(Effect):
         return (EffectParameter("limit_V", "V", "voltage at which the drives clip", model.rig.drive_limit_V,
                                 peak / 50, peak, peak, False, grid),)
 
-    def volts(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def volts(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         return np.clip(record.volts, -values["limit_V"], values["limit_V"])

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache, partial
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, register
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, Values, register
 from avis_ctrl.gap.effects.impedance import paths, peaks
 from avis_ctrl.gap.effects.sensors import receptance, second_order
 from avis_ctrl.gap.operators import AddedCoordinate, Operators, mount_geometry
@@ -50,7 +50,7 @@ class PayloadFlexibleMode(Effect):
                   for name, own in zip(names, driven, strict=True))]
         return tuple(found)
 
-    def priors(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    def priors(self, model: Table, place: str, values: Values) -> dict[str, tuple[float, float]]:
         """Where no motor pushes, a shape is of the size that it has elsewhere.
 
         A mode is held by the mounts' stiffness at these points, too: what they add to w^2 and 2 z w cannot be
@@ -65,7 +65,7 @@ class PayloadFlexibleMode(Effect):
             found |= {one.name: (0.0, max(float(size), SETTINGS.smallest_shape)) for one in shape if one.optional}
         return found
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         at_actuators, at_sensors = shape_rows(ops.base.rig, ops.base.actuators, ops.base.sensors.names)
         for frequency, zeta, shape in modes(values):
             if np.any(shape):
@@ -84,8 +84,7 @@ class PayloadFlexibleMode(Effect):
         found = _one_mode(score, [frequency for frequency, *_ in modes(one.by_name)]) if place else []
         return [(place, (*one.values, *found[0].values))] if place and found else []
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """The modes in the order of their frequencies."""
         found = list(super().reported(model, place, values, covariance).items())
         own = len(found) // COUNTS[place.partition("/")[2]]
@@ -93,7 +92,7 @@ class PayloadFlexibleMode(Effect):
         return dict(zip((name for name, _ in found), (value for mode in each for _, value in mode), strict=True))
 
 
-def modes(values: Mapping[str, float]) -> list[tuple[float, float, np.ndarray]]:
+def modes(values: Values) -> list[tuple[float, float, np.ndarray]]:
     """(frequency in Hz, damping ratio, shape (n_g,)) of each mode."""
     numbers, count = np.array(list(values.values())), sum(name.startswith("frequency") for name in values)
     return [(float(own[0]), float(own[1]), own[2:]) for own in np.split(numbers, count)]

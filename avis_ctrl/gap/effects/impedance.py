@@ -54,19 +54,15 @@ def _at_points(points: bytes, axes: str, oblique: bool) -> np.ndarray:
     return np.array(found)
 
 
-def project(score: Score, dynamic: Callable[[np.ndarray], np.ndarray], key: Hashable = None
-            ) -> tuple[np.ndarray, np.ndarray]:
+def project(score: Score, dynamic: Callable[[np.ndarray], np.ndarray], key: Hashable) -> tuple[np.ndarray, np.ndarray]:
     """Gram matrix (21, 21) and product with the residual (21,) of the unit matrices times dynamic(s).
 
-    key : under which the score keeps them for the next one who asks.
+    key : under which the score keeps them.
     """
-    if key is not None and key in score.kept:
-        return score.kept[key]
-    A = unit_matrices(score, dynamic)
-    found = A @ A.T, A @ score.e
-    if key is not None:
-        score.kept[key] = found
-    return found
+    if key not in score.kept:
+        A = unit_matrices(score, dynamic)
+        score.kept[key] = A @ A.T, A @ score.e
+    return score.kept[key]
 
 
 def unit_matrices(score: Score, dynamic: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

@@ -5,11 +5,9 @@ As `identification.large_motion`; motors and sensors, and the whole of it, enter
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table
+from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter, Table, Values
 from avis_ctrl.gap.record_motion import RecordMotion
 
 
@@ -19,10 +17,8 @@ class LargeMotion(Effect):
     name = "large_motion"
     title = "second-order terms of large rotations"
     looks_like = "a residual that grows with the square of the level, at low frequency first"
+    at = ("payload",)
     nonlinear = True
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("payload",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         # Little room beyond 0 and 1, and a size above it: a gap of another origin must not lead a fit astray here.
@@ -31,17 +27,14 @@ class LargeMotion(Effect):
             ("motors_turn", "share of the payload's rotation that turns the motors' axes"),
             ("sensors_turn", "share of it that turns the sensors' axes")))
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         return values["mounts"] * record.large_force + values["motors_turn"] * record.turned_force
 
-    def reading(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def reading(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         return values["sensors_turn"] * record.turned_reading
 
-    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
-        return (values["mounts"] * record.kept("large", omega, lambda: record.large_force)
-                + values["motors_turn"] * record.kept("turned", omega, lambda: record.turned_force))
-
-    def reading_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                         ) -> np.ndarray | None:
-        return values["sensors_turn"] * record.kept("reading", omega, lambda: record.turned_reading)
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
+        force = (values["mounts"] * record.kept("large", omega, lambda: record.large_force)
+                 + values["motors_turn"] * record.kept("turned", omega, lambda: record.turned_force))
+        reading = values["sensors_turn"] * record.kept("reading", omega, lambda: record.turned_reading)
+        return Added(force=force, reading=reading)

@@ -7,12 +7,11 @@ geometric centre.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.effects.base import Reported, Values
 from avis_ctrl.gap.effects.impedance import at_points
 from avis_ctrl.gap.starting_values import SETTINGS
 
@@ -41,7 +40,7 @@ def best_direction(G: np.ndarray, b: np.ndarray, points: np.ndarray) -> tuple[fl
     return float(chi2[k, v]), int(k), every[v], float(mass[k, v])
 
 
-def told(values: Mapping[str, float], covariance: np.ndarray, size: str, unit: str) -> dict[str, Reported]:
+def told(values: Values, covariance: np.ndarray, size: str, unit: str) -> dict[str, Reported]:
     """Size, direction and foot of the line of action by the values along_x .. and x_m .., to first order."""
     names = list(values)
     first, last = names.index("along_x"), names.index("x_m")
@@ -55,7 +54,7 @@ def told(values: Mapping[str, float], covariance: np.ndarray, size: str, unit: s
     return {name: Reported(float(v), float(s), u) for (name, u), v, s in zip(labels, line, std, strict=True)}
 
 
-def foot(values: Mapping[str, float]) -> np.ndarray:
+def foot(values: Values) -> np.ndarray:
     """(3,) m: the point of the line of action nearest to the geometric centre, by the values along_x .. and x_m .."""
     names = (*(f"along_{axis}" for axis in "xyz"), *(f"{axis}_m" for axis in "xyz"))
     return of_line(np.array([values[name] for name in names]))[4:]

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numba import njit
 
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, differs_from_zero, register
+from avis_ctrl.gap.effects.base import (
+    Added,
+    Effect,
+    EffectParameter,
+    Reported,
+    Table,
+    Values,
+    differs_from_zero,
+    register,
+)
 from avis_ctrl.gap.operators import Operators, mount_geometry
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.gap.table_model import ActiveEffect
+from avis_ctrl.rigs.rig import Rig
 
 
 def has_mounts(model: Table) -> bool:
@@ -21,21 +31,28 @@ def has_mounts(model: Table) -> bool:
     return "isolator1.k_z" in model.rig.parameters()
 
 
-def vertical(model_or_ops) -> np.ndarray:
+def vertical(rig: Rig) -> np.ndarray:
     """(n_g,) which mount rows are vertical."""
-    rig = model_or_ops.rig if hasattr(model_or_ops, "rig") else model_or_ops.base.rig
     return mount_geometry(rig).along("z")
 
 
-class _OfMounts(Effect):
-    where = "isolators z"
+def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> Iterator[EffectParameter]:
+    """Of mounts or contacts that differ from their mean; words with {} for the name."""
+    return (EffectParameter(f"uneven_{one}", "1", words.format(one), 0.0, -most, most, 0.1, False, (0.0,), True)
+            for one in names)
+
+
+class OfMounts(Effect):
+    """One that acts where mounts have stiffness and damping of their own by name."""
+
+    at: tuple[str, ...] = ("isolators z",)
 
     def places(self, model: Table) -> tuple[str, ...]:
-        return (self.where,) if has_mounts(model) else ()
+        return self.at if has_mounts(model) else ()
 
 
 @register
-class MountRelaxation(_OfMounts):
+class MountRelaxation(OfMounts):
     """Vertical stiffness k (1 + r s tau/(1 + s tau)): a Maxwell branch, a second chamber behind an orifice."""
 
     name = "mount_relaxation"
@@ -49,16 +66,16 @@ class MountRelaxation(_OfMounts):
                 EffectParameter("corner_Hz", "Hz", "above which the branch acts", 0.0, 0.02, 300.0, 1.0, False,
                                 (0.3, 0.8, 1.5, 2.5, 4.0, 7.0, 15.0, 40.0)))
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         x = ops.s / (2 * np.pi * values["corner_Hz"])
         branch = values["stiffness_ratio"] * x / (1 + x)
-        ops.stiffness_factor = ops.stiffness_factor + branch[:, None] * vertical(ops)
-        rows = mount_geometry(ops.base.rig).payload[vertical(ops)].T
+        ops.stiffness_factor = ops.stiffness_factor + branch[:, None] * vertical(ops.base.rig)
+        rows = mount_geometry(ops.base.rig).payload[vertical(ops.base.rig)].T
         ops.decays.append(rows / (ops.s + 2 * np.pi * values["corner_Hz"])[:, None, None])
 
 
 @register
-class StructuralDamping(_OfMounts):
+class StructuralDamping(OfMounts):
     """Loss nearly independent of frequency in every mount.
 
     causal : k (s/w_ref)^a, loss factor tan(pi a/2) at every frequency, with the rise of stiffness that causality
@@ -68,15 +85,12 @@ class StructuralDamping(_OfMounts):
     name = "structural_damping"
     title = "the mounts lose energy nearly independently of frequency, not in proportion to velocity"
     looks_like = "damping at low resonances larger, at high ones smaller than one dashpot gives"
-    where = "isolators"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("isolators/causal", "isolators/complex") if has_mounts(model) else ()
+    at = ("isolators/causal", "isolators/complex")
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("loss_factor", "1", "loss factor of the mounts", 0.0, 0.0, 1.0, 0.05),)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         eta = values["loss_factor"]
         if place.endswith("complex"):
             factor = np.full(len(ops.s), 1 + 1j * eta)
@@ -86,7 +100,7 @@ class StructuralDamping(_OfMounts):
 
 
 @register
-class MountSurge(_OfMounts):
+class MountSurge(OfMounts):
     """A mass inside every vertical mount, between two springs in series that have the mount's stiffness together.
 
     Frequency and damping ratio are those of the mass between payload and chassis at rest; both springs have the same
@@ -100,15 +114,14 @@ class MountSurge(_OfMounts):
     resonant = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        count = int(np.sum(vertical(model)))
+        count = int(np.sum(vertical(model.rig)))
         return (EffectParameter("frequency_Hz", "Hz", "of the mass inside the mounts", np.inf, 4.0, 400.0, 20.0, False,
                                 tuple(np.geomspace(*SETTINGS.surge_Hz).tolist())),
                 EffectParameter("payload_share", "1", "of the mount's compliance between mass and payload", 0.5, 0.05,
                                 0.95, 0.2, False, (0.5,), True),
                 EffectParameter("damping_ratio", "1", "of that resonance", 0.0, 0.0, 1.0, 0.05, False,
                                 (0.015, 0.05, 0.15), True),
-                *(EffectParameter(f"uneven_{i}", "1", f"frequency of mount {i} over the mean, less one", 0.0, -0.2, 0.2,
-                                  0.1, False, (0.0,), True) for i in range(1, count)))
+                *uneven(range(1, count), "frequency of mount {} over the mean, less one", 0.2))
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         """Over frequency and damping, by what the change of the response takes of the residual when it may be of any
@@ -125,23 +138,22 @@ class MountSurge(_OfMounts):
                 found.append(Seed(tuple(begin), took.chi2, len(parameters), len(starts)))
         return sorted(found, key=lambda seed: -seed.chi2)
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         return "" if differs_from_zero(values, std, ["frequency_Hz"]) else (
             "a resonance whose frequency the data do not determine")
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
-        up = vertical(ops)
+    def change(self, ops: Operators, place: str, values: Values) -> None:
+        up = vertical(ops.base.rig)
         ops.internal_omega[up] = surge_omega(values)
         ops.payload_share = np.where(up, values["payload_share"], ops.payload_share)
         ops.internal_damping = np.where(up, values["damping_ratio"], ops.internal_damping)
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """Means over the mounts. Their standard deviations include the scatter of the mounts, which one value for all
         of them does not describe; that of the mass follows from frequency, payload_share and scatter, with the mean
         stiffness taken as exact."""
         found = super().reported(model, place, values, covariance)
-        k = mount_geometry(model.effective.rig).stiffness[vertical(model)]
+        k = mount_geometry(model.effective.rig).stiffness[vertical(model.rig)]
         f, a, w = values["frequency_Hz"], values["payload_share"], surge_omega(values)
         m = k / (a * (1 - a) * w ** 2)
         slope = np.zeros(len(values))
@@ -158,19 +170,19 @@ def _of_mean(values: np.ndarray) -> float:
     return float(np.var(values, ddof=1) / len(values)) if len(values) > 1 else 0.0
 
 
-def surge_omega(values: Mapping[str, float]) -> np.ndarray:
+def surge_omega(values: Values) -> np.ndarray:
     """(mounts,) rad/s of the resonance inside each."""
     return 2 * np.pi * values["frequency_Hz"] * shares(values)
 
 
-def shares(values: Mapping[str, float]) -> np.ndarray:
+def shares(values: Values) -> np.ndarray:
     """(m,) of each mount or contact over their mean, from the values uneven_ .. of all but the last."""
     uneven = [value for name, value in values.items() if name.startswith("uneven_")]
     return 1 + np.array([*uneven, -sum(uneven)])
 
 
 @register
-class LevelingLoop(_OfMounts):
+class LevelingLoop(OfMounts):
     """Every leveled mount k (1 + w/s), w = 2 pi rate, with a valve that lags k (1 + w/(s (1 + s tau))), or each with a
     rate of its own.
 
@@ -181,10 +193,8 @@ class LevelingLoop(_OfMounts):
     name = "leveling_loop"
     title = "the leveling integrates the position of isolators 1-3"
     looks_like = "phase and gain change at the lowest frequencies, vertical and tilting channels only"
+    at = ("isolators 1-3 z/plain", "isolators 1-3 z/lag", "isolators 1-3 z/each")
     holds_states = True
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return tuple(f"isolators 1-3 z/{law}" for law in ("plain", "lag", "each")) if has_mounts(model) else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         # Faster than the best damped mode dies away, the loop is unstable: no table that was measured has it.
@@ -193,48 +203,47 @@ class LevelingLoop(_OfMounts):
         if place.endswith("plain"):
             return (rate,)
         if place.endswith("each"):
-            return (rate, *(EffectParameter(f"uneven_{i}", "1", f"rate of valve {i} over the mean, less one", 0.0, -0.9,
-                                            0.9, 0.1, False, (0.0,), True) for i in range(1, LIBRARY.leveled)))
+            return (rate, *uneven(range(1, LIBRARY.leveled), "rate of valve {} over the mean, less one"))
         # A valve may be faster than the data can show; its corner then runs to the upper end.
         return (rate, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, *LIBRARY.valve_Hz,
                                       1.0, False, (0.1, 0.3, 1.0, 3.0), True))
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         slow = values.get("valve_corner_Hz", np.inf) < 1.001 * LIBRARY.valve_Hz[0]
         return "valves so slow that the loop does not level" if slow else ""
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         ratio = 2 * np.pi * values["rate_Hz"] / ops.s
         if "valve_corner_Hz" in values:
             ratio = ratio / (1 + ops.s / (2 * np.pi * values["valve_corner_Hz"]))
-        each = np.zeros(len(leveled(ops)))
-        each[leveled(ops)] = shares(values)
+        own = leveled(ops.base.rig)
+        each = np.zeros(len(own))
+        each[own] = shares(values)
         ops.stiffness_factor = ops.stiffness_factor + ratio[:, None] * each
         # Each integrator starts with a force of its own, each valve with an opening.
-        rows = mount_geometry(ops.base.rig).payload[leveled(ops)].T
+        rows = mount_geometry(ops.base.rig).payload[own].T
         ops.decays.append(rows / ops.s[:, None, None])
         if "valve_corner_Hz" in values:
             ops.decays.append(rows / (ops.s + 2 * np.pi * values["valve_corner_Hz"])[:, None, None])
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """With the mean force by displacement and second over the leveled mounts, at their stiffness as fitted."""
         found = super().reported(model, place, values, covariance)
         rate, g = found["rate_Hz"], mount_geometry(model.rig)
-        by_rate = 2 * np.pi * float(np.mean(g.stiffness[leveled(model)]))
+        by_rate = 2 * np.pi * float(np.mean(g.stiffness[leveled(model.rig)]))
         if values.get("valve_corner_Hz", 0.0) > 0.999 * LIBRARY.valve_Hz[1]:
             del found["valve_corner_Hz"]
         return {**found, "integral_gain_N_per_ms": Reported(by_rate * rate.value, by_rate * rate.std, "N/(m s)")}
 
 
-def leveled(model_or_ops) -> np.ndarray:
+def leveled(rig: Rig) -> np.ndarray:
     """(n_g,) which mount rows the leveling acts on: the first three vertical ones."""
-    up = vertical(model_or_ops)
+    up = vertical(rig)
     return up & (np.cumsum(up) <= LIBRARY.leveled)
 
 
 @register
-class CubicStiffness(_OfMounts):
+class CubicStiffness(OfMounts):
     """Force -k3 d^3 at every vertical mount; mounts may differ in k3 about their mean."""
 
     name = "cubic_stiffness"
@@ -246,23 +255,21 @@ class CubicStiffness(_OfMounts):
         size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model) ** 2
         return (EffectParameter("k3_N_per_m3", "N/m^3", "cubic stiffness, mean of the mounts", 0.0, -1e4 * size,
                                 1e4 * size, size),
-                *(EffectParameter(f"uneven_{i}", "1", f"that of mount {i} over the mean, less one", 0.0, -0.9, 0.9, 0.1,
-                                  False, (0.0,), True) for i in range(1, int(np.sum(vertical(model))))))
+                *uneven(range(1, int(np.sum(vertical(model.rig)))), "that of mount {} over the mean, less one"))
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         return stiffened(record.deflection[:, record.vertical] ** 3, record, values)
 
-    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         """As `force`, from the spectra of the cubes."""
         cubes = record.kept(self.name, omega, lambda: record.deflection[:, record.vertical] ** 3)
-        return stiffened(cubes, record, values)
+        return Added(force=stiffened(cubes, record, values))
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         return "mounts that soften with amplitude" if values["k3_N_per_m3"] < 0 else ""
 
 
-def stiffened(cubes: np.ndarray, record: RecordMotion, values: Mapping[str, float]) -> np.ndarray:
+def stiffened(cubes: np.ndarray, record: RecordMotion, values: Values) -> np.ndarray:
     """(n, 6) generalized force on the payload by cubes of the mounts' deflections, (n, m), in time or on lines."""
     return -cubes @ (values["k3_N_per_m3"] * shares(values)[:, None] * record.rows[record.vertical])
 
@@ -301,21 +308,17 @@ class ContactFriction(Effect):
         return (EffectParameter("stiffness_N_per_m", "N/m", "of a contact before it slips", 0.0, 0.0, 20 * k, 0.05 * k),
                 EffectParameter("slip_m", "m", "displacement at which a contact slips", 0.0, 1e-3 * rms, 1e3 * rms, rms,
                                 False, tuple(rms * x for x in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0))),
-                *(EffectParameter(f"uneven_{name}", "1", f"stiffness of the contact of {name} over the mean, less one",
-                                  0.0, -0.9, 0.9, 0.1, False, (0.0,), True)
-                  for name in model.actuators[:-1]))
+                *uneven(model.actuators[:-1], "stiffness of the contact of {} over the mean, less one"))
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         return pushed(slipping(record, values["slip_m"]), record, values)
 
-    def force_spectrum(self, record: RecordMotion, place: str, values: Mapping[str, float], omega: np.ndarray
-                       ) -> np.ndarray | None:
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         """As `force`, interpolated between slips."""
         f = record.interpolated(self.name, values["slip_m"], omega, lambda slip: slipping(record, slip))
-        return pushed(f, record, values)
+        return Added(force=pushed(f, record, values))
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         k, slip = values["stiffness_N_per_m"], values["slip_m"]
         slope = np.array([slip, k])
         variance = float(slope @ covariance[:2, :2] @ slope)
@@ -323,7 +326,7 @@ class ContactFriction(Effect):
                 **super().reported(model, place, values, covariance)}
 
 
-def contacts(values: Mapping[str, float]) -> np.ndarray:
+def contacts(values: Values) -> np.ndarray:
     """(m,) N/m: stiffness of each contact, in the order of the actuators."""
     return values["stiffness_N_per_m"] * shares(values)
 
@@ -333,7 +336,7 @@ def slipping(record: RecordMotion, slip: float) -> np.ndarray:
     return dahl(np.ascontiguousarray(record.deflection[:, record.driven_rows]), slip)
 
 
-def pushed(f: np.ndarray, record: RecordMotion, values: Mapping[str, float]) -> np.ndarray:
+def pushed(f: np.ndarray, record: RecordMotion, values: Values) -> np.ndarray:
     """(n, 6) generalized force on the payload by friction over stiffness, (n, m), in time or on lines."""
     return -f @ (contacts(values)[:, None] * record.rows[record.driven_rows])
 
@@ -358,7 +361,7 @@ def dahl(deflection, slip):
 
 
 @register
-class StiffnessDrift(Effect):
+class StiffnessDrift(OfMounts):
     """Every stiffness times 1 + change p(t), p = -0.5 .. 0.5 from begin to end of the campaign.
 
     linear : p = (t - middle)/T. settling : as exp(-t/tau) towards an end, as after a change of temperature or pressure.
@@ -367,28 +370,26 @@ class StiffnessDrift(Effect):
     name = "stiffness_drift"
     title = "the mounts' stiffness changes over the campaign"
     looks_like = "resonances move from record to record, in the order of time and not of level"
+    at = ("isolators/linear", "isolators/settling")
     nonlinear = True
     strength = "relative_change"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("isolators/linear", "isolators/settling") if has_mounts(model) else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         change = EffectParameter("relative_change", "1", "of every stiffness over the campaign", 0.0, -0.9, 0.9, 0.02)
         if not place.endswith("settling"):
             return (change,)
-        T = next((one.campaign_s[1] - one.campaign_s[0] for one in model.motion.values()), 1.0)
+        begin, end = campaign_clock(model)
+        T = end - begin
         return (change, EffectParameter("time_constant_s", "s", "of the approach to the end", 0.0, 0.01 * T, 10 * T, T,
                                         False, (0.1 * T, 0.3 * T, T), True))
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         begin, end = record.campaign_s
         through = drifted((record.time_s - begin) / (end - begin), values.get("time_constant_s", 0.0) / (end - begin))
         push = record.deflection * record.stiffness * through[:, None]
         return -values["relative_change"] * (push @ record.rows)
 
-    def reported(self, model: Table, place: str, values: Mapping[str, float], covariance: np.ndarray
-                 ) -> dict[str, Reported]:
+    def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         found = super().reported(model, place, values, covariance)
         # The model's change is of the stiffness that the record's motion was found with; a person's is of what the
         # table's stiffness was at the beginning.
@@ -396,11 +397,16 @@ class StiffnessDrift(Effect):
         begin = 1 - own.value * ratio / 2
         one = Reported(own.value * ratio / begin, own.std * ratio / begin ** 2, own.unit)
         found["relative_change"] = one
-        spans = [record.campaign_s for record in model.motion.values()]
-        if spans:
-            hours = (spans[0][1] - spans[0][0]) / 3600
+        if model.motion:
+            begin_s, end_s = campaign_clock(model)
+            hours = (end_s - begin_s) / 3600
             found["rate_per_hour"] = Reported(one.value / hours, one.std / hours, "1/h")
         return found
+
+
+def campaign_clock(model: Table) -> tuple[float, float]:
+    """First and last time [s] of the campaign that a model was found from; (0, 1) where it knows no record."""
+    return next((one.campaign_s for one in model.motion.values()), (0.0, 1.0))
 
 
 def drift_over_stiffness(model: Table) -> float:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, Table, register
+from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, Table, Values, register
 
 PRODUCTS = {"Jxy": "J12", "Jxz": "J13", "Jyz": "J23"}
 
@@ -26,7 +24,7 @@ class ComOffset(Effect):
         return tuple(EffectParameter(f"offset_{axis}_m", "m", f"centre of mass beyond the model's along {axis}", 0.0,
                                      -0.5, 0.5, 0.05) for axis in "xyz")
 
-    def rig_changes(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, float]:
+    def rig_changes(self, model: Table, place: str, values: Values) -> dict[str, float]:
         known = model.rig.parameters()
         return {f"com_{axis}": known[f"com_{axis}"].value + values[f"offset_{axis}_m"] for axis in "xyz"}
 
@@ -48,7 +46,7 @@ class ProductOfInertia(Effect):
         return (EffectParameter(f"{place}_kgm2", "kg m^2", "entry of the inertia tensor beyond the model's", 0.0,
                                 -largest, largest, 0.1 * largest),)
 
-    def rig_changes(self, model: Table, place: str, values: Mapping[str, float]) -> dict[str, float]:
+    def rig_changes(self, model: Table, place: str, values: Values) -> dict[str, float]:
         name = PRODUCTS[place]
         return {name: model.rig.parameters()[name].value + values[f"{place}_kgm2"]}
 
@@ -62,5 +60,5 @@ class AtPoint(Effect):
                      for axis, grid in zip("xyz", ((-0.4, 0.0, 0.4), (-0.3, 0.0, 0.3), (-0.15, 0.25)), strict=True))
 
 
-def place_of(values: Mapping[str, float]) -> np.ndarray:
+def place_of(values: Values) -> np.ndarray:
     return np.array([values.get(f"{axis}_m", 0.0) for axis in "xyz"])

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, Table, register
+from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, Table, Values, register
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.rigs.rig import Rig
 
@@ -61,7 +59,7 @@ class GeophoneCorner(_OfSensor):
         return (EffectParameter("corner_Hz", "Hz", "suspension frequency", f, f / 5, 5 * f, f),
                 EffectParameter("damping", "1", "damping ratio of the suspension", z, z / 5, 5 * z, z))
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         # A factor of the present corner, which the tolerance fit may have moved: both then change the same parameter.
         k, (f, z) = ops.sensor(place), suspensions(ops.base.rig)[place]
         own = ops.base.sensors.suspensions
@@ -81,7 +79,7 @@ class SensorGain(_OfSensor):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("gain", "1", "sensitivity over that of the rig file", 1.0, 0.1, 10.0, 1.0),)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         ops.sensor_gain[ops.sensor(place)] *= values["gain"]
 
 
@@ -101,7 +99,7 @@ class SensorMisalignment(_OfSensor):
         return tuple(EffectParameter(f"towards_{axis}_deg", "deg", f"tilt of the axis towards {axis}", 0.0, -60.0, 60.0,
                                      5.0) for axis in "xyz" if axis != own)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         from avis_ctrl.rigs.rigid_body import point_map
 
         position, own = ops.base.rig.sensor_axes()[place]
@@ -133,7 +131,7 @@ class TiltCoupling(Effect):
         return (EffectParameter("gravity_m_per_s2", "m/s^2", "acceleration read for a tilt of 1 rad", 0.0, -30.0, 30.0,
                                 GRAVITY),)
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         n = len(ops.omega)
         rows = np.broadcast_to(ops.rows, (n, *ops.rows.shape[1:])).astype(complex)
         per_tilt = values["gravity_m_per_s2"] / ops.s ** 2
@@ -144,7 +142,7 @@ class TiltCoupling(Effect):
             rows[:, k, 4] -= direction[0] * per_tilt
         ops.rows = rows
 
-    def implausible(self, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+    def implausible(self, values: Values, std: Values) -> str:
         miss = abs(abs(values["gravity_m_per_s2"]) - GRAVITY)
         if miss > 0.1 * GRAVITY + 3 * std["gravity_m_per_s2"]:
             return f"gravity would have to be {values['gravity_m_per_s2']:.3g} m/s^2"

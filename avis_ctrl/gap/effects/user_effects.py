@@ -90,7 +90,7 @@ def _tried(effect: Effect, model: TableModel) -> None:
         if not isinstance(getattr(effect, field, None), str):
             raise InputError("expected a few words", field=field)
     for method in ("places", "parameters"):
-        if getattr(type(effect), method) is getattr(Effect, method):
+        if getattr(type(effect), method) is getattr(Effect, method) and not (method == "places" and effect.at):
             raise InputError("expected the method", field=method)
     omega = 2 * np.pi * np.array(SETTINGS.tried_Hz)
     for place in effect.places(model):

@@ -23,10 +23,9 @@ import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.signals.record_residual import Estimate
+from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.clipping import repeated_extreme
-from avis_ctrl.measurement.gates.finding import Limit, Picture, Series, thinned
 from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.rig import Rig
 
@@ -72,28 +71,15 @@ SETTINGS = ConverterSettings()
 class ConverterFinding:
     """One departure of one channel's converter from the rig file.
 
-    Attributes
-    ----------
-    kind : "resolution" or "clipping".
     parameters : "resolution_V" (step between values), or "clip_high_V" and/or "clip_low_V" (values where it clips).
-    nominal : what the rig file has in the place of each parameter.
     confidence : 1 - p, p a bound on the chance that a channel as in the rig file shows this anywhere in the campaign.
-    samples : that are clipped; 0 for a resolution.
     """
 
     channel: str
     kind: Literal["resolution", "clipping"]
-    parameters: dict[str, Estimate]
-    nominal: dict[str, float]
+    parameters: dict[str, Reported]
     confidence: float
     sentence: str
-    records: tuple[str, ...]
-    picture: Picture
-    samples: int = 0
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        return (self.channel,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,16 +154,10 @@ def _resolution(name: str, of: Sequence[_Samples], nominal: Converter, level: fl
     lsb = nominal.lsb_V
     value, std = step.q * lsb, step.std * lsb
     bits = np.log2(2 * nominal.range_V / value)
-    loudest = max(of, key=lambda one: np.ptp(one.y))
-    shown = slice(0, min(len(loudest.y), 400))
-    picture = Picture(f"Record {loudest.record}, {name}: values in steps of {1e3 * value:.4g} mV", "sample",
-                      f"{name} [V]", (Series(name, np.arange(len(loudest.y))[shown], loudest.y[shown], "points"),))
     return ConverterFinding(
-        name, "resolution", {"resolution_V": Estimate(value, std, "V")}, {"resolution_V": lsb},
-        1 - min(1.0, step.p),
+        name, "resolution", {"resolution_V": Reported(value, std, "V")}, 1 - min(1.0, step.p),
         f"Sensor {name} is converted in steps of {1e3 * value:.4g} +- {1e3 * std:.2g} mV, {step.q:.3g} times the"
-        f" {1e3 * lsb:.4g} mV of the rig file: {bits:.2f} instead of {nominal.bits} bits over its range.",
-        tuple(one.record for one in of), picture)
+        f" {1e3 * lsb:.4g} mV of the rig file: {bits:.2f} instead of {nominal.bits} bits over its range.")
 
 
 def _comb(of: Sequence[_Samples]) -> _Step | None:
@@ -260,34 +240,26 @@ def _gaps(of: Sequence[_Samples]) -> _Step | None:
 def _clipping(name: str, of: Sequence[_Samples], nominal: Converter, lsb: float, level: float
               ) -> ConverterFinding | None:
     """Both ends of a channel."""
-    parameters, limits, p_all, count, records = {}, {}, 0.0, 0, set()
+    parameters, p_all, count, records = {}, 0.0, 0, set()
     for end, sign, bound in (("low", -1.0, -nominal.limits_V[0]), ("high", 1.0, nominal.limits_V[1])):
         made = _plateau(of, sign, bound, nominal.lsb_V, lsb, level)
         if made is None:
             continue
         top, width, p, where = made
         std = max(lsb / np.sqrt(12.0), width / np.sqrt(12.0))
-        parameters[f"clip_{end}_V"] = Estimate(sign * top, std, "V")
-        limits[f"clip_{end}_V"] = sign * bound
+        parameters[f"clip_{end}_V"] = Reported(sign * top, std, "V")
         p_all = max(p_all, 4 * p)
         count += sum(where.values())
         records |= set(where)
     if not parameters:
         return None
-    shown = max(of, key=lambda one: sum(int(np.count_nonzero(np.sign(e.value) * one.y >= abs(e.value) - 2 * e.std))
-                                        for e in parameters.values()))
-    at = int(np.argmax(np.abs(shown.y)))
-    part = slice(max(0, at - 1000), at + 1000)
-    t, x = thinned(np.arange(len(shown.y))[part].astype(float), shown.y[part])
     levels = " and ".join(f"{e.value:.4g}" for e in parameters.values())
     names = tuple(one.record for one in of if one.record in records)
     return ConverterFinding(
-        name, "clipping", parameters, limits, 1 - min(1.0, p_all),
+        name, "clipping", parameters, 1 - min(1.0, p_all),
         f"Sensor {name} clips at {levels} V, {count} samples of record{'s' if len(names) > 1 else ''}"
         f" {', '.join(names)}; the rig file's converter ends at {nominal.limits_V[0]:.4g} and"
-        f" {nominal.limits_V[1]:.4g} V.",
-        names, Picture(f"Record {shown.record}, {name}", "sample", f"{name} [V]", (Series(name, t, x),),
-                       tuple(Limit("clips at", e.value) for e in parameters.values())), count)
+        f" {nominal.limits_V[1]:.4g} V.")
 
 
 def _plateau(of: Sequence[_Samples], sign: float, bound: float, nominal_lsb: float, lsb: float, level: float

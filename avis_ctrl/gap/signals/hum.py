@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, stats
 
-from avis_ctrl.gap.signals.record_residual import Estimate, RecordResidual, check_common
-from avis_ctrl.measurement.gates.finding import Limit, Picture, Series, thinned
+from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.signals.record_residual import RecordResidual, check_common
 
 MAINS_HZ = (50.0, 60.0)
 # int w^2 t^2 dt / (int w t^2 dt)^2 of a Hann window over the same of none: 28.1 / 12.
@@ -54,13 +54,12 @@ SETTINGS = HumSettings()
 class HumLine:
     """A harmonic in one channel: peak amplitude [unit of y] over the records, weighted by their noise.
 
-    p : of its own test. ratio : power to that of the lines next to it, mean of the records.
+    ratio : power to that of the lines next to it, mean of the records.
     """
 
     channel: str
     harmonic: int
-    amplitude: Estimate
-    p: float
+    amplitude: Reported
     ratio: float
 
 
@@ -68,8 +67,6 @@ class HumLine:
 class HumFinding:
     """Mains hum.
 
-    Attributes
-    ----------
     frequency_Hz : the fundamental, common to all records. nominal_Hz : 50 or 60.
     lines : harmonics and channels that stand out, the largest first.
     parameters : "frequency_Hz", and "amplitude_V" of the largest line (in the unit of y).
@@ -77,12 +74,11 @@ class HumFinding:
     """
 
     nominal_Hz: float
-    frequency_Hz: Estimate
+    frequency_Hz: Reported
     lines: tuple[HumLine, ...]
-    parameters: dict[str, Estimate]
+    parameters: dict[str, Reported]
     confidence: float
     sentence: str
-    picture: Picture
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -139,7 +135,7 @@ def find_hum(left: Sequence[RecordResidual]) -> HumFinding | None:
     own = there.p[0]
     hits = np.argwhere((own < SETTINGS.false_alarm / own.size) | sure[at])
     frequency = _refined(left, frequency.value, hits)
-    lines = _lines(left, frequency.value, hits, own, there.ratio[0])
+    lines = _lines(left, frequency.value, hits, there.ratio[0])
     return _finding(left, best.nominal_Hz, frequency, lines, chance, first.y_unit)
 
 
@@ -189,12 +185,16 @@ def _scores(left: Sequence[RecordResidual], nominal: float, f0: np.ndarray | Non
     return _Score(nominal, f0, score, ratio / np.maximum(tests, 1), tests)
 
 
+def _offsets(one: RecordResidual) -> np.ndarray:
+    """How many lines away those are that a line is compared with."""
+    stride = 2 * one.periods or 1
+    return max(stride, SETTINGS.guard + 1) + stride * np.arange(SETTINGS.neighbours)
+
+
 def _add(one: RecordResidual, f0: np.ndarray, score: np.ndarray, tests: np.ndarray, ratio: np.ndarray) -> None:
     """A record's part, harmonic by harmonic; lines are looked at once however many f0 fall on them."""
     power, df = np.abs(one.E) ** 2, one.frequency_Hz[1]
-    stride = 2 * one.periods if one.periods >= 2 else 1
-    first = stride if stride > SETTINGS.guard else SETTINGS.guard + 1
-    offsets = first + stride * np.arange(SETTINGS.neighbours)
+    offsets = _offsets(one)
     for k in range(1, score.shape[1] + 1):
         bins, back = np.unique(np.rint(k * f0 / df).astype(int), return_inverse=True)
         inside = (bins - offsets[-1] >= 1) & (bins + offsets[-1] < len(power) - 1)
@@ -227,14 +227,12 @@ def _fitted(A: np.ndarray, e: np.ndarray) -> np.ndarray:
 
 def _spread(one: RecordResidual, f: float) -> np.ndarray:
     """(n_y,) variance of either part of a sine's amplitude: 2 s^2 / N, s^2 of the lines near f that are like it."""
-    b = round(f / one.frequency_Hz[1])
-    stride = 2 * one.periods if one.periods >= 2 else 1
-    offsets = (stride if stride > SETTINGS.guard else SETTINGS.guard + 1) + stride * np.arange(SETTINGS.neighbours)
+    b, offsets = round(f / one.frequency_Hz[1]), _offsets(one)
     near = np.clip(np.concatenate([b - offsets, b + offsets]), 1, len(one.E) - 1)
     return 2 * np.mean(np.abs(one.E[near]) ** 2, axis=0) / one.header.samples
 
 
-def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> Estimate:
+def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> Reported:
     """f0 by least squares of all lines that stand out, amplitudes and phases free in each record.
 
     Its variance is that of a sine in white noise of the local level, var(2 pi f) = 12 v / (A T)^2 with v the variance
@@ -264,11 +262,10 @@ def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> 
         # The window's mean is 1/2; s is the variance of either part of the amplitude.
         A2 = (4 * abs(np.mean(c * np.exp(-2j * np.pi * k * shift * t)))) ** 2
         information += (2 * np.pi * k * duration) ** 2 * max(A2 - 2 * s, 0.0) / s / 12 / HANN_COST
-    return Estimate(start + shift, float(1 / np.sqrt(max(information, 1e-30))), "Hz")
+    return Reported(start + shift, float(1 / np.sqrt(max(information, 1e-30))), "Hz")
 
 
-def _lines(left: Sequence[RecordResidual], f0: float, hits: np.ndarray, p: np.ndarray, ratio: np.ndarray
-           ) -> tuple[HumLine, ...]:
+def _lines(left: Sequence[RecordResidual], f0: float, hits: np.ndarray, ratio: np.ndarray) -> tuple[HumLine, ...]:
     names, unit, rate = left[0].header.y_names, left[0].header.y_unit, left[0].header.sample_rate_Hz
     found = []
     ks = sorted({int(k) + 1 for k, _ in hits})
@@ -282,29 +279,20 @@ def _lines(left: Sequence[RecordResidual], f0: float, hits: np.ndarray, p: np.nd
         weight += 1 / v
     for k, j in hits:
         i = ks.index(int(k) + 1)
-        size = Estimate(float(np.sqrt(max(power[i, j] / weight[i, j], 0.0))), float(1 / np.sqrt(weight[i, j])), unit)
-        found.append(HumLine(names[j], int(k) + 1, size,
-                             float(p[k, j]), float(ratio[k, j])))
+        size = Reported(float(np.sqrt(max(power[i, j] / weight[i, j], 0.0))), float(1 / np.sqrt(weight[i, j])), unit)
+        found.append(HumLine(names[j], int(k) + 1, size, float(ratio[k, j])))
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
 
 
-def _finding(left: Sequence[RecordResidual], nominal: float, frequency: Estimate, lines: tuple[HumLine, ...],
+def _finding(left: Sequence[RecordResidual], nominal: float, frequency: Reported, lines: tuple[HumLine, ...],
              chance: float, unit: str) -> HumFinding:
     largest = lines[0]
     names = left[0].header.y_names
-    j = names.index(largest.channel)
-    shown = max(left, key=lambda one: one.header.samples)
-    f, a = shown.frequency_Hz[1:], np.abs(shown.E[1:, j]) * np.sqrt(2 / shown.header.sample_rate_Hz)
-    ks = sorted({line.harmonic for line in lines})
-    picture = Picture(f"Record {shown.header.name}, {largest.channel}: what the model leaves", "frequency [Hz]",
-                      f"amplitude density [{unit}/sqrt(Hz)]", (Series(largest.channel, *thinned(f, a)),),
-                      tuple(Limit(f"{k * nominal:g} Hz", k * frequency.value, "x") for k in ks), "log", "log")
-    at = ", ".join(f"{k * nominal:g}" for k in ks)
+    at = ", ".join(f"{k * nominal:g}" for k in sorted({line.harmonic for line in lines}))
     channels = sorted({line.channel for line in lines}, key=names.index)
     A = largest.amplitude
     sentence = (f"Mains hum of {frequency.value:.4f} +- {frequency.std:.1g} Hz with lines at {at} Hz in"
                 f" {', '.join(channels)}; the largest, at {largest.harmonic * nominal:g} Hz in {largest.channel}, has"
                 f" {1e3 * A.value:.4g} +- {1e3 * A.std:.2g} m{unit} peak, {10 * np.log10(largest.ratio):.0f} dB above"
                 " the lines next to it.")
-    return HumFinding(nominal, frequency, lines, {"frequency_Hz": frequency, "amplitude_V": A}, 1 - chance, sentence,
-                      picture)
+    return HumFinding(nominal, frequency, lines, {"frequency_Hz": frequency, "amplitude_V": A}, 1 - chance, sentence)

@@ -24,14 +24,12 @@ import numpy as np
 from scipy.stats import norm
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.signals.converter import nominal_converter
 from avis_ctrl.gap.signals.hum import HumFinding, polluted
 from avis_ctrl.gap.signals.quiet_lines import QuietLines, quiet_lines
-from avis_ctrl.gap.signals.record_residual import HANN_SHARED, Estimate, RecordResidual, check_common
-from avis_ctrl.measurement.gates.finding import Limit, Picture, Series
+from avis_ctrl.gap.signals.record_residual import HANN_SHARED, RecordResidual, check_common
 from avis_ctrl.rigs.rig import Rig
-
-DIRECTIONS = ("x", "y", "z")
 
 FloorResponse = Callable[[np.ndarray], np.ndarray]
 
@@ -82,81 +80,60 @@ SETTINGS = NoiseLevelSettings()
 class FloorLevel:
     """Velocity of the floor that was not measured.
 
-    Attributes
-    ----------
     rms : of each direction in 0.5-60 Hz, a power law beyond `seen_to_Hz`. seen : in 0.5 Hz to seen_to_Hz only.
     ambient : of the rig file [m/s].
     foreign : part of the excess over sensor noise that no floor motion makes, 0 to 1.
-    frequency_Hz (n,), density (n, 3) : one-sided [m^2/s^2/Hz] in bands of a third of an octave.
     clear, significant : whether the floor is above ambient clearly, and beyond doubt of statistics.
     """
 
-    rms: dict[str, Estimate]
-    seen: dict[str, Estimate]
+    rms: dict[str, Reported]
+    seen: dict[str, Reported]
     seen_to_Hz: dict[str, float]
-    mean_rms: Estimate
-    mean_seen: Estimate
+    mean_rms: Reported
+    mean_seen: Reported
     ambient: float
     foreign: float
-    frequency_Hz: np.ndarray
-    density: np.ndarray
     significant: bool
     clear: bool
 
     @property
-    def ground_motion(self) -> bool:
-        """The floor moves clearly more than the rig file says, and it is the floor."""
-        return self.significant and self.clear and self.foreign <= SETTINGS.foreign
-
-
-@dataclass(frozen=True, eq=False)
-class NoiseFinding:
-    """Noise of a sensor above ambient; no effect of the library.
-
-    parameters : "noise_rms_V". ratio : to what rig file and converter give.
-    """
-
-    channel: str
-    parameters: dict[str, Estimate]
-    ratio: float
-    sentence: str
-    picture: Picture
+    def parameters(self) -> dict[str, Reported]:
+        """"velocity_rms" (mean over directions) and "velocity_rms_x" ... [m/s] in 0.5-60 Hz."""
+        return {"velocity_rms": self.mean_rms} | {f"velocity_rms_{axis}": one for axis, one in self.rms.items()}
 
     @property
-    def channels(self) -> tuple[str, ...]:
-        return (self.channel,)
+    def confidence(self) -> float:
+        """1 - p, p a bound on the chance that estimates of a floor that is at ambient come out as high."""
+        chance = 5 * float(norm.sf(_excess(self.ambient, self.mean_rms, self.mean_seen, self.seen)))
+        return 1 - min(chance, 1.0)
 
-
-@dataclass(frozen=True, eq=False)
-class GroundMotionFinding:
-    """Unmeasured floor motion clearly above ambient.
-
-    parameters : "velocity_rms" (mean over directions) and "velocity_rms_x" ... [m/s] in 0.5-60 Hz.
-    confidence : 1 - p, p a bound on the chance that estimates of a floor that is at ambient come out as high.
-    """
-
-    channels: tuple[str, ...]
-    parameters: dict[str, Estimate]
-    ratio: float
-    confidence: float
-    sentence: str
-    picture: Picture
+    @property
+    def sentence(self) -> str:
+        m, seen = self.mean_rms, self.mean_seen
+        each = ", ".join(f"{axis} {1e6 * one.value:.3g}" for axis, one in self.rms.items())
+        return (f"The floor, not measured, moves with {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
+                f" ({each}), {m.value / self.ambient:.3g} times the rig file's ambient {1e6 * self.ambient:.3g} um/s;"
+                f" {1e6 * seen.value:.3g} +- {1e6 * seen.std:.2g} um/s of it are seen up to "
+                f"{min(self.seen_to_Hz.values()):.3g} Hz, the rest is a power law carried on.")
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseLevels:
     """Floor (None where every record has it measured, or no line shows it) and sensors, with what is above ambient.
 
-    sensors : r.m.s. of each channel with its converter's rounding, at the lowest level of the drives.
-    by_record : the same of each record. ways : how each record's noise was told from what u drives.
+    sensors : r.m.s. of each channel with its converter's rounding, at the lowest level of the drives. raised : those
+    above ambient, which is no effect of the library.
     """
 
     floor: FloorLevel | None
-    sensors: dict[str, Estimate]
-    by_record: dict[str, dict[str, Estimate]]
-    ground_motion: GroundMotionFinding | None
-    raised: tuple[NoiseFinding, ...]
-    ways: dict[str, str]
+    sensors: dict[str, Reported]
+    raised: tuple[str, ...]
+
+    @property
+    def ground_motion(self) -> FloorLevel | None:
+        """The floor where it moves clearly more than the rig file says, and it is the floor."""
+        floor = self.floor
+        return floor if floor and floor.significant and floor.clear and floor.foreign <= SETTINGS.foreign else None
 
 
 def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, rig: Rig, hum: HumFinding | None = None,
@@ -184,11 +161,10 @@ def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, 
     if not any(len(one.left) for one in high):
         raise InputError("expected lines that hold noise alone, above a tenth of the sample rate; records are too short"
                          " to tell the noise from what u drives", field="residuals")
-    by_record, sensors = _sensor_noise(high, first.y_names, first.y_unit)
+    sensors = _sensor_noise(high, first.y_names, first.y_unit)
     lsb = {name: (steps_V or {}).get(name, nominal_converter(rig).lsb_V) for name in first.y_names}
     expected = {name: float(np.hypot(ambient.sensor_noise_rms_V, lsb[name] / np.sqrt(12))) for name in first.y_names}
-    raised = tuple(_raised(name, sensors[name], expected[name], by_record)
-                   for name in first.y_names
+    raised = tuple(name for name in first.y_names
                    if sensors[name].value > SETTINGS.sensor_factor * expected[name]
                    and sensors[name].value - SETTINGS.significant * sensors[name].std > expected[name])
     unknown = [k for k, one in enumerate(left) if not one.header.floor_names]
@@ -198,23 +174,19 @@ def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, 
                           None if masks is None else [masks[k] for k in unknown])
         D = np.array([sensors[name].value ** 2 for name in first.y_names])
         floor = _floor(low, floor_response, D, ambient.floor_velocity_rms_m_per_s, rate)
-    made = None if floor is None or not floor.ground_motion else _ground_motion(floor, first.y_names)
-    return NoiseLevels(floor, sensors, by_record, made, raised, {one.record: one.kind for one in high})
+    return NoiseLevels(floor, sensors, raised)
 
 
-def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str
-                  ) -> tuple[dict[str, dict[str, Estimate]], dict[str, Estimate]]:
-    """By record, and of the records at the lowest level: distortion and misfit raise what others show."""
-    def estimates(of: Sequence[QuietLines]) -> dict[str, Estimate]:
-        power = np.concatenate([one.power for one in of])
-        weight = np.concatenate([one.left for one in of])
-        rms = np.sqrt(weight @ power / weight.sum())
-        std = rms / 2 * np.sqrt(HANN_SHARED / weight.sum())
-        return {name: Estimate(float(a), float(s), unit) for name, a, s in zip(names, rms, std, strict=True)}
+def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str) -> dict[str, Reported]:
+    """Of the records at the lowest level: distortion and misfit raise what others show."""
     some = [one for one in high if len(one.left)]
     least = min(one.level for one in some)
     quiet = [one for one in some if one.level <= 1.05 * least]
-    return {one.record: estimates([one]) for one in some}, estimates(quiet)
+    power = np.concatenate([one.power for one in quiet])
+    weight = np.concatenate([one.left for one in quiet])
+    rms = np.sqrt(weight @ power / weight.sum())
+    std = rms / 2 * np.sqrt(HANN_SHARED / weight.sum())
+    return {name: Reported(float(a), float(s), unit) for name, a, s in zip(names, rms, std, strict=True)}
 
 
 def _floor(low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarray, ambient: float, rate: float
@@ -326,7 +298,7 @@ def _level(S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarra
     width, centre = np.diff(edges), np.sqrt(edges[1:] * edges[:-1])
     seen2, seen_v, all2, all_v = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     ends = {}
-    for j, axis in enumerate(DIRECTIONS):
+    for j, axis in enumerate("xyz"):
         m = int(np.argmin(np.append(visible[:, j], False)))
         if m < 3:
             return None
@@ -335,22 +307,22 @@ def _level(S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarra
         tail, tail_std = _tail(centre[:m], S[:m, j], std[:m, j], edges[m])
         all2[j], all_v[j] = seen2[j] + tail, seen_v[j] + tail_std ** 2
 
-    def root(square: float, variance: float) -> Estimate:
+    def root(square: float, variance: float) -> Reported:
         rms = np.sqrt(max(square, 1e-30))
-        return Estimate(float(rms), float(np.sqrt(variance) / (2 * rms)), "m/s")
-    rms = {axis: root(all2[j], all_v[j]) for j, axis in enumerate(DIRECTIONS)}
-    seen = {axis: root(seen2[j], seen_v[j]) for j, axis in enumerate(DIRECTIONS)}
+        return Reported(float(rms), float(np.sqrt(variance) / (2 * rms)), "m/s")
+    rms = {axis: root(all2[j], all_v[j]) for j, axis in enumerate("xyz")}
+    seen = {axis: root(seen2[j], seen_v[j]) for j, axis in enumerate("xyz")}
     mean, mean_seen = root(all2.mean(), all_v.sum() / 9), root(seen2.mean(), seen_v.sum() / 9)
 
-    def above(one: Estimate, factor: float) -> bool:
+    def above(one: Reported, factor: float) -> bool:
         return one.value > factor * ambient and one.value - SETTINGS.significant * one.std > ambient
     significant = _excess(ambient, mean, mean_seen, seen) > SETTINGS.significant
     clear = (any(above(one, SETTINGS.seen_factor) for one in (mean_seen, *seen.values()))
              or any(above(one, SETTINGS.total_factor) for one in (mean, *rms.values())))
-    return FloorLevel(rms, seen, ends, mean, mean_seen, ambient, foreign, centre, S, significant, clear)
+    return FloorLevel(rms, seen, ends, mean, mean_seen, ambient, foreign, significant, clear)
 
 
-def _excess(ambient: float, mean: Estimate, mean_seen: Estimate, seen: dict[str, Estimate]) -> float:
+def _excess(ambient: float, mean: Reported, mean_seen: Reported, seen: dict[str, Reported]) -> float:
     """Standard errors by which the highest of these five estimates is above ambient."""
     return max((one.value - ambient) / max(one.std, 1e-30) for one in (mean, mean_seen, *seen.values()))
 
@@ -374,34 +346,3 @@ def _tail(f: np.ndarray, S: np.ndarray, std: np.ndarray, end: float) -> tuple[fl
     tail = a * integral
     mean = float(weight @ tail)
     return mean, float(np.sqrt(weight @ (a_var * scale * integral ** 2 + (tail - mean) ** 2)))
-
-
-def _raised(name: str, found: Estimate, expected: float, by_record: dict[str, dict[str, Estimate]]) -> NoiseFinding:
-    records = np.arange(len(by_record))
-    picture = Picture(f"Noise of {name} by record", "record", f"r.m.s. of a sample [{found.unit}]",
-                      (Series(name, records, np.array([one[name].value for one in by_record.values()]), "bars"),),
-                      (Limit("ambient and converter", expected),), x_names=tuple(by_record))
-    ratio = found.value / expected
-    return NoiseFinding(name, {"noise_rms_V": found}, ratio,
-                        f"Sensor {name} has noise of {1e3 * found.value:.4g} +- {1e3 * found.std:.2g} m{found.unit}"
-                        f" r.m.s., {ratio:.3g} times the {1e3 * expected:.4g} m{found.unit} of the rig file's ambient"
-                        " noise and converter; no effect of the library.", picture)
-
-
-def _ground_motion(floor: FloorLevel, names: tuple[str, ...]) -> GroundMotionFinding:
-    flat = floor.ambient ** 2 / (SETTINGS.floor_band_Hz[1] - SETTINGS.floor_band_Hz[0])
-    density = np.sqrt(np.maximum(np.nan_to_num(floor.density), 1e-30))
-    series = tuple(Series(f"floor {axis}", floor.frequency_Hz, density[:, j]) for j, axis in enumerate(DIRECTIONS))
-    picture = Picture("Floor velocity that explains what u and sensor noise do not", "frequency [Hz]",
-                      "amplitude density [m/s/sqrt(Hz)]", series, (Limit("ambient, if white", float(np.sqrt(flat))),),
-                      "log", "log")
-    each = ", ".join(f"{axis} {1e6 * one.value:.3g}" for axis, one in floor.rms.items())
-    m, seen, ratio = floor.mean_rms, floor.mean_seen, floor.mean_rms.value / floor.ambient
-    end = min(floor.seen_to_Hz.values())
-    sentence = (f"The floor, not measured, moves with {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
-                f" ({each}), {ratio:.3g} times the rig file's ambient {1e6 * floor.ambient:.3g} um/s;"
-                f" {1e6 * seen.value:.3g} +- {1e6 * seen.std:.2g} um/s of it are seen up to {end:.3g} Hz, the rest is a"
-                " power law carried on.")
-    parameters = {"velocity_rms": m} | {f"velocity_rms_{axis}": one for axis, one in floor.rms.items()}
-    chance = 5 * float(norm.sf(_excess(floor.ambient, m, seen, floor.seen)))
-    return GroundMotionFinding(names, parameters, ratio, 1 - min(chance, 1.0), sentence, picture)

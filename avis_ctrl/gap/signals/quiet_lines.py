@@ -50,11 +50,9 @@ SETTINGS = QuietLineSettings()
 class QuietLines:
     """Noise of one record: e (n, n_y) at frequency_Hz (n,), with E[e e^H] = left C of the noise; left (n,) from 0 to 1.
 
-    level : r.m.s. of u [V], over its channels. kind : "rest", "between harmonics" or "regression on u".
+    level : r.m.s. of u [V], over its channels.
     """
 
-    record: str
-    kind: str
     level: float
     frequency_Hz: np.ndarray
     e: np.ndarray
@@ -81,12 +79,11 @@ def quiet_lines(left: Sequence[RecordResidual], band_Hz: tuple[float, float], na
         if polluted is not None:
             keep &= ~polluted[k]
         inside.append(keep)
-        level = float(np.sqrt(np.mean(one.u ** 2)))
         if one.silent:
-            found[k] = _plain(one, "rest", level, keep)
+            found[k] = _plain(one, keep)
         elif one.periods >= SETTINGS.least_periods:
             away = np.arange(len(keep)) % one.periods
-            found[k] = _plain(one, "between harmonics", level, keep & (away >= 2) & (away <= one.periods - 2))
+            found[k] = _plain(one, keep & (away >= 2) & (away <= one.periods - 2))
         else:
             regressed.setdefault((len(keep), one.header.sample_rate_Hz), []).append(k)
     for ks in regressed.values():
@@ -95,8 +92,12 @@ def quiet_lines(left: Sequence[RecordResidual], band_Hz: tuple[float, float], na
     return tuple(found[k] for k in range(len(left)))
 
 
-def _plain(one: RecordResidual, kind: str, level: float, keep: np.ndarray) -> QuietLines:
-    return QuietLines(one.header.name, kind, level, one.frequency_Hz[keep], one.E[keep], np.ones(int(keep.sum())))
+def _plain(one: RecordResidual, keep: np.ndarray) -> QuietLines:
+    return QuietLines(_level(one), one.frequency_Hz[keep], one.E[keep], np.ones(int(keep.sum())))
+
+
+def _level(one: RecordResidual) -> float:
+    return float(np.sqrt(np.mean(one.u ** 2)))
 
 
 def _regression(left: Sequence[RecordResidual], keep: Sequence[np.ndarray], narrow: bool) -> list[QuietLines]:
@@ -108,10 +109,8 @@ def _regression(left: Sequence[RecordResidual], keep: Sequence[np.ndarray], narr
     # One parameter in two data at most, so that noise is left.
     width = max(width, int(np.ceil(2 * (order + 1) * n_u / R)))
     blocks = len(lines) // width
-    empty = [QuietLines(one.header.name, "regression on u", float(np.sqrt(np.mean(one.u ** 2))), np.empty(0),
-                        np.empty((0, one.e.shape[1]), complex), np.empty(0)) for one in left]
     if not blocks:
-        return empty
+        return [_plain(one, np.zeros(len(one.E), bool)) for one in left]
     at = lines[:blocks * width].reshape(blocks, width)
     x = np.linspace(-1, 1, width)[:, None] ** np.arange(order + 1)
     U = np.stack([one.U[at] for one in left], axis=1)
@@ -132,8 +131,7 @@ def _regression(left: Sequence[RecordResidual], keep: Sequence[np.ndarray], narr
     made = []
     for k, one in enumerate(left):
         good = (share[:, k] > SETTINGS.least_left) & keep[k][at] & lines_of_noise[:, k]
-        made.append(QuietLines(one.header.name, "regression on u", empty[k].level, one.frequency_Hz[at[good]],
-                               rest[:, k][good], share[:, k][good]))
+        made.append(QuietLines(_level(one), one.frequency_Hz[at[good]], rest[:, k][good], share[:, k][good]))
     return made
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -30,14 +29,6 @@ class LineSettings:
 
 
 SETTINGS = LineSettings()
-
-
-class Estimate(NamedTuple):
-    """A parameter of an effect with its standard error."""
-
-    value: float
-    std: float
-    unit: str
 
 
 @dataclass(frozen=True, eq=False)

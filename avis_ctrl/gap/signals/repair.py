@@ -73,13 +73,9 @@ def repair(campaign: Campaign, rig: Rig, predicted: Mapping[str, np.ndarray] | N
         if predicted is not None and record.header.name in predicted:
             model = _checked(record, predicted[record.header.name])
             y = np.where((top & (model > y)) | (bottom & (model < y)), model, y)
-        records.append(replace(record, u=drive_limited(record.u, rig.limits_of(record.header.u_names)), y=y))
+        limits_V = rig.limits_of(record.header.u_names)
+        records.append(replace(record, u=np.clip(record.u, -limits_V, limits_V), y=y))
     return Repaired(replace(campaign, records=tuple(records)), dict(zip(names, (at / samples).tolist(), strict=True)))
-
-
-def drive_limited(u: np.ndarray, limits_V: np.ndarray) -> np.ndarray:
-    """u (samples, n_u) [V] held at each drive's limit."""
-    return np.clip(u, -limits_V, limits_V)
 
 
 def _checked(record: Record, model: np.ndarray) -> np.ndarray:

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table
+from avis_ctrl.gap.effects.base import Effect, EffectParameter, Table, Values
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Part, Score
 from avis_ctrl.gap.starting_values import Seed
 
 
 class UnnamedFault(Effect):
-    """One that is never named."""
+    """One that is never named. words : for a sentence, with {place}, {into} and {source} of a pair, and values."""
 
     outside = True
     looks_like = "what the library has no name for"
+    words: str
+
+    def said(self, place: str, values: Values) -> str:
+        into, _, source = place.partition("/")
+        return self.words.format(place=place, into=into, source=source, **values)
 
 
 class FirstOrder(UnnamedFault):
@@ -44,11 +48,24 @@ class FirstOrder(UnnamedFault):
         return values
 
 
-def only(Y: np.ndarray, j: int, column: np.ndarray) -> np.ndarray:
-    """(1, n, n_y, m): column (n, m) in channel j, nothing in the others."""
-    out = np.zeros((1, *Y.shape), complex)
-    out[0, :, j] = column
-    return out
+class Late(FirstOrder):
+    """exp(-s T)/(1 + s tau) of one channel. To first order both are one; nothing is earlier than it was sent."""
+
+    words = "a lag or a delay of {place} alone"
+
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
+        what = "motor" if place in model.actuators else "sensor"
+        return (EffectParameter("delay_s", "s", f"delay of this {what} beside the others", 0.0, 0.0, 0.1, 1e-3),
+                EffectParameter("time_constant_s", "s", f"first-order lag of this {what} alone", 0.0, 0.0, 0.3, 1e-3))
+
+    def factor(self, s: np.ndarray, values: Values) -> np.ndarray:
+        return np.exp(-s * values["delay_s"]) / (1 + s * values["time_constant_s"])
+
+    def seeds(self, score: Score, place: str) -> list[Seed]:
+        return [seed for seed in super().seeds(score, place) if any(seed.values)]
+
+    def _begin(self, model: Table, place: str, point: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+        return np.full(2, max(float(np.sum(coefficients)), 0.0) / 2)
 
 
 def motion(part: Part) -> RecordMotion:
@@ -71,22 +88,3 @@ def pairs(names: tuple[str, ...]) -> tuple[str, ...]:
 def at(every: np.ndarray, names: tuple[str, ...], place: str) -> np.ndarray:
     """(n, channels) of a place alone; all where it is none of the channels."""
     return every * (np.array(names) == place) if place in names else every
-
-
-def timing(what: str) -> tuple[EffectParameter, ...]:
-    return (EffectParameter("delay_s", "s", f"delay of this {what} beside the others", 0.0, 0.0, 0.1, 1e-3),
-            EffectParameter("time_constant_s", "s", f"first-order lag of this {what} alone", 0.0, 0.0, 0.3, 1e-3))
-
-
-def late(s: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
-    return np.exp(-s * values["delay_s"]) / (1 + s * values["time_constant_s"])
-
-
-class Late(FirstOrder):
-    """exp(-s T)/(1 + s tau). To first order both are one; nothing is earlier than it was sent."""
-
-    def seeds(self, score: Score, place: str) -> list[Seed]:
-        return [seed for seed in super().seeds(score, place) if any(seed.values)]
-
-    def _begin(self, model: Table, place: str, point: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-        return np.full(2, max(float(np.sum(coefficients)), 0.0) / 2)

@@ -12,35 +12,20 @@ without the table's being assembled anew (`first_order`).
 
 from __future__ import annotations
 
+from avis_ctrl.gap.effects.unnamed.added import ADDED
 from avis_ctrl.gap.effects.unnamed.base import UnnamedFault
-from avis_ctrl.gap.effects.unnamed.drives import (
-    DeadZone,
-    DriveAbsolute,
-    DriveCrosstalk,
-    DriveCubic,
-    DriveQuadratic,
-    ForceByDeflection,
-    ForceBySquare,
-    ForceDrift,
+from avis_ctrl.gap.effects.unnamed.channels import (
     MotorLate,
-)
-from avis_ctrl.gap.effects.unnamed.sensors import (
-    ClockRate,
     SensorCrosstalk,
     SensorCrosstalkOfAll,
-    SensorCubic,
     SensorLate,
-    SensorQuadratic,
     SensorResonance,
 )
 from avis_ctrl.gap.effects.unnamed.table import Gyroscope, QuadraticDrag, QuadraticStiffness
 
-_FAULTS: tuple[type[UnnamedFault], ...] = (
-    SensorCrosstalk, SensorCrosstalkOfAll, SensorLate, SensorResonance, SensorQuadratic, SensorCubic, ClockRate,
-    MotorLate, DriveCrosstalk, DriveQuadratic, DriveAbsolute, DriveCubic, DeadZone, ForceByDeflection, ForceBySquare,
-    ForceDrift, QuadraticStiffness, QuadraticDrag, Gyroscope)
-
 
 def unnamed_faults() -> dict[str, UnnamedFault]:
     """Every one of them by name."""
-    return {kind.name: kind() for kind in _FAULTS}
+    every = (SensorCrosstalk(), SensorCrosstalkOfAll(), SensorLate(), SensorResonance(), MotorLate(), *ADDED.values(),
+             QuadraticStiffness(), QuadraticDrag(), Gyroscope())
+    return {one.name: one for one in every}

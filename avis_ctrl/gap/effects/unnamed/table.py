@@ -2,64 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Table
-from avis_ctrl.gap.effects.mounts import has_mounts, largest_rms
+from avis_ctrl.gap.effects.base import EffectParameter, Table, Values
+from avis_ctrl.gap.effects.mounts import OfMounts, largest_rms
 from avis_ctrl.gap.effects.unnamed.base import UnnamedFault
 from avis_ctrl.gap.operators import Operators, mount_geometry
 from avis_ctrl.gap.record_motion import RecordMotion
 
 
-class QuadraticStiffness(UnnamedFault):
+class QuadraticStiffness(UnnamedFault, OfMounts):
     """Force -k2 d^2 at every vertical mount: an air spring is stiffer in than out."""
 
     name = "quadratic_stiffness"
     title = "mounts of unlike stiffness up and down"
+    words = "vertical mounts with a term in the square of their deflection"
     nonlinear = True
     strength = "k2_N_per_m2"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("isolators z",) if has_mounts(model) else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model)
         return (EffectParameter("k2_N_per_m2", "N/m^2", "quadratic stiffness of each mount", 0.0, -1e4 * size,
                                 1e4 * size, size),)
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         up = record.vertical
         return -values["k2_N_per_m2"] * (record.deflection[:, up] ** 2 @ record.rows[up])
 
-    def said(self, place: str, values: Mapping[str, float]) -> str:
-        return "vertical mounts with a term in the square of their deflection"
 
-
-class QuadraticDrag(UnnamedFault):
+class QuadraticDrag(UnnamedFault, OfMounts):
     """Force -c |v| v on the payload at the table's centre, v its velocity against the chassis: air."""
 
     name = "quadratic_drag"
     title = "drag in proportion to the square of velocity"
+    words = "drag on the payload in proportion to the square of velocity"
+    at = ("payload",)
     nonlinear = True
     strength = "drag_Ns2_per_m2"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("payload",) if has_mounts(model) else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 10.0 / max(largest_rms(model) * 10.0, 1e-9)
         return (EffectParameter("drag_Ns2_per_m2", "N s^2/m^2", "of the payload", 0.0, -1e4 * size, 1e4 * size, size),)
 
-    def force(self, record: RecordMotion, place: str, values: Mapping[str, float]) -> np.ndarray | None:
+    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         v = np.gradient(record.deflection @ np.linalg.pinv(record.rows).T, 1 / record.sample_rate_Hz, axis=0)
         force = np.zeros_like(v)
         force[:, :3] = -values["drag_Ns2_per_m2"] * np.linalg.norm(v[:, :3], axis=1, keepdims=True) * v[:, :3]
         return force
-
-    def said(self, place: str, values: Mapping[str, float]) -> str:
-        return "drag on the payload in proportion to the square of velocity"
 
 
 class Gyroscope(UnnamedFault):
@@ -67,20 +56,16 @@ class Gyroscope(UnnamedFault):
 
     name = "gyroscope"
     title = "a rotor on the payload"
-
-    def places(self, model: Table) -> tuple[str, ...]:
-        return ("payload",)
+    words = "a rotor on the payload (moments at right angles to its tilting)"
+    at = ("payload",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return tuple(EffectParameter(f"h{axis}_Nms", "N m s", f"angular momentum about {axis}", 0.0, -1e6, 1e6, 1.0)
                      for axis in "xyz")
 
-    def change(self, ops: Operators, place: str, values: Mapping[str, float]) -> None:
+    def change(self, ops: Operators, place: str, values: Values) -> None:
         x, y, z = (values[f"h{axis}_Nms"] for axis in "xyz")
         W = np.zeros((6, 6))
         W[3:, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         Z = ops.s[:, None, None] * W
         ops.extra = Z if ops.extra is None else ops.extra + Z
-
-    def said(self, place: str, values: Mapping[str, float]) -> str:
-        return "a rotor on the payload (moments at right angles to its tilting)"

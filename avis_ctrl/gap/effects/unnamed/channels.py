@@ -1,0 +1,139 @@
+"""Linear faults of single sensors and motors that the library has no name for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avis_ctrl.gap.effects.base import EffectParameter, Table, Values
+from avis_ctrl.gap.effects.sensors import receptance
+from avis_ctrl.gap.effects.unnamed.base import FirstOrder, Late, by_volts, pairs
+from avis_ctrl.gap.operators import Operators
+from avis_ctrl.gap.score import Part
+
+
+def mix(ops: Operators, into: str, shares: Values) -> None:
+    """Shares of other sensors' signals in one."""
+    j, gain = ops.sensor(into), ops.base.sensors.sensitivity * ops.sensor_gain
+    rows = np.array(ops.rows)
+    for name, share in shares.items():
+        i = ops.sensor(name)
+        rows[:, j] = rows[:, j] + share * gain[i] / gain[j] * ops.rows[:, i]
+    ops.rows = rows
+
+
+def only(part: Part, place: str, column: np.ndarray) -> np.ndarray:
+    """(1, n, n_y, m): column (n, m) in the channel of a sensor, nothing in the others."""
+    out = np.zeros((1, *part.response.Y.shape), complex)
+    out[0, :, part.model.sensors.names.index(place)] = column
+    return out
+
+
+def read(part: Part, place: str) -> np.ndarray:
+    """(n, m) y of a sensor."""
+    return part.response.Y[:, part.model.sensors.names.index(place)]
+
+
+class SensorCrosstalk(FirstOrder):
+    """One output holds a share of another output's signal."""
+
+    name = "sensor_crosstalk"
+    title = "a share of one sensor's signal in another's"
+    words = "a share of {source}'s signal in {into}"
+
+    def places(self, model: Table) -> tuple[str, ...]:
+        return pairs(model.sensors.names)
+
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
+        return (EffectParameter("share", "1", "share of the other's signal", 0.0, -2.0, 2.0, 0.01),)
+
+    def change(self, ops: Operators, place: str, values: Values) -> None:
+        into, source = place.split("/")
+        mix(ops, into, {source: values["share"]})
+
+    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
+        into, source = place.split("/")
+        return only(part, into, read(part, source))
+
+
+class SensorCrosstalkOfAll(FirstOrder):
+    """One output holds shares of all others: a common ground, or a sensor somewhere else on the payload."""
+
+    name = "sensor_crosstalk_of_all"
+    title = "shares of all sensors' signals in one"
+    words = "shares of the other sensors' signals in {place}"
+
+    def places(self, model: Table) -> tuple[str, ...]:
+        return model.sensors.names if len(model.sensors.names) > 2 else ()
+
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
+        return tuple(EffectParameter(f"share_of_{name}", "1", f"share of {name}'s signal", 0.0, -2.0, 2.0, 0.01)
+                     for name in model.sensors.names if name != place)
+
+    def change(self, ops: Operators, place: str, values: Values) -> None:
+        mix(ops, place, {name.removeprefix("share_of_"): share for name, share in values.items()})
+
+    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
+        return np.concatenate([only(part, place, read(part, name)) for name in part.model.sensors.names
+                               if name != place])
+
+
+class SensorLate(Late):
+    """One output is later than the others: a low pass, a delay of its own."""
+
+    name = "sensor_late"
+    title = "one sensor is later than the others (a low pass or a delay of its own)"
+    words = "a low pass or a delay of {place} alone"
+
+    def places(self, model: Table) -> tuple[str, ...]:
+        return model.sensors.names
+
+    def change(self, ops: Operators, place: str, values: Values) -> None:
+        ops.sense[:, ops.sensor(place)] *= self.factor(ops.s, values)
+
+    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
+        return np.repeat(only(part, place, -part.s[:, 0] * read(part, place)), 2, axis=0)
+
+
+class MotorLate(Late):
+    """One motor is later than the others: a lag or a delay of its own amplifier."""
+
+    name = "motor_late"
+    title = "one motor is later than the others (a lag or a delay of its own)"
+
+    def places(self, model: Table) -> tuple[str, ...]:
+        return model.actuators
+
+    def change(self, ops: Operators, place: str, values: Values) -> None:
+        drive = np.array(np.broadcast_to(ops.drive, (len(ops.omega), ops.drive.shape[1])))
+        drive[:, ops.actuator(place)] *= self.factor(ops.s, values)
+        ops.drive = drive
+
+    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
+        k = part.model.actuators.index(place)
+        dY = by_volts(part)[:, :, k] * (-part.s[:, 0] * part.block.U[:, k])
+        return np.repeat(dY[None, :, :, None], 2, axis=0)
+
+
+class SensorResonance(FirstOrder):
+    """One output holds a resonance of its sensor's holder: times 1 + share s^2/(s^2 + 2 zeta w s + w^2)."""
+
+    name = "sensor_resonance"
+    title = "a resonance of one sensor (a spurious mode, its holder)"
+    words = "a resonance of {place} alone at {frequency_Hz:.3g} Hz"
+
+    def places(self, model: Table) -> tuple[str, ...]:
+        return model.sensors.names
+
+    def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
+        return (EffectParameter("share", "1", "of the resonance in the output", 0.0, -5.0, 5.0, 0.01),
+                EffectParameter("frequency_Hz", "Hz", "of the resonance", 0.0, 0.5, 400.0, 1.0, False,
+                                tuple(np.geomspace(8.0, 90.0, 10))),
+                EffectParameter("damping", "1", "its damping ratio", 0.0, 1e-3, 1.0, 0.02, False, (0.05,), True))
+
+    def change(self, ops: Operators, place: str, values: Values) -> None:
+        shape = ops.s ** 2 * receptance(ops.s, values["frequency_Hz"], values["damping"])
+        ops.sense[:, ops.sensor(place)] *= 1 + values["share"] * shape
+
+    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
+        s = part.s[:, 0]
+        return only(part, place, s ** 2 * receptance(s, float(point[1]), float(point[2])) * read(part, place))
