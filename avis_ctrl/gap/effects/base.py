@@ -17,19 +17,15 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
-
-if TYPE_CHECKING:
-    # The table that an effect acts on: the model without it, which is made of effects itself.
-    from avis_ctrl.gap.table_model import TableModel as Table
-else:
-    Table = object
+from avis_ctrl.identification.response import ResponseModel, SensorModel
+from avis_ctrl.rigs.rig import Rig
 
 
 @dataclass(frozen=True)
@@ -58,6 +54,35 @@ class LibrarySettings:
 SETTINGS = LibrarySettings()
 # Of parameters by name.
 Values = Mapping[str, float]
+
+
+class Table(Protocol):
+    """What an effect uses of the table that it acts on: the model without it (`gap.table_model.TableModel`).
+
+    base : the rig and its free parameters. effective : the same with what other effects set of the rig's parameters.
+    motion : records in time, by name.
+    """
+
+    @property
+    def base(self) -> ResponseModel: ...
+
+    @property
+    def effective(self) -> ResponseModel: ...
+
+    @property
+    def motion(self) -> Mapping[str, RecordMotion]: ...
+
+    @property
+    def rig(self) -> Rig: ...
+
+    @property
+    def sensors(self) -> SensorModel: ...
+
+    @property
+    def actuators(self) -> tuple[str, ...]: ...
+
+    @property
+    def delay_s(self) -> float: ...
 
 
 @dataclass(frozen=True)
