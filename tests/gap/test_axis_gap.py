@@ -112,7 +112,7 @@ def test_false_alarms_are_few():
 
 @pytest.mark.parametrize("extra", [
     lambda y, v: 0.03 * y ** 3 / (1 + 0.05 * y * y),  # stiffens and gives way: near a cubic spring, and near stops
-    lambda y, v: 0.3 * math.sin(2 * y),  # a periodic force: near no law
+    pytest.param(lambda y, v: 0.3 * math.sin(2 * y), marks=pytest.mark.slow),  # a periodic force: near no law
 ], ids=["giving way", "periodic"])
 def test_outside_the_library_nothing_is_named(extra):
     gap = searched(extra, 3)

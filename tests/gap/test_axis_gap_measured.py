@@ -39,9 +39,16 @@ def size(gap, effect, parameter):
     return next((e.parameters[parameter].value, e.parameters[parameter].std) for e in gap.effects if e.name == effect)
 
 
+def plain(gap):
+    """The gap, which its file and its report can hold."""
+    text = json.loads(json.dumps(gap.to_json(), allow_nan=False))
+    assert text["format"] == "avis-gap-axis" and text["gap"] and gap.pictures
+    return gap
+
+
 @pytest.fixture(scope="module")
 def emps(data):
-    return find_axis_gap_in("drive", folder(data, "emps/DATA_EMPS.mat"), EMPS, scale={"force": 35.15065188})
+    return plain(find_axis_gap_in("drive", folder(data, "emps/DATA_EMPS.mat"), EMPS, scale={"force": 35.15065188}))
 
 
 def test_emps_lacks_coulomb_friction_and_then_its_symmetry(emps):
@@ -83,7 +90,7 @@ def test_emps_first_half_alone_says_the_same(data):
     assert Fc == pytest.approx(20.39, rel=0.12) and abs(Fc - 20.39) < 2 * deviation
 
 
-@pytest.mark.parametrize("cutoff", [30.0, 100.0, None])
+@pytest.mark.parametrize("cutoff", [*(pytest.param(f, marks=pytest.mark.slow) for f in (30.0, 100.0)), None])
 def test_emps_with_pulses_has_a_pure_delay_at_every_cutoff(data, cutoff):
     """The phase of force over acceleration is a straight line to 190 Hz, 0.77 ms; the pulses do not repeat."""
     options = {} if cutoff is None else {"cutoff_Hz": cutoff}
@@ -106,8 +113,8 @@ def silverbox(data):
 @pytest.fixture(scope="module")
 def silverbox_gap(data):
     # The first half of the random middle.
-    return find_axis_gap_in("oscillator", folder(data, "silverbox/Schroeder80mV.mat"), {"u": "V1", "y": "V2"},
-                            sample_rate_Hz=SILVERBOX_RATE, band_Hz=(1.0, 200.0), range_s=(37.0, 115.0))
+    return plain(find_axis_gap_in("oscillator", folder(data, "silverbox/Schroeder80mV.mat"), {"u": "V1", "y": "V2"},
+                                  sample_rate_Hz=SILVERBOX_RATE, band_Hz=(1.0, 200.0), range_s=(37.0, 115.0)))
 
 
 def test_silverbox_lacks_a_cubic_stiffness(silverbox_gap):
@@ -120,14 +127,27 @@ def test_silverbox_lacks_a_cubic_stiffness(silverbox_gap):
     assert gap.stages[-1].nrmse < 0.005
     ratio = gap.ratios["k3/k"]
     assert 3.983 < ratio.value < 4.002 and ratio.std > 0.0095  # other stretches scatter over this range
-
-
-def test_silverbox_neither_more_damping_nor_more_order(silverbox_gap):
+    # Neither more damping nor more order.
     assert not {"attached_oscillator", "actuator_lag", "delay"} & {one.name for one in silverbox_gap.traces}
     # What damping effects there are count for less than a thousandth of the squared error.
     assert silverbox_gap.stages[1].nrmse ** 2 < 0.003 * silverbox_gap.stages[0].nrmse ** 2
 
 
+def test_silverbox_files_and_what_the_model_predicts(data, silverbox_gap, tmp_path):
+    path = folder(data, "silverbox/Schroeder80mV.mat")
+    (record,), rate = signals_in("oscillator", [path], Reading({"u": "V1", "y": "V2"}, {}, range_s=(130.0, 140.0),
+                                                               sample_rate_Hz=SILVERBOX_RATE))
+    left = [np.std((predicted(silverbox_gap.model, which, record, rate) - record.position)[500:-100])
+            / np.std(record.position) for which in ("baseline", "updated")]
+    assert left[1] < 0.01 < 0.1 < left[0]
+    files = write_axis_gap(tmp_path, silverbox_gap, path.name, {}, axis_gap_reports)
+    assert set(files) == {"gap.json", "gap.html", "gap.pdf", "axis_model.json"}
+    assert json.loads((tmp_path / "gap.json").read_text())["effects"][0]["name"] == "cubic_stiffness"
+    (_, baseline, updated), = write_axis_predictions(tmp_path, [path], tmp_path / "p.h5")
+    assert updated < 0.1 * baseline
+
+
+@pytest.mark.slow
 def test_silverbox_named_model_simulates_the_other_half(silverbox, silverbox_gap):
     """Independent of the machine: from rest, u alone, Runge-Kutta in time, on a stretch that no fit has seen."""
     p = {name: q.value for name, q in silverbox_gap.parameters.items()}
@@ -161,29 +181,14 @@ def test_silverbox_named_model_simulates_the_other_half(silverbox, silverbox_gap
     assert left(simulated(0.0, 0.0, 0.0)) > 0.3
 
 
-def test_silverbox_files_and_what_the_model_predicts(data, silverbox_gap, tmp_path):
-    path = folder(data, "silverbox/Schroeder80mV.mat")
-    (record,), rate = signals_in("oscillator", [path], Reading({"u": "V1", "y": "V2"}, {}, range_s=(130.0, 140.0),
-                                                               sample_rate_Hz=SILVERBOX_RATE))
-    left = [np.std((predicted(silverbox_gap.model, which, record, rate) - record.position)[500:-100])
-            / np.std(record.position) for which in ("baseline", "updated")]
-    assert left[1] < 0.01 < 0.1 < left[0]
-    files = write_axis_gap(tmp_path, silverbox_gap, path.name, {}, axis_gap_reports)
-    assert set(files) == {"gap.json", "gap.html", "gap.pdf", "axis_model.json"}
-    assert json.loads((tmp_path / "gap.json").read_text())["effects"][0]["name"] == "cubic_stiffness"
-    (_, baseline, updated), = write_axis_predictions(tmp_path, [path], tmp_path / "p.h5")
-    assert updated < 0.1 * baseline
-
-
 @pytest.fixture(scope="module")
 def sm3(data):
     path = folder(data, "seismometer_sm3")
     adc = dict(zip(*(line.split(",") for line in (path / "calcontrol.cal").read_text().split()), strict=True))
     laser = float(adc["ch3cal"]) * MICROVOLT * float(adc["laserres"]) * 1e-3 * float(adc["lcalconst"])
-    return find_axis_gap_in("seismometer", path, {"drive": "FuncGen", "coil": "Current", "displacement": "Laser",
-                                                  "t": "Seconds"},
-                            scale={"drive": float(adc["ch1cal"]) * MICROVOLT, "coil": float(adc["ch2cal"]) * MICROVOLT,
-                                   "displacement": laser})
+    columns = {"drive": "FuncGen", "coil": "Current", "displacement": "Laser", "t": "Seconds"}
+    scale = {"drive": float(adc["ch1cal"]) * MICROVOLT, "coil": float(adc["ch2cal"]) * MICROVOLT, "displacement": laser}
+    return plain(find_axis_gap_in("seismometer", path, columns, scale=scale))
 
 
 def test_sm3_laser_is_late_by_a_pure_delay(sm3):
@@ -208,7 +213,7 @@ def test_sm3_says_what_else_is_wrong(sm3):
 
 @pytest.fixture(scope="module")
 def mirror(data):
-    return find_axis_gap_in("levels", folder(data, "fine_steering_mirror"), sample_rate_Hz=6400.0)
+    return plain(find_axis_gap_in("levels", folder(data, "fine_steering_mirror"), sample_rate_Hz=6400.0))
 
 
 def test_mirror_first_mode_falls(mirror):
@@ -227,9 +232,3 @@ def test_mirror_softens_and_more_is_missing(mirror):
                if "stiffness_lost" in e.parameters)
     assert lost == pytest.approx(0.0192, rel=0.03)
     assert mirror.stages[-1].nrmse < 0.1 * mirror.stages[0].nrmse
-
-
-def test_all_are_plain_json(emps, silverbox_gap, sm3, mirror):
-    for gap in (emps, silverbox_gap, sm3, mirror):
-        text = json.loads(json.dumps(gap.to_json(), allow_nan=False))
-        assert text["format"] == "avis-gap-axis" and text["gap"] and gap.pictures
