@@ -52,12 +52,18 @@ def odds_against(one: Mapping[Any, float], other: Mapping[Any, float], beside: f
     return float(stats.norm.sf(ahead) / stats.norm.cdf(ahead))
 
 
+def larger_odds(one: Mapping[Any, float], other: Mapping[Any, float], beside: float) -> float:
+    """Odds of another model against one: by the sum of all, or by how evenly that is spread (`odds_against`), whichever
+    is larger."""
+    ahead = sum(one.values()) - sum(other.values()) + beside
+    return max(math.exp(-min(max(ahead, -50.0), 50.0)), odds_against(one, other, beside))
+
+
 def odds_against_fit(one: Fitted, other: Fitted) -> float:
-    """Of another fit against one: by evidence, or by how evenly that is spread, whichever is larger."""
-    ahead = one.log_evidence - other.log_evidence
-    beside = ahead - sum(one.log_likelihoods.values()) + sum(other.log_likelihoods.values())
-    return max(math.exp(-min(max(ahead, -50.0), 50.0)),
-               odds_against(one.log_likelihoods, other.log_likelihoods, beside))
+    """Of another fit against one (`larger_odds`)."""
+    mine, theirs = one.log_likelihoods, other.log_likelihoods
+    beside = one.log_evidence - other.log_evidence - sum(mine.values()) + sum(theirs.values())
+    return larger_odds(mine, theirs, beside)
 
 
 def probability_of(step: Step, settings: GapSettings) -> tuple[float, tuple[str, ...]]:

@@ -213,8 +213,8 @@ def _pruned(steps: list[Step], kept: int, data: Data, settings: GapSettings) -> 
 
 
 def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
-    """The choice of a step, beside what was found after it. Rivals that were further behind than all that was found
-    after it gained stay out: that much may have been theirs."""
+    """The choice of a step, beside what was found after it. A rival that was behind by more than all later effects
+    gained is not fitted again: it could not catch up."""
     rest = without_effect(best, step.label, data, settings)
     if rest is None:
         return step

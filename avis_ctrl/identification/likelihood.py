@@ -98,9 +98,9 @@ class Fitted:
         return self.weights.flatten(self.white.J)
 
     @property
-    def rows(self) -> dict[Group, np.ndarray]:
+    def rows(self) -> Mapping[Group, np.ndarray]:
         """Entries of `e` by level and band."""
-        return dict(self.weights.rows)
+        return self.weights.rows
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -132,8 +132,9 @@ class Fitted:
         return found
 
     def whole_covariance(self) -> np.ndarray:
-        """(n, n) of all parameters in their units: by the model, times what octaves or levels differ by beyond it, in
-        the mean over all directions, for there are fewer octaves and levels than directions."""
+        """(n, n) of all parameters in their units: that of the model times one factor, by how much more octaves or
+        levels differ than it expects. The factor is a mean over all directions, of which there are more than octaves.
+        """
         ratios = [float(np.mean(np.diag(np.linalg.solve(self.covariance, one)))) for one in self._by_clusters]
         slopes = self.priors.slopes(self.z)
         return np.asarray(max(1.0, *ratios) * self.covariance * slopes * slopes[:, None])

@@ -234,4 +234,3 @@ def _proportional(pid: int) -> int:
             raise
         return 0
     return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
-

@@ -5,8 +5,7 @@
 The responses are best linear approximations at each level; their variances hold noise and the scatter of distortion
 (`measurement.frequency_response.best_linear`). A spring that softens changes the stiffness alone. Hysteresis of
 Rayleigh's kind (Lord Rayleigh, Phil. Mag. 23 (1887) 225) takes stiffness in proportion to the amplitude, and adds a
-loss
-of 4/(3 pi) of what it takes, whatever the frequency. Friction has less damping at a higher level.
+loss of 4/(3 pi) of what it takes, whatever the frequency. Friction has less damping at a higher level.
 """
 
 from __future__ import annotations

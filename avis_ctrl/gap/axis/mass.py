@@ -127,8 +127,7 @@ def _modal_start(lines: Lines, steps: int = 8) -> tuple[np.ndarray, float]:
 
 def require_oriented(fitted, records: Sequence[Signals], names: tuple[str, str], settings: AxisSettings) -> None:
     """Refuse exchanged columns and a flipped sign: a mass is positive. Where the model fits with the input's sign
-    turned,
-    or with input and output exchanged, and not as the columns are, the columns are wrong and not the model.
+    turned, or with input and output exchanged, and not as the columns are, the columns are wrong and not the model.
 
     Raises
     ------

@@ -17,7 +17,7 @@ import numpy as np
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.axis.model import AxisModel, Effect, effect_priors
 from avis_ctrl.gap.axis.settings import AxisSettings
-from avis_ctrl.gap.probability import odds_against
+from avis_ctrl.gap.probability import larger_odds
 from avis_ctrl.gap.score import reduction
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, unseen
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened
@@ -255,8 +255,7 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
 
 def alike(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
     """Whether two models predict the same within the data: were one of them true, the other would be behind by less
-    than
-    that in log-likelihood [nats] on average."""
+    than `alike` in log-likelihood [nats] on average."""
     left = one.white.e - other.white.e
     return bool(0.5 * left @ left < settings.alike)
 
@@ -267,9 +266,7 @@ def odds_against_fit(one: Fitted, other: Fitted, settings: AxisSettings) -> floa
     noise."""
     mine, theirs = cells(one, False, settings), cells(other, False, settings)
     beside = one.log_evidence - other.log_evidence - sum(mine.values()) + sum(theirs.values())
-    mine, theirs = mine | cells(one, True, settings), theirs | cells(other, True, settings)
-    ahead = sum(mine.values()) - sum(theirs.values()) + beside
-    return max(math.exp(-min(max(ahead, -50.0), 50.0)), odds_against(mine, theirs, beside))
+    return larger_odds(mine | cells(one, True, settings), theirs | cells(other, True, settings), beside)
 
 
 def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int, int, bool], float]:

@@ -40,6 +40,8 @@ class AxisSettings(GapSettings):
     widened_p_value : p-value of the difference between a half of the data and the whole below which standard deviations
         are widened to cover it [1]: the usual level.
     frequencies : of a stepped sine that a search needs.
+    table : values of position, and of speed, in the table of forces that a simulation interpolates: an odd number, with
+        rest in the middle, 0.5 % of the reach apart.
     least_angle : travel from which a position may be an angle whose sine bends [rad].
     """
 
@@ -64,6 +66,7 @@ class AxisSettings(GapSettings):
     apart: float = 2.0
     widened_p_value: float = 0.05
     frequencies: int = 8
+    table: int = 801
     least_angle: float = 1.0
 
 

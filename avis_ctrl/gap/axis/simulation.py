@@ -1,6 +1,5 @@
 """What an identified axis does in another record: the motion of an oscillator by its input alone, integrated in time;
-the
-force of a drive by its motion."""
+the force of a drive by its motion."""
 
 from __future__ import annotations
 
@@ -16,8 +15,6 @@ from avis_ctrl.gap.axis.mass_effects import Scale, drive_effects, oscillator_eff
 from avis_ctrl.gap.axis.model import Effect
 from avis_ctrl.gap.axis.records import Lines, Motion, Signals
 from avis_ctrl.gap.axis.settings import SETTINGS
-
-GRID = 801
 
 
 def predicted(model: Mapping[str, Any], which: str, record: Signals, rate: float) -> np.ndarray:
@@ -83,7 +80,7 @@ def _motion(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarra
             u = _filtered(u, lambda s, f=one.path, p=p: f(s, p), rate)
     fine = signal.resample_poly(np.r_[u, u[-1], u[-1]], 2 * over, 1, window=("kaiser", 8.0), padtype="line")
     reach, speed = 4 * scale.reach, 4 * max(scale.speed, 1e-300)
-    q, v = np.meshgrid(np.linspace(-reach, reach, GRID), np.linspace(-speed, speed, GRID), indexing="ij")
+    q, v = np.meshgrid(*(np.linspace(-end, end, SETTINGS.table) for end in (reach, speed)), indexing="ij")
     flat = Motion(q.ravel(), v.ravel(), 0 * q.ravel(), 0.0, 1.0, 1.0)
     table, slip, sprung = np.zeros(q.size), np.array([0.0, 1.0]), np.zeros(3)
     for one, p in effects:
