@@ -15,7 +15,7 @@ in them there, which the score test and the starting values use; the others shap
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -131,6 +131,18 @@ class Added(NamedTuple):
 def differs_from_zero(values: Values, std: Values, names: Iterable[str]) -> bool:
     """Whether any of these parameters is more than three of its standard deviations from zero."""
     return any(abs(values[name]) > 3 * std[name] for name in names)
+
+
+def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> Iterator[EffectParameter]:
+    """Of mounts, contacts or drives that differ from their mean; words with {} for the name."""
+    return (EffectParameter(f"uneven_{one}", "1", words.format(one), 0.0, -most, most, 0.1, False, (0.0,), True)
+            for one in names)
+
+
+def shares(values: Values) -> np.ndarray:
+    """(m,) of each mount, contact or drive over their mean, from the values uneven_ .. of all but the last."""
+    given = [value for name, value in values.items() if name.startswith("uneven_")]
+    return 1 + np.array([*given, -sum(given)])
 
 
 class Effect(ABC):

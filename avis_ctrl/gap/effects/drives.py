@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, Values, register
+from avis_ctrl.gap.effects.base import (
+    Effect,
+    EffectParameter,
+    Reported,
+    Table,
+    Values,
+    register,
+    shares,
+    uneven,
+)
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
 
@@ -78,20 +87,23 @@ class LoopDelay(Effect):
 
 @register
 class ActuatorSaturation(Effect):
-    """Volts clipped at a limit below the rig file's."""
+    """Volts clipped at a limit below the rig file's, one for all drives or each at its own about their mean."""
 
     name = "actuator_saturation"
     title = "the drives clip below their nominal limit"
     looks_like = "less response than expected in records at high level only, and harmonics of the input"
-    at = ("actuators",)
+    at = ("actuators", "actuators/each")
     nonlinear = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         peaks = [float(np.max(np.abs(one.volts))) for one in model.motion.values()] or [model.rig.drive_limit_V]
         peak = min(max(peaks), model.rig.drive_limit_V) or model.rig.drive_limit_V
         grid = tuple(peak * share for share in (0.9, 0.7, 0.5, 0.35, 0.2))
-        return (EffectParameter("limit_V", "V", "voltage at which the drives clip", model.rig.drive_limit_V,
-                                peak / 50, peak, peak, False, grid),)
+        limit = EffectParameter("limit_V", "V", "voltage at which the drives clip", model.rig.drive_limit_V,
+                                peak / 50, peak, peak, False, grid)
+        own = uneven(model.actuators[:-1], "limit of drive {} over the mean, less one") if "/" in place else ()
+        return (limit, *own)
 
     def volts(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
-        return np.clip(record.volts, -values["limit_V"], values["limit_V"])
+        limits = values["limit_V"] * shares(values)
+        return np.clip(record.volts, -limits, limits)

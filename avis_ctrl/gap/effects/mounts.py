@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-
 import numpy as np
 from numba import njit
 
@@ -17,6 +15,8 @@ from avis_ctrl.gap.effects.base import (
     Values,
     differs_from_zero,
     register,
+    shares,
+    uneven,
 )
 from avis_ctrl.gap.operators import Operators, mount_geometry
 from avis_ctrl.gap.record_motion import RecordMotion
@@ -34,12 +34,6 @@ def has_mounts(model: Table) -> bool:
 def vertical(rig: Rig) -> np.ndarray:
     """(n_g,) which mount rows are vertical."""
     return mount_geometry(rig).along("z")
-
-
-def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> Iterator[EffectParameter]:
-    """Of mounts or contacts that differ from their mean; words with {} for the name."""
-    return (EffectParameter(f"uneven_{one}", "1", words.format(one), 0.0, -most, most, 0.1, False, (0.0,), True)
-            for one in names)
 
 
 class OfMounts(Effect):
@@ -173,12 +167,6 @@ def _of_mean(values: np.ndarray) -> float:
 def surge_omega(values: Values) -> np.ndarray:
     """(mounts,) rad/s of the resonance inside each."""
     return 2 * np.pi * values["frequency_Hz"] * shares(values)
-
-
-def shares(values: Values) -> np.ndarray:
-    """(m,) of each mount or contact over their mean, from the values uneven_ .. of all but the last."""
-    uneven = [value for name, value in values.items() if name.startswith("uneven_")]
-    return 1 + np.array([*uneven, -sum(uneven)])
 
 
 @register
