@@ -14,13 +14,14 @@ import scipy.fft
 class MotionSettings:
     """Of spectra of a record's motion.
 
-    most_kept : spectra kept for each record; those that have not been used for longest go first.
+    kept_bytes : of the spectra kept for each record; those that have not been used for longest go first. Enough for a
+        step of a fit with several effects; ten records of it are a fifth of the memory that a search may take.
     node_ratio : ratio of the values between which spectra are interpolated [1]. Of a contact's friction over its
         slip, cubic interpolation is then exact to a part in ten thousand, and its derivative to a part in five
         hundred.
     """
 
-    most_kept: int = 100
+    kept_bytes: int = 32_000_000
     node_ratio: float = 1.2
 
 
@@ -87,7 +88,7 @@ class RecordMotion:
         if not len(own):
             return np.zeros((len(omega), samples.shape[1]), complex)
         lines = np.rint(omega * len(own) / (2 * np.pi * self.sample_rate_Hz)).astype(int)
-        return scipy.fft.rfft(own - own.mean(0), axis=0)[lines] / np.sqrt(len(own))
+        return scipy.fft.rfft(own, axis=0)[lines] / np.sqrt(len(own))
 
     def kept(self, key: str, omega: np.ndarray, samples: Callable[[], np.ndarray]) -> np.ndarray:
         """`spectrum` of samples that never change, under a key: computed once for each set of lines."""
@@ -95,8 +96,10 @@ class RecordMotion:
         found = self._spectra.pop(where, None)
         if found is None:
             found = self.spectrum(samples(), omega)
-            while len(self._spectra) >= SETTINGS.most_kept:
-                self._spectra.pop(next(iter(self._spectra)), None)
+            room = SETTINGS.kept_bytes - found.nbytes
+            held = sum(one.nbytes for one in self._spectra.values())
+            while self._spectra and held > room:
+                held -= self._spectra.pop(next(iter(self._spectra))).nbytes
         self._spectra[where] = found
         return found
 

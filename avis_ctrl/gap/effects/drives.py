@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.gap.effects.base import (
+    Added,
     Effect,
     EffectParameter,
     Reported,
@@ -107,3 +108,12 @@ class ActuatorSaturation(Effect):
     def volts(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         limits = values["limit_V"] * shares(values)
         return np.clip(record.volts, -limits, limits)
+
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
+        """As `volts`, drive by drive: most keep their limit where that of one is changed."""
+        limits = np.broadcast_to(values["limit_V"] * shares(values), record.volts.shape[1])
+
+        def clipped(k: int, limit: float) -> np.ndarray:
+            return record.kept(f"{self.name} {k} {limit}", omega, lambda: np.clip(record.volts[:, [k]], -limit, limit))
+        volts = np.hstack([clipped(k, float(limit)) for k, limit in enumerate(limits)])
+        return Added(volts=volts - record.kept("volts", omega, lambda: record.volts))
