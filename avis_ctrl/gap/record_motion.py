@@ -28,6 +28,25 @@ class MotionSettings:
 SETTINGS = MotionSettings()
 
 
+class Kept:
+    """Arrays by key, up to so many bytes; those that have not been used for longest go first."""
+
+    def __init__(self, most_bytes: int):
+        self.most_bytes, self.bytes = most_bytes, 0
+        self.arrays: dict[tuple, np.ndarray] = {}
+
+    def of(self, key: tuple, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """The array of a key, made where it is not kept."""
+        found = self.arrays.pop(key, None)
+        if found is None:
+            found = make()
+            self.bytes += found.nbytes
+            while self.arrays and self.bytes > self.most_bytes:
+                self.bytes -= self.arrays.pop(next(iter(self.arrays))).nbytes
+        self.arrays[key] = found
+        return found
+
+
 @dataclass(frozen=True, eq=False)
 class RecordMotion:
     """A record, or the part of one that a block holds.
@@ -65,7 +84,7 @@ class RecordMotion:
     actuators: tuple[str, ...] = ()
     sensors: tuple[str, ...] = ()
     y: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    _spectra: dict[tuple, np.ndarray] = field(default_factory=dict, repr=False)
+    _spectra: Kept = field(default_factory=lambda: Kept(SETTINGS.kept_bytes), repr=False)
 
     @cached_property
     def time_s(self) -> np.ndarray:
@@ -93,15 +112,7 @@ class RecordMotion:
     def kept(self, key: str, omega: np.ndarray, samples: Callable[[], np.ndarray]) -> np.ndarray:
         """`spectrum` of samples that never change, under a key: computed once for each set of lines."""
         where = (key, len(omega), float(omega[0]), float(omega[-1]), float(np.sum(omega)))
-        found = self._spectra.pop(where, None)
-        if found is None:
-            found = self.spectrum(samples(), omega)
-            room = SETTINGS.kept_bytes - found.nbytes
-            held = sum(one.nbytes for one in self._spectra.values())
-            while self._spectra and held > room:
-                held -= self._spectra.pop(next(iter(self._spectra))).nbytes
-        self._spectra[where] = found
-        return found
+        return self._spectra.of(where, lambda: self.spectrum(samples(), omega))
 
     def interpolated(self, key: str, value: float, omega: np.ndarray, samples: Callable[[float], np.ndarray]
                      ) -> np.ndarray:
