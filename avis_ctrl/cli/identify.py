@@ -117,7 +117,7 @@ def predict(
     from avis_ctrl.study.files import require_other
     from avis_ctrl.study.gap_axis import is_axis_gap, write_axis_predictions
     from avis_ctrl.study.gap_names import GAP_FILE
-    from avis_ctrl.study.prediction_errors import compared, prediction_errors
+    from avis_ctrl.study.prediction_file import compared, prediction_errors
     from avis_ctrl.study.rig_channels import in_words_of
 
     require_other(out, campaign)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.identifiability_words import (
+from avis_ctrl.identification.identifiability_text import (
     combination_text,
     group_sentence,
     number,

@@ -19,8 +19,8 @@ from avis_ctrl.identification.modes import MeasuredModes, ModeRow, measured_mode
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.overlays import ResponseOverlay, measured_response, overlay
 from avis_ctrl.identification.portion import Portion
-from avis_ctrl.identification.prediction import predict
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
+from avis_ctrl.identification.predictor import predict
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.second_order import terms, without
 from avis_ctrl.identification.spectra import record_block, response_block

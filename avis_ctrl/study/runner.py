@@ -25,11 +25,11 @@ from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
 from avis_ctrl.study.design_file import Design, read_study
+from avis_ctrl.study.design_result import ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.limits import best_found
-from avis_ctrl.study.model import ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.requirements import judge, judge_loop
-from avis_ctrl.study.sampling import random_perturbations
 from avis_ctrl.study.simulation import simulate_study, six_dof_check
 from avis_ctrl.study.skyhooks import classical_skyhook, tuned_skyhook
 from avis_ctrl.study.workers import Workers

@@ -21,7 +21,7 @@ from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.result import Gap, NamedEffect, Reported, Stage, Where
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.identification.prediction import Predictor
+from avis_ctrl.identification.predictor import Predictor
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.formats.hdf5 import write_campaign

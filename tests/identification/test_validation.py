@@ -30,7 +30,7 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import open_loop
 from avis_ctrl.simulation.loop import simulate
-from avis_ctrl.study.campaign_plan import plan_from_table
+from avis_ctrl.study.plan_file import plan_from_table
 
 BAND = (0.5, 30.0)
 

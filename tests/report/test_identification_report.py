@@ -19,15 +19,15 @@ from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series
 from avis_ctrl.report import identification_html, identification_pdf, words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style
 from avis_ctrl.report.identification.content import document
-from avis_ctrl.report.identification.pictures import figure_of
+from avis_ctrl.report.identification.gate_figures import figure_of
 from avis_ctrl.report.identification.responses import strongest
 from avis_ctrl.report.matplotlib_backend import svg
 from avis_ctrl.report.pieces import Fold, Mark, Paragraph, Section, Table
 from avis_ctrl.report.plotly_backend import graph
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation import rehearse
-from avis_ctrl.study.campaign_plan import plan_from_table
 from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
+from avis_ctrl.study.plan_file import plan_from_table
 
 FREE = ("mass", "isolator*.k_x", "isolator*.k_z", "isolator1.c_z")
 PLAN = {"title": "small", "duration_s": 8.0, "settle_s": 2.0, "band_Hz": [1.0, 20.0],

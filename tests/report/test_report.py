@@ -16,7 +16,7 @@ from avis_ctrl.report import render_html, render_pdf
 from avis_ctrl.report.content import document
 from avis_ctrl.report.figures import Figure
 from avis_ctrl.report.pieces import Mark, Table
-from avis_ctrl.study.model import Bound, DesignResult
+from avis_ctrl.study.design_result import Bound, DesignResult
 
 HOSTILE = '</script><script>alert(1)</script> <b>x</b> #panic("y") $ *z* {{ 7*7 }} \\ & "'
 

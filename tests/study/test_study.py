@@ -18,11 +18,11 @@ from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot, mu_upper_slicot
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.controllers import passive
 from avis_ctrl.study.design_file import Design, design_from_table, read_study
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 from avis_ctrl.study.output import write_study
 from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.runner import provenance, run_design
-from avis_ctrl.study.sampling import random_perturbations
 from avis_ctrl.study.simulation import nominal_loop, with_delta
 from avis_ctrl.study.skyhooks import classical_skyhook
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexScalar, RealScalar

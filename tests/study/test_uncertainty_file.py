@@ -21,8 +21,8 @@ from avis_ctrl.study.design_file import design_from_table, read_study
 from avis_ctrl.study.identification_design import identification_design
 from avis_ctrl.study.identified_uncertainty import RESPONSE, in_design
 from avis_ctrl.study.plant import build_plant, channels_gain
+from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.runner import provenance
-from avis_ctrl.study.sampling import random_perturbations
 from avis_ctrl.study.simulation import nominal_loop, with_delta
 from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty
 from avis_ctrl.study.uncertainty_writer import uncertainty_content, uncertainty_json, write_uncertainty

@@ -9,7 +9,7 @@ import numpy as np
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz, level
 from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table
-from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
+from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
 
 Pick = Callable[[ControllerResult], Bound]
 

@@ -18,7 +18,7 @@ from avis_ctrl.report.figures import (
     numbered,
 )
 from avis_ctrl.report.pieces import Piece, Section, Table, table
-from avis_ctrl.study.model import ControllerResult, DesignResult
+from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
 HZ = np.geomspace(0.01, 500.0, 500)
 MOST_POLES = 60

@@ -7,10 +7,10 @@ import numpy as np
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz
 from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, Table, table
-from avis_ctrl.simulation.campaign import PlantCheck, SimulationCheck
+from avis_ctrl.simulation.design_check import PlantCheck, SimulationCheck
 from avis_ctrl.simulation.spectrum_check import SpectrumAgreement
 from avis_ctrl.study.companions import Companions
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 
 
 def simulation(result: DesignResult) -> Section:

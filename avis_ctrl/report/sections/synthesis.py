@@ -7,7 +7,7 @@ import numpy as np
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, level, numbered
 from avis_ctrl.report.pieces import Paragraph, Section, table
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 
 
 def synthesis(result: DesignResult) -> Section:

@@ -7,7 +7,7 @@ import numpy as np
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, controller_style, decibels, hertz
 from avis_ctrl.report.pieces import Section
-from avis_ctrl.study.model import ControllerResult, DesignResult
+from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
 GAIN_DB = (-60.0, 40.0)
 

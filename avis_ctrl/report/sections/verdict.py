@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Section, table
-from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
+from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
 from avis_ctrl.study.verdict import all_axes, first_sentence
 
 
