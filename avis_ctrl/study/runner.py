@@ -24,7 +24,7 @@ from avis_ctrl.robust.musyn import MuSynthesis
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
-from avis_ctrl.study.design_file import Design, read_study
+from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.limits import best_found
 from avis_ctrl.study.plant import DesignPlant, build_plant
@@ -36,11 +36,6 @@ from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
 SAMPLES = 60
-
-
-def run_file(path: str | Path, progress: Progress = lambda text: None) -> DesignResult:
-    """Run a design file; the rig it names is shipped, or a file beside it."""
-    return run_design(*read_study(path), progress, source=Path(path))
 
 
 def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,

@@ -198,20 +198,3 @@ def residual_statistics(e: np.ndarray, y: np.ndarray, honest: np.ndarray, plain:
     ratio = float(np.max(honest / np.maximum(plain, np.finfo(float).tiny)))
     share = float(np.linalg.norm(e) / max(float(np.linalg.norm(y)), np.finfo(float).tiny))
     return ResidualStatistics(float(np.sqrt(np.mean(flat))), share, lag_one, ratio, lags)
-
-
-def block_bootstrap(estimate: Callable[[np.ndarray], np.ndarray], samples: int, block: int, draws: int,
-                    rng: np.random.Generator) -> np.ndarray:
-    """(p,) standard deviations of estimate(indices) over moving blocks of rows (Kuensch, Ann. Statist. 17 (1989) 1217).
-
-    It assumes nothing of the scores but that blocks are long against their correlation.
-    """
-    if not 1 <= block <= samples // 4 or draws < 2:
-        raise InputError(f"expected blocks of 1 to {samples // 4} samples and at least two draws", field="block, draws",
-                         value=(block, draws))
-    count = -(-samples // block)
-    found = []
-    for _ in range(draws):
-        starts = rng.integers(0, samples - block + 1, count)
-        found.append(estimate((starts[:, None] + np.arange(block)).ravel()[:samples]))
-    return np.std(found, axis=0, ddof=1)
