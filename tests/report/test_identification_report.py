@@ -261,14 +261,7 @@ def test_little_was_found(found):
 def test_rounding_to_the_standard_deviation(value, sigma, negative):
     """What is shown lies within a twentieth of sigma of the value, and sigma within 5 % of itself."""
     signed = -value if negative else value
-    shown = [float(text.replace("−", "-")) for text in words.with_deviation(signed, sigma)]
+    shown = [float(text.replace("−", "-")) for text in words.with_std(signed, sigma)]
     assert abs(shown[0] - signed) <= 0.06 * sigma + 1e-15 * value
     if sigma < value:
         assert shown[1] == pytest.approx(sigma, rel=0.06)
-    if 1e-9 < sigma < 10:
-        text = words.in_brackets(signed, sigma)
-        if "(" in text:
-            number, _, rest = text.partition("(")
-            places = len(number.partition(".")[2])
-            assert abs(float(number.replace("−", "-")) - signed) <= 0.06 * sigma + 1e-15 * value
-            assert float(rest[:-1]) * 10.0 ** -places == pytest.approx(sigma, rel=0.06)

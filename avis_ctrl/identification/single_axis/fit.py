@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from avis_ctrl import uncertain_value
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
 
@@ -99,7 +100,7 @@ class SingleAxisFit:
 
     def lines(self) -> list[str]:
         """The result as text: one line for each parameter, then the residual."""
-        found = [f"{name} = {value:.6g} +- {sigma:.2g} {unit}".rstrip() for name, value, sigma, unit
+        found = [f"{name} = {uncertain_value.text(value, sigma, unit)}" for name, value, sigma, unit
                  in zip(self.names, self.values, self.standard_deviation, self.information.units, strict=True)]
         found.append(f"rank {self.information.rank} of {len(self.names)}; residual "
                      f"{100 * self.residual.share:.2f} % of the measured; chi2/dof {self.chi2_per_dof:.3g} against "
