@@ -111,7 +111,7 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
         stops = tuple(f"gate {one.gate}: {one.sentence}" for one in findings if one.severity == "stop")
         gap = replace(gap, seconds=seconds, sentences=(*gap.sentences, *known, *stops))
         design, note = _design(gap, options, progress)
-    return GapFinding(gap, measured, findings, _provenance(measured, rig, options, seconds), design, note)
+    return GapFinding(gap, measured, findings, gap_provenance(measured, rig, options, seconds), design, note)
 
 
 def _require_records(measured: Campaign, rig: Rig) -> None:
@@ -156,7 +156,7 @@ def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.
     return [(both[0][record.header.name], both[1][record.header.name]) for record in campaign.records]
 
 
-def _provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float) -> dict[str, Any]:
+def gap_provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float) -> dict[str, Any]:
     data, own = digest(measured), options.own_effects
     further = {} if own is None else {"own_effects": f"{own.path.name}: {', '.join(own.names)}",
                                       "own_effects_sha256": own.sha256}

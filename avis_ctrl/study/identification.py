@@ -154,7 +154,7 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
     identified = found.fit.model.rig
     seconds = time.monotonic() - began
     return Identification(rig, identified, options, measured, findings, split, found, report, advice, validation,
-                          kalman, note, _provenance(measured, rig, options, seconds), seconds)
+                          kalman, note, identification_provenance(measured, rig, options, seconds), seconds)
 
 
 def _check(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> None:
@@ -277,7 +277,7 @@ def _kalman(fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str]
         return None, f"the extended Kalman filter failed: {error}"
 
 
-def _provenance(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions, seconds: float
+def identification_provenance(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions, seconds: float
                 ) -> dict[str, Any]:
     if isinstance(measured, Campaign):
         data, source = digest(measured), measured.source

@@ -102,7 +102,7 @@ def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesi
                       if text)
     requirements = (*judge_loop(compared.loop.check), *judge(design, controllers))
     return DesignResult(design, rig, plant, controllers, synthesis.history, requirements, reduction, six_dof,
-                        compared.loop, _provenance(design, source, rig, seconds), seconds, notes, compared.failed)
+                        compared.loop, design_provenance(design, source, rig, seconds), seconds, notes, compared.failed)
 
 
 ORDER = ("passive", "skyhook_classical", "skyhook", "hinf", "mu")
@@ -180,6 +180,6 @@ def skyhook_limit(design: Design, mu: ControllerResult) -> float:
     return max(known, default=10 ** (design.transmissibility.peak_dB / 20))
 
 
-def _provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:
+def design_provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:
     return provenance(rig, design.model_dump_json(), design.simulation.seed, seconds,
                       ("numpy", "scipy", "cvxpy", "clarabel", "numba"), design_file=source.name if source else None)

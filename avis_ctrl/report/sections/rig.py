@@ -180,4 +180,4 @@ def _compared(result: DesignResult, n: int) -> Figure:
                   title="difference, relative to the largest gain")
     return Figure("reduction", "Transmissibility without control, floor to payload along each kept axis: six degrees "
                   "of freedom (coloured) and the small model on top of it (black, dotted), with the contribution of "
-                  "the floor's other axes. Below, their difference.", (panel, lower))
+                  "the floor's other axes. Beside it, their difference.", (panel, lower), 2)

@@ -44,4 +44,4 @@ def synthesis(result: DesignResult) -> Section:
               "functions, compared with the best scalings at each frequency. The best controller of all iterations is "
               "used.",
               ("step", "kind", "gamma", "mu upper", "order", "order of D", "fit", "time"), rows, "rlrrrrrr"),
-        Figure("dk_history", caption, (values, orders))))
+        Figure("dk_history", caption, (values, orders), 2)))
