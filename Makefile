@@ -32,12 +32,12 @@ demo: $(BIN)/.installed
 
 # Minutes each; the campaigns of hours beside them (gates, random_plants, sound_campaigns, mutations, own_tables, blind)
 # are started by hand.
-BENCHMARKS = ekf_vs_filterpy hinfsyn interval_coverage maximum_likelihood mu_upper musyn_vs_dkpy sequential_fit
+BENCHMARKS = ekf_vs_filterpy hinfsyn interval_coverage maximum_likelihood mu_upper musyn_vs_dkpy sequential
 
 # The peers that we measure ourselves against are no dependency of the product.
 bench: $(BIN)/.installed
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[benchmarks]"
-	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py || exit 1; done
+	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name || exit 1; done
 
 clean:
 	rm -rf .venv build *.egg-info

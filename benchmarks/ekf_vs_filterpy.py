@@ -1,7 +1,7 @@
 """The extended Kalman filter beside filterpy's on the same model, data and settings: time per sample, and estimates.
 
-    python benchmarks/ekf_vs_filterpy.py            # filterpy on 2000 samples, ours on these and on 10^6
-    python benchmarks/ekf_vs_filterpy.py 20000 100000
+    python -m benchmarks.ekf_vs_filterpy            # filterpy on 2000 samples, ours on these and on 10^6
+    python -m benchmarks.ekf_vs_filterpy 20000 100000
 
 The problem is that of Rademakers' chapter 3: 12 states and 26 parameters, 6 velocities, records of 100 s at 1 kHz.
 filterpy's ExtendedKalmanFilter leaves the prediction to its user. Here the user computes it as ours does: the Taylor
@@ -21,12 +21,12 @@ from filterpy.kalman import ExtendedKalmanFilter
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.identification.ekf import ParameterFilter, identify_ekf, noise_root
-from avis_ctrl.identification.ekf_campaign import source_campaign
 from avis_ctrl.identification.ekf_model import LinearModel, linear_model, source_parameters
 from avis_ctrl.identification.ekf_settings import SOURCE_SETTINGS, measurement_variance
 from avis_ctrl.identification.prefilter import prefilter, sensor_inverse
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rig import Rig
+from benchmarks.rademakers_records import source_campaign
 
 PERIOD_s, SETS = 1e-3, 10
 

@@ -1,6 +1,6 @@
 """How often do the gates stop a sound campaign, and how often do they find a fault that is there?
 
-    python benchmarks/gates.py [--count N] [--first SEED] [--processes N] [--list]
+    python -m benchmarks.gates [--count N] [--first SEED] [--processes N] [--list]
 
 Campaigns of tables that are not as their rig file says: parameters 5 % off, damping 20 %, tolerances drawn, and in most
 of them one or two hidden effects, of the library or outside of it, at any strength. Four in five come from the

@@ -1,6 +1,6 @@
 """H-infinity synthesis beside SLICOT's SB10AD (what python-control's hinfsyn calls).
 
-    python benchmarks/hinfsyn.py [--limit SECONDS]
+    python -m benchmarks.hinfsyn [--limit SECONDS]
 
 For each plant: seconds, the gamma each claims, and the norm that its closed loop is measured to have by
 SLICOT's AB13DD (inf: unstable). A claim counts only where the norm confirms it.

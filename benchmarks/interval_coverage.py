@@ -1,6 +1,6 @@
 """Do the 95 % intervals of an identification hold the truth 95 % of the time, and are its errors as small as can be?
 
-    python benchmarks/interval_coverage.py [--campaigns N] [--processes N] [--duration S] [--records N]
+    python -m benchmarks.interval_coverage [--campaigns N] [--processes N] [--duration S] [--records N]
 
 Simulated campaigns of the AVIS (nonlinear table, ambient floor that is not measured, sensor noise, quantiser): each
 has its own true parameters (5 % about the rig file's, damping 20 %), records, floor and noise; the fit starts from the

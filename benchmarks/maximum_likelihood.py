@@ -3,7 +3,7 @@
 The peer is scipy.optimize.least_squares on the same whitened residual, with the Jacobian by differences, as one would
 write it without an analytic Jacobian. Both start from the same parameters, 5 % off, and must reach the same chi-square.
 
-    python benchmarks/maximum_likelihood.py [--peer]     the peer takes minutes
+    python -m benchmarks.maximum_likelihood [--peer]     the peer takes minutes
 """
 
 from __future__ import annotations

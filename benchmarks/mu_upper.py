@@ -1,6 +1,6 @@
 """Upper bound of mu: time and value against LMI bisection (cvxpy, Clarabel) and SLICOT's AB13MD.
 
-    python benchmarks/mu_upper.py
+    python -m benchmarks.mu_upper
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.robust.mu import mu_upper
-from avis_ctrl.robust.mu_oracle import mu_upper_by_bisection
 from avis_ctrl.robust.slycot_adapter import mu_upper_slicot
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
+from benchmarks.mu_by_bisection import mu_upper_by_bisection
 
 CASES = {
     "4 complex scalars": [ComplexScalar()] * 4,

@@ -1,6 +1,6 @@
 """musyn beside dkpy on the same generalized plant: CPU seconds and peak mu.
 
-    python benchmarks/musyn_vs_dkpy.py
+    python -m benchmarks.musyn_vs_dkpy
 
 Plant: Skogestad and Postlethwaite's distillation example, as dkpy ships it (its `example_skogestad2006_p325`). dkpy
 runs as its own example shows: SLICOT's H-infinity synthesis, mu by linear matrix inequalities at 61 frequencies,

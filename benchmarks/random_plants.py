@@ -1,6 +1,6 @@
 """Random problems for hinfsyn, mu, mu_peak and worst_case_gain, each answer recomputed by another route.
 
-    python benchmarks/random_plants.py --out FILE.jsonl [--count N] [--seed S] [--first I] [--jobs J] [--sb10ad K]
+    python -m benchmarks.random_plants --out FILE.jsonl [--count N] [--seed S] [--first I] [--jobs J] [--sb10ad K]
 
 Problem i of a seed is always the same one. Orders are 2 to 60; D11 and D22 are not zero, modes lie near the imaginary
 axis, signals and states are scaled by up to 1e8, parts are uncontrollable or unobservable, D12 or D21 loses rank,

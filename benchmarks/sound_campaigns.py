@@ -39,7 +39,7 @@ from avis_ctrl.simulation.campaign_data import ASSUMED_RANGE_V, RANGE_SHARE, ope
 from avis_ctrl.simulation.loop import SimulationRecord, simulate
 from avis_ctrl.simulation.rehearsal import perturbed_truth
 from avis_ctrl.simulation.sampled_loop import SampledLoop
-from avis_ctrl.study.campaign_plan import plan_from_table
+from avis_ctrl.study.plan_file import plan_from_table
 
 BAND_Hz, PERIOD_s, SETTLE_s = (0.5, 80.0), 10.0, 10.0
 # Words in what `avis identify` prints that a sound campaign gives no reason for.

@@ -14,7 +14,7 @@ from test_cli import avis
 from avis_ctrl.measurement.formats import write_campaign
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation import simulate_campaign
-from avis_ctrl.study.campaign_plan import plan_from_table
+from avis_ctrl.study.plan_file import plan_from_table
 
 PLAN = {"title": "short", "duration_s": 20.0, "multisine": {"period_s": 5.0},
         "record": [{"excitation": "noise", "level_percent": 40.0, "records": 2, "band_Hz": [0.5, 50.0]}]}

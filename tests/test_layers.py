@@ -11,14 +11,15 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "avis_ctrl"
-LEVEL = {"errors": -2, "files": -1, "lti": 0, "rigs": 1, "measurement": 1, "identification": 2, "uncertainty": 2,
-         "robust": 3, "classical": 3, "simulation": 4, "gap": 5, "study": 6, "report": 7, "cli": 8}
+LEVEL = {"errors": -2, "files": -1, "uncertain_value": -1, "lti": 0, "rigs": 1, "measurement": 1, "identification": 2,
+         "uncertainty": 2, "robust": 3, "classical": 3, "simulation": 4, "gap": 5, "study": 6, "report": 7, "cli": 8}
+PROJECT = ("avis_ctrl", "tests", "benchmarks", "designs")
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 
 def imports(path: Path) -> Iterator[tuple[str, bool]]:
     """(dotted name, whether it is imported when the module is) of each import."""
-    package = [PACKAGE.name, *path.relative_to(PACKAGE).parent.parts]
+    package = [*path.relative_to(PACKAGE.parent).parent.parts]
 
     def walk(node: ast.AST, at_once: bool) -> Iterator[tuple[str, bool]]:
         for child in ast.iter_child_nodes(node):
@@ -112,6 +113,28 @@ def test_a_circle_is_found_however_it_is_hidden(tmp_path, monkeypatch, back):
     (folder / "b.py").write_text(back)
     (folder / "c.py").write_text("from avis_ctrl.lti import a\n")
     assert import_circles() == [["avis_ctrl.lti.a", "avis_ctrl.lti.b"]]
+
+
+def private_imports(path: Path) -> list[str]:
+    """Names with a leading underscore that a file takes from a module of the project."""
+    return [name for name, _ in imports(path) if name.split(".")[0] in PROJECT
+            and any(part.startswith("_") and not part.startswith("__") for part in name.split("."))]
+
+
+@pytest.mark.parametrize("folder", PROJECT)
+def test_private_names_stay_in_their_module(folder):
+    """Tests included: what a test needs of a module is part of what the module offers."""
+    files = sorted((PACKAGE.parent / folder).rglob("*.py"))
+    assert files and {str(path): found for path in files if (found := private_imports(path))} == {}
+
+
+def test_a_private_import_is_found_even_inside_a_function(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path / "avis_ctrl")
+    path = tmp_path / "tests" / "test_a.py"
+    path.parent.mkdir()
+    path.write_text("from __future__ import annotations\nfrom os import _exit\nfrom avis_ctrl import __version__\n"
+                    "def f():\n    from avis_ctrl.lti.norms import _inner\n")
+    assert private_imports(path) == ["avis_ctrl.lti.norms._inner"]
 
 
 def users(library: str, at_once: bool = False) -> list[str]:

@@ -200,8 +200,8 @@ class Search:
         # Unstable loops have finite responses too: the return difference must not encircle the origin. A worst case
         # of each frequency on its own is no plant, and turns say nothing there.
         plants = self.channels.yu[:self.scenarios.plants]
-        turns = _encirclements(np.linalg.det(np.eye(len(self.axes)) - plants * K[:, None, :]))
-        sigma = _largest_singular_value(self.channels.closed(K))
+        turns = encirclements(np.linalg.det(np.eye(len(self.axes)) - plants * K[:, None, :]))
+        sigma = largest_singular_value(self.channels.closed(K))
         return Merit(float(np.max(sigma)), float(np.max(sigma[:, self.inside])), limit, turns)
 
     def starts(self) -> list[np.ndarray]:
@@ -302,7 +302,7 @@ def tune_skyhook(scenarios: Scenarios, axes: tuple[str, ...], search: TuningRang
     return best
 
 
-def _largest_singular_value(T: np.ndarray) -> np.ndarray:
+def largest_singular_value(T: np.ndarray) -> np.ndarray:
     """sigma_max of each matrix; in closed form for 2 x 2, where a decomposition of each would take most of the time."""
     if T.shape[-2:] != (2, 2):
         return np.linalg.norm(T, ord=2, axis=(-2, -1))
@@ -311,7 +311,7 @@ def _largest_singular_value(T: np.ndarray) -> np.ndarray:
     return np.sqrt((square + np.sqrt(np.maximum(square ** 2 - 4 * product ** 2, 0.0))) / 2)
 
 
-def _encirclements(return_difference: np.ndarray) -> float:
+def encirclements(return_difference: np.ndarray) -> float:
     """Largest number of half turns of det(I - P K) about the origin over the samples, from its phase."""
     phase = np.unwrap(np.angle(return_difference), axis=-1)
     return float(np.max(np.round(np.abs(phase[..., -1] - phase[..., 0]) / np.pi)))

@@ -117,7 +117,7 @@ def predict(
     from avis_ctrl.study.files import require_other
     from avis_ctrl.study.gap_axis import is_axis_gap, write_axis_predictions
     from avis_ctrl.study.gap_names import GAP_FILE
-    from avis_ctrl.study.prediction_errors import compared, prediction_errors
+    from avis_ctrl.study.prediction_file import compared, prediction_errors
     from avis_ctrl.study.rig_channels import in_words_of
 
     require_other(out, campaign)
@@ -180,6 +180,8 @@ def _prior(text: str) -> tuple[str, tuple[float, float]]:
 def _summary(console, found) -> None:
     from rich.table import Table
 
+    from avis_ctrl.uncertain_value import rounded, text
+
     information = found.information
     loaded = " with its load" if getattr(found.rig, "load", None) else ""
     start = {name: one.value for name, one in found.campaign_fit.first.model.all_parameters().items()}
@@ -188,16 +190,15 @@ def _summary(console, found) -> None:
                   title=f"{found.rig.name}{loaded}, identified")
     for name, value, sigma, unit in zip(information.names, information.values, information.standard_deviation,
                                         information.units, strict=True):
-        table.add_row(name, f"{start[name]:.6g}", f"{value:.6g}",
-                      f"{sigma:.2g}" if sigma < float("inf") else "only in combination", unit)
+        shown, std = rounded(value, sigma)
+        table.add_row(name, f"{start[name]:.6g}", shown, std if sigma < float("inf") else "only in combination", unit)
     console.print(table)
     verdict, *validation = found.validation.sentences
     console.print(f"{verdict[:1].upper()}{verdict[1:]}.")
     for sentence in (found.caution, *found.campaign_fit.notes, *validation, *found.identifiability.sentences):
         console.print(f"- {sentence}")
     for one in found.campaign_fit.tolerances[:5]:
-        console.print(f"- {one.parameter}: {one.value:.6g} +- {one.std:.2g} {one.unit}, moved by {one.moved:+.1f} "
-                      "tolerances")
+        console.print(f"- {one.parameter}: {text(one.value, one.std, one.unit)}, moved by {one.moved:+.1f} tolerances")
     if found.advice:
         console.print(f"- {found.advice[0]} (Other records that would help are in section 5 of the report.)")
 

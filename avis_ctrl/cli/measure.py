@@ -42,7 +42,7 @@ def excite(
     from avis_ctrl.measurement.excitation.files import write_signals
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.simulation.campaign_data import largest_level, open_loop
-    from avis_ctrl.study.campaign_plan import plan_from_table
+    from avis_ctrl.study.plan_file import plan_from_table
 
     console = Console(highlight=False)
     table = load_rig(rig)
@@ -96,8 +96,8 @@ def simulate_campaign(
     from avis_ctrl.measurement.formats.hdf5 import write_campaign
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.simulation import rehearse
-    from avis_ctrl.study.campaign_plan import default_plan, plan_toml, read_plan
     from avis_ctrl.study.files import require_other
+    from avis_ctrl.study.plan_file import default_plan, plan_toml, read_plan
 
     for written in (out, write_plan, truth):
         if written is not None:

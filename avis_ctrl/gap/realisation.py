@@ -18,7 +18,7 @@ from avis_ctrl.gap.effects.sensors import GRAVITY, suspensions
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.state_space import SETTINGS, ReducedTable, addition, chassis, has_addition
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.identification.sampling import hold
+from avis_ctrl.identification.sample_and_hold import hold
 from avis_ctrl.lti.connect import connect
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, append, gain

@@ -20,7 +20,7 @@ from avis_ctrl.gap.signals.noise_level import FloorLevel, NoiseLevels, noise_lev
 from avis_ctrl.gap.signals.record_residual import RecordResidual, record_residuals
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.identification.prediction import model_inputs
+from avis_ctrl.identification.predictor import model_inputs
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.rigs.rig import Rig
 

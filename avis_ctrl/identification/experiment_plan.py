@@ -19,7 +19,7 @@ from avis_ctrl.identification.experiments import (
     predicted_information,
 )
 from avis_ctrl.identification.identifiability import IdentifiabilityReport, identifiability_report
-from avis_ctrl.identification.identifiability_words import listed, number
+from avis_ctrl.identification.identifiability_text import listed, number
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.identification.structure import size_of, structural_null_space, structure_of

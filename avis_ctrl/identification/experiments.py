@@ -156,22 +156,6 @@ class Noise:
         return C
 
 
-def site_noise(model: ResponseModel) -> Noise:
-    """From the rig's file: ambient floor, each sensor's noise, converter steps."""
-    rig = model.rig
-    own = {one.name: one.noise_rms_V for one in rig.sensors()}
-    noise = np.array([own.get(name, np.nan) for name in model.sensors.names])
-    if model.sensors.unit != "V" or not np.any(noise > 0):
-        raise InputError("expected y in V and a rig file that states its sensors' noise, or the noise of a campaign",
-                         field="noise", value=rig.name)
-    noise[np.isnan(noise)] = np.nanmedian(noise)
-    rounding = rig.converter.noise_rms_V if rig.converter else 0.0
-    floor = rig.ambient.floor_velocity_rms_m_per_s if rig.ambient else 2e-6
-    assumed = "" if rig.ambient else "the rig's file has no [ambient]: a floor of 2e-6 m/s r.m.s. is assumed"
-    sensor = np.hypot(noise, rounding)
-    return Noise(float(sensor[0]) if np.ptp(sensor) == 0 else sensor, floor, assumed=assumed)
-
-
 def campaign_noise(blocks: Sequence[SpectralBlock]) -> Noise:
     """What a fit estimated, of the record that has most lines.
 

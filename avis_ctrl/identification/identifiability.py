@@ -1,8 +1,4 @@
-"""Which combinations of a rig's parameters the data determine, which they do not, in words.
-
-Three sources of information are read alike: the maximum likelihood fit holds its own, the extended Kalman filter's is
-what its covariance lost against the prior's, the sequential fit's is that of its tests taken jointly.
-"""
+"""Which combinations of a rig's parameters the data determine, which they do not, in words."""
 
 from __future__ import annotations
 
@@ -12,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.identifiability_words import (
+from avis_ctrl.identification.identifiability_text import (
     combination_text,
     group_sentence,
     number,
@@ -23,8 +19,7 @@ from avis_ctrl.identification.identifiability_words import (
 )
 from avis_ctrl.identification.information import UNDETERMINED, Combination, Information
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.sequential_problem import Problem
-from avis_ctrl.identification.structure import Group, Structure, size_of, structural_null_space, structure_of
+from avis_ctrl.identification.structure import Structure, size_of, structural_null_space, structure_of
 
 # A combination known to worse than this share of its value is called weak.
 WEAK = 0.05
@@ -231,67 +226,3 @@ def _prior_sentence(count: int, priors: Mapping[str, float]) -> str:
     named = f" on {', '.join(priors)}" if 0 < len(priors) <= 6 else ""
     return (f"{count} of the combinations are determined by the priors{named} alone: these data contain no information "
             "on them, and more data of the same kind would not, either.")
-
-
-def information_from_covariance(names: Sequence[str], P: np.ndarray, P0: np.ndarray, values: np.ndarray,
-                                units: Sequence[str] | None = None, share: float = 0.5) -> Information:
-    """What the data told a filter: inv(P) - inv(P0), for the directions whose variance fell.
-
-    Parameters
-    ----------
-    P, P0 : (n_p, n_p) covariance after and before the data, in the parameters' units. values : (n_p,) estimates.
-    share : a direction that kept this share of its prior variance holds no information. A filter's covariance
-        shrinks a little along such directions too, by linearising at changing parameters.
-
-    Raises
-    ------
-    InputError : matrices that are no covariances of these parameters.
-    """
-    n = len(names)
-    P, P0, values = np.asarray(P, float), np.asarray(P0, float), np.asarray(values, float)
-    if not 0 < share <= 1:
-        raise InputError("expected a share from 0 to 1", field="share", value=share)
-    for field, matrix in (("P", P), ("P0", P0)):
-        if matrix.shape != (n, n) or not np.all(np.isfinite(matrix)):
-            raise InputError(f"expected a finite ({n}, {n}) covariance", field=field, value=matrix.shape)
-    try:
-        L = np.linalg.cholesky(P0)
-    except np.linalg.LinAlgError:
-        raise InputError("expected a positive definite prior covariance", field="P0") from None
-    white = np.linalg.solve(L, np.linalg.solve(L, P).T)
-    ratio, vectors = np.linalg.eigh((white + white.T) / 2)
-    if ratio[0] <= 0:
-        raise InputError("expected a positive definite covariance; a filter whose covariance lost this has diverged",
-                         field="P", value=float(ratio[0]))
-    gained = np.where(ratio < share, 1 / ratio - 1, 0.0)
-    half = np.linalg.solve(L.T, vectors * np.sqrt(gained))
-    return Information(tuple(names), values, tuple(units) if units is not None else ("",) * n, half @ half.T,
-                       size_of(values))
-
-
-def information_of_tests(problem: Problem, theta: np.ndarray, units: Sequence[str] | None = None) -> Information:
-    """Of all tests of a sequential fit jointly, at theta: no scheme that takes them in turn knows more.
-
-    Variances of the lines are the measured ones, or what the fit leaves in each test.
-
-    Raises
-    ------
-    InputError : a line without variance, or a test that the fit meets exactly.
-    """
-    theta = np.asarray(theta, float)
-    H = np.zeros((theta.size, theta.size))
-    for test in problem.tests:
-        variance = np.asarray(problem.line_variance(test, theta), float)
-        if not np.all(variance > 0):
-            raise InputError("expected a positive variance on every line", field=f"test {test.number}",
-                             value=float(np.min(variance)))
-        J = problem.jacobian([test], theta) * np.repeat(problem.scale[test.number] / np.sqrt(variance / 2), 2)[:, None]
-        H += J.T @ J
-    return Information(problem.names, theta, tuple(units) if units is not None else ("",) * theta.size, H,
-                       size_of(theta))
-
-
-def group_of(report: IdentifiabilityReport, name: str) -> Group | None:
-    """The group that a parameter stands in."""
-    index = report.information.names.index(name)
-    return next((group for group in report.structure.groups if index in group.members), None)

@@ -156,18 +156,6 @@ class Information:
         """With independent knowledge of single parameters: standard deviations in their units."""
         return replace(self, matrix=self.matrix + self._priors(deviations))
 
-    def without_priors(self, deviations: Mapping[str, float]) -> Information:
-        """What the data alone hold, of an information that these priors went into."""
-        return replace(self, matrix=self.matrix - self._priors(deviations))
-
-    def fixing(self, names: Sequence[str]) -> Information:
-        """Of the other parameters, when these are known exactly."""
-        if unknown := [name for name in names if name not in self.names]:
-            raise InputError(f"expected some of {', '.join(self.names)}", field="fixed parameters", value=unknown)
-        keep = [j for j, name in enumerate(self.names) if name not in names]
-        return Information(tuple(self.names[j] for j in keep), self.values[keep], tuple(self.units[j] for j in keep),
-                           self.matrix[np.ix_(keep, keep)], self.scale[keep])
-
     def of_some(self, names: Sequence[str]) -> Information:
         """Of some of the parameters, whatever the others are (Schur complement)."""
         keep = np.array([self.names.index(name) for name in names], int)

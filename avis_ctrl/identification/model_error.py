@@ -14,7 +14,7 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.excited_space import excited_space
-from avis_ctrl.identification.prediction import Predictor, model_inputs
+from avis_ctrl.identification.predictor import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse

@@ -27,7 +27,7 @@ from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.identification.response import N_Q, ResponseModel
-from avis_ctrl.identification.sampling import aliases, hold
+from avis_ctrl.identification.sample_and_hold import aliases, hold
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rigid_body import COORDINATES
 

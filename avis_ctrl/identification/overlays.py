@@ -22,17 +22,15 @@ POINTS = 400
 
 
 @dataclass(frozen=True, eq=False)
-class ResponseOverlay:
-    """From each driven input to each output; if the drives were not excited separately, from forces along coordinates.
+class MeasuredOverlay:
+    """A measured response from each driven input to each output; what a model's response is drawn over.
 
     Attributes
     ----------
     frequency_Hz : (n,). inputs, outputs : names. unit : of an entry.
-    measured, start, model : (n, n_y, n_u) complex.
+    measured : (n, n_y, n_u) complex.
     measured_std : (n, n_y, n_u) standard deviation of real part, imaginary part and, where it is small, magnitude of
         the measured entry: root of E|error|^2 / 2.
-    model_magnitude_std, model_phase_std : (n, n_y, n_u) of the identified model's magnitude and phase [rad], from the
-        covariance of its parameters; 1.96 of them to each side hold 95 %.
     method : how the response was measured, in words.
     """
 
@@ -42,11 +40,25 @@ class ResponseOverlay:
     unit: str
     measured: np.ndarray
     measured_std: np.ndarray
+    method: str
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseOverlay(MeasuredOverlay):
+    """With the start and the identified model. If the drives were not excited separately, the inputs are forces along
+    coordinates.
+
+    Attributes
+    ----------
+    start, model : (n, n_y, n_u) complex.
+    model_magnitude_std, model_phase_std : (n, n_y, n_u) of the identified model's magnitude and phase [rad], from the
+        covariance of its parameters; 1.96 of them to each side hold 95 %.
+    """
+
     start: np.ndarray
     model: np.ndarray
     model_magnitude_std: np.ndarray
     model_phase_std: np.ndarray
-    method: str
 
     @property
     def inside(self) -> float:
@@ -84,8 +96,8 @@ def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseMo
     return ResponseOverlay(
         measured.frequency_Hz, measured.inputs, model.sensors.names,
         f"{measured.output_unit} per {measured.input_unit}", measured.value[:, rows],
-        measured.standard_deviation[:, rows] / np.sqrt(2), start.driven(measured.omega, U, False).Y, found.Y,
-        spread[0] * np.abs(found.Y), spread[1], measured.method)
+        measured.standard_deviation[:, rows] / np.sqrt(2), measured.method,
+        start.driven(measured.omega, U, False).Y, found.Y, spread[0] * np.abs(found.Y), spread[1])
 
 
 def _along_coordinates(measured: FrequencyResponse, model: ResponseModel) -> tuple[FrequencyResponse, np.ndarray]:
@@ -124,9 +136,9 @@ def measured_response(data: Campaign | FrequencyResponse, band_Hz: tuple[float, 
     InputError, ComputationError : records that allow neither.
     """
     if isinstance(data, FrequencyResponse):
-        return _thinned(data.between(*band_Hz))
+        return thinned(data.between(*band_Hz))
     try:
-        return _thinned(best_linear_approximation(data, band_Hz=band_Hz))
+        return thinned(best_linear_approximation(data, band_Hz=band_Hz))
     except AvisError:
         # Not periodic, several levels, or different lines for different inputs: the local model asks for none of that.
         driven = [r.header for r in data.records if r.header.excitation not in ("rest", "sine")]
@@ -145,7 +157,7 @@ def _wholes(data: Campaign) -> Campaign:
     return replace(data, records=tuple(wholes.values()))
 
 
-def _thinned(response: FrequencyResponse) -> FrequencyResponse:
+def thinned(response: FrequencyResponse) -> FrequencyResponse:
     """Few enough lines for a figure, evenly in logarithm."""
     f = response.frequency_Hz
     if f.size <= POINTS:

@@ -25,7 +25,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
-from avis_ctrl.identification.sampling import Motion, aliases, hold
+from avis_ctrl.identification.sample_and_hold import Motion, aliases, hold
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace

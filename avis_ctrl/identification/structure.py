@@ -53,10 +53,6 @@ class Structure:
     groups: tuple[Group, ...]
     singles: tuple[int, ...]
 
-    @property
-    def nullity(self) -> int:
-        return len(self.scalings) + sum(len(group.unseen) for group in self.groups)
-
 
 def size_of(values: np.ndarray) -> np.ndarray:
     """What one relative unit of a parameter is: its size, or 0.1 for one that is zero (as in the fit)."""

@@ -19,8 +19,8 @@ from avis_ctrl.identification.modes import MeasuredModes, ModeRow, measured_mode
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.overlays import ResponseOverlay, measured_response, overlay
 from avis_ctrl.identification.portion import Portion
-from avis_ctrl.identification.prediction import predict
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
+from avis_ctrl.identification.predictor import predict
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.second_order import terms, without
 from avis_ctrl.identification.spectra import record_block, response_block
@@ -154,7 +154,7 @@ def validate(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
     figures = [_figures(found, fitted, *one, len(blocks), notes) for one in blocks]
     modes, mode_note = _modes(found, [one[0] for one in blocks])
     drawn = _overlay(found, fitted, held_out, notes)
-    verdict = _verdict(figures)
+    verdict = verdict_of(figures)
     said = (verdict, *_sentences(figures), *_mode_sentence(modes), mode_note, *_overlay_sentence(drawn))
     return Validation(found.fit.model.sensors.names, found.band_Hz, tuple(figures), drawn, modes, mode_note, verdict,
                       said, tuple(notes))
@@ -230,7 +230,7 @@ def _figures(found: CampaignFit, fitted: Campaign | FrequencyResponse, block: Sp
         before.chi2 / before.dof, _local_chi2(found, fitted, raw, notes), error.output_chi2 / error.output_dof,
         np.array(of_output), _root(error.error, power), _root(before.error, power), np.sqrt(floor / power),
         _root_all(error), _root_all(before), float(np.sqrt(floor.sum() / power.sum())),
-        _floor_interval(error, float(floor.sum() / power.sum()), noise_dof / (2 * block.Y.size)),
+        floor_interval(error, float(floor.sum() / power.sum()), noise_dof / (2 * block.Y.size)),
         *_in_time(found, record), white, _exact(found, block))
 
 
@@ -238,7 +238,7 @@ def _exact(found: CampaignFit, block: SpectralBlock) -> float | None:
     return _root_all(prediction_error(found.first.model, block, derivative=False)) if found.tolerances else None
 
 
-def _floor_interval(error: PredictionError, floor: float, times: float) -> tuple[float, float]:
+def floor_interval(error: PredictionError, floor: float, times: float) -> tuple[float, float]:
     """Interval of the root of sum |e|^2 / sum |Y|^2 of noise, estimated from `times` as many lines; it has few degrees
     of freedom where few lines hold most of it (Welch and Satterthwaite)."""
     assert error.block.noise is not None
@@ -328,7 +328,7 @@ def _overlay(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
         return None
 
 
-def _verdict(figures: list[HeldOut]) -> str:
+def verdict_of(figures: list[HeldOut]) -> str:
     """Of the record that fits worst; where some are beyond what noise leaves, of the worst of these."""
     def ratio(one: HeldOut) -> float:
         return one.chi2_per_dof / one.chi2_interval[1]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from avis_ctrl.report import html, pdf
 from avis_ctrl.report.content import document
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -15,7 +15,7 @@ from avis_ctrl.report.sections.synthesis import synthesis
 from avis_ctrl.report.sections.transmissibility import transmissibility
 from avis_ctrl.report.sections.verdict import comparison, verdict
 from avis_ctrl.report.words import axis, joined
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 
 SECTIONS = (verdict, comparison, transmissibility, rig, generalized_plant, bounds, synthesis, controllers, site,
             simulation, method, provenance)

@@ -27,6 +27,9 @@ from avis_ctrl.report.pieces import (
     Table,
 )
 
+# Of the text: a drawing leaves room for what it explains on the same page.
+DRAWING_WIDTH = 0.72
+
 
 def render(document: Document) -> bytes:
     """The document as PDF.
@@ -36,7 +39,7 @@ def render(document: Document) -> bytes:
     ComputationError : the typesetter refuses, with what it says.
     """
     content = {"title": document.title, "subtitle": document.subtitle, "stamp": document.stamp, "sections": [
-        {"title": s.title, "pieces": [_piece(p) for p in s.pieces]} for s in document.sections]}
+        {"title": s.title, "alone": s.alone, "pieces": [_piece(p) for p in s.pieces]} for s in document.sections]}
     template = (resources.files("avis_ctrl.report") / "report.typ").read_bytes()
     # The drawings' sans-serif text is set in the font that matplotlib brings, the same on every machine.
     folder = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
@@ -66,9 +69,10 @@ def _piece(piece: Piece) -> dict[str, Any]:
                     "align": [piece.alignment(k) for k in range(len(piece.header))],
                     "rows": [[_cell(c) for c in row] for row in piece.rows]}
         case Drawing(_, caption, image, alternative):
-            return {"kind": "figure", "caption": caption, "svg": image, "alternative": alternative}
+            return {"kind": "figure", "width": DRAWING_WIDTH, "caption": caption, "svg": image,
+                    "alternative": alternative}
         case Figure():
-            return {"kind": "figure", "caption": piece.caption, "svg": matplotlib_backend.svg(piece),
+            return {"kind": "figure", "width": 1.0, "caption": piece.caption, "svg": matplotlib_backend.svg(piece),
                     "alternative": piece.caption}
         case Fold(title, pieces):
             return {"kind": "fold", "title": title, "pieces": [_piece(p) for p in pieces]}

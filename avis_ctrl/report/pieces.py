@@ -99,11 +99,12 @@ Piece = Heading | Paragraph | Bullets | Formula | Table | Figure | Drawing | Fol
 
 @dataclass(frozen=True)
 class Section:
-    """A numbered section."""
+    """A numbered section. alone : on a page of its own, to be read without the rest."""
 
     title: str
     anchor: str
     pieces: tuple[Piece, ...]
+    alone: bool = False
 
     def flat(self) -> list[Piece]:
         """All pieces in order, those inside folds in their place."""

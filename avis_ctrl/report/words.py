@@ -6,6 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from avis_ctrl.uncertain_value import rounded
+
 AXIS_WORDS = {"phi_x_edge": "phi_x (edge)", "phi_y_edge": "phi_y (edge)", "phi_z_edge": "phi_z (edge)"}
 
 
@@ -23,27 +25,12 @@ def number(value: float, digits: int = 3) -> str:
     return f"{rounded:.{places}f}".replace("-", "−")
 
 
-def with_deviation(value: float, sigma: float) -> tuple[str, str]:
+def with_std(value: float, std: float) -> tuple[str, str]:
     """A value and its standard deviation, both to the second significant digit of the latter."""
-    if not (np.isfinite(sigma) and sigma > 0 and np.isfinite(value)):
-        return number(value, 5), number(sigma, 2)
-    places = 1 - int(np.floor(np.log10(float(f"{sigma:.1e}"))))
-    if places > 9 or abs(value) >= 1e7:
-        # Many zeros are read wrongly: both as multiples of the value's power of ten.
-        power = int(np.floor(np.log10(abs(value)))) if value else int(np.floor(np.log10(sigma)))
-        digits = max(places + power, 0)
-        first, second = (f"{v / 10.0 ** power:.{digits}f}e{power}".replace("-", "−") for v in (value, sigma))
-    else:
-        first, second = (f"{round(v, places):.{max(places, 0)}f}".replace("-", "−") for v in (value, sigma))
-    return first, second
-
-
-def in_brackets(value: float, sigma: float) -> str:
-    """A value with its standard deviation in units of its last two digits, 1.2345(67)."""
-    places = 1 - int(np.floor(np.log10(float(f"{sigma:.1e}"))))
-    if not 0 <= places <= 12:
-        return " ± ".join(with_deviation(value, sigma))
-    return f"{value:.{places}f}({round(sigma * 10.0 ** places)})".replace("-", "−")
+    if not (np.isfinite(std) and std > 0 and np.isfinite(value)):
+        return number(value, 5), number(std, 2)
+    first, second = rounded(value, std)
+    return first.replace("-", "−"), second.replace("-", "−")
 
 
 def bound(value: float, digits: int = 3) -> str:

@@ -7,11 +7,8 @@ double-logarithmic axes) and integrated exactly.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -67,55 +64,6 @@ def check_spectrum(frequency_Hz: np.ndarray, asd: np.ndarray, field: str = "asd"
         raise InputError("finite, positive, increasing frequencies", field="frequency_Hz")
     if not (np.all(np.isfinite(asd)) and np.all(np.asarray(asd) > 0)):
         raise InputError("finite, positive densities", field=field)
-
-
-def read_floor_motion(path: str | Path) -> MeasuredSpectrum:
-    """A displacement ASD from a text file (two columns: Hz, m/sqrt(Hz)) or an .npz with arrays `f` and `asd`.
-
-    Raises
-    ------
-    InputError : a file that cannot be read, lacks a column or array, or holds values that check_spectrum refuses.
-    """
-    path = Path(path)
-    try:
-        if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as arrays:
-                frequency, asd = arrays["f"].astype(float), arrays["asd"].astype(float)
-        else:
-            with warnings.catch_warnings():
-                # An empty file warns; the shape says so below.
-                warnings.simplefilter("ignore", UserWarning)
-                columns = np.loadtxt(path, ndmin=2)
-            if columns.shape[1] != 2:
-                raise InputError(f"two columns, the file has {columns.shape[1]}", field="columns")
-            frequency, asd = columns.T
-        return MeasuredSpectrum(path.stem, frequency, asd)
-    except InputError as error:
-        raise error.in_file(path) from None
-    except (OSError, ValueError, KeyError, IndexError, EOFError, BadZipFile) as error:
-        raise InputError(f"a displacement spectrum: {error}", file=path) from error
-
-
-def shared_points(a: MeasuredSpectrum, b: MeasuredSpectrum) -> list[tuple[float, float]]:
-    """Bands [Hz] over which two files hold the very same numbers, which two measurements never do."""
-    other = dict(zip(b.frequency_Hz.tolist(), b.displacement_asd.tolist(), strict=True))
-    same = np.array([other.get(f) == d for f, d in
-                     zip(a.frequency_Hz.tolist(), a.displacement_asd.tolist(), strict=True)])
-    return [(float(a.frequency_Hz[i]), float(a.frequency_Hz[j])) for i, j in _runs(same, 3)]
-
-
-def drawn_lines(spectrum: MeasuredSpectrum, points: int = 6) -> list[tuple[float, float, float]]:
-    """Stretches (low Hz, high Hz, slope) where the ASD is an exact power law: drawn, not measured."""
-    slope = np.diff(np.log(spectrum.displacement_asd)) / np.diff(np.log(spectrum.frequency_Hz))
-    straight = np.abs(np.diff(slope)) < 1e-6
-    return [(float(spectrum.frequency_Hz[i]), float(spectrum.frequency_Hz[j + 2]), float(slope[i]))
-            for i, j in _runs(straight, points - 2)]
-
-
-def _runs(flags: np.ndarray, shortest: int) -> list[tuple[int, int]]:
-    """First and last index of each run of True at least that long."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return [(int(i), int(j) - 1) for i, j in edges.reshape(-1, 2) if j - i >= shortest]
 
 
 def convert_asd(frequency_Hz: np.ndarray, asd: np.ndarray, given: Quantity, wanted: Quantity) -> np.ndarray:

@@ -93,7 +93,7 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
         both = np.outer(scale, scale)
         a, r, q = noise[0] / scale[:, None] * scale, noise[1] / both, noise[2] * both
         error = np.block([[a, r], [q, a.T]])
-    indefinite = _negative_beyond_error(H, U[:, :n], error)
+    indefinite = negative_beyond_error(H, U[:, :n], error)
     return RiccatiSolution(X, not indefinite, doubtful=not indefinite)
 
 
@@ -146,7 +146,7 @@ def _error(closed: np.ndarray, size: np.ndarray) -> np.ndarray | None:
     return E if np.all(np.isfinite(E)) else None
 
 
-def _negative_beyond_error(H: np.ndarray, basis: np.ndarray, error: np.ndarray | None = None) -> bool:
+def negative_beyond_error(H: np.ndarray, basis: np.ndarray, error: np.ndarray | None = None) -> bool:
     """Whether X = X2 inv(X1) has a negative eigenvalue for certain; basis = [X1; X2] of the stable subspace of H."""
     n = basis.shape[1]
     X1, X2 = basis[:n], basis[n:]

@@ -1,4 +1,4 @@
-"""What to record in a simulated measurement campaign. Read from a file by `avis_ctrl.study.campaign_plan`."""
+"""What to record in a simulated measurement campaign. Read from a file by `avis_ctrl.study.plan_file`."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.floor_motion import third_octave_edges, third_octave_midbands
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.loop import SimulationRecord
-from avis_ctrl.simulation.prediction import sampled_response
 from avis_ctrl.simulation.sampled_loop import lever_arms
+from avis_ctrl.simulation.sampled_response import sampled_response
 
 # Points of the predicted density per line of the estimate: a resonance as narrow as a line is still resolved.
 POINTS_PER_LINE = 4

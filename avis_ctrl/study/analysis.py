@@ -17,7 +17,7 @@ from avis_ctrl.rigs.floor_motion import band_rms, third_octave_midbands, third_o
 from avis_ctrl.rigs.vibration_criteria import rating
 from avis_ctrl.robust.mu_peak import MuPeak, mu_peak, worst_case_gain
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.model import Bound, ControllerKind, ControllerResult, SiteResponse, Transmissibility
+from avis_ctrl.study.design_result import Bound, ControllerKind, ControllerResult, SiteResponse, Transmissibility
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 

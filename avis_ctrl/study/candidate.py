@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from avis_ctrl.lti.statespace import StateSpace
-from avis_ctrl.study.model import ControllerKind
+from avis_ctrl.study.design_result import ControllerKind
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,8 +30,8 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.robust.frequency_grid import resonances
 from avis_ctrl.simulation.discrete import digital_controller, sampled, spectral_radius
-from avis_ctrl.simulation.prediction import OpenResponse, open_response
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
+from avis_ctrl.simulation.sampled_response import OpenResponse, open_response
 from avis_ctrl.uncertainty.weight_base import Weight
 
 

@@ -17,7 +17,7 @@ from avis_ctrl.robust.musyn import MuSynthesis, musyn
 from avis_ctrl.robust.reduction import reduce_controller, residualise_fast
 from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.model import ControllerResult
+from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.plant import DesignPlant
 
 # Coarse: it only ranks controllers of different order; what is reported is computed on the one chosen. The resonances

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import platform
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-import avis_ctrl
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.gap.analysis import analyse
 from avis_ctrl.gap.effects.user_effects import OwnEffects, try_out
@@ -32,6 +28,7 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.gap_design import DesignEffect, design_effect
 from avis_ctrl.study.gap_files import converter_limits
 from avis_ctrl.study.identification import amplifier_corner, amplifier_words
+from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.record_checks import check_campaign
 from avis_ctrl.study.rig_channels import in_words_of
 from avis_ctrl.study.workers import each
@@ -114,7 +111,7 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
         stops = tuple(f"gate {one.gate}: {one.sentence}" for one in findings if one.severity == "stop")
         gap = replace(gap, seconds=seconds, sentences=(*gap.sentences, *known, *stops))
         design, note = _design(gap, options, progress)
-    return GapFinding(gap, measured, findings, provenance(measured, rig, options, seconds), design, note)
+    return GapFinding(gap, measured, findings, gap_provenance(measured, rig, options, seconds), design, note)
 
 
 def _require_records(measured: Campaign, rig: Rig) -> None:
@@ -159,19 +156,12 @@ def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.
     return [(both[0][record.header.name], both[1][record.header.name]) for record in campaign.records]
 
 
-def provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float) -> dict[str, Any]:
-    """What made this result: versions, hash of the inputs, seed, time."""
-    data = digest(measured)
-    text = repr(sorted((k, v.value) for k, v in rig.parameters().items())) + repr(options) + data
-    own = options.own_effects
-    told = {} if own is None else {"own_effects": f"{own.path.name}: {', '.join(own.names)}",
-                                   "own_effects_sha256": own.sha256}
+def gap_provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float) -> dict[str, Any]:
+    data, own = digest(measured), options.own_effects
+    further = {} if own is None else {"own_effects": f"{own.path.name}: {', '.join(own.names)}",
+                                      "own_effects_sha256": own.sha256}
     if options.design_file is not None:
         with contextlib.suppress(OSError):  # nothing was made of it then, which design_note says
-            told["design_sha256"] = hashlib.sha256(options.design_file.read_bytes()).hexdigest()
-    return {"avis_ctrl": avis_ctrl.__version__, "measurement": measured.source, **told,
-            "measurement_sha256": data, "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
-            "settings": tuning_values(), "seed": options.seed,
-            "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
-            "python": platform.python_version(),
-            **{name: metadata.version(name) for name in ("numpy", "scipy", "numba", "h5py")}}
+            further["design_sha256"] = hashlib.sha256(options.design_file.read_bytes()).hexdigest()
+    return provenance(rig, repr(options) + data, options.seed, seconds, ("numpy", "scipy", "numba", "h5py"),
+                      measurement=measured.source, **further, measurement_sha256=data, settings=tuning_values())

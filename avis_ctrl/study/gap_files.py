@@ -19,7 +19,7 @@ from avis_ctrl.gap.signals.converter import nominal_converter
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, inseparable_parameters
 from avis_ctrl.identification.parameter_sets import default_parameters
-from avis_ctrl.identification.prediction import model_inputs, predict
+from avis_ctrl.identification.predictor import model_inputs, predict
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.rigs.avis import AvisTable

@@ -17,7 +17,7 @@ from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.campaign_fit import SAME_LEVEL, driven_inputs, excited_band
 from avis_ctrl.identification.model_error import HALF_WIDTHS
-from avis_ctrl.identification.overlays import POINTS
+from avis_ctrl.identification.overlays import POINTS, MeasuredOverlay, thinned
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
@@ -28,29 +28,20 @@ BESIDE = "response of the model with what it leaves: "
 
 
 @dataclass(frozen=True, eq=False)
-class GapOverlay:
-    """From each driven input to each output.
+class GapOverlay(MeasuredOverlay):
+    """With the re-identified and the updated model.
 
     Attributes
     ----------
-    frequency_Hz : (n,). inputs, outputs : names. unit : of an entry.
-    measured, baseline, updated : (n, n_y, n_u) complex. Effects that depend on amplitude or time have no frequency
+    baseline, updated : (n, n_y, n_u) complex. Effects that depend on amplitude or time have no frequency
         response: with them, `updated` is measured as `measured` is, from what the model simulates of the same records.
-    measured_std : (n, n_y, n_u) of real part, imaginary part and, where it is small, magnitude.
-    records : that the measured response is from. method : how, in words.
+    records : that the measured response is from.
     simulated : effects for which `updated` was measured from a simulation. left_out : effects that `updated` lacks.
     """
 
-    frequency_Hz: np.ndarray
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    unit: str
-    measured: np.ndarray
-    measured_std: np.ndarray
     baseline: np.ndarray
     updated: np.ndarray
     records: tuple[str, ...]
-    method: str
     left_out: tuple[str, ...] = ()
     simulated: tuple[str, ...] = ()
 
@@ -103,9 +94,8 @@ def _overlay(records: Campaign, baseline: TableModel, updated: TableModel, clock
             after, left_out = _with_nonlinear(loaded, beside, updated, measured, after, clock), ()
     return GapOverlay(measured.frequency_Hz, tuple(measured.inputs), baseline.sensors.names,
                       f"{measured.output_unit} per {measured.input_unit}", value,
-                      measured.standard_deviation[:, rows] / np.sqrt(2), before, after,
-                      tuple(r.header.name for r in records.records), measured.method, left_out,
-                      () if left_out else named)
+                      measured.standard_deviation[:, rows] / np.sqrt(2), measured.method, before, after,
+                      tuple(r.header.name for r in records.records), left_out, () if left_out else named)
 
 
 def _with_nonlinear(records: Campaign, beside: Campaign | None, updated: TableModel, measured: FrequencyResponse,
@@ -133,11 +123,9 @@ def _response(model: TableModel, like: FrequencyResponse) -> np.ndarray:
 def _best_linear(records: Campaign) -> FrequencyResponse | None:
     """The best linear approximation on few enough lines for a figure; None where the records allow none."""
     try:
-        found = best_linear_approximation(records, band_Hz=excited_band(records))
+        return thinned(best_linear_approximation(records, band_Hz=excited_band(records)))
     except AvisError:
         return None
-    keep = np.searchsorted(found.frequency_Hz, np.geomspace(found.frequency_Hz[0], found.frequency_Hz[-1], POINTS))
-    return found.at(np.unique(np.clip(keep, 0, len(found.frequency_Hz) - 1)))
 
 
 def _regressed_on_grid(beside: Campaign) -> FrequencyResponse:

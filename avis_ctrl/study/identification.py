@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
-from importlib import metadata
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-import avis_ctrl
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification.campaign_fit import (
     CampaignFit,
@@ -43,6 +39,7 @@ from avis_ctrl.measurement.gates import Finding
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
 from avis_ctrl.study.plausible_fit import far_from_file
+from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.record_checks import check_campaign
 from avis_ctrl.study.rig_channels import in_words_of
 
@@ -157,7 +154,7 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
     identified = found.fit.model.rig
     seconds = time.monotonic() - began
     return Identification(rig, identified, options, measured, findings, split, found, report, advice, validation,
-                          kalman, note, provenance(measured, rig, options, seconds), seconds)
+                          kalman, note, identification_provenance(measured, rig, options, seconds), seconds)
 
 
 def _check(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> None:
@@ -280,18 +277,13 @@ def _kalman(fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str]
         return None, f"the extended Kalman filter failed: {error}"
 
 
-def provenance(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions, seconds: float
-               ) -> dict[str, Any]:
-    """What made this result: versions, hash of the inputs, seed, time."""
+def identification_provenance(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions, seconds: float
+                ) -> dict[str, Any]:
     if isinstance(measured, Campaign):
         data, source = digest(measured), measured.source
     else:
         data = hashlib.sha256(measured.frequency_Hz.tobytes() + measured.value.tobytes()).hexdigest()
         source = measured.method
-    text = repr(sorted((k, v.value) for k, v in rig.parameters().items())) + repr(replace(options, priors={})) + repr(
-        sorted(options.priors.items()))
-    return {"avis_ctrl": avis_ctrl.__version__, "measurement": source, "measurement_sha256": data,
-            "inputs_sha256": hashlib.sha256((text + data).encode()).hexdigest(), "seed": options.seed,
-            "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
-            "python": platform.python_version(),
-            **{name: metadata.version(name) for name in ("numpy", "scipy", "numba", "h5py")}}
+    return provenance(rig, repr(replace(options, priors={})) + repr(sorted(options.priors.items())) + data,
+                      options.seed, seconds, ("numpy", "scipy", "numba", "h5py"), measurement=source,
+                      measurement_sha256=data)

@@ -14,7 +14,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
 from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
-from avis_ctrl.identification.prediction import Predictor, model_inputs
+from avis_ctrl.identification.predictor import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, ranges
 from avis_ctrl.measurement.formats.hdf5_writing import replacing

@@ -8,8 +8,8 @@ import numpy as np
 
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.robust.mu import mu_upper
+from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.identified_uncertainty import RESPONSE
-from avis_ctrl.study.model import ControllerResult
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
+from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.files import as_json
-from avis_ctrl.study.model import Bound, ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.verdict import first_sentence
 
 FILES = "plant.json", "sampled_controller.json", "report.html", "report.pdf", "result.json"

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.identifiability_words import listed
+from avis_ctrl.identification.identifiability_text import listed
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates import Finding

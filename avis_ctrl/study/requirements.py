@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.simulation.campaign import SimulationCheck
+from avis_ctrl.simulation.design_check import SimulationCheck
 from avis_ctrl.study.design_file import Design, Quantity
+from avis_ctrl.study.design_result import ControllerResult, Requirement
 from avis_ctrl.study.limits import no_better_than_none
-from avis_ctrl.study.model import ControllerResult, Requirement
 
 
 def decibel(value: float) -> float:

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import platform
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-import avis_ctrl
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
@@ -24,23 +19,19 @@ from avis_ctrl.robust.musyn import MuSynthesis
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
-from avis_ctrl.study.design_file import Design, read_study
+from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.design_result import ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.limits import best_found
-from avis_ctrl.study.model import ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.study.provenance import provenance
+from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.requirements import judge, judge_loop
-from avis_ctrl.study.sampling import random_perturbations
 from avis_ctrl.study.simulation import simulate_study, six_dof_check
 from avis_ctrl.study.skyhooks import classical_skyhook, tuned_skyhook
 from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
 SAMPLES = 60
-
-
-def run_file(path: str | Path, progress: Progress = lambda text: None) -> DesignResult:
-    """Run a design file; the rig it names is shipped, or a file beside it."""
-    return run_design(*read_study(path), progress, source=Path(path))
 
 
 def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
@@ -111,7 +102,7 @@ def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesi
                       if text)
     requirements = (*judge_loop(compared.loop.check), *judge(design, controllers))
     return DesignResult(design, rig, plant, controllers, synthesis.history, requirements, reduction, six_dof,
-                        compared.loop, provenance(design, source, rig, seconds), seconds, notes, compared.failed)
+                        compared.loop, design_provenance(design, source, rig, seconds), seconds, notes, compared.failed)
 
 
 ORDER = ("passive", "skyhook_classical", "skyhook", "hinf", "mu")
@@ -189,11 +180,6 @@ def skyhook_limit(design: Design, mu: ControllerResult) -> float:
     return max(known, default=10 ** (design.transmissibility.peak_dB / 20))
 
 
-def provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:
-    """What made this result: versions, hash of the inputs, seed, time."""
-    text = design.model_dump_json() + repr(sorted((k, v.value) for k, v in rig.parameters().items()))
-    libraries = ("numpy", "scipy", "slycot", "cvxpy", "clarabel", "numba")
-    return {"avis_ctrl": avis_ctrl.__version__, "design_file": source.name if source else None,
-            "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(), "seed": design.simulation.seed,
-            "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
-            "python": platform.python_version(), **{name: metadata.version(name) for name in libraries}}
+def design_provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:
+    return provenance(rig, design.model_dump_json(), design.simulation.seed, seconds,
+                      ("numpy", "scipy", "cvxpy", "clarabel", "numba"), design_file=source.name if source else None)

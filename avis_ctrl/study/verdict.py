@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.identification.identifiability_words import listed
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.identification.identifiability_text import listed
+from avis_ctrl.study.design_result import DesignResult
 
 
 def first_sentence(result: DesignResult) -> str:

@@ -14,8 +14,8 @@ from avis_ctrl.classical.tuning import (
     Scenarios,
     Search,
     TuningRange,
-    _encirclements,
-    _largest_singular_value,
+    encirclements,
+    largest_singular_value,
     tune_skyhook,
 )
 from avis_ctrl.errors import ComputationError
@@ -101,9 +101,9 @@ def test_largest_singular_value_in_closed_form(rng):
     T = rng.standard_normal((50, 3, 2, 2)) + 1j * rng.standard_normal((50, 3, 2, 2))
     T[0] = 0.0
     T[1, :, 1] = T[1, :, 0]  # rank one
-    np.testing.assert_allclose(_largest_singular_value(T), np.linalg.svd(T, compute_uv=False)[..., 0], rtol=1e-7)
+    np.testing.assert_allclose(largest_singular_value(T), np.linalg.svd(T, compute_uv=False)[..., 0], rtol=1e-7)
     other = rng.standard_normal((5, 3, 3))
-    np.testing.assert_allclose(_largest_singular_value(other), np.linalg.svd(other, compute_uv=False)[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(largest_singular_value(other), np.linalg.svd(other, compute_uv=False)[:, 0], rtol=1e-12)
 
 
 def test_encirclements_tell_stable_from_unstable(plant, scenarios, critical, rng):
@@ -117,7 +117,7 @@ def test_encirclements_tell_stable_from_unstable(plant, scenarios, critical, rng
         delta = plant.full.blocks.random(rng, real=True)
         skyhook = random_skyhook(rng, critical, TuningRange(critical).gain_factor[1])
         channels, K = scenarios.with_delta(delta).channels(), diagonal(skyhook, OMEGA)
-        turns = _encirclements(np.linalg.det(np.eye(2) - channels.yu[-1:] * K[:, None, :]))
+        turns = encirclements(np.linalg.det(np.eye(2) - channels.yu[-1:] * K[:, None, :]))
         closed = sample_lft(scenarios.plant.P, plant.full.blocks, delta)
         poles = lft_lower(closed, skyhook.controller()).poles()
         if np.min(np.abs(poles.real) / np.abs(poles)) > 0.02:
@@ -131,7 +131,7 @@ def test_half_turns_count_unstable_poles():
     """1 - P K = (s - a)(s - b)/(s + 1)^2 by hand."""
     s = 1j * np.geomspace(1e-4, 1e4, 400)
     for unstable, roots in ((0, (-2, -3)), (1, (2, -3)), (2, (2, 3)), (2, (1 + 4j, 1 - 4j))):
-        assert _encirclements(((s - roots[0]) * (s - roots[1]) / (s + 1) ** 2)[None]) == unstable
+        assert encirclements(((s - roots[0]) * (s - roots[1]) / (s + 1) ** 2)[None]) == unstable
 
 
 @pytest.fixture(scope="module")

@@ -21,13 +21,13 @@ from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.result import Gap, NamedEffect, Reported, Stage, Where
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.identification.prediction import Predictor
+from avis_ctrl.identification.predictor import Predictor
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.formats.hdf5 import write_campaign
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rig_file import load_rig as read_rig
-from avis_ctrl.study.gap import GapFinding, GapOptions, predict, provenance
+from avis_ctrl.study.gap import GapFinding, GapOptions, gap_provenance, predict
 from avis_ctrl.study.gap_files import read_gap, write_gap, write_gap_predictions
 from avis_ctrl.study.gap_names import GAP_FILES
 
@@ -207,9 +207,9 @@ def test_gap_json_says_where_it_comes_from(tmp_path):
 def test_a_design_that_cannot_be_read_costs_no_result(tmp_path):
     path = tmp_path / "design.toml"
     options, measured = GapOptions(design=True, design_file=path), campaign_of(1.0, samples=10)
-    assert "design_sha256" not in provenance(measured, RIG, options, 1.0)
+    assert "design_sha256" not in gap_provenance(measured, RIG, options, 1.0)
     path.write_text("title = 1\n")
-    assert len(provenance(measured, RIG, options, 1.0)["design_sha256"]) == 64
+    assert len(gap_provenance(measured, RIG, options, 1.0)["design_sha256"]) == 64
 
 
 def test_without_reports_and_again(tmp_path):

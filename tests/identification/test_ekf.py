@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from avis_ctrl.identification.ekf import ParameterFilter, identify_ekf, noise_root
-from avis_ctrl.identification.ekf_campaign import source_campaign
 from avis_ctrl.identification.ekf_kernel import Scaling, flow, step_room
 from avis_ctrl.identification.ekf_model import LinearModel, linear_model, source_parameters
 from avis_ctrl.identification.ekf_settings import HONEST_SETTINGS, SOURCE_SETTINGS, EkfSettings
 from avis_ctrl.identification.ekf_square_root import propagate, update
 from avis_ctrl.rigs import load_rig
+from benchmarks.rademakers_records import source_campaign
 
 H1 = 1e-3
 

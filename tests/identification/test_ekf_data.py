@@ -8,7 +8,6 @@ from scipy.integrate import solve_ivp
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.ekf import identify_ekf
-from avis_ctrl.identification.ekf_campaign import flat_floor, logical_drive, sensor_volts, source_campaign
 from avis_ctrl.identification.ekf_model import linear_model, source_parameters
 from avis_ctrl.identification.ekf_result import Directions, innovation_statistics, parameter_curves
 from avis_ctrl.identification.ekf_settings import (
@@ -23,6 +22,7 @@ from avis_ctrl.identification.prefilter import delayed, prefilter, sensor_invers
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
+from benchmarks.rademakers_records import flat_floor, logical_drive, sensor_volts, source_campaign
 
 FEW = ("mass", "isolator3.k_z")
 

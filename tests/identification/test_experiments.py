@@ -13,7 +13,6 @@ from avis_ctrl.identification.experiments import (
     Noise,
     changed,
     predicted_information,
-    site_noise,
 )
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs import load_rig
@@ -112,15 +111,6 @@ def test_information_grows_with_time_and_power(avis):
     one = predicted_information(model, DRIVE, NOISE).matrix
     assert np.allclose(predicted_information(model, replace(DRIVE, duration_s=240.0), NOISE).matrix, 4 * one)
     assert np.allclose(predicted_information(model, replace(DRIVE, level_V=0.6), NOISE).matrix, 4 * one)
-
-
-def test_floor_that_was_not_measured_costs_precision(avis):
-    model = ResponseModel.of(avis, [*BODY, *MOUNTS])
-    site = site_noise(model)
-    assert site.floor_m_per_s == 2e-6 and site.sensor_V > 1e-3
-    quiet = predicted_information(model, DRIVE, replace(site, floor_m_per_s=0.0))
-    assert np.all(predicted_information(model, DRIVE, site).standard_deviation[:4]
-                  > quiet.standard_deviation[:4])
 
 
 def test_sentences_and_the_plan(avis):

@@ -15,7 +15,7 @@ from avis_ctrl.identification.excited_space import excited_space
 from avis_ctrl.identification.large_motion import Turning, turned_force, turned_reading
 from avis_ctrl.identification.noise import relative_noise
 from avis_ctrl.identification.portion import Portion
-from avis_ctrl.identification.prediction import Predictor
+from avis_ctrl.identification.predictor import Predictor
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.second_order import chosen_turning, terms, without
 from avis_ctrl.identification.spectra import record_block
@@ -25,7 +25,7 @@ from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.nonlinear import rig_arrays
 from avis_ctrl.simulation.campaign_data import open_loop
 from avis_ctrl.simulation.loop import simulate
-from avis_ctrl.study.campaign_plan import plan_from_table
+from avis_ctrl.study.plan_file import plan_from_table
 
 
 def off(found: np.ndarray, expected: np.ndarray) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.identification.prediction import Predictor
+from avis_ctrl.identification.predictor import Predictor
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import simulate_campaign

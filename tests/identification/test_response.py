@@ -8,7 +8,7 @@ from exact import discrete_avis, multisine, record
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.response import ResponseModel, positive
-from avis_ctrl.identification.sampling import aliases, hold, sampled_pole
+from avis_ctrl.identification.sample_and_hold import aliases, hold, sampled_pole
 from avis_ctrl.identification.spectra import record_block, transient_columns
 from avis_ctrl.rigs import load_rig
 

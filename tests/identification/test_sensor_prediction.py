@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from exact import floor_velocity, multisine, record
 
-from avis_ctrl.identification.prediction import Predictor, predict
+from avis_ctrl.identification.predictor import Predictor, predict
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs import load_rig
 

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.identification.sequential import joint_fit, sequential_fit
-from avis_ctrl.identification.sequential_data import (
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.rigs import load_rig
+from avis_ctrl.rigs.rigid_body import point_map
+from benchmarks.sequential.data import (
     Analyser,
     MeasuredTests,
     disturbance_density,
@@ -19,8 +21,9 @@ from avis_ctrl.identification.sequential_data import (
     transfers_from_response,
     voltage_transfers,
 )
-from avis_ctrl.identification.sequential_problem import steps_of
-from avis_ctrl.identification.sequential_tests import (
+from benchmarks.sequential.fit import joint_fit, sequential_fit
+from benchmarks.sequential.problem import steps_of
+from benchmarks.sequential.published import (
     LOADED_SOURCE_FINAL,
     LOADED_START,
     LOADED_TESTS,
@@ -32,9 +35,6 @@ from avis_ctrl.identification.sequential_tests import (
     values_of,
     with_values,
 )
-from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.rigs import load_rig
-from avis_ctrl.rigs.rigid_body import point_map
 
 BARE, LOADED = load_rig("halcyonics"), load_rig("halcyonics_loaded")
 START = loaded_start(BARE, 10.0)

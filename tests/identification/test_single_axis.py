@@ -6,14 +6,14 @@ import re
 
 import numpy as np
 import pytest
+from lags import compare_lags, cubic_share
 from scipy import signal
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.single_axis.decay import fit_decay
 from avis_ctrl.identification.single_axis.drive import fit_drive
-from avis_ctrl.identification.single_axis.fit import block_bootstrap, long_run_covariance, regression
+from avis_ctrl.identification.single_axis.fit import long_run_covariance, regression
 from avis_ctrl.identification.single_axis.identify import identify_single_axis
-from avis_ctrl.identification.single_axis.lag import compare_lags, cubic_share
 from avis_ctrl.identification.single_axis.oscillator import damping_ratio, fit_oscillator, resonance_Hz
 from avis_ctrl.identification.single_axis.seismometer import Responses, band, fit_seismometer, response
 from avis_ctrl.identification.single_axis.sine import fit_sine
@@ -29,19 +29,6 @@ def test_long_run_variance_of_an_autoregression_is_its_spectrum_at_zero(rng):
     x = coloured(rng, 200_000, 0.8)[:, None]
     assert long_run_covariance(x, 200)[0, 0] == pytest.approx(25.0, rel=0.15)
     assert long_run_covariance(x, 0)[0, 0] == pytest.approx(1 / 0.36, rel=0.03)
-
-
-@pytest.mark.parametrize("block", [250, 2000])
-def test_a_bootstrap_of_blocks_keeps_the_correlation(rng, block):
-    """The mean of 8000 values of the autoregression has the deviation 5 / sqrt(8000); blocks of up to a quarter."""
-    x = coloured(rng, 8000, 0.8)
-    sigma = block_bootstrap(lambda at: np.array([x[at].mean()]), 8000, block, 400, rng)
-    assert sigma[0] == pytest.approx(5 / np.sqrt(8000), rel=0.2 if block == 250 else 0.6)
-    for wrong in (0, 2001):
-        with pytest.raises(InputError, match="blocks of 1 to 2000 samples"):
-            block_bootstrap(lambda at: x[at], 8000, wrong, 400, rng)
-    with pytest.raises(InputError, match="at least two draws"):
-        block_bootstrap(lambda at: x[at], 8000, block, 1, rng)
 
 
 def test_stated_deviations_are_those_of_repeated_experiments(rng):

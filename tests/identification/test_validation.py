@@ -23,14 +23,14 @@ from avis_ctrl.identification.prediction_error import PredictionError, interval,
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import record_block
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.identification.validation import _floor_interval, _verdict, validate
+from avis_ctrl.identification.validation import floor_interval, validate, verdict_of
 from avis_ctrl.identification.whiteness import whiteness
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import open_loop
 from avis_ctrl.simulation.loop import simulate
-from avis_ctrl.study.campaign_plan import plan_from_table
+from avis_ctrl.study.plan_file import plan_from_table
 
 BAND = (0.5, 30.0)
 
@@ -90,16 +90,16 @@ def test_one_record_beyond_its_noise_is_enough(checked):
     high = one.nrms_all_interval[1]
     first = replace(one, chi2_per_dof=9.0 * one.chi2_interval[1], nrms_all=0.9 * high)
     second = replace(other, chi2_per_dof=5.0 * other.chi2_interval[1], nrms_all=3.0 * other.nrms_all_interval[1])
-    assert "small systematic error" in _verdict([first, one]) and "record 04" in _verdict([first, one])
-    assert "does not agree" in _verdict([first, second]) and "record 05" in _verdict([first, second])
+    assert "small systematic error" in verdict_of([first, one]) and "record 04" in verdict_of([first, one])
+    assert "does not agree" in verdict_of([first, second]) and "record 05" in verdict_of([first, second])
 
 
 def test_a_residual_that_is_not_white_is_in_the_verdict(checked):
     """The colour of the verdict is that of `passed`, and the words say the same."""
     one = checked.held_out[0]
     coloured = replace(one, whiteness=SimpleNamespace(white=False, sentences=()))
-    assert one.whiteness.white and "not white" not in _verdict([one])
-    assert not replace(checked, held_out=(coloured,)).passed and "not white" in _verdict([coloured])
+    assert one.whiteness.white and "not white" not in verdict_of([one])
+    assert not replace(checked, held_out=(coloured,)).passed and "not white" in verdict_of([coloured])
 
 
 def test_errors_in_time_and_by_frequency_agree(checked):
@@ -321,7 +321,7 @@ def test_the_floor_of_a_few_loud_lines_is_wide(true):
     e *= np.sqrt(level / 2)[:, None, None]
     drawn = np.sqrt(np.sum(np.abs(e) ** 2, axis=(1, 2, 3)) / 1200)
     error = PredictionError(block, e[0], e[0], e[0], np.empty(0), 2400, np.full(6, 400.0))
-    low, high = _floor_interval(error, float(np.sum(6 * level) / 1200), np.inf)
+    low, high = floor_interval(error, float(np.sum(6 * level) / 1200), np.inf)
     assert np.mean((drawn > low) & (drawn < high)) == pytest.approx(0.95, abs=0.012)
 
 

@@ -22,7 +22,7 @@ from avis_ctrl.measurement.gates.hum import Hum
 from avis_ctrl.measurement.gates.missing_samples import delay_step, repeated_block, runs_away
 from avis_ctrl.measurement.gates.periodicity import compared
 from avis_ctrl.measurement.gates.sine_fit import fit_sine, second_order
-from avis_ctrl.measurement.gates.spikes import _corner, _departure
+from avis_ctrl.measurement.gates.spikes import departure, jump_corner
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -68,9 +68,9 @@ def test_a_corner_leaves_nothing_and_a_single_sample_much(share, size):
     """Where the slope changes, at a sample or between two, the departure from cubics has the shape of a corner."""
     t = np.arange(-4.0, 5.0)
     bend = size * np.maximum(t - share, 0.0)
-    assert _corner(_departure(bend)) < 1e-12 * np.sum(_departure(bend) ** 2)
+    assert jump_corner(departure(bend)) < 1e-12 * np.sum(departure(bend) ** 2)
     alone = np.where(t == 0, size, 0.0)
-    assert _corner(_departure(alone)) > 0.04 * np.sum(_departure(alone) ** 2)
+    assert jump_corner(departure(alone)) > 0.04 * np.sum(departure(alone) ** 2)
 
 
 @given(seeds, st.integers(20, 200), st.integers(0, 300))

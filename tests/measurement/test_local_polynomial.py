@@ -17,7 +17,6 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
 from avis_ctrl.measurement.frequency_response.local_fit import LocalFit, least_half_width, local_model
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial, local_rational, noise_covariance
-from avis_ctrl.measurement.frequency_response.pooling import pool
 
 RATE = 200.0
 
@@ -260,23 +259,6 @@ def test_units_do_not_matter(a, b):
         assert np.allclose(other.value * scale_u / scale_y[:, None], one.value, rtol=1e-9)
         assert np.allclose(other.noise / np.outer(scale_y, scale_y), one.noise, rtol=1e-9)
         assert np.allclose(other.gram / np.outer(scale_u, scale_u), one.gram, rtol=1e-9)
-
-
-def test_pooled_estimates_weigh_by_their_gram_matrices(rng):
-    system = Modal(rng, 2, 2, [40.0], 0.3, RATE)
-    where = np.linspace(20, 80, 30)
-    parts = []
-    for scale in (1.0, 3.0):
-        u = scale * rng.standard_normal((4000, 2))
-        data = campaign([(u, system.simulate(u) + 0.3 * rng.standard_normal((4000, 2)))], RATE)
-        parts.append(local_polynomial(data, frequency_Hz=where))
-    both = pool(parts)
-    assert np.allclose(both.gram, parts[0].gram + parts[1].gram)
-    assert np.mean(squared_error(both, system.response(where))) == pytest.approx(1.0, abs=0.4)
-    error = [np.mean(np.abs(p.value - system.response(where)) ** 2) for p in (*parts, both)]
-    assert error[2] < error[1] < error[0]
-    with pytest.raises(InputError, match="same frequencies"):
-        pool([parts[0], parts[1].at(np.arange(3))])
 
 
 def test_floor_velocity_as_further_inputs(rng):

@@ -12,7 +12,7 @@ from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn_state import Iteration
 from avis_ctrl.study.design_file import read_design
-from avis_ctrl.study.model import (
+from avis_ctrl.study.design_result import (
     Bound,
     ControllerResult,
     DesignResult,

@@ -18,8 +18,8 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.finding import Finding
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import simulate_campaign
-from avis_ctrl.study.campaign_plan import plan_from_table
 from avis_ctrl.study.gap_design import DesignEffect, LoopFigures
+from avis_ctrl.study.plan_file import plan_from_table
 
 OFFSET = (0.02, -0.012, 0.0)
 OUTPUTS = ("Sy1", "Sz1", "Sx2", "Sz2", "Sy3", "Sz3")

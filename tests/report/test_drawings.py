@@ -18,7 +18,7 @@ from avis_ctrl.report.matplotlib_backend import svg
 from avis_ctrl.report.plotly_backend import graph
 from avis_ctrl.report.rig_drawing import rig_drawing
 from avis_ctrl.rigs.rig_file import load_rig
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 
 
 @pytest.mark.parametrize(("low", "high", "labels"), [

@@ -19,15 +19,15 @@ from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series
 from avis_ctrl.report import identification_html, identification_pdf, words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style
 from avis_ctrl.report.identification.content import document
-from avis_ctrl.report.identification.pictures import figure_of
+from avis_ctrl.report.identification.gate_figures import figure_of
 from avis_ctrl.report.identification.responses import strongest
 from avis_ctrl.report.matplotlib_backend import svg
 from avis_ctrl.report.pieces import Fold, Mark, Paragraph, Section, Table
 from avis_ctrl.report.plotly_backend import graph
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation import rehearse
-from avis_ctrl.study.campaign_plan import plan_from_table
 from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
+from avis_ctrl.study.plan_file import plan_from_table
 
 FREE = ("mass", "isolator*.k_x", "isolator*.k_z", "isolator1.c_z")
 PLAN = {"title": "small", "duration_s": 8.0, "settle_s": 2.0, "band_Hz": [1.0, 20.0],
@@ -261,14 +261,7 @@ def test_little_was_found(found):
 def test_rounding_to_the_standard_deviation(value, sigma, negative):
     """What is shown lies within a twentieth of sigma of the value, and sigma within 5 % of itself."""
     signed = -value if negative else value
-    shown = [float(text.replace("−", "-")) for text in words.with_deviation(signed, sigma)]
+    shown = [float(text.replace("−", "-")) for text in words.with_std(signed, sigma)]
     assert abs(shown[0] - signed) <= 0.06 * sigma + 1e-15 * value
     if sigma < value:
         assert shown[1] == pytest.approx(sigma, rel=0.06)
-    if 1e-9 < sigma < 10:
-        text = words.in_brackets(signed, sigma)
-        if "(" in text:
-            number, _, rest = text.partition("(")
-            places = len(number.partition(".")[2])
-            assert abs(float(number.replace("−", "-")) - signed) <= 0.06 * sigma + 1e-15 * value
-            assert float(rest[:-1]) * 10.0 ** -places == pytest.approx(sigma, rel=0.06)

@@ -16,7 +16,7 @@ from avis_ctrl.report import render_html, render_pdf
 from avis_ctrl.report.content import document
 from avis_ctrl.report.figures import Figure
 from avis_ctrl.report.pieces import Mark, Table
-from avis_ctrl.study.model import Bound, DesignResult
+from avis_ctrl.study.design_result import Bound, DesignResult
 
 HOSTILE = '</script><script>alert(1)</script> <b>x</b> #panic("y") $ *z* {{ 7*7 }} \\ & "'
 
@@ -103,6 +103,27 @@ def test_first_words_are_what_is_not_met(fabricated: DesignResult) -> None:
     good = replace(fabricated, requirements=fabricated.requirements[:1])
     first = document(good).sections[0].pieces[0]
     assert first.text.startswith("The requirement is met.") and first.good is True
+
+
+def test_the_first_page_is_read_alone(fabricated: DesignResult, html: bytes, pdf: bytes, tmp_path) -> None:
+    """Task, verdicts, certificate and one figure, and nothing else; the second section begins on the second page."""
+    pages = pdf_text(pdf, tmp_path).split("\f")
+    first = " ".join(pages[0].split())
+    for shown in ("1 Summary", "Asked was one controller for z and phi_x (edge)", "mass ± 10 %", "Table 1", "NOT MET",
+                  "the peak of mu is between", "Figure 1"):
+        assert shown in first, shown
+    assert "2 Controllers compared" not in first and "2 Controllers compared" in " ".join(pages[1].split())
+    assert [s.alone for s in document(fabricated).sections[:3]] == [True, False, False]
+
+
+def test_a_wide_table_folds_on_a_phone(fabricated: DesignResult, html: bytes) -> None:
+    """Each cell carries the title of its column; the style sheet shows it where the header is hidden."""
+    page = Reader(html)
+    labels = [a["data-label"] for tag, a in page.elements if tag == "td"]
+    table = next(p for p in document(fabricated).sections[1].pieces if isinstance(p, Table))
+    assert table.header[1] == "mu synthesis"  # the delivered controller is not the one that is cut off
+    assert labels.count("mu synthesis") == len(table.rows)
+    assert sum("folds" in (a.get("class") or "") for tag, a in page.elements if tag == "table") > 3
 
 
 def test_same_sections_figures_and_tables_in_both(fabricated: DesignResult, html: bytes, pdf: bytes, tmp_path) -> None:

@@ -12,9 +12,9 @@ from avis_ctrl.report.content import document
 from avis_ctrl.report.figures import Figure
 from avis_ctrl.report.pieces import Mark, Table
 from avis_ctrl.report.sections.simulation import simulation
-from avis_ctrl.simulation.campaign import check_designs
+from avis_ctrl.simulation.design_check import check_designs
 from avis_ctrl.study.companions import Companion, Companions
-from avis_ctrl.study.model import DesignResult, Simulated
+from avis_ctrl.study.design_result import DesignResult, Simulated
 from avis_ctrl.study.output import result_dict
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import bare_loop

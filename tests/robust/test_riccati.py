@@ -8,7 +8,7 @@ import scipy.linalg as la
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from avis_ctrl.robust.riccati import ON_AXIS, _negative_beyond_error, refined, solve_riccati
+from avis_ctrl.robust.riccati import ON_AXIS, negative_beyond_error, refined, solve_riccati
 
 
 def residual(A, R, Q, X):
@@ -109,9 +109,9 @@ def test_round_off_of_eigenvalues_makes_no_solution_indefinite():
         a, v = rng.uniform(1, 3, 6), 10.0 ** rng.uniform(-6, 4, 6)
         X = np.outer(v, v) / (a[:, None] + a)
         H = np.block([[np.diag(-a), np.zeros((6, 6))], [-np.outer(v, v), np.diag(a)]])
-        assert not _negative_beyond_error(H, np.vstack([np.eye(6), X]))
+        assert not negative_beyond_error(H, np.vstack([np.eye(6), X]))
         against = np.block([[np.diag(-a), np.zeros((6, 6))], [np.outer(v, v), np.diag(a)]])
-        assert _negative_beyond_error(against, np.vstack([np.eye(6), -X]))
+        assert negative_beyond_error(against, np.vstack([np.eye(6), -X]))
         computed.append(la.eigvalsh(X)[0])
     assert min(computed) < 0
 

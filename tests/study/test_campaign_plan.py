@@ -13,7 +13,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.simulation.campaign_plan import RecordPlan
-from avis_ctrl.study.campaign_plan import CampaignPlan, default_plan, plan_from_table, plan_toml, read_plan
+from avis_ctrl.study.plan_file import CampaignPlan, default_plan, plan_from_table, plan_toml, read_plan
 
 TEXT = """
 title = "a plan"

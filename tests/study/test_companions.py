@@ -14,7 +14,7 @@ from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.simulation.culprit import find_culprit
 from avis_ctrl.simulation.discrete import spectral_radius
 from avis_ctrl.simulation.loop import simulate
-from avis_ctrl.simulation.prediction import sampled_response
+from avis_ctrl.simulation.sampled_response import sampled_response
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.companions import CompanionSettings, design_companions, until_stable
 from avis_ctrl.study.design_file import design_from_table

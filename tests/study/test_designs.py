@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from avis_ctrl.study.design_file import read_study
-from avis_ctrl.study.runner import provenance
+from avis_ctrl.study.runner import design_provenance
 
 DESIGNS = Path(__file__).resolve().parents[2] / "designs"
 NAMES = sorted(path.stem for path in DESIGNS.glob("*.toml"))
@@ -26,14 +26,14 @@ def test_script_and_file_have_the_same_inputs(name):
     script = runpy.run_path(str(DESIGNS / f"{name}.py"))
     design, rig = read_study(DESIGNS / f"{name}.toml")
     assert script["design"] == design
-    by_script, by_file = (provenance(d, None, r, 0.0)["inputs_sha256"] for d, r in ((script["design"], script["rig"]),
-                                                                                    (design, rig)))
+    by_script, by_file = (design_provenance(d, None, r, 0.0)["inputs_sha256"]
+                          for d, r in ((script["design"], script["rig"]), (design, rig)))
     assert by_script == by_file
 
 
 def test_the_hash_notices_a_change_of_design_and_of_rig():
     design, rig = read_study(DESIGNS / "avis_z_phix.toml")
-    hashes = {provenance(d, None, r, 0.0)["inputs_sha256"] for d, r in (
+    hashes = {design_provenance(d, None, r, 0.0)["inputs_sha256"] for d, r in (
         (design, rig), (design.model_copy(update={"keep": ["phi_x", "z"]}), rig),
         (design, rig.with_parameters({"mass": rig.parameters()["mass"].value * (1 + 1e-12)})))}
     assert len(hashes) == 3

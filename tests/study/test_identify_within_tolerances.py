@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from truth.cases import build_plant, draw_case, simulate_case
 
-from avis_ctrl.identification.prediction import predict
+from avis_ctrl.identification.predictor import predict
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.instruments import Tolerances

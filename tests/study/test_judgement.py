@@ -14,12 +14,12 @@ from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.controllers import passive, reduction_grid
 from avis_ctrl.study.design_file import Design, RequirementSection, read_study
+from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.limits import best_found
-from avis_ctrl.study.model import ControllerResult
 from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.requirements import judge
 from avis_ctrl.study.runner import skyhook_limit
-from avis_ctrl.study.sampling import random_perturbations
 from avis_ctrl.study.skyhooks import classical_skyhook
 
 DESIGNS = Path(__file__).resolve().parents[2] / "designs"

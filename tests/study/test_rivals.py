@@ -17,7 +17,7 @@ from avis_ctrl.robust.mu_peak import worst_case_gain
 from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.controllers import best_of, mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
-from avis_ctrl.study.model import Bound, ControllerResult
+from avis_ctrl.study.design_result import Bound, ControllerResult
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.skyhooks import at_limits, classical_skyhook, critical_gains, tuned_skyhook
 

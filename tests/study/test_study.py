@@ -18,11 +18,11 @@ from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot, mu_upper_slicot
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.controllers import passive
 from avis_ctrl.study.design_file import Design, design_from_table, read_study
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 from avis_ctrl.study.output import write_study
 from avis_ctrl.study.plant import DesignPlant, build_plant
-from avis_ctrl.study.runner import provenance, run_design
-from avis_ctrl.study.sampling import random_perturbations
+from avis_ctrl.study.random_plants import random_perturbations
+from avis_ctrl.study.runner import design_provenance, run_design
 from avis_ctrl.study.simulation import nominal_loop, with_delta
 from avis_ctrl.study.skyhooks import classical_skyhook
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexScalar, RealScalar
@@ -177,7 +177,8 @@ def test_files_of_a_small_study_follow_the_contract(small, tmp_path):
     controllers = [analyse(design, plant, c.K, c.name, c.title, c.kind, samples)
                    for c in (passive(), classical_skyhook(plant, rig, design))]
     result = partial_result(design=design, rig=rig, plant=plant, controllers=tuple(controllers), dk_history=(),
-                            requirements=(), provenance=provenance(design, None, rig, 1.0), seconds=1.0, notes=())
+                            requirements=(), provenance=design_provenance(design, None, rig, 1.0), seconds=1.0,
+                            notes=())
     written = write_study(result, tmp_path, b"<html>", b"%PDF")
     assert written[-1] == tmp_path / "result.json"
     assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()} == {

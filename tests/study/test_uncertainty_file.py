@@ -21,8 +21,8 @@ from avis_ctrl.study.design_file import design_from_table, read_study
 from avis_ctrl.study.identification_design import identification_design
 from avis_ctrl.study.identified_uncertainty import RESPONSE, in_design
 from avis_ctrl.study.plant import build_plant, channels_gain
-from avis_ctrl.study.runner import provenance
-from avis_ctrl.study.sampling import random_perturbations
+from avis_ctrl.study.random_plants import random_perturbations
+from avis_ctrl.study.runner import design_provenance
 from avis_ctrl.study.simulation import nominal_loop, with_delta
 from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty
 from avis_ctrl.study.uncertainty_writer import uncertainty_content, uncertainty_json, write_uncertainty
@@ -116,7 +116,7 @@ def test_a_design_reads_it_beside_itself(folder, content):
     # The hash of the inputs follows the content, not the place of the file.
     other = design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
         update={"identified": content.model_copy(update={"undetermined": 2})})})
-    hashes = {provenance(d, None, rig, 0.0)["inputs_sha256"] for d in (design, other)}
+    hashes = {design_provenance(d, None, rig, 0.0)["inputs_sha256"] for d in (design, other)}
     assert len(hashes) == 2
 
 

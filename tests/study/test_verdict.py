@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.simulation.campaign import PlantCheck
 from avis_ctrl.simulation.culprit import Culprit
-from avis_ctrl.study.model import DesignResult, Requirement, Simulated
+from avis_ctrl.simulation.design_check import PlantCheck
+from avis_ctrl.study.design_result import DesignResult, Requirement, Simulated
 from avis_ctrl.study.requirements import judge_loop
 from avis_ctrl.study.verdict import all_axes, first_sentence, refuse_unstable
 

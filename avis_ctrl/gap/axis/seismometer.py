@@ -19,8 +19,7 @@ from avis_ctrl.gap.axis.analysis import Problem
 from avis_ctrl.gap.axis.model import Answer, AxisModel, Effect, Parameter, split
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.likelihood import Data
-from avis_ctrl.identification.single_axis.lag import LARGEST_MODE_DAMPING
-from avis_ctrl.identification.single_axis.seismometer import Responses, fit_seismometer, response
+from avis_ctrl.identification.single_axis.seismometer import LARGEST_MODE_DAMPING, Responses, fit_seismometer, response
 from avis_ctrl.identification.single_axis.sine import SineRecord
 from avis_ctrl.identification.spectral_block import SpectralBlock
 

@@ -7,8 +7,6 @@ every channel that sees it; the amplitudes and a drifting zero of each channel a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -86,48 +84,3 @@ def _columns(t: np.ndarray, theta: np.ndarray, drift: int) -> np.ndarray:
     else:
         first, second = envelope * np.cos(rest.real * t), envelope * t * np.sinc(rest.real * t / np.pi)
     return np.column_stack([first, second * w0, (2 * t[:, None] / t[-1] - 1) ** np.arange(drift + 1)])
-
-
-@dataclass(frozen=True, eq=False)
-class AmplitudeDependence:
-    """Corner and damping of consecutive stretches of a long decay.
-
-    amplitude : (k,) of the first channel in its unit, root mean square times sqrt(2). corner_Hz, damping : (k,) with
-    standard deviations. at_rest : corner extrapolated linearly to zero amplitude, with its standard deviation from the
-    scatter about the line. slope : Hz a unit of amplitude.
-    """
-
-    amplitude: np.ndarray
-    corner_Hz: np.ndarray
-    corner_deviation: np.ndarray
-    damping: np.ndarray
-    damping_deviation: np.ndarray
-    at_rest: tuple[float, float]
-    slope: tuple[float, float]
-
-
-def amplitude_dependence(time: np.ndarray, channel: np.ndarray, corner_Hz: float, damping: float, stretches: int = 8
-                         ) -> AmplitudeDependence:
-    """Fit consecutive stretches of one decay each by itself.
-
-    Raises
-    ------
-    InputError : fewer than three stretches, or of less than two periods each.
-    """
-    time, y = np.asarray(time, float), np.asarray(channel, float)
-    if stretches < 3 or (time[-1] - time[0]) / stretches * corner_Hz < 2:
-        raise InputError("expected at least three stretches of at least two periods each", field="stretches",
-                         value=stretches)
-    rows = []
-    for keep in np.array_split(np.arange(len(time)), stretches):
-        fit = fit_decay(time[keep], y[keep], corner_Hz, damping)
-        amplitude = np.sqrt(2) * y[keep].std()
-        rows.append((amplitude, *fit.of("corner_Hz"), *fit.of("damping")))
-    amplitude, corner, corner_sd, zeta, zeta_sd = np.array(rows).T
-    X = np.column_stack([np.ones(stretches), amplitude / amplitude.max()])
-    line, *_ = np.linalg.lstsq(X, corner, rcond=None)
-    e = corner - X @ line
-    covariance = np.linalg.inv(X.T @ X) * float(e @ e) / (stretches - 2)
-    sigma = np.sqrt(np.diag(covariance))
-    return AmplitudeDependence(amplitude, corner, corner_sd, zeta, zeta_sd, (float(line[0]), float(sigma[0])),
-                               (float(line[1] / amplitude.max()), float(sigma[1] / amplitude.max())))

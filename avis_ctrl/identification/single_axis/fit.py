@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from avis_ctrl import uncertain_value
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
 
@@ -99,7 +100,7 @@ class SingleAxisFit:
 
     def lines(self) -> list[str]:
         """The result as text: one line for each parameter, then the residual."""
-        found = [f"{name} = {value:.6g} +- {sigma:.2g} {unit}".rstrip() for name, value, sigma, unit
+        found = [f"{name} = {uncertain_value.text(value, sigma, unit)}" for name, value, sigma, unit
                  in zip(self.names, self.values, self.standard_deviation, self.information.units, strict=True)]
         found.append(f"rank {self.information.rank} of {len(self.names)}; residual "
                      f"{100 * self.residual.share:.2f} % of the measured; chi2/dof {self.chi2_per_dof:.3g} against "
@@ -198,20 +199,3 @@ def residual_statistics(e: np.ndarray, y: np.ndarray, honest: np.ndarray, plain:
     ratio = float(np.max(honest / np.maximum(plain, np.finfo(float).tiny)))
     share = float(np.linalg.norm(e) / max(float(np.linalg.norm(y)), np.finfo(float).tiny))
     return ResidualStatistics(float(np.sqrt(np.mean(flat))), share, lag_one, ratio, lags)
-
-
-def block_bootstrap(estimate: Callable[[np.ndarray], np.ndarray], samples: int, block: int, draws: int,
-                    rng: np.random.Generator) -> np.ndarray:
-    """(p,) standard deviations of estimate(indices) over moving blocks of rows (Kuensch, Ann. Statist. 17 (1989) 1217).
-
-    It assumes nothing of the scores but that blocks are long against their correlation.
-    """
-    if not 1 <= block <= samples // 4 or draws < 2:
-        raise InputError(f"expected blocks of 1 to {samples // 4} samples and at least two draws", field="block, draws",
-                         value=(block, draws))
-    count = -(-samples // block)
-    found = []
-    for _ in range(draws):
-        starts = rng.integers(0, samples - block + 1, count)
-        found.append(estimate((starts[:, None] + np.arange(block)).ravel()[:samples]))
-    return np.std(found, axis=0, ddof=1)

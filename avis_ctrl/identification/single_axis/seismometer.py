@@ -23,6 +23,8 @@ from avis_ctrl.identification.single_axis.fit import SingleAxisFit, not_below, r
 
 # The misfit of neighbouring frequencies is alike; scores are taken as correlated over this many.
 CORRELATED_LINES = 2
+# A mode of the mount with more damping has the phase of a delay to fourth order: the two cannot be distinguished.
+LARGEST_MODE_DAMPING = 0.2
 POWER = {"coil": 1, "displacement": 0, "ground": 2}
 PARAMETERS = {"corner_Hz": "Hz", "damping": ""}
 

@@ -63,7 +63,7 @@ class Spikes(Gate):
                 if len(where):
                     k = int(where[np.argmax(ratio)])
                     part = slice(max(0, k - 100), k + 100)
-                    expected = float(x[k] - _departure(x[k - 2 : k + 3])[0])
+                    expected = float(x[k] - departure(x[k - 2 : k + 3])[0])
                     found.append(
                         _Kept(
                             seen.header.name,
@@ -131,7 +131,7 @@ def spikes(x: np.ndarray, lsb: float | None = None) -> tuple[np.ndarray, np.ndar
     """Samples (m,) that are spikes, their departure by the median one around (m,), and that median (blocks,)."""
     if len(x) < 16 or np.ptp(x) == 0:
         return np.zeros(0, int), np.zeros(0), np.zeros(0)
-    r = np.concatenate([np.zeros(2), _departure(x), np.zeros(2)])
+    r = np.concatenate([np.zeros(2), departure(x), np.zeros(2)])
     if lsb is None:
         lsb = float(np.min(np.diff(np.unique(x[: 1 << 14])), initial=np.inf))
         lsb = lsb if np.isfinite(lsb) else 0.0
@@ -147,12 +147,12 @@ def spikes(x: np.ndarray, lsb: float | None = None) -> tuple[np.ndarray, np.ndar
         here = r[k - 2 : k + 3]
         left = here - r[k] * SHAPE
         largest = abs(r[k]) >= np.max(np.abs(here))
-        if largest and np.max(np.abs(left)) < LEFT * abs(r[k]) and np.sum(left**2) < _corner(here):
+        if largest and np.max(np.abs(left)) < LEFT * abs(r[k]) and np.sum(left**2) < jump_corner(here):
             single.append(int(k))
     return np.array(single, int), ratio[single], spread
 
 
-def _corner(here: np.ndarray) -> float:
+def jump_corner(here: np.ndarray) -> float:
     """Sum of squares that the best corner leaves of five departures: at the middle sample or between it and another."""
     trials = [np.column_stack([CORNER, np.roll(CORNER, shift)]) for shift in (-1, 1)]
     sums = []
@@ -164,7 +164,7 @@ def _corner(here: np.ndarray) -> float:
     return min(sums)
 
 
-def _departure(x: np.ndarray) -> np.ndarray:
+def departure(x: np.ndarray) -> np.ndarray:
     """(n - 4,) of each sample from the cubic through its two neighbours on either side."""
     return np.convolve(x, SHAPE, "valid")
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from avis_ctrl.gap.axis.result import AxisGap
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.result import NamedEffect, sized, spoken
-from avis_ctrl.report.identification.pictures import figure_of
+from avis_ctrl.report.identification.gate_figures import figure_of
 from avis_ctrl.report.pieces import Bullets, Document, Paragraph, Piece, Section, table
 from avis_ctrl.report.sections.provenance import provenance_table, stamp_of
 

@@ -8,14 +8,15 @@ import numpy as np
 
 from avis_ctrl.gap.result import Gap, HeatMap
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, Style, hertz, level
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, level
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.response_panels import difference, drives, magnitude
 from avis_ctrl.study.gap_overlay import BESIDE, GapOverlay, gap_overlay
 
 BEFORE, AFTER, NOISE = Style("#d55e00", "dash", 1.8), Style("#0072b2", "solid", 2.0), Style("#7a7a7a", "dot", 1.6)
-PAIRS, MOST_POINTS = 3, 70
+PAIRS = 3
 # Of a row of a stage's name under its bar, so that four stand beside each other on a phone.
 LETTERS = 13
 
@@ -129,7 +130,8 @@ def responses(seen: GapOverlay, named: bool) -> list[Piece]:
                  "no frequency response.")
     points = (f"the {who} model's response plus what it leaves in the records, regressed on the inputs (points)"
               if seen.method.startswith(BESIDE) else "measured (points)")
-    panels = [panel for i, j in pairs for panel in (_magnitude(seen, i, j, named), _residual(seen, i, j, named))]
+    models = [("re-identified", seen.baseline, BEFORE)] + ([("updated", seen.updated, AFTER)] if named else [])
+    panels = [draw(seen, i, j, models) for i, j in pairs for draw in (magnitude, difference)]
     figure = Figure("gap_responses", f"Left: magnitude, {points} with a band of two standard deviations to "
                     "each side. Right: magnitude of the complex difference between measured and model; with noise "
                     "alone 86 % of the points lie below the dotted line.", tuple(panels), 2, 0.68)
@@ -141,42 +143,5 @@ def worst_pairs(seen: GapOverlay) -> list[tuple[int, int]]:
     with np.errstate(divide="ignore", invalid="ignore"):
         far = np.abs(seen.measured - seen.baseline) ** 2 / seen.measured_std ** 2
     size = np.mean(np.where(np.isfinite(far), far, 0.0), axis=0)
-    drives = [j for j, name in enumerate(seen.inputs) if name not in ("vx", "vy", "vz")] or list(
-        range(len(seen.inputs)))
-    best = [(i, max(drives, key=lambda j: size[i, j])) for i in range(len(seen.outputs))]
+    best = [(i, max(drives(seen), key=lambda j: size[i, j])) for i in range(len(seen.outputs))]
     return sorted(best, key=lambda pair: -size[pair])[:PAIRS]
-
-
-def _unit(seen: GapOverlay, j: int) -> str:
-    output, _, inputs = seen.unit.partition(" per ")
-    return words.unit(f"{output}/({'m/s' if seen.inputs[j] in ('vx', 'vy', 'vz') else inputs.partition(';')[0]})"
-                      ).replace("/(V)", "/V")
-
-
-def _models(seen: GapOverlay, named: bool) -> list[tuple[str, np.ndarray, Style]]:
-    return [("re-identified", seen.baseline, BEFORE)] + ([("updated", seen.updated, AFTER)] if named else [])
-
-
-def _magnitude(seen: GapOverlay, i: int, j: int, named: bool) -> Panel:
-    f, size, two = seen.frequency_Hz, np.abs(seen.measured[:, i, j]), 2 * seen.measured_std[:, i, j]
-    keep = np.unique(np.linspace(0, len(f) - 1, min(len(f), MOST_POINTS)).round().astype(int))
-    models = [(label, np.abs(G[:, i, j]), style) for label, G, style in _models(seen, named)]
-    low = 0.5 * float(min(np.quantile(size, 0.02), *(m.min() for _, m, _ in models)))
-    high = 2.0 * float(max(size.max(), *(m.max() for _, m, _ in models)))
-    curves = [Curve(f[keep], size[keep], "measured", Style("#222222"), points=True, line=False),
-              *(Curve(f, m, label, style) for label, m, style in models)]
-    band = Band(f, np.maximum(size - two, low), np.maximum(size + two, low), "measured, ± 2 σ", Style("#7a7a7a"))
-    return Panel(hertz(float(f[0]), float(f[-1])), Axis(f"magnitude [{_unit(seen, j)}]", "log", (low, high)),
-                 tuple(curves), (band,), f"{seen.outputs[i]} from {seen.inputs[j]}")
-
-
-def _residual(seen: GapOverlay, i: int, j: int, named: bool) -> Panel:
-    f, two = seen.frequency_Hz, 2 * seen.measured_std[:, i, j]
-    left = [(label, np.abs(seen.measured[:, i, j] - G[:, i, j]), style) for label, G, style in _models(seen, named)]
-    values = np.concatenate([two, *(v for _, v, _ in left)])
-    values = values[values > 0]
-    limits = (0.5 * float(np.quantile(values, 0.01)), 2 * float(values.max())) if values.size else (1e-3, 1.0)
-    curves = [*(Curve(f, v, label, style) for label, v, style in left),
-              Curve(f, two, "two standard deviations of the measured", Style("#222222", "dot", 1.4))]
-    return Panel(hertz(float(f[0]), float(f[-1])), Axis(f"difference [{_unit(seen, j)}]", "log", limits),
-                 tuple(curves), (), f"{seen.outputs[i]} from {seen.inputs[j]}")

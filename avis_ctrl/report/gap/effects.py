@@ -38,7 +38,7 @@ def _sizes(gap: Gap) -> Table:
     rows = []
     for one in (*gap.effects, *gap.traces):
         for name, p in one.parameters.items():
-            value, sigma = words.with_deviation(p.value, p.std)
+            value, sigma = words.with_std(p.value, p.std)
             known = np.isfinite(p.std) and p.std > 0
             rows.append((one.name, one.location, name, value, f"± {sigma}" if known else "none",
                          "" if p.unit == "1" else words.unit(p.unit)))
@@ -74,7 +74,7 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
         new = after.get(name, np.nan)
         shown, spread = words.number(new, 5), "not by itself" if name in shared else "not stated"
         if name in sigma and name not in shared:
-            shown, spread = words.with_deviation(new, sigma[name])
+            shown, spread = words.with_std(new, sigma[name])
         change = f"{100 * (new / value - 1):+.2f} %".replace("-", "−") if value and np.isfinite(new) else "none"
         middle = (words.number(value, 5), shown, spread, change) if gap.effects else (shown, spread)
         rows.append((name, *middle, words.unit(units[name])))
@@ -104,7 +104,7 @@ def _always(gap: Gap) -> list[Piece]:
     sigma = _deviations(gap)
     told = []
     for name, value in own:
-        size, spread = words.with_deviation(value, sigma.get(name, np.nan))
+        size, spread = words.with_std(value, sigma.get(name, np.nan))
         told.append(f"{wording.titled(name.rpartition('.')[2])} {size} ± {spread}" if name in sigma else
                     f"{wording.titled(name.rpartition('.')[2])} {words.number(value)}")
     return [Paragraph("Every model, with or without a named effect, also holds the second-order terms of large "

@@ -74,7 +74,7 @@ def percent(share: float, digits: int = 3) -> str:
 
 def quantity(one: Reported) -> str:
     """value ± standard deviation unit."""
-    value, sigma = words.with_deviation(one.value, one.std)
+    value, sigma = words.with_std(one.value, one.std)
     unit = "" if one.unit in ("", "1") else f" {words.unit(one.unit)}"
     if not (np.isfinite(one.std) and one.std > 0):
         return f"{value}{unit} (no standard deviation)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from avis_ctrl.report.identification.comparison import ways
 from avis_ctrl.report.identification.gates import gates
 from avis_ctrl.report.identification.identifiability import identifiability
 from avis_ctrl.report.identification.measurements import measurements
@@ -10,7 +11,6 @@ from avis_ctrl.report.identification.opening import opening
 from avis_ctrl.report.identification.responses import responses
 from avis_ctrl.report.identification.uncertainty import uncertainty
 from avis_ctrl.report.identification.validation import validation
-from avis_ctrl.report.identification.ways import ways
 from avis_ctrl.report.pieces import Document
 from avis_ctrl.report.sections.provenance import provenance_table, stamp_of
 from avis_ctrl.study.identification import Identification

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from avis_ctrl.measurement.gates.finding import SEVERITIES, Finding, Picture
-from avis_ctrl.report.identification.pictures import figure_of
+from avis_ctrl.report.identification.gate_figures import figure_of
 from avis_ctrl.report.pieces import Cell, Fold, Mark, Paragraph, Piece, Section, table
 from avis_ctrl.study.identification import Identification
 

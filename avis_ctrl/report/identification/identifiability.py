@@ -33,7 +33,7 @@ def _combinations(found: Identification) -> Table:
     for one in found.identifiability.combinations:
         unit = "" if one.unit in ("1", "mixed units") else words.unit(one.unit)
         if one.determined:
-            value, sigma = words.with_deviation(one.value, one.standard_deviation)
+            value, sigma = words.with_std(one.value, one.standard_deviation)
             share = f"{words.number(100 * one.relative, 2)} %"
         else:
             value, sigma, share = words.number(one.value, 4), "not determined", ""

@@ -53,7 +53,7 @@ def _parameters(found: Identification) -> Table:
                                                 information.standard_deviation, strict=True):
         change = f"{100 * (value / before - 1):+.2f} %".replace("-", "−") if before else "from zero"
         if np.isfinite(sigma):
-            shown, spread = words.with_deviation(value, sigma)
+            shown, spread = words.with_std(value, sigma)
             share = f"{words.number(100 * sigma / abs(value), 2)} %" if value else ""
         else:
             shown, spread, share = words.number(value, 5), TOGETHER, ""

@@ -6,14 +6,27 @@ import numpy as np
 
 from avis_ctrl.identification.overlays import ResponseOverlay
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, hertz
+from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style
 from avis_ctrl.report.pieces import Paragraph, Piece, Section
+from avis_ctrl.report.response_panels import (
+    MEASURED,
+    MOST_POINTS,
+    SCATTER,
+    Model,
+    difference,
+    drives,
+    frequencies,
+    magnitude,
+    thin,
+    title,
+    unit,
+)
 from avis_ctrl.study.identification import Identification
 
-MEASURED, START, MODEL = Style("#222222"), Style("#e69f00", "dash", 1.6), Style("#0072b2", "solid", 1.6)
+START, MODEL = Style("#e69f00", "dash", 1.6), Style("#0072b2", "solid", 1.6)
 OUTPUTS_TOGETHER = 3
-# Points of a measured response in a full figure, and in the overview.
-MOST_POINTS, MOST_SMALL = 60, 90
+# Points of a measured response in the overview.
+MOST_SMALL = 90
 
 
 def responses(found: Identification) -> Section:
@@ -41,45 +54,16 @@ def responses(found: Identification) -> Section:
 
 def strongest(seen: ResponseOverlay) -> list[tuple[int, int]]:
     """Output and its input with the largest gain by the mean logarithm; the floor only where there is no other."""
-    actuators = [j for j, name in enumerate(seen.inputs) if name not in ("vx", "vy", "vz")] or range(len(seen.inputs))
     with np.errstate(divide="ignore"):
         gain = np.mean(np.log(np.abs(seen.model)), axis=0)
-    return [(i, max(actuators, key=lambda j: gain[i, j])) for i in range(len(seen.outputs))]
-
-
-def _unit(seen: ResponseOverlay, j: int) -> str:
-    """Floor columns are per m/s whatever the drives' unit is, which stands first."""
-    output, _, inputs = seen.unit.partition(" per ")
-    drive = inputs.partition(";")[0]
-    return words.unit(f"{output} per {'m/s' if seen.inputs[j] in ('vx', 'vy', 'vz') else drive}")
-
-
-def _frequencies(seen: ResponseOverlay) -> Axis:
-    return hertz(float(seen.frequency_Hz[0]), float(seen.frequency_Hz[-1]))
-
-
-def _thin(count: int, most: int) -> np.ndarray:
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+    return [(i, max(drives(seen), key=lambda j: gain[i, j])) for i in range(len(seen.outputs))]
 
 
 def _bode(seen: ResponseOverlay, pairs: list[tuple[int, int]], number: int) -> Figure:
-    panels = [panel for i, j in pairs for panel in (_magnitude(seen, i, j), _phase(seen, i, j))]
+    panels = [panel for i, j in pairs for panel in (magnitude(seen, i, j, _models(seen)), _phase(seen, i, j))]
     return Figure(f"response_{number}", "Magnitude (left) and phase (right): measured (points) with a band of ± 2 "
                   "standard deviations, start model (dashed) and identified model (line). A band narrower than a point "
                   "is not visible.", tuple(panels), 2, 0.85)
-
-
-def _magnitude(seen: ResponseOverlay, i: int, j: int) -> Panel:
-    f, size, s = seen.frequency_Hz, np.abs(seen.measured[:, i, j]), 2 * seen.measured_std[:, i, j]
-    keep = _thin(len(f), MOST_POINTS)
-    start, model = np.abs(seen.start[:, i, j]), np.abs(seen.model[:, i, j])
-    low = 0.5 * float(min(model.min(), start.min(), np.quantile(size, 0.02)))
-    high = 2.0 * float(max(model.max(), start.max(), size.max()))
-    curves = (Curve(f[keep], size[keep], "measured", Style(MEASURED.colour), points=True, line=False),
-              Curve(f, model, "identified", MODEL), Curve(f, start, "start", START))
-    band = Band(f, np.maximum(size - s, low), np.maximum(size + s, low), "measured, ± 2 σ", Style("#7a7a7a"))
-    return Panel(_frequencies(seen), Axis(f"magnitude [{_unit(seen, j)}]", "log", (low, high)), curves, (band,),
-                 f"{seen.outputs[i]} from {seen.inputs[j]}")
 
 
 def _phase(seen: ResponseOverlay, i: int, j: int) -> Panel:
@@ -89,35 +73,27 @@ def _phase(seen: ResponseOverlay, i: int, j: int) -> Panel:
     shown = {name: np.rad2deg(base + np.angle(value / model)) for name, value in
              (("measured", measured), ("start", seen.start[:, i, j]))}
     s = np.rad2deg(np.minimum(2 * seen.measured_std[:, i, j] / np.maximum(np.abs(measured), 1e-300), np.pi))
-    keep = _thin(len(f), MOST_POINTS)
-    curves = (Curve(f[keep], shown["measured"][keep], "measured", Style(MEASURED.colour), points=True, line=False),
+    keep = thin(len(f), MOST_POINTS)
+    curves = (Curve(f[keep], shown["measured"][keep], "measured", MEASURED, points=True, line=False),
               Curve(f, np.rad2deg(base), "identified", MODEL), Curve(f, shown["start"], "start", START))
-    band = Band(f, shown["measured"] - s, shown["measured"] + s, "measured, ± 2 σ", Style("#7a7a7a"))
-    return Panel(_frequencies(seen), Axis("phase [°]"), curves, (band,),
-                 f"{seen.outputs[i]} from {seen.inputs[j]}")
+    band = Band(f, shown["measured"] - s, shown["measured"] + s, "measured, ± 2 σ", SCATTER)
+    return Panel(frequencies(seen), Axis("phase [°]"), curves, (band,),
+                 title(seen, i, j))
+
+
+def _models(seen: ResponseOverlay) -> list[Model]:
+    return [("identified", seen.model, MODEL), ("start", seen.start, START)]
 
 
 def _residual(seen: ResponseOverlay, pairs: list[tuple[int, int]]) -> Figure:
-    panels = []
-    for i, j in pairs:
-        f = seen.frequency_Hz
-        before, after = (np.abs(seen.measured[:, i, j] - other[:, i, j]) for other in (seen.start, seen.model))
-        two = 2 * seen.measured_std[:, i, j]
-        values = np.concatenate([before, after, two])
-        values = values[values > 0]
-        limits = (0.5 * float(np.quantile(values, 0.005)), 2 * float(values.max())) if values.size else (1e-3, 1.0)
-        curves = (Curve(f, before, "measured less start", START), Curve(f, after, "measured less identified", MODEL),
-                  Curve(f, two, "two standard deviations of the measured", Style("#222222", "dot", 1.4)))
-        panels.append(Panel(_frequencies(seen), Axis(f"residual [{_unit(seen, j)}]", "log", limits), curves, (),
-                            f"{seen.outputs[i]} from {seen.inputs[j]}"))
     return Figure("residuals", "Residual: magnitude of the complex difference between measured response and model. "
-                  "With noise alone, 86 % of the points are expected below the dotted line.", tuple(panels), 2, 0.75)
+                  "With noise alone, 86 % of the points are expected below the dotted line.",
+                  tuple(difference(seen, i, j, _models(seen)) for i, j in pairs), 2, 0.75)
 
 
 def _overview(seen: ResponseOverlay) -> Figure:
-    columns = [j for j, name in enumerate(seen.inputs) if name not in ("vx", "vy", "vz")] or list(
-        range(len(seen.inputs)))
-    keep = _thin(len(seen.frequency_Hz), MOST_SMALL)
+    columns = drives(seen)
+    keep = thin(len(seen.frequency_Hz), MOST_SMALL)
     f, n_y = seen.frequency_Hz[keep], len(seen.outputs)
     size = np.abs(np.concatenate([seen.model[:, :, columns], seen.start[:, :, columns]]))
     positive = size[size > 0]
@@ -130,8 +106,8 @@ def _overview(seen: ResponseOverlay) -> Figure:
             curves = (Curve(f, measured, "measured", Style("#7a7a7a", "solid", 2.6)),
                       Curve(f, model, "identified", Style(MODEL.colour, "solid", 1.0)),
                       Curve(f, start, "start", Style(START.colour, "dash", 1.0)))
-            panels.append(Panel(Axis("[Hz]" if last else "", "log", _frequencies(seen).range, silent=not last),
+            panels.append(Panel(Axis("[Hz]" if last else "", "log", frequencies(seen).range, silent=not last),
                                 Axis(f"{seen.outputs[i]}" if first else "", "log", limits, silent=not first),
                                 curves, (), seen.inputs[j] if i == 0 else ""))
-    return Figure("overview", f"Magnitude of every pair on the same scales [{_unit(seen, columns[0])}]: inputs from "
+    return Figure("overview", f"Magnitude of every pair on the same scales [{unit(seen, columns[0])}]: inputs from "
                   "left to right, outputs from top to bottom.", tuple(panels), len(columns), 0.36, True)

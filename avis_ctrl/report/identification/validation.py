@@ -122,8 +122,8 @@ def _modes(found: Identification) -> Table:
         rows.append((row.shape, words.number(row.start_frequency_Hz, 4), f, measured_f, _sigma(row.frequency_sigma),
                      words.number(100 * row.start_damping, 3), z, measured_z, _sigma(row.damping_sigma)))
     return table("Modes of the start and of the identified model beside those measured in the held-out data without "
-                 "the rig's equations. Brackets give one standard deviation in units of the last "
-                 "digits. Shapes are given by the distribution of the kinetic energy; the difference is model minus "
+                 "the rig's equations, each with one standard deviation. Shapes "
+                 "are given by the distribution of the kinetic energy; the difference is model minus "
                  "measured, divided by its standard deviation.",
                  ("shape", "start [Hz]", "identified [Hz]", "measured [Hz]", "diff. [σ]", "damping, start [%]",
                   "identified [%]", "measured [%]", "diff. [σ]"), rows)
@@ -134,7 +134,7 @@ def _pair(value: float, sigma: float) -> str:
         return "none"
     if not (np.isfinite(sigma) and sigma > 0):
         return words.number(value, 4)
-    return words.in_brackets(value, sigma)
+    return " ± ".join(words.with_std(value, sigma))
 
 
 def _sigma(value: float) -> str:

@@ -9,14 +9,14 @@ import numpy as np
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz, level
 from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table
-from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
+from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
 
 Pick = Callable[[ControllerResult], Bound]
 
 
 def bounds(result: DesignResult) -> Section:
     """mu of the weighted performance and of stability alone, and what reaches them."""
-    pieces: list[Piece] = [_guarantee(result)]
+    pieces: list[Piece] = [certificate(result)]
     pieces += [_figure("mu_performance", result, lambda c: c.mu, "mu, performance", "mu of the weighted performance",
                        "Below 1 (dashed line) every weighted requirement holds for every plant of the uncertainty "
                        "set."),
@@ -27,7 +27,8 @@ def bounds(result: DesignResult) -> Section:
     return Section("Bounds of mu", "bounds", tuple(pieces))
 
 
-def _guarantee(result: DesignResult) -> Paragraph:
+def certificate(result: DesignResult) -> Paragraph:
+    """Both bounds of mu, and whether the upper one is proved between the computed frequencies."""
     mu = result.controller("mu").mu
     gap = 100 * (1 - mu.lower / mu.upper) if np.isfinite(mu.upper) and mu.upper > 0 else np.nan
     between = ("The upper bound is guaranteed at every frequency, also between the computed points."
@@ -36,7 +37,8 @@ def _guarantee(result: DesignResult) -> Paragraph:
     return Paragraph(f"With the mu controller the peak of mu is between {words.bound(mu.lower, 4)} and "
                      f"{words.bound(mu.upper, 4)}, at {words.hertz(mu.omega)}"
                      + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
-                     + f". The lower bound is a perturbation that makes the loop singular. {between}")
+                     + f". Below 1, every weighted requirement holds for every plant of the uncertainty set. {between} "
+                     "The lower bound is a perturbation that makes the loop singular.")
 
 
 def _figure(name: str, result: DesignResult, pick: Pick, label: str, what: str, meaning: str) -> Figure:

@@ -18,7 +18,7 @@ from avis_ctrl.report.figures import (
     numbered,
 )
 from avis_ctrl.report.pieces import Piece, Section, Table, table
-from avis_ctrl.study.model import ControllerResult, DesignResult
+from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
 HZ = np.geomspace(0.01, 500.0, 500)
 MOST_POLES = 60
@@ -75,7 +75,7 @@ def _bode(result: DesignResult) -> Figure:
     return Figure("controller_bode", "Bode plot of the mu controller, each measurement to each command; the phase is "
                   "wrapped into ±180 degrees.",
                   (Panel(x, Axis("gain [N s/m]", "log"), tuple(sizes)),
-                   Panel(x, Axis("phase [deg]", "linear", (-190.0, 190.0)), tuple(phases))))
+                   Panel(x, Axis("phase [deg]", "linear", (-190.0, 190.0)), tuple(phases))), 2)
 
 
 def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
@@ -93,10 +93,10 @@ def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
         loops.append(Curve(HZ, decibels(np.linalg.norm(L, ord=2, axis=(1, 2))), c.title, controller_style(c.name)))
         sensitivities.append(Curve(HZ, decibels(size), c.title, controller_style(c.name)))
     x = hertz(0.01, 500.0)
-    return Figure("loops", "Largest singular value of the open loop G K at the measurement (above) and of the "
-                  f"sensitivity (I − G K)⁻¹ (below); nominal plant. Peaks of the sensitivity: {'; '.join(peaks)}.",
+    return Figure("loops", "Largest singular value of the open loop G K at the measurement (left) and of the "
+                  f"sensitivity (I − G K)⁻¹ (right); nominal plant. Peaks of the sensitivity: {'; '.join(peaks)}.",
                   (Panel(x, Axis("open loop [dB]", "linear", (-80.0, 50.0)), tuple(loops)),
-                   Panel(x, Axis("sensitivity [dB]", "linear", (-40.0, 20.0)), tuple(sensitivities))))
+                   Panel(x, Axis("sensitivity [dB]", "linear", (-40.0, 20.0)), tuple(sensitivities))), 2)
 
 
 def _poles(mu: ControllerResult) -> Table:

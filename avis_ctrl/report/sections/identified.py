@@ -7,8 +7,8 @@ import numpy as np
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, numbered
 from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Table, table
+from avis_ctrl.study.design_result import DesignResult
 from avis_ctrl.study.identified_uncertainty import InDesign
-from avis_ctrl.study.model import DesignResult
 
 # Parameters shown for each direction.
 SHOWN = 5

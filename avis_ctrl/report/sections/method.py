@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from avis_ctrl.report.pieces import Bullets, Formula, Heading, Paragraph, Section
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 
 SOURCES = (
     "B. M. Beadle, S. Hurlebaus, U. Stöbener, L. Gaul: Modeling and Parameter Identification of an Active "

@@ -11,8 +11,8 @@ from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, decibel
 from avis_ctrl.report.pieces import Bullets, Drawing, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.sections.identified import identified
 from avis_ctrl.report.sections.transmissibility import asked_dB, upper_bound
+from avis_ctrl.study.design_result import ControllerResult, DesignResult
 from avis_ctrl.study.identified_uncertainty import RESPONSE
-from avis_ctrl.study.model import ControllerResult, DesignResult
 from avis_ctrl.study.plant import EFFORT, DesignPlant
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection, UncertainEquation
 from avis_ctrl.uncertainty.weights import NeglectedDynamics

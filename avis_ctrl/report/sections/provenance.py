@@ -7,7 +7,7 @@ from typing import Any
 
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Section, table
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 
 NAMES = {"avis_ctrl": "avis_ctrl version", "design_file": "design file", "inputs_sha256": "SHA-256 of the inputs",
          "measurement_sha256": "SHA-256 of the measurement", "seconds": "seconds of computing", "python": "Python"}

@@ -13,7 +13,7 @@ from avis_ctrl.report.rig_drawing import rig_drawing
 from avis_ctrl.rigs.instruments import Sensor
 from avis_ctrl.rigs.rig import Parameter, Rig
 from avis_ctrl.rigs.subsystem import ReductionError
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 
 # By what a sensor measures: its kind, the unit of its gain, and a factor with the unit of its limit.
 _KINDS = {"velocity": ("geophone", "V s/m", 1e3, "mm/s"), "acceleration": ("accelerometer", "V s²/m", 1.0, "m/s²"),
@@ -180,4 +180,4 @@ def _compared(result: DesignResult, n: int) -> Figure:
                   title="difference, relative to the largest gain")
     return Figure("reduction", "Transmissibility without control, floor to payload along each kept axis: six degrees "
                   "of freedom (coloured) and the small model on top of it (black, dotted), with the contribution of "
-                  "the floor's other axes. Below, their difference.", (panel, lower))
+                  "the floor's other axes. Beside it, their difference.", (panel, lower), 2)

@@ -7,10 +7,10 @@ import numpy as np
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz
 from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, Table, table
-from avis_ctrl.simulation.campaign import PlantCheck, SimulationCheck
+from avis_ctrl.simulation.design_check import PlantCheck, SimulationCheck
 from avis_ctrl.simulation.spectrum_check import SpectrumAgreement
 from avis_ctrl.study.companions import Companions
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 
 
 def simulation(result: DesignResult) -> Section:
@@ -81,7 +81,8 @@ def _spectrum(name: str, s: SpectrumAgreement) -> Figure:
         panels.append(Panel(hertz(float(s.frequency_Hz[0]), 100.0), Axis("velocity [m/s/√Hz]", "log"), curves, (),
                             words.axis(axis)))
     return Figure("spectrum", f"Spectral density of the payload velocity for the plant \"{name}\": simulated (Welch's "
-                  "method), and predicted by the linear model of the sampled loop.", tuple(panels))
+                  "method), and predicted by the linear model of the sampled loop.", tuple(panels),
+                  min(2, len(panels)))
 
 
 def _ratios(check: SimulationCheck) -> Figure:
@@ -99,7 +100,8 @@ def _ratios(check: SimulationCheck) -> Figure:
         panels.append(Panel(hertz(0.8, 100.0), Axis("simulated over predicted [dB]", "linear"), tuple(curves), (),
                             words.axis(axis)))
     return Figure("spectrum_ratio", "Power in third octaves, simulated over predicted, for every plant. The dashed "
-                  "lines are the limits of the first plant; each plant is tested against its own.", tuple(panels))
+                  "lines are the limits of the first plant; each plant is tested against its own.", tuple(panels),
+                  min(2, len(panels)))
 
 
 def _record(check: SimulationCheck) -> Figure:

@@ -9,7 +9,7 @@ from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, 
 from avis_ctrl.report.pieces import Paragraph, Section, Table, table
 from avis_ctrl.report.sections.transmissibility import left_out
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
-from avis_ctrl.study.model import ControllerResult, DesignResult
+from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
 
 def site(result: DesignResult) -> Section:

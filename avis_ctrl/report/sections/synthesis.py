@@ -7,7 +7,7 @@ import numpy as np
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, level, numbered
 from avis_ctrl.report.pieces import Paragraph, Section, table
-from avis_ctrl.study.model import DesignResult
+from avis_ctrl.study.design_result import DesignResult
 
 
 def synthesis(result: DesignResult) -> Section:
@@ -44,4 +44,4 @@ def synthesis(result: DesignResult) -> Section:
               "functions, compared with the best scalings at each frequency. The best controller of all iterations is "
               "used.",
               ("step", "kind", "gamma", "mu upper", "order", "order of D", "fit", "time"), rows, "rlrrrrrr"),
-        Figure("dk_history", caption, (values, orders))))
+        Figure("dk_history", caption, (values, orders), 2)))

@@ -39,5 +39,5 @@ def tolerances(found: Sequence[Tolerance], shown: Shown = Shown()) -> list[Piece
 
 
 def _row(one: Tolerance) -> tuple[str, ...]:
-    value, sigma = words.with_deviation(one.value, one.std)
+    value, sigma = words.with_std(one.value, one.std)
     return one.parameter, value, f"± {sigma}", words.unit(one.unit), f"{one.moved:+.1f}".replace("-", "−")

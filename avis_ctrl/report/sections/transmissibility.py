@@ -7,7 +7,7 @@ import numpy as np
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, controller_style, decibels, hertz
 from avis_ctrl.report.pieces import Section
-from avis_ctrl.study.model import ControllerResult, DesignResult
+from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
 GAIN_DB = (-60.0, 40.0)
 
@@ -57,6 +57,16 @@ def _panel(curves: list[Curve], bands: list[Band], title: str, ranged: tuple[flo
     return Panel(hertz(0.1, 200.0), Axis("largest gain [dB]", "linear", ranged), tuple(curves), tuple(bands), title)
 
 
+def summary_figure(result: DesignResult) -> Figure:
+    """The delivered controller beside the table without control, with the bound over the whole set."""
+    mu, passive = result.controller("mu"), result.controller("passive")
+    curves = [*(_sigma(c) for c in (passive, mu) if c.stable), upper_bound(mu, "mu synthesis, worst case of the set"),
+              _limit(result)]
+    return Figure("summary", "Transmissibility from floor to payload, largest gain: without control, with the mu "
+                  "controller on the nominal plant, and its upper bound over every plant of the uncertainty set.",
+                  (_panel(curves, [], ""),))
+
+
 def _nominal(result: DesignResult) -> Figure:
     mu, passive = result.controller("mu"), result.controller("passive")
     caption = (f"Largest singular value from floor velocity to payload velocity, nominal plant. Without control the "
@@ -75,7 +85,7 @@ def _uncertain(result: DesignResult) -> Figure:
         worst = upper_bound(c, "upper bound over the whole set")
         band = Band(_hz(c), decibels(T.low), decibels(T.high), f"{c.title}: range over sampled plants", style)
         panels.append(_panel([_sigma(c), worst, _limit(result)], [band], c.title))
-    return Figure("transmissibility_uncertain", _spread_words(result), tuple(panels))
+    return Figure("transmissibility_uncertain", _spread_words(result), tuple(panels), 2)
 
 
 def _spread_words(result: DesignResult) -> str:
@@ -97,7 +107,8 @@ def _by_axis(result: DesignResult) -> Figure:
         panels.append(Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", GAIN_DB), tuple(curves), (),
                             words.axis(axis)))
     return Figure("transmissibility_axes", "Each axis alone, nominal plant: payload velocity over floor velocity along "
-                  "the same axis, without the coupling between axes." + left_out(result), tuple(panels))
+                  "the same axis, without the coupling between axes." + left_out(result), tuple(panels),
+                  min(2, len(panels)))
 
 
 def _six_dof(result: DesignResult) -> Figure:

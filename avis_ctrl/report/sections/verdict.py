@@ -2,32 +2,49 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Section, table
-from avis_ctrl.study.model import Bound, ControllerResult, DesignResult
+from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, table
+from avis_ctrl.report.sections.bounds import certificate
+from avis_ctrl.report.sections.transmissibility import summary_figure
+from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
 from avis_ctrl.study.verdict import all_axes, first_sentence
 
 
 def verdict(result: DesignResult) -> Section:
-    """The verdict table, with one sentence above it that says what was achieved."""
+    """The page that is read alone: what was asked, whether it is met, the certificate, and one figure."""
     rows = [(r.name, Mark("met" if r.met else "NOT MET", r.met), words.quantity(r.value, r.unit),
-             f"{r.comparison} {words.quantity(r.limit, r.unit)}", r.note) for r in result.requirements]
-    asked = [table("Requirements of the design and the results of the mu controller. Values in dB are the largest "
-                   "singular value from floor to payload, rotations as displacement of the edge.",
-                   ("requirement", "verdict", "result", "limit", "note"), rows, "lcrrl")] if rows else []
-    notes = [Paragraph(note, "note") for note in result.notes]
-    return Section("Verdict", "verdict", (_sentence(result), *asked, *notes))
+             f"{r.comparison} {words.quantity(r.limit, r.unit)}") for r in result.requirements]
+    met = [table("Requirements of the design and the results of the mu controller. Values in dB are the largest "
+                 "singular value from floor to payload, rotations as displacement of the edge.",
+                 ("requirement", "verdict", "result", "limit"), rows, "lcrr")] if rows else []
+    return Section("Summary", "verdict", (_sentence(result), _asked(result), *met, certificate(result),
+                                          summary_figure(result)), alone=True)
 
 
 def _sentence(result: DesignResult) -> Paragraph:
     good = None if not result.requirements else result.stable and all(r.met for r in result.requirements)
     if not result.stable:
         return Paragraph(first_sentence(result), "verdict", False)
-    return Paragraph(f"{first_sentence(result)} {_achieved(result)}", "verdict", good)
+    said = f"{first_sentence(result)} {_achieved(result)}"
+    return Paragraph(re.sub(r"(?<= )-(?=\d)", "−", said), "verdict", good)
+
+
+def _asked(result: DesignResult) -> Paragraph:
+    """The task in two sentences."""
+    design, uncertain = result.design, result.design.uncertainty.parameters_percent
+    low, high = design.transmissibility.band_Hz
+    spread = words.joined([f"{name} ± {value:g} %" for name, value in uncertain.items()]) if uncertain else ""
+    members = f"every plant of the uncertainty set{' with ' * bool(spread)}{spread}"
+    return Paragraph(
+        f"Asked was one controller for {words.joined([words.axis(name) for name in result.plant.axes])} of the rig "
+        f"{result.rig.name}, stable and within the bounds for {members}: "
+        f"transmissibility at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz and at most "
+        f"{design.transmissibility.peak_dB:+g} dB elsewhere.".replace(" -", " −"))
 
 
 def _achieved(result: DesignResult) -> str:
@@ -66,7 +83,8 @@ def comparison(result: DesignResult) -> Section:
         ("largest voltage, once in 10 min", lambda c: _settled(c, _volts(c.site.volts_peak))),
         ("fastest pole", lambda c: f"{words.number(c.fastest_pole_Hz)} Hz" if c.K is not None else "none"),
     ]
-    controllers = result.controllers
+    # The delivered one first: on a narrow page the last columns are read least.
+    controllers = sorted(result.controllers, key=lambda c: c.name != "mu")
     body = [(name, *(value(c) for c in controllers)) for name, value in rows]
     notes = [Paragraph(f"{c.title}: {'; '.join(c.notes)}", "note") for c in controllers if c.notes]
     notes += [Paragraph(f"The controller {c.title!r} is not in the table: {c.reason}", "note") for c in result.failed]
@@ -75,7 +93,14 @@ def comparison(result: DesignResult) -> Section:
         table("All controllers, evaluated in the same way on the same plants. Worst cases are upper bounds over the "
               "whole uncertainty set; \"unstable\" means that the controller is not proved to stabilise every plant of "
               f"the set. The floor itself meets {floor or 'no criterion'}.",
-              ("", *(c.title for c in controllers)), body), *notes))
+              ("", *(c.title for c in controllers)), body), *_remarks(result), *notes))
+
+
+def _remarks(result: DesignResult) -> list[Piece]:
+    """What the requirements' figures stand for."""
+    rows = [(r.name, r.note) for r in result.requirements if r.note]
+    told: list[Piece] = [table("Notes to the requirements of the summary.", ("requirement", "note"), rows, "ll")]
+    return [*(told if rows else []), *(Paragraph(note, "note") for note in result.notes)]
 
 
 def _robustly_stable(c: ControllerResult) -> Cell:

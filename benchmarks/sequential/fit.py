@@ -7,7 +7,7 @@ parameter moves by less than 5 %.
 Moving by less than 5 % is not being within 5 %: where a round of tests shrinks the distance to the rest point by a
 factor rate, a move m leaves m rate/(1 - rate). Each result carries that distance (`to_rest`).
 
-Beside the source (benchmarks/sequential_fit.py computes all of this; data simulated from the printed values): the
+Beside the source (benchmarks/sequential computes all of this; data simulated from the printed values): the
 loaded fit needs 6 rounds where the source needed 4. The rounds depend on the load's mass, which the source does not
 print: with 2.5 or 5 kg they are 4, with the 10 kg assumed in the rig file the rate is 0.83 and the 5 % rule leaves L7
 12 % and I_yy 4 % from the rest point. Unfinished rounds leave I_yy low, I_zz high and k_r above its unloaded value, as
@@ -31,10 +31,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.sequential_data import MeasuredTests
-from avis_ctrl.identification.sequential_problem import Problem, Spread, Weighting, spread_at
-from avis_ctrl.identification.sequential_tests import SIGNED, TestCase, unit_of, values_of, with_values
 from avis_ctrl.rigs.halcyonics import Halcyonics
+from benchmarks.sequential.data import MeasuredTests
+from benchmarks.sequential.problem import Problem, Spread, Weighting, spread_at
+from benchmarks.sequential.published import SIGNED, TestCase, unit_of, values_of, with_values
 
 BAND_HZ = (2.5, 20.0)
 DRAWN_HZ = (2.5, 40.0)

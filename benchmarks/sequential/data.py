@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.sequential_tests import TestCase, place_of
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.rigid_body import point_map
+from benchmarks.sequential.published import TestCase, place_of
 
 _DERIVATIVE = {"m": 0, "m/s": 1, "m/s^2": 2}
 

@@ -76,7 +76,7 @@ def _table(found: Identification, result: EkfResult) -> Table:
     rows = []
     for one, (value, sigma, other, spread, apart) in zip(found.identifiability.combinations,
                                                          _differences(found, result), strict=True):
-        first, second = words.with_deviation(value, sigma), words.with_deviation(other, spread)
+        first, second = words.with_std(value, sigma), words.with_std(other, spread)
         rows.append((one.words, *(first if one.determined else (first[0], "not determined")), *second,
                      f"{apart:+.1f}".replace("-", "−") if np.isfinite(apart) else "",
                      words.unit(one.unit) if one.unit != "1" else ""))

@@ -1,6 +1,6 @@
 """The sequential parameter identification of Beadle et al. on simulated transfer functions, beside the source's tables.
 
-    python benchmarks/sequential_fit.py [--seeds N]
+    python -m benchmarks.sequential [--seeds N]
 
 Printed: Table 1 and its basin of starts; Table 2, round by round, with what the 5 % rule leaves; the same over the
 load's mass, which the source does not print; rest points of a rig known slightly wrongly; and a Monte Carlo of the
@@ -18,10 +18,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.identification.sequential import SequentialResult, joint_fit, sequential_fit
-from avis_ctrl.identification.sequential_data import Analyser, MeasuredTests, simulate_tests
-from avis_ctrl.identification.sequential_problem import Weighting
-from avis_ctrl.identification.sequential_tests import (
+from avis_ctrl.rigs import load_rig
+from avis_ctrl.rigs.halcyonics import Halcyonics
+from benchmarks.sequential.data import Analyser, MeasuredTests, simulate_tests
+from benchmarks.sequential.fit import SequentialResult, joint_fit, sequential_fit
+from benchmarks.sequential.problem import Weighting
+from benchmarks.sequential.published import (
     LOADED_SOURCE_FINAL,
     LOADED_TESTS,
     SOURCE_ITERATIONS,
@@ -31,8 +33,6 @@ from avis_ctrl.identification.sequential_tests import (
     perturbed_start,
     values_of,
 )
-from avis_ctrl.rigs import load_rig
-from avis_ctrl.rigs.halcyonics import Halcyonics
 
 
 def bare_and_loaded() -> tuple[Halcyonics, Halcyonics]:

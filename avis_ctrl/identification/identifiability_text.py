@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from avis_ctrl import uncertain_value
 from avis_ctrl.identification.information import Combination, Information
 from avis_ctrl.identification.structure import Scaling
 
@@ -51,10 +52,9 @@ def unit_text(unit: str, powers: Sequence[tuple[str, float]]) -> str:
 
 def known_text(one: Combination) -> str:
     """Value and standard deviation."""
-    unit = "" if one.unit in ("1", "", "mixed units") else f" {one.unit}"
     if not one.determined:
         return f"{one.words} (not determined by these data)"
-    return f"{one.words} = {one.value:.6g} +- {number(one.standard_deviation)}{unit}"
+    return f"{one.words} = {uncertain_value.text(one.value, one.standard_deviation, one.unit)}"
 
 
 def group_sentence(members: Sequence[str], seen: Sequence[Combination]) -> str:
@@ -117,9 +117,8 @@ def scaling_sentence(scaling: Scaling, information: Information) -> str:
 
 
 def weak_sentence(one: Combination) -> str:
-    unit = "" if one.unit in ("1", "", "mixed units") else f" {one.unit}"
-    return (f"{one.words} is determined only to {number(100 * one.relative)} %: {one.value:.4g} +- "
-            f"{number(one.standard_deviation)}{unit}.")
+    return (f"{one.words} is determined only to {number(100 * one.relative)} %: "
+            f"{uncertain_value.text(one.value, one.standard_deviation, one.unit)}.")
 
 
 def weak_direction_sentence(names: Sequence[str], direction: np.ndarray, sigma: float) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.signal as signal
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.prediction import Predictor
+from avis_ctrl.identification.predictor import Predictor
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.rigs.converter import Converter

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
-from avis_ctrl.study.prediction_errors import compared, prediction_errors
+from avis_ctrl.study.prediction_file import compared, prediction_errors
 
 
 @pytest.fixture

@@ -10,15 +10,15 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.identification.sequential_data import MeasuredTests, row_of, voltage_transfers
-from avis_ctrl.identification.sequential_tests import (
+from avis_ctrl.rigs.halcyonics import Halcyonics
+from benchmarks.sequential.data import MeasuredTests, row_of, voltage_transfers
+from benchmarks.sequential.published import (
     SIGNED,
     TestCase,
     parameters_of,
     values_of,
     with_values,
 )
-from avis_ctrl.rigs.halcyonics import Halcyonics
 
 Weighting = Literal["equal", "variance"]
 # Unit of the search for a parameter that may vanish [m or kg m^2]; positive ones are searched by their logarithm.

@@ -10,8 +10,8 @@ import numpy as np
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import ReductionError
-from avis_ctrl.simulation.campaign import SimulationCheck
 from avis_ctrl.simulation.culprit import Culprit
+from avis_ctrl.simulation.design_check import SimulationCheck
 from avis_ctrl.study.companions import Companions
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.plant import DesignPlant

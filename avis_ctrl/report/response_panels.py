@@ -1,0 +1,71 @@
+"""Panels of measured frequency responses with those of models over them, alike in all reports."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from avis_ctrl.identification.overlays import MeasuredOverlay
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import Axis, Band, Curve, Panel, Style, hertz
+
+FLOOR = ("vx", "vy", "vz")
+MEASURED, SCATTER, TWO_SIGMA = Style("#222222"), Style("#7a7a7a"), Style("#222222", "dot", 1.4)
+# Points of a measured response in a panel.
+MOST_POINTS = 60
+
+# Label, response (n, n_y, n_u), look.
+Model = tuple[str, np.ndarray, Style]
+
+
+def drives(seen: MeasuredOverlay) -> list[int]:
+    """Columns of the drives; those of the floor only where there are no others."""
+    return [j for j, name in enumerate(seen.inputs) if name not in FLOOR] or list(range(len(seen.inputs)))
+
+
+def unit(seen: MeasuredOverlay, j: int) -> str:
+    """Of a column: floor columns are per m/s whatever the drives' unit is, which stands first."""
+    output, _, inputs = seen.unit.partition(" per ")
+    per = "m/s" if seen.inputs[j] in FLOOR else inputs.partition(";")[0]
+    return words.unit(f"{output}/{f'({per})' if '/' in per or ' ' in per else per}")
+
+
+def frequencies(seen: MeasuredOverlay) -> Axis:
+    """The axis of all panels of an overlay."""
+    return hertz(float(seen.frequency_Hz[0]), float(seen.frequency_Hz[-1]))
+
+
+def thin(count: int, most: int) -> np.ndarray:
+    """Indices of at most so many of `count` points, evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
+def title(seen: MeasuredOverlay, i: int, j: int) -> str:
+    """Of a panel."""
+    return f"{seen.outputs[i]} from {seen.inputs[j]}"
+
+
+def magnitude(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) -> Panel:
+    """Measured points with two standard deviations to each side, and a line for each model."""
+    f, size, two = seen.frequency_Hz, np.abs(seen.measured[:, i, j]), 2 * seen.measured_std[:, i, j]
+    keep, lines = thin(len(f), MOST_POINTS), [(label, np.abs(G[:, i, j]), style) for label, G, style in models]
+    low = 0.5 * float(min(np.quantile(size, 0.02), *(line.min() for _, line, _ in lines)))
+    high = 2.0 * float(max(size.max(), *(line.max() for _, line, _ in lines)))
+    curves = (Curve(f[keep], size[keep], "measured", MEASURED, points=True, line=False),
+              *(Curve(f, line, label, style) for label, line, style in lines))
+    band = Band(f, np.maximum(size - two, low), np.maximum(size + two, low), "measured, ± 2 σ", SCATTER)
+    return Panel(frequencies(seen), Axis(f"magnitude [{unit(seen, j)}]", "log", (low, high)), curves, (band,),
+                 title(seen, i, j))
+
+
+def difference(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) -> Panel:
+    """Magnitude of measured less model, complex, for each model; with noise alone 86 % lie below the dotted line."""
+    f, two = seen.frequency_Hz, 2 * seen.measured_std[:, i, j]
+    lines = [(label, np.abs(seen.measured[:, i, j] - G[:, i, j]), style) for label, G, style in models]
+    values = np.concatenate([two, *(line for _, line, _ in lines)])
+    values = values[values > 0]
+    limits = (0.5 * float(np.quantile(values, 0.01)), 2 * float(values.max())) if values.size else (1e-3, 1.0)
+    curves = (*(Curve(f, line, f"measured less {label}", style) for label, line, style in lines),
+              Curve(f, two, "two standard deviations of the measured", TWO_SIGMA))
+    return Panel(frequencies(seen), Axis(f"difference [{unit(seen, j)}]", "log", limits), curves, (), title(seen, i, j))

@@ -1,0 +1,28 @@
+"""What made a result: versions, hash of the inputs, seed, date, time of computing."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from datetime import UTC, datetime
+from importlib import metadata
+from typing import Any
+
+import avis_ctrl
+from avis_ctrl.rigs.rig import Rig
+
+
+def provenance(rig: Rig, inputs: str, seed: int, seconds: float, libraries: tuple[str, ...], /, **own: Any
+               ) -> dict[str, Any]:
+    """The section `provenance` of a result file.
+
+    Parameters
+    ----------
+    rig : its parameters count among the hashed inputs. inputs : everything else that the result depends on, as text.
+    seconds : of computing. libraries : distributions whose versions may change the last digits. own : further entries
+        of this kind of result, which stand first.
+    """
+    text = repr(sorted((name, one.value) for name, one in rig.parameters().items())) + inputs
+    return {"avis_ctrl": avis_ctrl.__version__, **own, "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
+            "seed": seed, "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
+            "python": platform.python_version(), **{name: metadata.version(name) for name in libraries}}

@@ -1,0 +1,28 @@
+"""A value with its standard deviation as text: the one rule by which sentences, tables and the terminal round it."""
+
+from __future__ import annotations
+
+import math
+
+
+def rounded(value: float, std: float) -> tuple[str, str]:
+    """Value and standard deviation, both to the second significant digit of the latter.
+
+    Where that would need many zeros, both are multiples of the value's power of ten (1.2340e9, 0.0012e9). Without a
+    positive, finite standard deviation five digits of the value are given.
+    """
+    if not (math.isfinite(std) and std > 0 and math.isfinite(value)):
+        return f"{value:.5g}", f"{std:.2g}"
+    places = 1 - int(f"{std:.1e}".partition("e")[2])
+    if -4 <= places <= 9 and abs(value) < 1e7:
+        return f"{round(value, places):.{max(places, 0)}f}", f"{round(std, places):.{max(places, 0)}f}"
+    power = math.floor(math.log10(abs(value) or std))
+    first, second = (f"{v / 10.0 ** power:.{max(places + power, 0)}f}e{power}" for v in (value, std))
+    return first, second
+
+
+def text(value: float, std: float, unit: str = "") -> str:
+    """value +- std unit; the value alone where there is no standard deviation."""
+    first, second = rounded(value, std)
+    known = f"{first} +- {second}" if math.isfinite(std) and std > 0 else first
+    return known if unit in ("", "1", "mixed units") else f"{known} {unit}"
