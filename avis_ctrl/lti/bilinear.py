@@ -17,8 +17,8 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti.statespace import StateSpace
 
-# Condition of I + A (and of 2/dt I - A back) beyond which the image is round-off.
-LARGEST_CONDITION = 1e13
+# Distance of a pole from the point that goes to infinity, relative to that point, up to which it counts as there.
+AT_INFINITY = 1e-9
 
 
 def continuous_image(system: StateSpace) -> StateSpace:
@@ -31,7 +31,7 @@ def continuous_image(system: StateSpace) -> StateSpace:
     n, a = system.nstates, 2.0 / system.dt
     if not n:
         return replace(system, dt=0.0)
-    inverse = _inverse(np.eye(n) + system.A, system,
+    inverse = _inverse(np.eye(n) + system.A, 1.0,
                        "a pole at z = -1, half the sample rate, has no continuous image",
                        "a derivative discretised by the bilinear rule, or a resonance aliased to half the rate")
     root = np.sqrt(2 * a)
@@ -47,7 +47,7 @@ def sampled_image(system: StateSpace, dt: float) -> StateSpace:
     n, a = system.nstates, 2.0 / dt
     if not n:
         return replace(system, dt=dt)
-    inverse = _inverse(a * np.eye(n) - system.A, system, f"a pole at s = 2/dt = {a:.6g} rad/s has no sampled image",
+    inverse = _inverse(a * np.eye(n) - system.A, a, f"a pole at s = 2/dt = {a:.6g} rad/s has no sampled image",
                        "an unstable pole as fast as the sample rate")
     root = np.sqrt(2 * a)
     return replace(system, A=inverse @ (a * np.eye(n) + system.A), B=root * inverse @ system.B,
@@ -67,11 +67,10 @@ def sampled_frequency(image: np.ndarray | float, dt: float) -> np.ndarray | floa
     return (2 / dt * np.arctan(np.asarray(image) * dt / 2))[()] if dt else image
 
 
-def _inverse(matrix: np.ndarray, system: StateSpace, failed: str, cause: str) -> np.ndarray:
-    # Judged in balanced coordinates: the units of the states do not count.
-    scaled = la.matrix_balance(matrix, permute=False)[0]
-    condition = np.linalg.cond(scaled)
-    if not condition < LARGEST_CONDITION:
-        raise ComputationError(failed, measured=f"condition {condition:.1e} of the matrix to be inverted, {system!r}",
-                               cause=cause, next_step="move the pole off this point, or take another discretisation")
+def _inverse(matrix: np.ndarray, size: float, failed: str, cause: str) -> np.ndarray:
+    # By the poles, not by a condition, in which the units of the states would count.
+    nearest = float(np.min(np.abs(la.eigvals(matrix)))) / size
+    if nearest <= AT_INFINITY:
+        raise ComputationError(failed, measured=f"relative distance {nearest:.1e}", cause=cause,
+                               next_step="move the pole off this point, or take another discretisation")
     return np.linalg.inv(matrix)

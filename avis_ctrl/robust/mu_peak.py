@@ -23,7 +23,7 @@ from avis_ctrl.robust.mu_coupled import Coupled, coupled
 from avis_ctrl.robust.mu_cover import Cover, Interval, cover
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_lmi import Array, Scalings
-from avis_ctrl.robust.mu_lower import LowerBound, lower_bound, singular_frequency
+from avis_ctrl.robust.mu_lower import SETTINGS, LowerBound, lower_bound, singular_frequency
 from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
 from avis_ctrl.robust.mu_upper import UpperBound, skewed_upper_bound, upper_bound
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
@@ -234,7 +234,8 @@ def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found
         moved = singular_frequency(N, structure, near, done.level, band)
         if moved is not None and moved[0] > best:
             best, at, delta = moved
-    return (best, at, delta) if best > 0 else (0.0, at, None)
+    noise = SETTINGS.round_off * float(np.max(np.linalg.norm(N.frequency_response(omega), 2, axis=(1, 2))))
+    return (best, at, delta) if best > noise else (0.0, at, None)
 
 
 def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, slack: float, dt: float) -> MuPeak:
