@@ -16,7 +16,8 @@ A problem is WRONG where
         SLICOT's AB13DD and from P(jw), K(jw) closed pointwise (the larger of the two; the tolerance is 1e-3);
     a bracket wider than 1 per cent is reported as the optimum;
     the bracket's lower end is above that norm, or the bracket misses that of the plant before it was scaled and
-        padded, or for every fourth problem that of the transposed plant or the optimum of the matrix inequalities;
+        padded, or for every fourth problem that of the transposed plant or the optimum of the matrix inequalities
+        (an upper end that a controller keeps by AB13DD is right whatever these say);
     I - M Delta is not singular, Delta has not its structure or its norm, or a bound of mu is passed by a perturbation;
     musyn's bound is below mu of its loop at a frequency, by AB13MD where that takes the blocks;
     an exception is neither InputError nor ComputationError.
@@ -45,7 +46,7 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, discretise
 from avis_ctrl.robust.hinf_lmi import lmi_gamma
-from avis_ctrl.robust.hinfsyn import Status, hinfsyn
+from avis_ctrl.robust.hinfsyn import Status, hinf_suboptimal, hinfsyn
 from avis_ctrl.robust.mu import mu
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.robust.musyn import musyn
@@ -317,9 +318,17 @@ def judge_synthesis(P: StateSpace, base: StateSpace, u: int, y: int, r: Any, sec
     for name, low, high in others:
         if lower > high * (1 + SAME) + tiny:
             wrong.append(f"lower bound {lower:.6g} above {high:.6g} reached: {name}")
-        if low > min(upper, norm) * (1 + SAME) + 100 * tiny:
+        if low > min(upper, norm) * (1 + SAME) + 100 * tiny and not confirmed(base, u, y, upper):
             wrong.append(f"upper bound {upper:.6g} (norm {norm:.6g}) below what is possible, {low:.6g}: {name}")
     return wrong
+
+
+def confirmed(base: StateSpace, u: int, y: int, upper: float) -> bool:
+    """Whether a controller at an upper bound keeps it by AB13DD: then it is the other opinion that is wrong."""
+    with contextlib.suppress(ComputationError):
+        loop = closed(base, hinf_suboptimal(base, y, u, upper * (1 + SAME / 2)).K)
+        return bool(loop.is_stable() and hinf_norm_slicot(loop) <= upper * (1 + SAME))
+    return False
 
 
 def judge_delta(N: np.ndarray, blocks: BlockStructure, lower: float, delta: np.ndarray | None) -> list[str]:

@@ -22,7 +22,7 @@ AT_INFINITY = 1e-9
 
 
 def continuous_image(system: StateSpace) -> StateSpace:
-    """Continuous system with the response of a sampled one, on the warped frequency axis; names kept.
+    """Continuous system with the response of a sampled one, on the warped frequency axis; signal names kept.
 
     A continuous system is returned as it is. ComputationError where A has an eigenvalue at z = -1.
     """
@@ -31,12 +31,16 @@ def continuous_image(system: StateSpace) -> StateSpace:
     n, a = system.nstates, 2.0 / system.dt
     if not n:
         return replace(system, dt=0.0)
-    inverse = _inverse(np.eye(n) + system.A, 1.0,
+    # In Schur coordinates a pole near z = -1 does not blur the others.
+    _, (scale, _) = la.matrix_balance(system.A, permute=False, separate=True)
+    T, Q = la.schur(system.A / scale[:, None] * scale)
+    B, C = Q.T @ (system.B / scale[:, None]), (system.C * scale) @ Q
+    inverse = _inverse(np.eye(n) + T, 1.0,
                        "a pole at z = -1, half the sample rate, has no continuous image",
                        "a derivative discretised by the bilinear rule, or a resonance aliased to half the rate")
     root = np.sqrt(2 * a)
-    return replace(system, A=a * inverse @ (system.A - np.eye(n)), B=root * inverse @ system.B,
-                   C=root * system.C @ inverse, D=system.D - system.C @ inverse @ system.B, dt=0.0)
+    return replace(system, A=a * inverse @ (T - np.eye(n)), B=root * inverse @ B, C=root * C @ inverse,
+                   D=system.D - C @ inverse @ B, dt=0.0, states=())
 
 
 def sampled_image(system: StateSpace, dt: float) -> StateSpace:

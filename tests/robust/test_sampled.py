@@ -193,3 +193,8 @@ def test_direct_terms_between_u_and_y(index):
     """The loop around D22 judged in the units of u and y, and central controllers with poles at z = -1."""
     found = solve(1, index, sampled=True)
     assert found["wrong"] == [] and found["status"] == "OPTIMAL"
+
+
+def test_a_pole_near_minus_one_does_not_blur_a_light_mode():
+    """Poles within 3e-6 of z = -1 and of the circle at once: the perturbation still fits the response there."""
+    assert solve(2, 646, sampled=True)["wrong"] == []
