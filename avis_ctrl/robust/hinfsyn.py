@@ -18,7 +18,8 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import StateSpace, balance, discretise, hinf_norm, lft_lower
+from avis_ctrl.lti import StateSpace, balance, hinf_norm, lft_lower
+from avis_ctrl.lti.bilinear import sampled_image
 from avis_ctrl.robust.hinf_bounds import pointwise_bound
 from avis_ctrl.robust.hinf_plant import (
     NormalForm,
@@ -285,7 +286,7 @@ class _Problem:
         fastest = float(np.max(np.abs(K.poles()), initial=0.0))
         K = balance(K)
         if self.P.dt:
-            K = discretise(K, self.P.dt, "tustin")
+            K = sampled_image(K, self.P.dt)
         closed = lft_lower(self.P, K)
         return Synthesis(K, hinf_norm(closed).gain, (0.0, np.inf), Status.OPTIMAL, closed, fastest, "")
 

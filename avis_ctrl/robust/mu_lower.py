@@ -38,11 +38,14 @@ class MuLowerSettings:
         M Delta is far from normal, a small singular value alone proves nothing: I - d J of a nilpotent J has the
         determinant 1 for every d, but a smallest singular value that falls as a power of 1/d. Dividing Delta by the
         eigenvalue makes I - M Delta singular, so this is the relative error of the bound, one in the printed digits.
+    round_off : a lower bound of a peak relative to the largest gain of N at any frequency, up to which it is given as
+        zero: half the sample rate of a sampled N is where its terms cancel, and leave round-off of that gain.
     """
 
     singular: float = 1e-9
     meaningless: float = 1e-6
     eigenvalue: float = 1e-6
+    round_off: float = 1e-14
 
 
 SETTINGS = MuLowerSettings()

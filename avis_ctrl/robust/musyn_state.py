@@ -73,23 +73,24 @@ class State:
     history: tuple[Iteration, ...] = ()
     round_mu: float = np.inf
 
-    def as_dict(self, P: StateSpace, nmeas: int, ncon: int) -> dict[str, Any]:
-        """JSON form, with the sizes of the problem it belongs to."""
+    def as_dict(self, P: StateSpace, nmeas: int, ncon: int, dt: float) -> dict[str, Any]:
+        """JSON form, with the sizes and the sample time of the problem it belongs to."""
         assert self.last is not None and self.best is not None and self.path is not None and self.points is not None
-        return {"format": FORMAT, "version": VERSION, "problem": [P.nstates, P.ninputs, P.noutputs, nmeas, ncon],
+        return {"format": FORMAT, "version": VERSION, "problem": _problem(P, nmeas, ncon, dt),
                 "phase": self.phase, "round_mu": self.round_mu, "omega": self.points.omega.tolist(),
                 "last": self.last.as_dict(), "best": self.best.as_dict(),
                 "path": self.path.as_dict(), "history": [asdict(row) for row in self.history]}
 
     @staticmethod
-    def from_dict(saved: dict[str, Any], structure: BlockStructure, P: StateSpace, nmeas: int, ncon: int) -> State:
+    def from_dict(saved: dict[str, Any], structure: BlockStructure, P: StateSpace, nmeas: int, ncon: int,
+                  dt: float) -> State:
         """Inverse of `as_dict`; InputError for a state of another format or problem."""
         if not isinstance(saved, dict) or saved.get("format") != FORMAT or saved.get("version") != VERSION:
             raise InputError(f"expected a saved state of format {FORMAT!r}, version {VERSION}", field="state")
-        problem = [P.nstates, P.ninputs, P.noutputs, nmeas, ncon]
+        problem = _problem(P, nmeas, ncon, dt)
         if saved.get("problem") != problem:
-            raise InputError(f"the saved state belongs to another plant: sizes {saved.get('problem')}, not {problem}",
-                             field="state")
+            raise InputError("the saved state belongs to another plant: sizes and sample time "
+                             f"{saved.get('problem')}, not {problem}", field="state")
         n_y, n_u = P.outputs[P.noutputs - nmeas:], P.inputs[P.ninputs - ncon:]
 
         def loop(item: dict[str, Any]) -> Loop:
@@ -101,6 +102,11 @@ class State:
         return State(str(saved["phase"]), points, last, loop(saved["best"]), loop(saved["path"]),
                      tuple(Iteration(**row) for row in saved["history"]),
                      float(saved["round_mu"]))
+
+
+def _problem(P: StateSpace, nmeas: int, ncon: int, dt: float) -> list[float]:
+    """What a saved state and its problem must agree in: states, inputs, outputs, y, u, and the sample time if any."""
+    return [P.nstates, P.ninputs, P.noutputs, nmeas, ncon, *([dt] if dt else [])]
 
 
 def analysed(P: StateSpace, K: StateSpace, structure: BlockStructure, omega: np.ndarray) -> PointwiseScalings:
