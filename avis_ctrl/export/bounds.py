@@ -39,6 +39,7 @@ class CoverSettings:
 
     lowest : first frequency of the grid over half the sample rate; below it both errors are constant.
     points : of the logarithmic grid, about 0.7 % apart: neighbours differ by less than `margin`.
+    fitted : every so many points are fitted; the filter is then raised over all of them.
     margin : relative; what the filters lie above the values of the grid at least.
     excess_dB : by which a filter may exceed the error; more order than that needs is not spent.
     harmless : errors below this fraction of the controller, or of the table, need not be followed closely: a thousandth
@@ -47,7 +48,8 @@ class CoverSettings:
     """
 
     lowest: float = 1e-7
-    points: int = 2200
+    points: int = 2201
+    fitted: int = 10
     margin: float = 0.02
     excess_dB: float = 2.0
     harmless: float = 1e-3
@@ -59,15 +61,18 @@ class Bounds:
     """Upper bounds of the loop that runs the emitted numbers.
 
     mu : robust performance of the weighted channels. peak, band : worst-case transmissibility, largest singular value,
-    up to half the sample rate and in the design's band. whole : worst-case r.m.s. gain from the floor's velocity at all
-    frequencies to the payload's velocity at all times, between the samples too; inf where it was not proved.
+    up to half the sample rate and in the design's band.
+    all_times : worst-case r.m.s. gain from the floor's velocity up to half the sample rate to the payload's velocity at
+    all times, between the samples too. above : the same from the floor's velocity above half the rate, which the
+    samples show at other frequencies. Both inf where not proved.
     gain_above : largest loop gain at and above half the sample rate; the proof of stability needs it below 1.
     """
 
     mu: MuPeak
     peak: MuPeak
     band: MuPeak
-    whole: float
+    all_times: float
+    above: float
     gain_above: float
 
 
@@ -95,7 +100,7 @@ def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Boun
     return Bounds(mu_peak(performance, whole, band=below, slack=SLACK),
                   worst_case_gain(motion, blocks, band=below, slack=SLACK),
                   worst_case_gain(motion, blocks, band=(low, min(high, axes.half_rate)), slack=SLACK),
-                  _between_samples(axes, K, W_a, W_E, grid, settings), _gain_above(axes, K, W_a, W_E))
+                  *_between_samples(axes, K, W_a, W_E, grid, settings), _gain_above(axes, K, W_a, W_E))
 
 
 def _gain_above(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational) -> float:
@@ -108,12 +113,11 @@ def _gain_above(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational) 
 
 
 def _between_samples(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational, grid: np.ndarray,
-                     settings: CoverSettings) -> float:
-    """Worst-case gain of the lifted loop: floor and payload with all their frequencies above half the sample rate.
+                     settings: CoverSettings) -> tuple[float, float]:
+    """Worst-case gains of the lifted loop from the floor up to half the sample rate, and above, to all of the payload.
 
-    The floor above half the rate acts on the samples like a seen velocity of at most W_f times its r.m.s., the held
-    forces move the payload there by at most W_v times theirs; beside that the payload follows the floor as without
-    control.
+    The held forces move the payload above half the rate by at most W_v times their r.m.s. The floor there acts on the
+    samples like a seen velocity of at most W_f times its r.m.s.; beside that the payload follows it as without control.
     """
     plant = axes.folder.plant
     part = plant.full.restricted(plant.floor_velocities, plant.velocities)
@@ -121,8 +125,12 @@ def _between_samples(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Ratio
     W_v = _cover(grid, held, settings.harmless * np.max(held) * np.ones(grid.size), settings)
     W_f = _cover(grid, folded, settings.harmless * np.max(folded) * np.ones(grid.size), settings)
     motion, blocks = _with_errors(part, K, W_a, W_E, W_v, W_f)
-    found = worst_case_gain(motion, blocks, band=(0.0, axes.half_rate), slack=SLACK)
-    return found.upper + axes.passive_above() if found.guaranteed else np.inf
+    n_w, n_d = blocks.n_w, len(part.w)
+    found = [worst_case_gain(motion.select(None, [*range(n_w), *inputs]), blocks, band=(0.0, axes.half_rate),
+                             slack=SLACK)
+             for inputs in (range(n_w, n_w + n_d), range(n_w + n_d, motion.ninputs))]
+    first, second = (one.upper if one.guaranteed else np.inf for one in found)
+    return first, second + axes.passive_above()
 
 
 def _table(plant: GeneralizedPlant, omega: np.ndarray) -> np.ndarray:
@@ -135,14 +143,14 @@ def _cover(omega: np.ndarray, error: np.ndarray, harmless: np.ndarray, settings:
     """A filter with |W| >= error, of the lowest order that stays near it where it is not harmless."""
     lower = (1 + settings.margin) * np.maximum(error, np.finfo(float).tiny)
     upper = np.maximum(lower, harmless)
-    best = None
-    for fit in covering_fits(omega, lower, upper, range(settings.most + 1)):
+    best, every = None, slice(None, None, settings.fitted)
+    for fit in covering_fits(omega[every], lower[every], upper[every], range(settings.most + 1)):
         if best is None or fit.error_max_dB < best.error_max_dB:
             best = fit
         if fit.error_max_dB <= settings.excess_dB:
             break
     assert best is not None
-    return best.function
+    return best.function.scaled(max(1.0, float(np.max(lower / best.function.magnitude(omega)))))
 
 
 def _with_errors(plant: GeneralizedPlant, K: StateSpace, W_a: Rational, W_E: Rational, W_v: Rational | None = None,

@@ -15,8 +15,10 @@ import avis_ctrl
 from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.export.c_source import HEADER, SOURCE, Provenance, c_files, constants_of
 from avis_ctrl.export.certificate import Certificate, Progress, certify
+from avis_ctrl.export.compiled import compiler
 from avis_ctrl.export.design_folder import DesignFolder
 from avis_ctrl.export.protection import protection
+from avis_ctrl.export.replay import Replay, replay_worst_plant
 from avis_ctrl.export.sampled_controller import Arithmetic, SampledController, parse_controller, read_controller
 from avis_ctrl.export.vectors import as_csv, vectors
 from avis_ctrl.study.files import as_json
@@ -29,11 +31,13 @@ FORMATS = ("c", "mat", "json")
 
 @dataclass(frozen=True, eq=False)
 class Package:
-    """What an export writes: contents by file name, the certificate last."""
+    """What an export writes: contents by file name, the certificate last. replay : of the worst plant through the
+    compiled code; None without gcc."""
 
     controller: SampledController
     certificate: Certificate
     contents: dict[str, bytes]
+    replay: Replay | None = None
 
 
 def formats_of(text: str) -> tuple[str, ...]:
@@ -56,11 +60,18 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     text = folder.sampled(name, arithmetic).as_bytes()
     controller = parse_controller(text)  # the numbers as the file has them
     guard = protection(controller, folder.rig)
-    certificate = certify(folder, controller, c_files(controller, guard, Provenance(())), progress)
+    plain = c_files(controller, guard, Provenance(()))
+    certificate = certify(folder, controller, plain, progress)
     if not certificate.content["stable"]:
         raise ComputationError(f"the loop of the exported controller {name!r} is not proved stable; nothing was "
                                "written", measured="; ".join(certificate.reasons),
                                next_step="export without --float32, or another controller of the folder")
+    replay = None
+    if compiler() is not None:
+        progress("replay of the worst plant through the compiled code, on the nonlinear table")
+        replay = replay_worst_plant(folder, certificate, controller, plain)
+        if replay.record.diverged:
+            raise ComputationError("the worst plant diverged under the compiled code; nothing was written")
     contents = {CONTROLLER: text}
     if "c" in formats:
         files = c_files(controller, guard, _provenance(folder, controller, certificate))
@@ -69,7 +80,7 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     if "mat" in formats:
         contents[MAT] = _mat(controller)
     contents[CERTIFICATE] = as_json(certificate.content)
-    return Package(controller, certificate, contents)
+    return Package(controller, certificate, contents, replay)
 
 
 def _provenance(folder: DesignFolder, controller: SampledController, certificate: Certificate) -> Provenance:

@@ -30,15 +30,15 @@ class ProtectionSettings:
     rise_s : from gain 0 to 1; a few periods of a table's lowest resonances, so that the rise excites none.
     fall_s : from gain 1 to 0; short, because a wrong input drives the table meanwhile.
     output_noise : standard deviation of each drive voltage that L assumes beside what y = 1 V causes, relative to the
-        largest of these. Eight drives of six axes have two directions that the controller never uses; without it the
-        covariance of u would be singular.
+        largest of these. Far above 1, L corrects only what many limited samples agree on: the slow states that wind up.
+        Near 0 it inverts the controller at every limited sample, and a short limit then becomes a long one.
     digits : significant digits of L; more would only differ between numerical libraries.
     """
 
     wait_s: float = 0.5
     rise_s: float = 1.0
     fall_s: float = 0.1
-    output_noise: float = 1e-3
+    output_noise: float = 30.0
     digits: int = 4
 
 

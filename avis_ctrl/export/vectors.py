@@ -12,29 +12,35 @@ from avis_ctrl.export.sampled_controller import SampledController
 
 @dataclass(frozen=True)
 class SignalSettings:
-    """samples : rows of the file, as the contract says. low_Hz, high_Hz, tones : sines of the inputs, over the band in
-    which tables are controlled. overdrive : by which the largest demand exceeds its limit. range_fraction : of the
-    converter that the inputs use at most, so that only the last samples leave its range. invalid : number of last
-    samples with an input out of range."""
+    """samples : rows of the file, as the contract says. low_Hz, high_Hz, tones : sines of the inputs, whole periods of
+    which fit between the start and the end. rest : amplitude of the tones beside the strongest one, relative to it.
+    overdrive : by which the largest demand exceeds its limit, unless the converter's range does not allow it.
+    range_fraction : of the converter that the inputs use at most. invalid : number of last samples with an input out of
+    range."""
 
     samples: int = 2000
-    low_Hz: float = 0.5
-    high_Hz: float = 50.0
+    low_Hz: float = 4.0
+    high_Hz: float = 100.0
     tones: int = 12
-    overdrive: float = 3.0
-    range_fraction: float = 0.5
+    rest: float = 0.01
+    overdrive: float = 2.0
+    range_fraction: float = 0.95
     invalid: int = 50
 
 
 def vectors(controller: SampledController, guard: Protection, settings: SignalSettings = SignalSettings()
             ) -> tuple[np.ndarray, np.ndarray]:
-    """Inputs (samples, n_y) and outputs (samples, n_u) from `init` on, computed in double precision [V]."""
-    rng = np.random.default_rng(1)
+    """Inputs (samples, n_y) and outputs (samples, n_u) from `init` on, computed in double precision [V].
+
+    At each tone the sensors move together so that they drive one voltage as far as they can.
+    """
     time = np.arange(settings.samples) * controller.system.dt
-    frequency = np.geomspace(settings.low_Hz, settings.high_Hz, settings.tones)
-    n_y = controller.system.ninputs
-    phase = rng.uniform(0, 2 * np.pi, (settings.tones, n_y))
-    y = np.sum(np.sin(2 * np.pi * frequency[:, None, None] * time[:, None] + phase[:, None]) / settings.tones, axis=0)
+    omega = 2 * np.pi * np.geomspace(settings.low_Hz, settings.high_Hz, settings.tones)
+    response = controller.system.frequency_response(omega)
+    reach = np.sum(np.abs(response / controller.limits_V[:, None]), axis=2)
+    phase = np.angle(response[np.arange(omega.size), np.argmax(reach, axis=1)])
+    size = np.where(np.arange(omega.size) == np.argmax(reach.max(axis=1)), 1.0, settings.rest)
+    y = np.einsum("k,ktj->tj", size, np.sin(omega[:, None, None] * time[:, None] - phase[:, None]))
     linear = _run(Processor(controller, guard), y, unlimited=True)
     within = guard.input_limit_V * settings.range_fraction
     scale = min(settings.overdrive / max(float(np.max(np.abs(linear) / controller.limits_V)), 1e-30),

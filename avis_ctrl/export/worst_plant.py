@@ -14,17 +14,19 @@ import numpy as np
 from avis_ctrl.export.bounds import Bounds
 from avis_ctrl.export.sampled_response import SampledAxes
 from avis_ctrl.robust.mu import mu
-from avis_ctrl.robust.mu_gain import worst_gain
+from avis_ctrl.robust.mu_gain import perturbed, worst_gain
 from avis_ctrl.robust.mu_peak import MuPeak
 from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
 
 
 class WorstPlant(NamedTuple):
-    """gain : from floor to payload velocity. omega : rad/s. delta : (n_w, n_z) of the design's blocks."""
+    """gain : from floor to payload velocity of the kept axes, rotations at the edge. omega : rad/s. delta : (n_w, n_z)
+    of the design's blocks. direction : (n_axes,) complex floor velocity of norm 1 that is amplified so."""
 
     gain: float
     omega: float
     delta: np.ndarray
+    direction: np.ndarray
 
 
 def mu_lower(axes: SampledAxes, found: Bounds) -> float:
@@ -41,7 +43,8 @@ def worst_transmissibility(axes: SampledAxes, found: Bounds) -> WorstPlant:
     M = _closed(plant.full.restricted(plant.floor_velocities, plant.velocities), axes, omega)
     worst = worst_gain(M, plant.full.blocks)
     k = int(np.argmax(worst.gain))
-    return WorstPlant(float(worst.gain[k]), float(omega[k]), worst.delta[k])
+    _, _, Vh = np.linalg.svd(perturbed(M[k], worst.delta[k]))
+    return WorstPlant(float(worst.gain[k]), float(omega[k]), worst.delta[k], np.conj(Vh[0]))
 
 
 def _near(peak: MuPeak, half_rate: float, count: int = 12) -> np.ndarray:
