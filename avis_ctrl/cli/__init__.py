@@ -13,6 +13,7 @@ import typer
 
 import avis_ctrl
 from avis_ctrl.cli.design import design
+from avis_ctrl.cli.export import export
 from avis_ctrl.cli.gap import gap
 from avis_ctrl.cli.gap_axis import gap_axis
 from avis_ctrl.cli.identify import identify, predict, single_axis
@@ -62,9 +63,9 @@ def doctor() -> None:
         raise typer.Exit(3)
 
 
-for command, name in ((design, "design"), (identify, "identify"), (gap, "gap"), (predict, "predict"),
-                      (gap_axis, "gap-axis"), (excite, "excite"), (simulate_campaign, "simulate-campaign"),
-                      (convert, "convert"), (single_axis, "single-axis")):
+for command, name in ((design, "design"), (export, "export"), (identify, "identify"), (gap, "gap"),
+                      (predict, "predict"), (gap_axis, "gap-axis"), (excite, "excite"),
+                      (simulate_campaign, "simulate-campaign"), (convert, "convert"), (single_axis, "single-axis")):
     app.command(name, epilog=LAYOUTS if name in ("identify", "gap", "convert") else None)(command)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,10 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.files import as_json
+from avis_ctrl.study.saved import STUDY, study_dict
 from avis_ctrl.study.verdict import first_sentence
 
-FILES = "plant.json", "sampled_controller.json", "report.html", "report.pdf", "result.json"
+FILES = STUDY, "plant.json", "sampled_controller.json", "report.html", "report.pdf", "result.json"
 FOLDERS = ("controllers",)
 
 
@@ -104,6 +106,8 @@ def write_study(result: DesignResult, folder: Path, html: bytes | None = None, p
     if result.loop is not None:
         contents["sampled_controller.json"] = as_json(sampled_controller_dict(result, result.loop))
     contents["plant.json"] = as_json(result.plant.synthesis.as_dict())
+    with contextlib.suppress(InputError):  # a rig of the user's own class has no file form, and no export
+        contents[STUDY] = as_json(study_dict(result.design, result.rig))
     contents |= {name: content for name, content in (("report.html", html), ("report.pdf", pdf)) if content is not None}
     contents["result.json"] = as_json(result_dict(result))
     # Files of an earlier study are removed.
