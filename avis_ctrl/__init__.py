@@ -15,6 +15,13 @@ single_axis         a small model of one axis: seismometer, decay, drive, oscill
 Linear systems and robust control of any plant:
 
 StateSpace          a linear system with named signals
+tf                  a system from the coefficients of a transfer function
+ss                  a system from A, B, C, D, whose entries may be uncertain
+connect             systems connected through signals of one name
+real                an uncertain real parameter
+complex_disk        an uncertain complex number
+dynamics            unknown stable dynamics of bounded size
+matrix              a matrix with uncertain entries
 RealScalar          block of a real parameter, repeated or not
 ComplexScalar       block of a complex number, repeated or not
 ComplexFull         block of a full complex matrix
@@ -45,6 +52,13 @@ _PLACES = {
     "design": "avis_ctrl.interface.workflow",
     "single_axis": "avis_ctrl.interface.workflow",
     "StateSpace": "avis_ctrl.lti",
+    "tf": "avis_ctrl.lti",
+    "ss": "avis_ctrl.uncertainty.uncertain_system",
+    "connect": "avis_ctrl.uncertainty.uncertain_system",
+    "real": "avis_ctrl.uncertainty.uncertain_system",
+    "complex_disk": "avis_ctrl.uncertainty.uncertain_system",
+    "dynamics": "avis_ctrl.uncertainty.uncertain_system",
+    "matrix": "avis_ctrl.uncertainty.uncertain_system",
     "InputError": "avis_ctrl.errors",
     "RealScalar": "avis_ctrl.uncertainty.blocks",
     "ComplexScalar": "avis_ctrl.uncertainty.blocks",
