@@ -19,7 +19,7 @@ from avis_ctrl.export.worst_plant import WorstPlant, mu_lower, worst_transmissib
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.simulation.discrete import spectral_radius
 from avis_ctrl.simulation.sampled_loop import SampledLoop
-from avis_ctrl.study.sampling import random_perturbations
+from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.simulation import with_delta
 
 Progress = Callable[[str], None]
