@@ -20,8 +20,8 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.export.sampled_controller import SampledController
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.discrete import N_Q, disturbed_period_map
-from avis_ctrl.simulation.sampled_response import open_response
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
+from avis_ctrl.simulation.sampled_response import open_response
 from avis_ctrl.study.analysis import PEAK_FACTOR
 
 
