@@ -19,11 +19,11 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.simulation.rehearsal import rehearse
-from avis_ctrl.study.campaign_plan import default_plan, plan_from_table, read_plan
 from avis_ctrl.study.design_file import Design, design_from_table, read_study
 from avis_ctrl.study.gap import GapOptions, find_gap
 from avis_ctrl.study.identification import IdentifyOptions
 from avis_ctrl.study.identification import identify as identify_rig
+from avis_ctrl.study.plan_file import default_plan, plan_from_table, read_plan
 from avis_ctrl.study.runner import run_design
 
 Progress = Callable[[str], Any]
