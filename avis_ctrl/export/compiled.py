@@ -16,6 +16,7 @@ import numpy as np
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.export.c_source import SOURCE
 from avis_ctrl.export.sampled_controller import SampledController
+from avis_ctrl.files import write_together
 
 # Every warning of the contract.
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wdouble-promotion", "-Werror")
@@ -56,8 +57,7 @@ class CompiledController:
             _fields_ = (("x", real * max(controller.system.nstates, 1)), ("gain", real), ("wait", ctypes.c_uint32))
 
         with tempfile.TemporaryDirectory() as folder:
-            for name, text in files.items():
-                (Path(folder) / name).write_text(text)
+            write_together(Path(folder), {name: text.encode() for name, text in files.items()})
             library = Path(folder) / "controller.so"
             done = subprocess.run([gcc, *STRICT, *flags, str(Path(folder) / SOURCE), "-o", str(library)],
                                   capture_output=True, text=True)
@@ -116,8 +116,7 @@ def step_time_us(files: Mapping[str, str], controller: SampledController, settin
     if gcc is None:
         return None
     with tempfile.TemporaryDirectory() as folder:
-        for name, text in {**files, "timer.c": _TIMER}.items():
-            (Path(folder) / name).write_text(text)
+        write_together(Path(folder), {name: text.encode() for name, text in {**files, "timer.c": _TIMER}.items()})
         library = Path(folder) / "timer.so"
         done = subprocess.run([gcc, "-std=gnu99", *BUILD, str(Path(folder) / SOURCE), str(Path(folder) / "timer.c"),
                                "-o", str(library)], capture_output=True, text=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.files import write_together
 from avis_ctrl.identification.single_axis.identify import identify_single_axis as single_axis
 from avis_ctrl.interface.results import DesignStudy, GapStudy, IdentificationStudy
 from avis_ctrl.measurement.campaign import Campaign
@@ -127,8 +128,7 @@ def study_inputs(source: Any, **sections: Any) -> tuple[Design, Rig]:
 def _identified(source: IdentificationStudy, sections: dict[str, Any]) -> tuple[Design, Rig]:
     # Through the files of the command, so that both give the same controller.
     with tempfile.TemporaryDirectory() as folder:
-        for name, text in source.files(sections or None).items():
-            Path(folder, name).write_text(text, encoding="utf-8")
+        write_together(Path(folder), {name: text.encode() for name, text in source.files(sections or None).items()})
         return read_study(Path(folder, "design.toml"))
 
 
