@@ -258,6 +258,13 @@ def made_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
 def starts(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure, count: int,
            rng: np.random.Generator) -> Array:
     """First perturbations (count, B, n_w, n_z) of norm 1/beta from the null vectors w of the upper bound's LMI."""
+    return np.stack([_aligned(w, (M @ w[..., None])[..., 0], structure) / beta[:, None, None]
+                     for w in null_vectors(M, scalings, beta, structure, count, rng)])
+
+
+def null_vectors(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure, count: int,
+                 rng: np.random.Generator) -> Array:
+    """Vectors w (count, B, n_w) that the upper bound's LMI nearly annuls: the three least, then mixtures of them."""
     batch = M.shape[0]
     F = residual(M[:, None], scalings, beta ** 2, np.ones(structure.n_w, bool))[:, 0]
     values, vectors = np.linalg.eigh(scalings.X_w)
@@ -268,8 +275,7 @@ def starts(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure,
     for k in range(count):
         few = min(3, structure.n_w)
         mix = rng.standard_normal((batch, few)) + 1j * rng.standard_normal((batch, few))
-        w = null[:, :, k] if k < few else np.einsum("bik,bk->bi", null[:, :, :few], mix)
-        made.append(_aligned(w, (M @ w[..., None])[..., 0], structure) / beta[:, None, None])
+        made.append(null[:, :, k] if k < few else np.einsum("bik,bk->bi", null[:, :, :few], mix))
     return np.stack(made)
 
 
@@ -334,14 +340,15 @@ def _search_complex(best: LowerBound, M: Array, structure: BlockStructure, upper
     size = upper[live]
     unit = M[live] / size[:, None, None]
     part = Scalings(scalings.X_z[live], scalings.X_w[live], scalings.G[live])
-    first = starts(unit, part, np.ones(live.size), structure, count, rng)
+    first = null_vectors(unit, part, np.ones(live.size), structure, count, rng)
     kinds = np.array([FULL if block.kind == "full" else 0 for block in structure.blocks])
     w, z = (np.cumsum([0, *sizes]) for sizes in zip(*((b.rows, b.cols) for b in structure.blocks), strict=True))
     unit = np.ascontiguousarray(unit)
-    value, found = search_complex(unit, first, kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, enough, SETTINGS.settled)
+    value, found, vector = search_complex(unit, first, kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, enough,
+                                          SETTINGS.settled)
     # The best one to its end.
-    further, settled = search_complex(unit, found[None], kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, np.inf,
-                                      SETTINGS.settled ** 2)
+    further, settled, _ = search_complex(unit, vector[None], kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, np.inf,
+                                         SETTINGS.settled ** 2)
     _keep(best, live, size, unit, np.where((further > value)[:, None, None], settled, found), structure)
 
 

@@ -105,8 +105,25 @@ def _linearised(a, x, e, kinds, w, z, new):
 
 
 @njit(cache=True)
+def _aligned(v, u, kinds, w, z, delta):
+    """Fill `delta` with the Delta of norm 1 that comes nearest to v = Delta u, block by block."""
+    delta[:] = 0.0
+    for b in range(kinds.size):
+        if kinds[b] == FULL:
+            size = np.sqrt(np.sum(np.abs(v[w[b]:w[b + 1]]) ** 2) * np.sum(np.abs(u[z[b]:z[b + 1]]) ** 2))
+            for i in range(w[b], w[b + 1]):
+                for j in range(z[b], z[b + 1]):
+                    delta[i, j] = v[i] * np.conj(u[j]) / size if size > 0 else 0j
+        else:
+            product = np.sum(np.conj(u[z[b]:z[b + 1]]) * v[w[b]:w[b + 1]])
+            value = product / abs(product) if abs(product) > 0 else 1.0 + 0j
+            for i in range(w[b + 1] - w[b]):
+                delta[w[b] + i, z[b] + i] = value
+
+
+@njit(cache=True)
 def search_complex(M, starts, kinds, w, z, iterations, damping, enough, settled):
-    """The largest 1/||Delta|| (B,) found with its Delta (B, n_w, n_z), from starts (count, B, n_w, n_z).
+    """The largest 1/||Delta|| (B,) found, its Delta (B, n_w, n_z) and Delta x (B, n_w), from starts w (count, B, n_w).
 
     M (B, n_z, n_w) in units of its upper bound; kinds (n_blocks,) FULL or not, w, z (n_blocks + 1,) where the blocks
     begin. A start ends where the norm changes by less than `settled`, the matrix where `enough` is reached. Nothing is
@@ -114,12 +131,14 @@ def search_complex(M, starts, kinds, w, z, iterations, damping, enough, settled)
     """
     batch, n_z, n_w = M.shape
     value, found = np.zeros(batch), np.zeros((batch, n_w, n_z), np.complex128)
+    vector = np.zeros((batch, n_w), np.complex128)
     new, pivot = np.empty((n_w, n_z), np.complex128), np.empty(n_z, np.int64)
     for b in range(batch):
         for start in range(starts.shape[0]):
             if value[b] >= enough:
                 break
-            delta = starts[start, b].copy()
+            delta = np.empty((n_w, n_z), np.complex128)
+            _aligned(starts[start, b], np.dot(M[b], starts[start, b]), kinds, w, z, delta)
             x, y = np.ones(n_z, np.complex128), np.ones(n_z, np.complex128)
             Mh = np.conj(M[b]).T.copy()
             before, norm = 0.0, 1.0
@@ -142,6 +161,7 @@ def search_complex(M, starts, kinds, w, z, iterations, damping, enough, settled)
                     if size > value[b] and size <= 1.0 + 1e-6 and abs(quotient - 1.0) < 0.1:
                         value[b] = size
                         found[b] = delta / quotient
+                        vector[b] = np.dot(delta, x)
                     if abs(size - before) <= settled * size:
                         break
                     before = size
@@ -155,4 +175,4 @@ def search_complex(M, starts, kinds, w, z, iterations, damping, enough, settled)
                 else:
                     norm = k
                     delta = new.copy()
-    return value, found
+    return value, found, vector

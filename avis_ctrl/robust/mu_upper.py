@@ -59,8 +59,10 @@ def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5,
     Matrices along axis 1 share scalings. With `goal` > 0 the search stops where beta <= goal, at the analytic
     centre of the scalings that prove it: the ones with most room around them.
     """
-    n_chunk = max(1, int(BATCH_BYTES / (32 * ScalingSpace.of(structure).form.row.size ** 2 * M.shape[1])))
     goals = np.broadcast_to(goal, M.shape[:1])
+    if _is_diagonal(structure):
+        return _upper_chunk(M, structure, tolerance, goals)
+    n_chunk = max(1, int(BATCH_BYTES / (32 * ScalingSpace.of(structure).form.row.size ** 2 * M.shape[1])))
     parts = [_upper_chunk(M[k:k + n_chunk], structure, tolerance, goals[k:k + n_chunk])
              for k in range(0, M.shape[0], n_chunk)]
     return UpperBound(np.concatenate([p.beta for p in parts]),
@@ -75,7 +77,7 @@ def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Ar
     size = np.where(live, size, 1.0)
     unit = balanced / size[:, None, None, None]
     floor = np.where(goal > 0, (goal / size) ** 2, -1e-8)
-    if all(block.kind == "full" or (block.kind == "complex" and block.rows == 1) for block in structure.blocks):
+    if _is_diagonal(structure):
         scalings = _diagonal(unit, structure, live, floor, tolerance)
     else:
         space = ScalingSpace.of(structure)
@@ -87,6 +89,11 @@ def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Ar
     lam = np.where(live, least_level(unit, scalings, np.ones(structure.n_w, bool)), 0.0)
     beta = size * np.sqrt(np.maximum(lam, 0.0))
     return UpperBound(beta, rescaled(scalings, d_z, d_w, size))
+
+
+def _is_diagonal(structure: BlockStructure) -> bool:
+    """Whether every block has one number for its scaling."""
+    return all(block.kind == "full" or (block.kind == "complex" and block.rows == 1) for block in structure.blocks)
 
 
 def _diagonal(M: Array, structure: BlockStructure, live: Array, floor: Array, tolerance: float) -> Scalings:
