@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance
@@ -26,6 +25,7 @@ from avis_ctrl.robust.mu_lmi import Array, Scalings
 from avis_ctrl.robust.mu_lower import SETTINGS, LowerBound, lower_bound, singular_frequency
 from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
 from avis_ctrl.robust.mu_upper import UpperBound, skewed_upper_bound, upper_bound
+from avis_ctrl.robust.one_thread import one_thread
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 SLACK = 5e-4
@@ -78,7 +78,7 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     if (system.noutputs, system.ninputs) != (structure.n_z, structure.n_w):
         raise InputError(f"the blocks need {structure.n_z} outputs and {structure.n_w} inputs, N has "
                          f"{system.noutputs} and {system.ninputs}", field="blocks")
-    with threadpool_limits(1):
+    with one_thread():
         part = _prepared(system, structure)
         found = _mu_peak(part.N, part.structure, _continuous_band(system, band), slack, known_upper, system.dt)
         return _in_rad_s(system, part, found)
@@ -106,7 +106,7 @@ def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     if n_d < 1 or n_e < 1:
         raise InputError(f"the blocks take {structure.n_z} outputs and {structure.n_w} inputs of N's "
                          f"{system.noutputs} and {system.ninputs}: no performance channel is left", field="blocks")
-    with threadpool_limits(1):
+    with one_thread():
         part = _prepared(system, structure)
         found = _worst_case_gain(part.N, part.structure, _continuous_band(system, band), slack, system.dt)
         return _in_rad_s(system, part, found)

@@ -14,7 +14,7 @@ from avis_ctrl.study.design_file import read_study
 from avis_ctrl.study.files import write_json
 from avis_ctrl.study.output import controller_dict
 from avis_ctrl.study.plant import build_plant
-from avis_ctrl.study.runner import provenance
+from avis_ctrl.study.runner import design_provenance
 from avis_ctrl.study.saved import study_dict
 from avis_ctrl.study.simulation import bare_loop
 from avis_ctrl.study.skyhooks import classical_skyhook
@@ -39,7 +39,7 @@ def write_folder(path: Path, design_name: str, make) -> Path:
         "format": "avis-design", "version": 1, "stable": True, "verdict": "",
         "controllers": [{"name": made.name, "file": f"controllers/{made.name}.json"},
                         {"name": "passive", "file": None}],
-        "all_axes": {"companions": rows}, "provenance": provenance(design, source, rig, 0.0)})
+        "all_axes": {"companions": rows}, "provenance": design_provenance(design, source, rig, 0.0)})
     return path
 
 
