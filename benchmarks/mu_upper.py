@@ -11,12 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-<<<<<<< HEAD
-from avis_ctrl.robust.mu import mu_upper
-=======
 from avis_ctrl.robust.mu import mu, mu_upper
-from avis_ctrl.robust.mu_oracle import mu_upper_by_bisection
->>>>>>> discrete
 from avis_ctrl.robust.slycot_adapter import mu_upper_slicot
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
 from benchmarks.mu_by_bisection import mu_upper_by_bisection

@@ -8,11 +8,7 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import InputError
 from avis_ctrl.robust.mu import mu, mu_upper
 from avis_ctrl.robust.mu_lower import is_singular
-<<<<<<< HEAD
-=======
-from avis_ctrl.robust.mu_oracle import mu_upper_by_bisection
 from avis_ctrl.robust.mu_upper import upper_bound
->>>>>>> discrete
 from avis_ctrl.robust.slycot_adapter import mu_upper_slicot
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
 from benchmarks.mu_by_bisection import mu_upper_by_bisection
