@@ -96,7 +96,7 @@ def certify(folder: DesignFolder, controller: SampledController, files: Mapping[
                "stable": not unstable and bool(np.isfinite(found.peak.upper)),
                "worst_case_peak_transmissibility_dB": dB(found.peak.upper),
                "worst_case_band_transmissibility_dB": dB(found.band.upper),
-               "rounding_noise_m_per_s": float(np.max(noise)),
+               "rounding_noise_m_per_s": float(np.linalg.norm(noise)),
                "step_time_us": None if files is None else step_time_us(files, controller),
                "between_samples": {"worst_case_gain_dB": dB(found.all_times),
                                    "floor_above_half_rate_dB": dB(found.above)}}
