@@ -26,11 +26,16 @@ RealScalar          block of a real parameter, repeated or not
 ComplexScalar       block of a complex number, repeated or not
 ComplexFull         block of a full complex matrix
 BlockStructure      the blocks of a structured perturbation
+uncertainty_weight  a filter that covers what responses differ by
 hinfsyn             H-infinity controller
+mixed_sensitivity   H-infinity controller for weights on S, KS and T
 musyn               mu controller (D-K iteration)
 mu                  bounds of the structured singular value of matrices
 mu_peak             its peak over frequency, proved between the points
 worst_case_gain     the largest gain over all perturbations
+robust_stability    the part of the uncertainty up to which a loop is stable
+robust_performance  the same with a bound on its gain
+disk_margin         gain and phase margins of all channels at once
 plot                bode, sigma, mu, transmissibility, dk_history, order, vc_curves
 InputError          what a wrong input raises: one line
 
@@ -68,7 +73,12 @@ _PLACES = {
     "musyn": "avis_ctrl.robust.musyn",
     "mu": "avis_ctrl.robust.mu",
     "mu_peak": "avis_ctrl.robust.mu_peak",
-    "worst_case_gain": "avis_ctrl.robust.mu_peak",
+    "worst_case_gain": "avis_ctrl.robust.robustness",
+    "robust_stability": "avis_ctrl.robust.robustness",
+    "robust_performance": "avis_ctrl.robust.robustness",
+    "disk_margin": "avis_ctrl.robust.disk_margin",
+    "mixed_sensitivity": "avis_ctrl.robust.mixed_sensitivity",
+    "uncertainty_weight": "avis_ctrl.uncertainty.uncertainty_weight",
 }
 # Packages that are names of the interface, too; `gap` can be called.
 _PACKAGES = ("gap", "plot")

@@ -19,7 +19,8 @@ def in_short(value: Any) -> str:
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return in_short(value.item()) if not value.shape else f"array{tuple(value.shape)}"
     if isinstance(value, dict):
-        return f"{len(value)} entries"
+        few = ", ".join(f"{key}: {in_short(one)}" for key, one in value.items())
+        return few if len(few) <= LONGEST else f"{len(value)} entries"
     if isinstance(value, (list, tuple)) and len(value) > 2:
         return f"{len(value)} items"
     text = repr(value)

@@ -65,7 +65,10 @@ class DesignStudy:
         lines = [first_sentence(self.result)]
         if self.result.stable:
             lines.append(all_axes(self.result))
-        lines += [f"  {name:52s} {limit:>20s} {value:>14s}  {met}" for name, limit, value, met in self._rows()]
+        rows = self._rows()
+        widths = [max((len(row[k]) for row in rows), default=0) for k in range(3)]
+        lines += ["  " + "  ".join([name.ljust(widths[0]), limit.rjust(widths[1]), value.rjust(widths[2]), met])
+                  for name, limit, value, met in rows]
         return "\n".join([*lines, *self.result.notes])
 
     def _rows(self) -> list[tuple[str, str, str, str]]:

@@ -84,7 +84,11 @@ def plot_frequencies(given: Any, points: int = 400) -> np.ndarray:
         high = np.pi / system.dt
         low = min(low, high / 1e3)
     grid = np.geomspace(low, high, points)
-    resonant = poles[np.abs(poles.imag) > 0.9 * np.abs(poles)]
-    near = [abs(p.imag) * np.exp(np.linspace(-5, 5, 21) * abs(p.real) / abs(p)) for p in resonant]
+    near = []
+    for p in poles[np.abs(poles.imag) > 0.9 * np.abs(poles)]:
+        damping = abs(p.real) / abs(p)
+        # A pole on the axis has no peak to show: keep away from it.
+        steps = np.linspace(-5, 5, 21) * damping if damping > 1e-7 else np.linspace(-5, 5, 20) * 1e-3
+        near.append(abs(p.imag) * np.exp(steps))
     every = np.unique(np.concatenate([grid, *near]))
     return every[(every >= low) & (every <= high)]

@@ -26,8 +26,8 @@ def axes_of(given: Any, rows: int = 1) -> Any:
     return given
 
 
-def finish(ax: Any, x: str, y: str, log: bool = True, legend: bool = True) -> Any:
-    """Labels, a light grid, and a legend where something has a name."""
+def finish(ax: Any, x: str, y: str, log: bool = True, above: bool = False) -> Any:
+    """Labels, a light grid, and a legend, inside or above, where something has a name."""
     if log:
         ax.set_xscale("log")
     if x:
@@ -35,8 +35,9 @@ def finish(ax: Any, x: str, y: str, log: bool = True, legend: bool = True) -> An
     ax.set_ylabel(y)
     ax.grid(True, which="major", linewidth=0.5, color="#d8d8d8")
     ax.set_axisbelow(True)
-    if legend and ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize="small", frameon=False)
+    if ax.get_legend_handles_labels()[0]:
+        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 2} if above else {}
+        ax.legend(fontsize="small", framealpha=0.85, edgecolor="none", **place)
     return ax
 
 
@@ -45,3 +46,11 @@ def decibels(size: np.ndarray) -> np.ndarray:
     size = np.abs(np.asarray(size))
     known = np.isfinite(size) & (size > 0)
     return np.where(known, 20 * np.log10(np.where(known, size, 1.0)), np.nan)
+
+
+def whole_numbers(ax: Any) -> None:
+    """Ticks of the x axis at whole numbers only."""
+    from matplotlib.ticker import MaxNLocator
+
+    ax.set_xscale("linear")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.plot.axes import HERTZ, axes_of, decibels, finish
+from avis_ctrl.plot.axes import HERTZ, axes_of, decibels, finish, whole_numbers
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
 
 # Colours of Okabe and Ito; controllers look as in the report.
 COLOURS = {"passive": "#7a7a7a", "skyhook_classical": "#56b4e9", "skyhook": "#e69f00", "hinf": "#009e73",
            "mu": "#0072b2"}
-LIMIT = "#b3261e"
+LIMIT, LOWER = "#b3261e", "#e69f00"
 
 
 def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu"]) -> Any:
@@ -25,9 +25,9 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
     ax = axes_of(ax)
     f = np.asarray(peak.frequencies) / HERTZ
     shown = f > 0
-    ax.plot(f[shown], peak.upper_curve[shown], color=color, label=f"{label}, upper bound")
+    ax.plot(f[shown], peak.upper_curve[shown], ".-", markersize=4, color=color, label=f"{label}, upper bound")
     lower = np.where(peak.lower_curve > 0, peak.lower_curve, np.nan)
-    ax.plot(f[shown], lower[shown], color=color, linestyle=":", label=f"{label}, lower bound")
+    ax.plot(f[shown], lower[shown], color=LOWER, linestyle="--", label=f"{label}, lower bound")
     if np.isfinite(peak.upper):
         worth = "proved between all points" if peak.guaranteed else "at the computed points only"
         ax.axhline(peak.upper, color=color, linewidth=0.8, linestyle="--",
@@ -36,7 +36,7 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
         ax.plot(peak.omega / HERTZ, peak.lower, "o", color=color, markersize=5, fillstyle="none",
                 label=f"reached: {peak.lower:.4g} at {peak.omega / HERTZ:.4g} Hz")
     ax.set_ylim(bottom=0)
-    return finish(ax, "frequency [Hz]", label)
+    return finish(ax, "frequency [Hz]", label, above=True)
 
 
 def transmissibility(result: Any, ax: Any = None, *, controllers: Iterable[str] | None = None) -> Any:
@@ -81,7 +81,7 @@ def dk_history(history: Any, ax: Any = None) -> Any:
     if values.max() > 10 * values.min():
         ax.set_yscale("log")
     ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
-    ax.xaxis.get_major_locator().set_params(integer=True)
+    whole_numbers(ax)
     return finish(ax, "iteration", "gamma, mu", log=False)
 
 
@@ -97,7 +97,7 @@ def order(history: Any, ax: Any = None) -> Any:
     if values.max() > 10 * values.min():
         ax.set_yscale("log")
     ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
-    ax.xaxis.get_major_locator().set_params(integer=True)
+    whole_numbers(ax)
     return finish(ax, "states of the controller", "peak mu", log=False)
 
 
@@ -120,7 +120,7 @@ def vc_curves(spectra: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None
         ax.plot(f[known], 1e6 * rms[known], "o-", markersize=3, label=name)
     ax.set_yscale("log")
     ax.margins(x=0.08)
-    return finish(ax, "third octave [Hz]", "velocity, r.m.s. [um/s]")
+    return finish(ax, "midband of the third octave [Hz]", "velocity, r.m.s. [µm/s]")
 
 
 def _rows(history: Any) -> list[Any]:

@@ -40,6 +40,7 @@ from avis_ctrl.robust.hinf_riccati import (
 from avis_ctrl.robust.hinf_settings import SETTINGS
 from avis_ctrl.robust.reduction import residualise_fast
 from avis_ctrl.robust.riccati import INACCURATE, ON_AXIS
+from avis_ctrl.summary import Shown
 
 
 class Status(Enum):
@@ -55,8 +56,8 @@ class Status(Enum):
     SUBOPTIMAL = "a controller at the gamma asked for; the optimum was not sought"
 
 
-@dataclass(frozen=True)
-class Synthesis:
+@dataclass(frozen=True, repr=False)
+class Synthesis(Shown):
     """Result of an H-infinity synthesis.
 
     K : controller, inputs named as the plant's y, outputs as its u; positive feedback u = K y.

@@ -18,11 +18,12 @@ from avis_ctrl.robust.mu_lmi import Array
 from avis_ctrl.robust.mu_lower import lower_bound
 from avis_ctrl.robust.mu_upper import UpperBound, upper_bound
 from avis_ctrl.robust.one_thread import one_thread
+from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 
-@dataclass(frozen=True, eq=False)
-class MuUpper:
+@dataclass(frozen=True, eq=False, repr=False)
+class MuUpper(Shown):
     """Upper bound of mu with its scalings; a leading frequency axis where M had one.
 
     upper : scalar or (n_omega,).
@@ -38,7 +39,7 @@ class MuUpper:
     G: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MuBounds(MuUpper):
     """Both bounds of mu; a leading frequency axis where M had one.
 

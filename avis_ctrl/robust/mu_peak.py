@@ -26,6 +26,7 @@ from avis_ctrl.robust.mu_lower import SETTINGS, LowerBound, lower_bound, singula
 from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
 from avis_ctrl.robust.mu_upper import UpperBound, skewed_upper_bound, upper_bound
 from avis_ctrl.robust.one_thread import one_thread
+from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 SLACK = 5e-4
@@ -33,8 +34,8 @@ KNOWN_SLACK = 5e-3
 ALL_FREQUENCIES: Interval = (0.0, np.inf)
 
 
-@dataclass(frozen=True, eq=False)
-class MuPeak:
+@dataclass(frozen=True, eq=False, repr=False)
+class MuPeak(Shown):
     """Bounds of a supremum over frequency.
 
     upper : never exceeded in the band if `guaranteed`; else proved at the frequencies computed only.

@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
 from avis_ctrl.lti.bilinear import continuous_image, sampled_image
+from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.robust.dstep import PointwiseScalings, tightened
 from avis_ctrl.robust.frequency_grid import frequency_grid
 from avis_ctrl.robust.hinf_plant import as_plant
@@ -28,6 +29,7 @@ from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.musyn_iteration import Options, Problem, iterate
 from avis_ctrl.robust.musyn_state import Iteration, Loop, State
 from avis_ctrl.robust.scalings import Scalings
+from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 # What the certificate may leave above mu of the final loop.
@@ -35,8 +37,8 @@ TIGHT = 0.003
 NORM_TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class MuSynthesis:
+@dataclass(frozen=True, eq=False, repr=False)
+class MuSynthesis(Shown):
     """The best controller of all iterations, and what was measured on it.
 
     mu_upper, mu_lower : bounds of the peak of mu over all frequencies with the blocks as given (real ones real).
@@ -106,7 +108,7 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     cap = P.nstates + 20 if max_added_states is None else max_added_states
     options = _options(target, max_iterations, backoff, polish, cap, callback)
     problem = Problem(continuous_image(P), structure, nmeas, ncon)
-    given = tuple(continuous_image(_named(P, K, nmeas, ncon)) for K in starts)
+    given = tuple(continuous_image(_named(P, as_system(K, "starts"), nmeas, ncon)) for K in starts)
     with threadpool_limits(1, user_api="blas"):
         current = State() if state is None else State.from_dict(state, structure, problem.P, nmeas, ncon, P.dt)
         current, status = iterate(problem, current, given, options)

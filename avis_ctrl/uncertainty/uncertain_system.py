@@ -31,6 +31,21 @@ STATES = Element("states")
 Parts = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
+@dataclass(frozen=True)
+class UncertainSettings:
+    """singular : condition number from which on a matrix to invert counts as singular: round-off alone makes 1e15.
+    same : difference of two LFTs, relative to the size of their entries, up to which a reduction of copies is accepted:
+    a few hundred operations make as much.
+    inside : deltas at which they are compared, as a fraction of the range: away from a pole at its ends."""
+
+    singular: float = 1e13
+    same: float = 1e-12
+    inside: float = 0.7
+
+
+SETTINGS = UncertainSettings()
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class UncertainSystem:
     """An uncertain system; without states an uncertain matrix, of one entry an uncertain number.
@@ -234,7 +249,7 @@ class UncertainSystem:
         """The inverse. ComputationError where the nominal value has none."""
         if self.shape[0] != self.shape[1]:
             raise InputError("expected as many inputs as outputs", field="inverse", value=self.shape)
-        if np.linalg.cond(self.d) > 1e13:
+        if np.linalg.cond(self.d) > SETTINGS.singular:
             raise ComputationError("the nominal value cannot be inverted", measured=f"D = {self.d.tolist()}",
                                    cause="a division by zero, or by a strictly proper system",
                                    next_step="choose a nominal value other than zero")
@@ -266,7 +281,7 @@ class UncertainSystem:
         if Y.shape != (X.shape[1], X.shape[0]):
             raise InputError(f"feedback of shape {Y.shape} around {X.shape}")
         loop = np.eye(X.shape[0]) - sign * X.d @ Y.d
-        if np.linalg.cond(loop) > 1e13:
+        if np.linalg.cond(loop) > SETTINGS.singular:
             raise ComputationError("the nominal loop is not well posed", measured=f"I + X Y = {loop.tolist()} at "
                                    "infinite frequency", cause="an algebraic loop of unit gain")
         R = np.linalg.inv(loop)
@@ -538,7 +553,7 @@ def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice
     rest_w = [k for k in range(system.a.shape[1]) if not w.start <= k < w.stop]
     rest_z = [k for k in range(system.a.shape[0]) if not z.start <= k < z.stop]
     loop = np.eye(z.stop - z.start) - system.a[z, w] @ inner.d
-    if np.linalg.cond(loop) > 1e13:
+    if np.linalg.cond(loop) > SETTINGS.singular:
         element = system.elements[place]
         raise ComputationError("the system has no value here", measured=f"I - M Delta is singular at {element}",
                                cause="a division by zero", next_step="choose a value inside the range")
@@ -602,12 +617,12 @@ def _same(M: Parts, sizes: Sequence[int], small: Parts, kept: Sequence[int]) -> 
         values = np.repeat(delta, counts)
         return d + c @ (values[:, None] * np.linalg.solve(np.eye(len(values)) - a * values, b))
     for _ in range(3):
-        delta = rng.uniform(-0.7, 0.7, len(sizes))
+        delta = SETTINGS.inside * rng.uniform(-1, 1, len(sizes))
         one, other = value(M, sizes, delta), value(small, kept, delta)
         size = np.maximum(np.abs(one), np.abs(M[3]))
         # An entry that is the difference of larger ones has their round-off.
         largest = np.outer(np.max(np.abs(M[2]), axis=1, initial=0.0), np.max(np.abs(M[1]), axis=0, initial=0.0))
-        if np.any(np.abs(one - other) > 1e-12 * np.maximum(size, largest)):
+        if np.any(np.abs(one - other) > SETTINGS.same * np.maximum(size, largest)):
             return False
     return True
 

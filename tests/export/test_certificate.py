@@ -20,7 +20,7 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation import simulate
 from avis_ctrl.simulation.discrete import spectral_radius
 from avis_ctrl.simulation.sampled_loop import lever_arms
-from avis_ctrl.study.sampling import random_perturbations
+from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.simulation import with_delta
 
 
