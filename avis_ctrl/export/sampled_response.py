@@ -24,12 +24,13 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.export.design_folder import DesignFolder
+from avis_ctrl.export.intervals import delay_jet, roots_jet, sinc_jet, system_jet
 from avis_ctrl.export.sampled_controller import SampledController
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.actuator import pade_delay
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rigid_body import COORDINATES
-from avis_ctrl.rigs.sensing import conditioning
+from avis_ctrl.rigs.sensing import Filter, conditioning
 from avis_ctrl.robust.mu_upper import skewed_upper_bound
 
 
@@ -124,18 +125,31 @@ class SampledAxes:
         """(n_omega, n, n) R without the design model's delay: what stands in the place of its controller."""
         return (self.hold(omega) / self.pade(omega))[:, None, None] * (self.forces @ self.volts(omega))
 
-    def controller_error(self, K: StateSpace, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) bound of |R - K exp(-j omega tau)| and of what rounded decoding adds [N s/m].
+    def controller_error(self, K: StateSpace, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound over |omega - centre| <= half of |R - K exp(-j omega tau)| and of what rounded decoding adds
+        [N s/m].
 
         K : continuous, from seen velocities to forces; the delay is that of the design's model.
         """
-        direct = self.response(omega) - K.frequency_response(omega)
-        return np.linalg.norm(direct, ord=2, axis=(1, 2)) + self._beside(omega)
+        T, rig, own = self.period_s, self.folder.rig, self.controller.system
+        design_delay = pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, self.folder.design.loop.pade_order)
+        delay = design_delay.poles().tolist()
+        # The all-pass of the design's delay, inverted; its sign is 1 at rest.
+        no_pade = roots_jet(delay, [-one for one in delay], (-1.0) ** len(delay), centre, half)
+        channel = self._channel
+        unfiltered = roots_jet(channel.poles, channel.zeros, 1 / channel.leading, centre, half)
+        code = StateSpace(own.A, own.B @ (self.gains_V[:, None] * self.rows), self.forces @ own.C,
+                          self.forces @ own.D @ (self.gains_V[:, None] * self.rows), T)
+        held = sinc_jet(T, centre) * (delay_jet(T * (0.5 + self.controller.delay_samples), centre) * no_pade)
+        R = held * (unfiltered * system_jet(code, centre, half))
+        # What rounding sends beside the axes is some 1e-7 of R and as smooth: doubled for the interval.
+        return (R - system_jet(K, centre, half)).bound(half) + 2 * self._beside(centre)
 
-    def folding(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) bound of |E| [m/(N s)] for omega up to half the sample rate."""
-        terms = [self._filter(omega) / self._filter(image) * self._high_gain("force", "seen", image) * omega / image
-                 for image in self._images(omega)]
+    def folding(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound of |E| [m/(N s)] over |omega - centre| <= half, up to half the sample rate."""
+        own = self._filter(centre, half)[0]
+        terms = [own / self._filter(image, half)[1] * self._high_gain("force", "seen", image - half)
+                 * (centre + half) / (image - half) for image in self._images(centre)]
         # Hold and table together fall at least as k^-2: the sum over k > n of n^2 / k^2 is below n, on either side.
         return np.sum(terms, axis=0) + 2 * self.settings.images * terms[-1]
 
@@ -162,11 +176,18 @@ class SampledAxes:
         return found
 
     # -- images of the sample rate -------------------------------------------------------
-    def _filter(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) |F|, one for all sensors of the axes."""
+    @property
+    def _channel(self) -> Filter:
+        """F, one for all sensors of the axes."""
         used = np.any(np.abs(self.rows) > 0, axis=1)
-        first = next(one for one, in_use in zip(self._filters, used, strict=True) if in_use)
-        return np.ones(omega.size) if first is None else np.abs(first.frequency_response(omega)[:, 0, 0])
+        found = conditioning(self.folder.rig, self.folder.design.loop.integrator_corner_Hz)
+        return next(one for one, in_use in zip(found, used, strict=True) if in_use)
+
+    def _filter(self, centre: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) largest and least |F| over the intervals."""
+        one = self._channel
+        jet = roots_jet(one.zeros, one.poles, one.leading, centre, half)
+        return jet.size, np.abs(jet.value) ** 2 / jet.size
 
     def _images(self, omega: np.ndarray) -> list[np.ndarray]:
         """(n_omega,) frequencies that fold onto omega, the nearest first."""
@@ -178,15 +199,16 @@ class SampledAxes:
         1/k, so that the squares' rest is below the number of pairs times the last, on either side."""
         return np.sqrt(np.sum(np.square(terms), axis=0) + 2 * self.settings.images * terms[-1] ** 2)
 
-    def held_images(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) bound of the payload velocity at all images per force at omega, r.m.s. [m/(N s)]."""
-        return self._energy([self._high_gain("force", "velocity", image) * omega / image
-                             for image in self._images(omega)])
+    def held_images(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound over each interval of the payload velocity at all images per force, r.m.s. [m/(N s)]."""
+        return self._energy([self._high_gain("force", "velocity", image - half) * (centre + half) / (image - half)
+                             for image in self._images(centre)])
 
-    def folded_floor(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) bound of the seen velocity at omega per floor velocity at all images, r.m.s."""
-        return self._energy([self._high_gain("floor", "seen", image) * self._filter(omega) / self._filter(image)
-                             for image in self._images(omega)])
+    def folded_floor(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound over each interval of the seen velocity per floor velocity at all images, r.m.s."""
+        own = self._filter(centre, half)[0]
+        return self._energy([self._high_gain("floor", "seen", image - half) * own / self._filter(image, half)[1]
+                             for image in self._images(centre)])
 
     @property
     def high_grid(self) -> np.ndarray:
