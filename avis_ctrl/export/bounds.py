@@ -121,12 +121,12 @@ def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Boun
     return Bounds(mu_peak(performance, whole, band=below, slack=SLACK),
                   worst_case_gain(motion, blocks, band=below, slack=SLACK),
                   worst_case_gain(motion, blocks, band=(low, min(high, axes.half_rate)), slack=SLACK),
-                  *_between_samples(axes, K, W_a, W_E, grid, settings), _gain_above(axes, K, W_a, W_E))
+                  *_between_samples(axes, K, W_a, W_E, grid, settings), _gain_above(axes, K, W_a, W_E, settings))
 
 
-def _gain_above(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational) -> float:
+def _gain_above(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational, settings: CoverSettings) -> float:
     """Bound of the loop gain from half the sample rate on, both errors included."""
-    omega = axes.high_grid
+    omega = np.geomspace(1.0, settings.beyond, settings.intervals) * axes.half_rate
     size = np.linalg.norm(K.frequency_response(omega), ord=2, axis=(1, 2)) + W_a.magnitude(omega)
     table = axes.force_to_seen(omega)
     table[0] += W_E.magnitude(omega[:1])[0]  # the images belong to half the rate itself

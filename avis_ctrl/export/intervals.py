@@ -7,7 +7,7 @@ Intervals |omega - centre| <= half, all quantities arrays over the intervals. Re
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,22 +45,21 @@ class Jet:
         return value + half * slope + half ** 2 / 2 * self.curve
 
 
-def roots_jet(zeros: Sequence[complex], poles: Sequence[complex], leading: float, centre: np.ndarray,
+def roots_jet(zeros: Iterable[complex], poles: Iterable[complex], leading: float, centre: np.ndarray,
               half: np.ndarray) -> Jet:
     """leading * prod(s - z) / prod(s - p) at s = j omega."""
     s = 1j * centre
-    signs = [*[1.0] * len(zeros), *[-1.0] * len(poles)]
-    roots = [complex(one) for one in (*zeros, *poles)]
+    signed = [*((complex(one), 1.0) for one in zeros), *((complex(one), -1.0) for one in poles)]
     value, first = np.full(centre.size, leading, complex), np.zeros(centre.size, complex)
-    for root, sign in zip(roots, signs, strict=True):
+    for root, sign in signed:
         value = value * (s - root) ** sign
         first = first + sign * 1j / (s - root)
-    S1, S2 = log_slopes(roots, centre, half)
+    S1, S2 = log_slopes([root for root, _ in signed], centre, half)
     size = np.abs(value) * np.exp(half * S1)
     return Jet(value, value * first, size, size * S1, size * (S1 ** 2 + S2))
 
 
-def log_slopes(roots: Sequence[complex], centre: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def log_slopes(roots: Iterable[complex], centre: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n,) bounds of sum 1/|j omega - r| and of sum 1/|j omega - r|^2 over the intervals."""
     S1, S2 = np.zeros(centre.size), np.zeros(centre.size)
     for root in roots:
