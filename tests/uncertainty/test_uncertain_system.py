@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, tf
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
-from avis_ctrl.uncertainty.uncertain_system import complex_disk, connect, dynamics, matrix, real, ss
+from avis_ctrl.uncertainty.uncertain_models import complex_disk, connect, dynamics, matrix, real, ss
 
 NAMES = ("p", "q", "r")
 ELEMENTS = {"p": real("p", 2.0, percent=30), "q": real("q", 3.0, range=(2.0, 5.0)),
