@@ -94,3 +94,14 @@ def test_a_study_shows_saves_and_plots_its_result(fabricated, tmp_path):
         _, given = plt.subplots()
         assert draw(given) is given
     plt.close("all")
+
+
+def test_a_report_without_rivals(fabricated, tmp_path):
+    """Left out on request, or failed: the report speaks of the controllers that there are."""
+    alone = replace(fabricated, controllers=tuple(c for c in fabricated.controllers if c.name in ("passive", "mu")))
+    study = DesignStudy(alone)
+    study.save(tmp_path)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "skyhook, tuned" not in page and "mu synthesis" in page
+    assert len(study.plot_transmissibility().lines) == 3  # two controllers and the certified worst case
+    plt.close("all")
