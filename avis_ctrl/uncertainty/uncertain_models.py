@@ -128,7 +128,7 @@ def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], out
         P, n_w, n_z = part.opened()
         ws, zs = ([f"{key}|{name}" for name in names] for names in (P.inputs[:n_w], P.outputs[:n_z]))
         whole[key] = P.renamed([*ws, *part.inputs], [*zs, *part.outputs])
-        elements += [(one, n) for one, n in zip(part.elements, part.copies, strict=True) if one is not STATES]
+        elements += [(one, n) for one, n in zip(part.elements, part.copies, strict=True) if one != STATES]
         w, z = w + ws, z + zs
     if not elements:
         return connect_systems(whole, inputs, outputs)

@@ -25,7 +25,7 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.elements import ComplexDisk, Element, RealParameter
 from avis_ctrl.uncertainty.lft_reduction import reduce_copies
 
-# The states among the elements: a block 1/s I (or z^-1 I).
+# The states among the elements: a block 1/s I (or z^-1 I). Equal to no uncertain element: these are of other classes.
 STATES = Element("states")
 Parts = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -83,12 +83,12 @@ class UncertainSystem:
 
     @property
     def nstates(self) -> int:
-        return sum(n for one, n in zip(self.elements, self.copies, strict=True) if one is STATES)
+        return sum(n for one, n in zip(self.elements, self.copies, strict=True) if one == STATES)
 
     @property
     def uncertain(self) -> dict[str, Element]:
         """The uncertain elements by name."""
-        return {one.name: one for one in self.elements if one is not STATES}
+        return {one.name: one for one in self.elements if one != STATES}
 
     def _slices(self) -> list[tuple[Element, int, slice, slice]]:
         """(element, copies, its place in i_in, its place in i_out)."""
@@ -101,7 +101,7 @@ class UncertainSystem:
     def lft(self) -> tuple[StateSpace, BlockStructure]:
         """(P, blocks): P with inputs (w_delta, u) and outputs (z_delta, y); what `mu_peak`, `musyn` and
         `worst_case_gain` take. InputError for dynamics of several channels that appear more than once."""
-        blocks = BlockStructure(tuple(one.block(n) for one, n, _, _ in self._slices() if one is not STATES))
+        blocks = BlockStructure(tuple(one.block(n) for one, n, _, _ in self._slices() if one != STATES))
         return self.opened()[0], blocks
 
     def opened(self) -> tuple[StateSpace, int, int]:
@@ -109,7 +109,7 @@ class UncertainSystem:
         n = self.nstates
         w, z = list[str](), list[str]()
         for one, copies, _, _ in self._slices():
-            if one is not STATES:
+            if one != STATES:
                 for names, letter, count in ((w, "w", copies * one.rows), (z, "z", copies * one.cols)):
                     names += [f"{letter}:{one.name}" + (f"[{k}]" if count > 1 else "") for k in range(count)]
         P = StateSpace(self.a[:n, :n], np.hstack([self.a[:n, n:], self.b[:n]]),
@@ -182,7 +182,7 @@ class UncertainSystem:
         """The elements named closed by their normalised deltas (numbers, or systems)."""
         system = self
         for name, delta in deltas.items():
-            place = next(k for k, one in enumerate(system.elements) if one.name == name and one is not STATES)
+            place = next(k for k, one in enumerate(system.elements) if one.name == name and one != STATES)
             element, n, w, z = system._slices()[place]
             if isinstance(delta, StateSpace):
                 if delta.D.shape != (element.rows, element.cols):
@@ -315,7 +315,7 @@ class UncertainSystem:
     # -- words -------------------------------------------------------------------------------
     def _rows(self) -> list[tuple[str, str]]:
         return [(str(one), f"{n} {'copy' if n == 1 else 'copies'}") for one, n, _, _ in self._slices()
-                if one is not STATES]
+                if one != STATES]
 
     def __repr__(self) -> str:
         what = "; ".join(f"{text}, {count}" for text, count in self._rows()) or "nothing uncertain"
@@ -398,7 +398,7 @@ def gathered(parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs
     w = z = 0
     for one, n in kinds:
         # No element may have the empty name.
-        key = "" if one is STATES else one.name
+        key = "" if one == STATES else one.name
         known, ws, zs = places.setdefault(key, (one, [], []))
         if known != one:
             raise InputError(f"two different uncertain elements have this name: {known} and {one}", field=key)
@@ -439,7 +439,7 @@ def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice
 def reduced(system: UncertainSystem) -> UncertainSystem:
     """The same with fewer copies of scalar elements, by `reduce_copies`, each channel scaled to size one before."""
     slices = system._slices()
-    scalar = [k for k, (one, *_) in enumerate(slices) if one.scalar and one is not STATES]
+    scalar = [k for k, (one, *_) in enumerate(slices) if one.scalar and one != STATES]
     if not scalar:
         return system
     sizes = [slices[k][1] for k in scalar]

@@ -94,3 +94,16 @@ def test_an_option_that_does_not_exist_is_named():
     for command in (ac.identify, ac.gap):
         with pytest.raises(ac.InputError, match="option = 'stars'"):
             command(campaign, "avis", stars=1)
+
+
+@pytest.mark.slow
+def test_gap_names_the_lag_that_was_simulated(tmp_path):
+    """designs/plans/lagging_amplifiers.toml hides a lag of 120 Hz in the amplifiers; about a minute."""
+    campaign = ac.simulate_campaign("avis", AVIS_DESIGN.parent / "plans" / "lagging_amplifiers.toml")
+    found = ac.gap(campaign, "avis")
+    assert found.verdict == "explained" and [one.name for one in found.effects] == ["actuator_lag"]
+    corner = found.effects[0].parameters["corner_Hz"]
+    assert abs(corner.value - 120.0) < 5 * corner.std + 0.5
+    assert "lag" in found.summary() and "explained" in repr(found) and "noise alone" in found._repr_html_()
+    assert len(found.plot_stages().patches) == len(found.gap.stages)
+    assert {path.name for path in found.save(tmp_path)} >= {"gap.json", "gap.html", "gap.pdf", "updated.toml"}
