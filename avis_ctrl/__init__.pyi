@@ -22,12 +22,12 @@ from avis_ctrl.uncertainty.blocks import BlockStructure as BlockStructure
 from avis_ctrl.uncertainty.blocks import ComplexFull as ComplexFull
 from avis_ctrl.uncertainty.blocks import ComplexScalar as ComplexScalar
 from avis_ctrl.uncertainty.blocks import RealScalar as RealScalar
-from avis_ctrl.uncertainty.uncertain_system import complex_disk as complex_disk
-from avis_ctrl.uncertainty.uncertain_system import connect as connect
-from avis_ctrl.uncertainty.uncertain_system import dynamics as dynamics
-from avis_ctrl.uncertainty.uncertain_system import matrix as matrix
-from avis_ctrl.uncertainty.uncertain_system import real as real
-from avis_ctrl.uncertainty.uncertain_system import ss as ss
+from avis_ctrl.uncertainty.uncertain_models import complex_disk as complex_disk
+from avis_ctrl.uncertainty.uncertain_models import connect as connect
+from avis_ctrl.uncertainty.uncertain_models import dynamics as dynamics
+from avis_ctrl.uncertainty.uncertain_models import matrix as matrix
+from avis_ctrl.uncertainty.uncertain_models import real as real
+from avis_ctrl.uncertainty.uncertain_models import ss as ss
 from avis_ctrl.uncertainty.uncertainty_weight import uncertainty_weight as uncertainty_weight
 
 __version__: str

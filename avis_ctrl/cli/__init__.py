@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 import avis_ctrl
+from avis_ctrl.cli.compare import compare
 from avis_ctrl.cli.design import design
 from avis_ctrl.cli.export import export
 from avis_ctrl.cli.gap import gap
@@ -63,8 +64,8 @@ def doctor() -> None:
         raise typer.Exit(3)
 
 
-for command, name in ((design, "design"), (export, "export"), (identify, "identify"), (gap, "gap"),
-                      (predict, "predict"), (gap_axis, "gap-axis"), (excite, "excite"),
+for command, name in ((design, "design"), (compare, "compare"), (export, "export"), (identify, "identify"),
+                      (gap, "gap"), (predict, "predict"), (gap_axis, "gap-axis"), (excite, "excite"),
                       (simulate_campaign, "simulate-campaign"), (convert, "convert"), (single_axis, "single-axis")):
     app.command(name, epilog=LAYOUTS if name in ("identify", "gap", "convert") else None)(command)
 

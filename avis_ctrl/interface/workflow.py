@@ -61,8 +61,8 @@ def simulate_campaign(table: Rig | str, plan: Mapping[str, Any] | str | Path | N
     table = _rig(table)
     chosen = (default_plan(table) if plan is None else plan_from_table(dict(plan)) if isinstance(plan, Mapping)
               else read_plan(plan))
-    told = None if progress is None else lambda k, total, name: progress(f"record {name}, {k} of {total}")
-    return rehearse(table, chosen, seed, told).campaign
+    record_done = None if progress is None else lambda k, total, name: progress(f"record {name}, {k} of {total}")
+    return rehearse(table, chosen, seed, record_done).campaign
 
 
 def identify(measured: Campaign | FrequencyResponse | str | Path, table: Rig | str, *, progress: Progress | None = None,

@@ -18,7 +18,8 @@ from avis_ctrl.robust.mu_peak import SLACK, MuPeak, mu_peak
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.elements import Dynamics
-from avis_ctrl.uncertainty.uncertain_system import UncertainSystem, matrix
+from avis_ctrl.uncertainty.uncertain_models import matrix
+from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 
 At = Literal["outputs", "inputs", "both"]
 

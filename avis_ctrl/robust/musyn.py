@@ -95,7 +95,8 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     max_added_states : most states that all scalings together may add to the plant.
     starts : controllers u = K y known already. The iteration starts from the best of them and of the H-infinity
         controller of P; the result is never worse (in complex mu on the grid) than any that stabilises P.
-    state : `saved_state` of an earlier result, to go on from.
+    state : `saved_state` of an earlier result, to go on from. Of another plant with the same y and u (a changed weight,
+        more uncertainty), its controllers are started from, as if given in `starts`.
     order : most states of the controller: the one of full order is shortened, then improved by descent on mu over its
         entries (`fixed_order`); mu is what that controller has. `saved_state` is that of the full order.
     sample_rate_Hz : the controller's fastest pole is compared with half of it, in `notes`.
@@ -103,7 +104,7 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     Raises
     ------
     InputError : blocks that do not fit P, counts or options that are wrong, controllers that do not fit, a state of
-        another problem.
+        other controllers.
     ComputationError : no stabilising controller (the mode is named), or none found.
     """
     P = as_plant(P, nmeas, ncon)
@@ -115,8 +116,10 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     problem = Problem(continuous_image(P), structure, nmeas, ncon)
     given = tuple(continuous_image(_named(P, as_system(K, "starts"), nmeas, ncon)) for K in starts)
     with threadpool_limits(1, user_api="blas"):
-        current = State() if state is None else State.from_dict(state, structure, problem.P, nmeas, ncon, P.dt)
-        current, status = iterate(problem, current, given, options)
+        current, known = State(), tuple[StateSpace, ...]()
+        if state is not None:
+            current, known = State.from_dict(state, structure, problem.P, nmeas, ncon, P.dt)
+        current, status = iterate(problem, current, (*known, *given), options)
         assert current.best is not None
         best, notes = current.best, tuple[str, ...]()
         if order is not None and best.K.nstates > order:
@@ -201,4 +204,4 @@ def _result(P: StateSpace, problem: Problem, uncertainty: BlockStructure, state:
     guaranteed = peak.guaranteed or mu_upper == gamma
     return MuSynthesis(K, mu_upper, peak.lower, peak.omega, complex_upper, guaranteed, peak.delta, uncertainty,
                        scalings, gamma, closed, fastest, state.history, status, tuple(notes),
-                       state.as_dict(problem.P, problem.nmeas, problem.ncon, P.dt))
+                       state.as_dict(problem.P, problem.structure, problem.nmeas, problem.ncon, P.dt))

@@ -18,15 +18,14 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import connect as connect_systems
 from avis_ctrl.lti.interchange import as_system, plot_frequencies
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.summary import html_table
 from avis_ctrl.uncertainty.blocks import BlockStructure
-from avis_ctrl.uncertainty.elements import ComplexDisk, Dynamics, Element, RealParameter
+from avis_ctrl.uncertainty.elements import ComplexDisk, Element, RealParameter
 from avis_ctrl.uncertainty.lft_reduction import reduce_copies
 
-# The states among the elements: a block 1/s I (or z^-1 I).
+# The states among the elements: a block 1/s I (or z^-1 I). Equal to no uncertain element: these are of other classes.
 STATES = Element("states")
 Parts = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -50,9 +49,9 @@ SETTINGS = UncertainSettings()
 class UncertainSystem:
     """An uncertain system; without states an uncertain matrix, of one entry an uncertain number.
 
-    Made by `real`, `complex_disk`, `dynamics`, `matrix` and `ss`, and by arithmetic: + - and integer powers; * and / by
-    anything of one entry multiply entries; @ (and * between matrices) is the product, or series connection. Numbers,
-    arrays, StateSpace and python-control systems may stand beside it.
+    Made by the functions of `uncertain_models` and by arithmetic: + - and whole powers; * and / by anything of one
+    entry multiply entries; @ (and * between matrices) is the product, or series connection. Numbers, arrays,
+    StateSpace and python-control systems may stand beside it.
 
     a, b, c, d : the matrices above. elements, copies : the blocks in order, the states first where there are any.
     """
@@ -84,12 +83,12 @@ class UncertainSystem:
 
     @property
     def nstates(self) -> int:
-        return sum(n for one, n in zip(self.elements, self.copies, strict=True) if one is STATES)
+        return sum(n for one, n in zip(self.elements, self.copies, strict=True) if one == STATES)
 
     @property
     def uncertain(self) -> dict[str, Element]:
         """The uncertain elements by name."""
-        return {one.name: one for one in self.elements if one is not STATES}
+        return {one.name: one for one in self.elements if one != STATES}
 
     def _slices(self) -> list[tuple[Element, int, slice, slice]]:
         """(element, copies, its place in i_in, its place in i_out)."""
@@ -102,15 +101,15 @@ class UncertainSystem:
     def lft(self) -> tuple[StateSpace, BlockStructure]:
         """(P, blocks): P with inputs (w_delta, u) and outputs (z_delta, y); what `mu_peak`, `musyn` and
         `worst_case_gain` take. InputError for dynamics of several channels that appear more than once."""
-        blocks = BlockStructure(tuple(one.block(n) for one, n, _, _ in self._slices() if one is not STATES))
-        return self._open()[0], blocks
+        blocks = BlockStructure(tuple(one.block(n) for one, n, _, _ in self._slices() if one != STATES))
+        return self.opened()[0], blocks
 
-    def _open(self) -> tuple[StateSpace, int, int]:
+    def opened(self) -> tuple[StateSpace, int, int]:
         """P as in `lft`, and the numbers of its w_delta and z_delta."""
         n = self.nstates
         w, z = list[str](), list[str]()
         for one, copies, _, _ in self._slices():
-            if one is not STATES:
+            if one != STATES:
                 for names, letter, count in ((w, "w", copies * one.rows), (z, "z", copies * one.cols)):
                     names += [f"{letter}:{one.name}" + (f"[{k}]" if count > 1 else "") for k in range(count)]
         P = StateSpace(self.a[:n, :n], np.hstack([self.a[:n, n:], self.b[:n]]),
@@ -183,17 +182,17 @@ class UncertainSystem:
         """The elements named closed by their normalised deltas (numbers, or systems)."""
         system = self
         for name, delta in deltas.items():
-            place = next(k for k, one in enumerate(system.elements) if one.name == name and one is not STATES)
+            place = next(k for k, one in enumerate(system.elements) if one.name == name and one != STATES)
             element, n, w, z = system._slices()[place]
             if isinstance(delta, StateSpace):
                 if delta.D.shape != (element.rows, element.cols):
                     raise InputError(f"expected {element.rows} outputs and {element.cols} inputs", field=name,
                                      value=delta.D.shape)
-                inner = _of(delta)
+                inner = as_uncertain(delta)
                 for _ in range(n - 1):
-                    inner = _diagonal(inner, _of(delta))
+                    inner = _diagonal(inner, as_uncertain(delta))
             else:
-                inner = _of(delta * np.eye(n * element.rows, n * element.cols))
+                inner = as_uncertain(delta * np.eye(n * element.rows, n * element.cols))
             system = _close(system, place, inner, w, z)
         return system if system.uncertain else system._certain()
 
@@ -204,25 +203,25 @@ class UncertainSystem:
 
     # -- arithmetic --------------------------------------------------------------------------
     def __add__(self, other: Any) -> UncertainSystem:
-        X, Y = self, _of(other)
+        X, Y = self, as_uncertain(other)
         if X.shape != Y.shape:
             raise InputError(f"sum of shapes {X.shape} and {Y.shape}")
         parts = la.block_diag(X.a, Y.a), np.vstack([X.b, Y.b]), np.hstack([X.c, Y.c]), X.d + Y.d
-        return _gathered(parts, X, Y, X.inputs, X.outputs)
+        return _of_both(parts, X, Y, X.inputs, X.outputs)
 
     def __neg__(self) -> UncertainSystem:
         return replace(self, c=-self.c, d=-self.d)
 
     def __sub__(self, other: Any) -> UncertainSystem:
-        return self + (-_of(other))
+        return self + (-as_uncertain(other))
 
     def __rsub__(self, other: Any) -> UncertainSystem:
-        return _of(other) - self
+        return as_uncertain(other) - self
 
     __radd__ = __add__
 
     def __matmul__(self, other: Any) -> UncertainSystem:
-        X, Y = self, _of(other)
+        X, Y = self, as_uncertain(other)
         if X.shape == Y.shape == (1, 1) and not (X.nstates or Y.nstates):
             # Numbers commute. Divisors act last, as a mass does on a sum of forces, so that entries of one row share
             # them; and equal products of parameters come in one order.
@@ -231,19 +230,19 @@ class UncertainSystem:
             raise InputError(f"product of shapes {X.shape} and {Y.shape}")
         parts = (np.block([[X.a, X.b @ Y.c], [np.zeros((Y.a.shape[0], X.a.shape[1])), Y.a]]),
                  np.vstack([X.b @ Y.d, Y.b]), np.hstack([X.c, X.d @ Y.c]), X.d @ Y.d)
-        return _gathered(parts, X, Y, Y.inputs, X.outputs)
+        return _of_both(parts, X, Y, Y.inputs, X.outputs)
 
     def __rmatmul__(self, other: Any) -> UncertainSystem:
-        return _of(other) @ self
+        return as_uncertain(other) @ self
 
     def __mul__(self, other: Any) -> UncertainSystem:
-        X, Y = self, _of(other)
+        X, Y = self, as_uncertain(other)
         if Y.shape == (1, 1) and X.shape != (1, 1):
             return X @ _repeated(Y, X.shape[1])
         return X @ Y if X.shape != (1, 1) else _repeated(X, Y.shape[0]) @ Y
 
     def __rmul__(self, other: Any) -> UncertainSystem:
-        return _of(other) * self
+        return as_uncertain(other) * self
 
     def inverse(self) -> UncertainSystem:
         """The inverse. ComputationError where the nominal value has none."""
@@ -258,16 +257,16 @@ class UncertainSystem:
                        inputs=self.outputs, outputs=self.inputs)
 
     def __truediv__(self, other: Any) -> UncertainSystem:
-        return self * _of(other).inverse()
+        return self * as_uncertain(other).inverse()
 
     def __rtruediv__(self, other: Any) -> UncertainSystem:
-        return _of(other) * self.inverse()
+        return as_uncertain(other) * self.inverse()
 
     def __pow__(self, power: int) -> UncertainSystem:
         if isinstance(power, bool) or not isinstance(power, (int, np.integer)):
             raise InputError("expected a whole number", field="power", value=power)
         base = self if power >= 0 else self.inverse()
-        result = _of(np.eye(self.shape[0]))
+        result = as_uncertain(np.eye(self.shape[0]))
         for _ in range(abs(int(power))):
             result = result @ base
         return result
@@ -275,7 +274,7 @@ class UncertainSystem:
     # -- connection --------------------------------------------------------------------------
     def feedback(self, other: Any = 1.0, sign: int = -1) -> UncertainSystem:
         """The loop closed by `other` from the outputs to the inputs, negative by default: (I + X Y)^-1 X."""
-        X, Y = self, _of(other)
+        X, Y = self, as_uncertain(other)
         if Y.shape == (1, 1) and X.shape[0] == X.shape[1]:
             Y = _repeated(Y, X.shape[0])
         if Y.shape != (X.shape[1], X.shape[0]):
@@ -292,12 +291,12 @@ class UncertainSystem:
         out = np.vstack([X.b @ u, Y.b @ y])
         n = X.a.shape[1] + Y.a.shape[1]
         out[:, :n] += la.block_diag(X.a, Y.a)
-        return _gathered((out[:, :n], out[:, n:], y[:, :n], y[:, n:]), X, Y, X.inputs, X.outputs)
+        return _of_both((out[:, :n], out[:, n:], y[:, :n], y[:, n:]), X, Y, X.inputs, X.outputs)
 
     def select(self, outputs: Any = None, inputs: Any = None) -> UncertainSystem:
         """Some outputs and inputs, by name or position."""
         rows, cols = _chosen(self.outputs, outputs), _chosen(self.inputs, inputs)
-        return _reduced(replace(self, b=self.b[:, cols], c=self.c[rows], d=self.d[np.ix_(rows, cols)],
+        return reduced(replace(self, b=self.b[:, cols], c=self.c[rows], d=self.d[np.ix_(rows, cols)],
                                 inputs=tuple(self.inputs[k] for k in cols),
                                 outputs=tuple(self.outputs[k] for k in rows)))
 
@@ -316,7 +315,7 @@ class UncertainSystem:
     # -- words -------------------------------------------------------------------------------
     def _rows(self) -> list[tuple[str, str]]:
         return [(str(one), f"{n} {'copy' if n == 1 else 'copies'}") for one, n, _, _ in self._slices()
-                if one is not STATES]
+                if one != STATES]
 
     def __repr__(self) -> str:
         what = "; ".join(f"{text}, {count}" for text, count in self._rows()) or "nothing uncertain"
@@ -329,127 +328,8 @@ class UncertainSystem:
         return html_table(self._rows(), ("uncertain", "copies"), f"uncertain system, {size}")
 
 
-# -- elements ------------------------------------------------------------------------------------
-def real(name: str, nominal: float, *, percent: float | tuple[float, float] | None = None,
-         plus_minus: float | tuple[float, float] | None = None, range: tuple[float, float] | None = None
-         ) -> UncertainSystem:
-    """An uncertain real number: exactly one of percent, plus_minus and range.
-
-    percent, plus_minus : half the range, relative or absolute; a pair is (below, above). range : (low, high).
-    Where the range is not symmetric about the nominal value, delta = 0 is still the nominal value.
-
-    Raises InputError for a range that does not contain the nominal value.
-    """
-    if sum(one is not None for one in (percent, plus_minus, range)) != 1:
-        raise InputError("expected exactly one of percent, plus_minus and range", field=name)
-    try:
-        if range is not None:
-            low, high = (float(v) for v in range)
-        else:
-            down, up = np.broadcast_to(np.asarray(percent if percent is not None else plus_minus, float), 2).tolist()
-            unit = abs(nominal) / 100 if percent is not None else 1.0
-            low, high = nominal - abs(down) * unit, nominal + abs(up) * unit
-        element = RealParameter(name, 1, 1, float(nominal), low, high)
-    except (TypeError, ValueError) as error:
-        raise error if isinstance(error, InputError) else InputError("expected numbers", field=name) from None
-    return _one(element, element.lft())
-
-
-def complex_disk(name: str, centre: float = 0.0, radius: float = 1.0) -> UncertainSystem:
-    """An uncertain complex number within `radius` of a real centre."""
-    element = ComplexDisk(name, 1, 1, float(centre), float(radius))
-    return _one(element, element.lft())
-
-
-def dynamics(name: str, weight: Any = 1.0, shape: tuple[int, int] = (1, 1)) -> UncertainSystem:
-    """Unknown stable dynamics W(s) Delta(s) with a Delta of H-infinity norm at most 1.
-
-    weight : W, of one output or as many as shape[0]: a number, a system, or a filter of `uncertainty_weight`.
-    shape : (outputs, inputs) of Delta. A chain with 20 % to 300 %: G * (1 + dynamics("chain", W)).
-
-    Raises InputError for a weight that does not fit, or is not stable.
-    """
-    element = Dynamics(name, *shape)
-    rows, cols = shape
-    n = np.zeros((cols, rows)), np.eye(cols), np.eye(rows), np.zeros(shape)
-    Delta = UncertainSystem(*n, (element,), (1,))
-    W = as_system(weight, f"{name}: weight")
-    if not W.is_stable():
-        raise InputError("expected a stable weight", field=f"{name}: weight")
-    if W.D.shape not in ((1, 1), (rows, rows)):
-        raise InputError(f"expected one output and input, or {rows}", field=f"{name}: weight", value=W.D.shape)
-    return _of(W) * Delta
-
-
-def matrix(rows: Sequence[Sequence[Any]] | Any) -> UncertainSystem:
-    """A matrix of numbers, uncertain numbers, or blocks: matrix([[0, 1], [-k / m, -c / m]]).
-
-    Raises InputError for rows of different lengths, or blocks that do not fit.
-    """
-    if isinstance(rows, UncertainSystem):
-        return rows
-    table = [list(row) if isinstance(row, (list, tuple, np.ndarray)) else [row] for row in rows]
-    if not table or len({len(row) for row in table}) != 1:
-        raise InputError("expected rows of one length", field="matrix", value=[len(row) for row in table])
-    stacked = [_beside([_of(one) for one in row]) for row in table]
-    return _reduced(_above(stacked))
-
-
-def ss(A: Any, B: Any, C: Any, D: Any = None, *, dt: float = 0.0, inputs: Sequence[str] = (),
-       outputs: Sequence[str] = ()) -> Any:
-    """A system x' = A x + B u, y = C x + D u whose matrices may have uncertain entries; D zero by default.
-
-    Each matrix is an array, nested lists with uncertain numbers, or of `matrix`. A StateSpace where nothing is
-    uncertain, otherwise an `UncertainSystem`. dt : sample time [s], 0 for continuous time.
-
-    Raises InputError for shapes that do not fit.
-    """
-    a, b, c = (_matrix(one) for one in (A, B, C))
-    d = _of(np.zeros((c.shape[0], b.shape[1]))) if D is None else _matrix(D)
-    n = a.shape[0]
-    if a.shape != (n, n) or b.shape[0] != n or c.shape[1] != n or d.shape != (c.shape[0], b.shape[1]):
-        raise InputError(f"shapes do not fit: A {a.shape}, B {b.shape}, C {c.shape}, D {d.shape}")
-    M = _reduced(_above([_beside([a, b]), _beside([c, d])]))
-    inner = np.block([[M.d[:n, :n], M.c[:n]], [M.b[:, :n], M.a]])
-    system = UncertainSystem(inner, np.vstack([M.d[:n, n:], M.b[:, n:]]), np.hstack([M.d[n:, :n], M.c[n:]]),
-                             M.d[n:, n:], (STATES, *M.elements), (n, *M.copies), float(dt), tuple(inputs),
-                             tuple(outputs))
-    return system if system.uncertain else system._certain()
-
-
-def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], outputs: Sequence[str]) -> Any:
-    """Interconnect parts through the signals that share a name: certain, uncertain, or of python-control.
-
-    Parameters
-    ----------
-    parts : systems; a dict names them in error messages. inputs : external signals. outputs : signals to bring out.
-
-    A StateSpace, or an UncertainSystem where a part is uncertain. Raises as `avis_ctrl.lti.connect`: InputError for a
-    signal driven twice or by nothing, ComputationError for an algebraic loop.
-    """
-    named = dict(parts) if isinstance(parts, Mapping) else {f"part {k}": one for k, one in enumerate(parts)}
-    whole, elements, w, z = {}, list[tuple[Element, int]](), list[str](), list[str]()
-    for key, part in named.items():
-        if not isinstance(part, UncertainSystem):
-            whole[key] = as_system(part, key)
-            continue
-        P, n_w, n_z = part._open()
-        ws, zs = ([f"{key}|{name}" for name in names] for names in (P.inputs[:n_w], P.outputs[:n_z]))
-        whole[key] = P.renamed([*ws, *part.inputs], [*zs, *part.outputs])
-        elements += [(one, n) for one, n in zip(part.elements, part.copies, strict=True) if one is not STATES]
-        w, z = w + ws, z + zs
-    if not elements:
-        return connect_systems(whole, inputs, outputs)
-    P = connect_systems(whole, [*w, *inputs], [*z, *outputs])
-    n, nw, nz = P.nstates, len(w), len(z)
-    parts_ = (np.block([[P.A, P.B[:, :nw]], [P.C[:nz], P.D[:nz, :nw]]]), np.vstack([P.B[:, nw:], P.D[:nz, nw:]]),
-              np.hstack([P.C[nz:], P.D[nz:, :nw]]), P.D[nz:, nw:])
-    kinds = [(STATES, n), *elements] if n else elements
-    return _reduced(_sorted(parts_, kinds, P.dt, tuple(inputs), tuple(outputs)))
-
-
 # -- how it is done ------------------------------------------------------------------------------
-def _of(given: Any) -> UncertainSystem:
+def as_uncertain(given: Any) -> UncertainSystem:
     """Anything that may stand beside an uncertain system."""
     if isinstance(given, UncertainSystem):
         return given
@@ -458,25 +338,9 @@ def _of(given: Any) -> UncertainSystem:
     return UncertainSystem(P.A, P.B, P.C, P.D, (STATES,) * bool(n), (n,) * bool(n), P.dt, P.inputs, P.outputs)
 
 
-def _one(element: Element, lft: np.ndarray) -> UncertainSystem:
-    return UncertainSystem(lft[:1, :1], lft[:1, 1:], lft[1:, :1], lft[1:, 1:], (element,), (1,))
-
-
-def _matrix(given: Any) -> UncertainSystem:
-    """An uncertain matrix without states; two dimensions, or a single number."""
-    if isinstance(given, np.ndarray) and given.dtype != object:
-        made = _of(given) if given.ndim in (0, 2) else None
-    else:
-        made = matrix([[given]]) if np.isscalar(given) else matrix(given)
-    if made is None or made.nstates:
-        raise InputError("expected a matrix: numbers or uncertain numbers in rows", field="matrix",
-                         value=np.shape(given) if isinstance(given, np.ndarray) else "a system with states")
-    return made
-
-
 def _diagonal(X: UncertainSystem, Y: UncertainSystem) -> UncertainSystem:
     parts = tuple(la.block_diag(p, q) for p, q in ((X.a, Y.a), (X.b, Y.b), (X.c, Y.c), (X.d, Y.d)))
-    return _sorted(parts, _kinds(X, Y), _clock(X, Y), (), ())
+    return gathered(parts, _kinds(X, Y), _clock(X, Y), (), ())
 
 
 def _repeated(X: UncertainSystem, n: int) -> UncertainSystem:
@@ -487,7 +351,7 @@ def _repeated(X: UncertainSystem, n: int) -> UncertainSystem:
     return result
 
 
-def _beside(systems: Sequence[UncertainSystem]) -> UncertainSystem:
+def beside(systems: Sequence[UncertainSystem]) -> UncertainSystem:
     """[X Y ...]: the sum of outputs, each with inputs of its own."""
     result = systems[0]
     for X in systems[1:]:
@@ -495,11 +359,11 @@ def _beside(systems: Sequence[UncertainSystem]) -> UncertainSystem:
             raise InputError("expected blocks of as many rows", field="matrix", value=[one.shape for one in systems])
         parts = (la.block_diag(result.a, X.a), la.block_diag(result.b, X.b), np.hstack([result.c, X.c]),
                  np.hstack([result.d, X.d]))
-        result = _sorted(parts, _kinds(result, X), _clock(result, X), (), ())
+        result = gathered(parts, _kinds(result, X), _clock(result, X), (), ())
     return result
 
 
-def _above(systems: Sequence[UncertainSystem]) -> UncertainSystem:
+def above(systems: Sequence[UncertainSystem]) -> UncertainSystem:
     """[X; Y; ...]: outputs under each other, of the same inputs."""
     result = systems[0]
     for X in systems[1:]:
@@ -507,7 +371,7 @@ def _above(systems: Sequence[UncertainSystem]) -> UncertainSystem:
             raise InputError("expected blocks of as many columns", field="matrix", value=[one.shape for one in systems])
         parts = (la.block_diag(result.a, X.a), np.vstack([result.b, X.b]), la.block_diag(result.c, X.c),
                  np.vstack([result.d, X.d]))
-        result = _sorted(parts, _kinds(result, X), _clock(result, X), (), ())
+        result = gathered(parts, _kinds(result, X), _clock(result, X), (), ())
     return result
 
 
@@ -522,19 +386,19 @@ def _clock(*systems: UncertainSystem) -> float:
     return clocks.pop()
 
 
-def _gathered(parts: Parts, X: UncertainSystem, Y: UncertainSystem, inputs: Sequence[str],
+def _of_both(parts: Parts, X: UncertainSystem, Y: UncertainSystem, inputs: Sequence[str],
               outputs: Sequence[str]) -> UncertainSystem:
-    return _reduced(_sorted(parts, _kinds(X, Y), _clock(X, Y), tuple(inputs), tuple(outputs)))
+    return reduced(gathered(parts, _kinds(X, Y), _clock(X, Y), tuple(inputs), tuple(outputs)))
 
 
-def _sorted(parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs: tuple[str, ...],
+def gathered(parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs: tuple[str, ...],
             outputs: tuple[str, ...]) -> UncertainSystem:
     """States first, then one block for each element, in the order in which they come."""
     places: dict[str, tuple[Element, list[int], list[int]]] = {}
     w = z = 0
     for one, n in kinds:
         # No element may have the empty name.
-        key = "" if one is STATES else one.name
+        key = "" if one == STATES else one.name
         known, ws, zs = places.setdefault(key, (one, [], []))
         if known != one:
             raise InputError(f"two different uncertain elements have this name: {known} and {one}", field=key)
@@ -568,14 +432,14 @@ def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice
                      np.hstack([np.zeros((m, n)), inner.a, np.zeros((m, b.shape[1]))]) + inner.b @ seen])
     y = np.hstack([c[:, rest_w], np.zeros((c.shape[0], m)), d]) + c[:, w] @ fed
     kinds = [pair for k, pair in enumerate(_kinds(system)) if k != place] + _kinds(inner)
-    return _sorted((out[:, :n + m], out[:, n + m:], y[:, :n + m], y[:, n + m:]), kinds, _clock(system, inner),
+    return gathered((out[:, :n + m], out[:, n + m:], y[:, :n + m], y[:, n + m:]), kinds, _clock(system, inner),
                    system.inputs, system.outputs)
 
 
-def _reduced(system: UncertainSystem) -> UncertainSystem:
+def reduced(system: UncertainSystem) -> UncertainSystem:
     """The same with fewer copies of scalar elements, by `reduce_copies`, each channel scaled to size one before."""
     slices = system._slices()
-    scalar = [k for k, (one, *_) in enumerate(slices) if one.scalar and one is not STATES]
+    scalar = [k for k, (one, *_) in enumerate(slices) if one.scalar and one != STATES]
     if not scalar:
         return system
     sizes = [slices[k][1] for k in scalar]
@@ -601,7 +465,7 @@ def _reduced(system: UncertainSystem) -> UncertainSystem:
              np.hstack([D[q:, :p], c[q:]]), D[q:, p:])
     kinds = [(one, n_one) for k, (one, n_one, _, _) in enumerate(slices) if k not in scalar]
     kinds += [(slices[k][0], n_one) for k, n_one in zip(scalar, kept, strict=True) if n_one]
-    return _sorted(parts, kinds, system.dt, system.inputs, system.outputs)
+    return gathered(parts, kinds, system.dt, system.inputs, system.outputs)
 
 
 def _power_of_two(size: np.ndarray) -> np.ndarray:
@@ -658,5 +522,3 @@ def _random_dynamics(one: Element, rng: np.random.Generator, grid: np.ndarray, d
         return StateSpace(r * np.eye(one.cols), np.eye(one.cols), (1 - r * r) * UV, -r * UV, dt)
     return StateSpace(-corner * np.eye(one.cols), np.eye(one.cols), -2 * corner * UV, UV)
 
-
-__all__ = ["UncertainSystem", "complex_disk", "connect", "dynamics", "matrix", "real", "ss"]

@@ -9,7 +9,7 @@ import pytest
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, discretise, tf
 from avis_ctrl.robust.disk_margin import disk_margin
-from avis_ctrl.uncertainty.uncertain_system import real
+from avis_ctrl.uncertainty.uncertain_models import real
 
 # Seiler, Packard and Gahinet 2020, section "Disk margins": alpha 0.46, gains 0.63 to 1.59, phase 26 degrees.
 L = control.tf([25], [1, 10, 10, 10])

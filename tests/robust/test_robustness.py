@@ -11,7 +11,7 @@ from avis_ctrl.lti import StateSpace, hinf_norm, tf
 from avis_ctrl.robust.mixed_sensitivity import mixed_sensitivity
 from avis_ctrl.robust.robustness import robust_performance, robust_stability, worst_case_gain
 from avis_ctrl.uncertainty.blocks import RealScalar
-from avis_ctrl.uncertainty.uncertain_system import dynamics, real, ss
+from avis_ctrl.uncertainty.uncertain_models import dynamics, real, ss
 from avis_ctrl.uncertainty.uncertainty_weight import uncertainty_weight
 
 # Skogestad and Postlethwaite, Multivariable Feedback Control, 2005: plant of section 2.6, weights of example 2.17.

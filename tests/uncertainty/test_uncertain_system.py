@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import control
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, tf
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
-from avis_ctrl.uncertainty.uncertain_system import complex_disk, connect, dynamics, matrix, real, ss
+from avis_ctrl.uncertainty.uncertain_models import complex_disk, connect, dynamics, matrix, real, ss
 
 NAMES = ("p", "q", "r")
 ELEMENTS = {"p": real("p", 2.0, percent=30), "q": real("q", 3.0, range=(2.0, 5.0)),
@@ -275,6 +277,25 @@ def test_wrong_input_is_one_line(call, error, words):
     with pytest.raises(error, match=words) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+def test_a_system_crosses_a_process_boundary():
+    G = mass_spring_damper()
+    again = pickle.loads(pickle.dumps(G))
+    assert again.nstates == 2 and again.uncertain == G.uncertain
+    assert (again + G).copies == (4, 2, 2, 2)
+    np.testing.assert_array_equal(again.nominal.A, G.nominal.A)
+
+
+def test_sampled_dynamics_are_all_pass_up_to_their_gain():
+    for one in (dynamics("d") * tf([1.0], [1.0])).values(5, seed=2):
+        assert hinf_norm(one["d"]).gain <= 1 + 1e-9
+    sampled = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1) * dynamics("d")
+    for one in sampled.values(10, seed=4):
+        size = np.abs(one["d"].frequency_response(np.linspace(0.01, 31.0, 40))[:, 0, 0])
+        assert one["d"].is_stable() and one["d"].dt == 0.1
+        np.testing.assert_allclose(size, size[0], rtol=1e-9)
+        assert size[0] <= 1
 
 
 def test_short_and_rich_texts():
