@@ -92,6 +92,6 @@ def test_the_identification_report_states_it():
     size, _, channel = even.partition(" % ")
     square = np.fft.rfft(data.records[0].u[:N, 0] ** 2)[ODD[0]:ODD[-1] + 1] / N  # u itself has unit variance
     assert float(size) == pytest.approx(10 * np.sqrt(2 * np.sum(np.abs(square) ** 2)), rel=0.05)
-    assert channel == "(y0)"
+    assert channel == "(y1)"
     assert name == "00" and (odd == "below the noise" or float(odd.partition(" ")[0]) < 1.0)
     assert distortion(record(rng, lambda u: np.hstack([u, u]), 0.01, detection=False)) is None
