@@ -143,9 +143,10 @@ def users(library: str, at_once: bool = False) -> list[str]:
             for name, direct in imports(path) if name.split(".")[0] == library and (direct or not at_once)]
 
 
-def test_slycot_is_imported_in_one_module():
-    """It is GPL-2.0: one adapter."""
+def test_nothing_depends_on_slycot():
+    """One adapter imports it, for tests and benchmarks; no module of the package imports this adapter."""
     assert set(users("slycot")) == {"robust/slycot_adapter.py"}
+    assert not [path for path in FILES for name, _ in imports(path) if "slycot_adapter" in name]
 
 
 @pytest.mark.parametrize("library", ["slycot", "control"])

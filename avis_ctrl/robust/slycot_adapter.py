@@ -1,6 +1,6 @@
-"""SLICOT routines through slycot, as a second opinion: the only module that imports it (slycot is GPL-2.0).
+"""SLICOT routines through slycot, as a second opinion: the only module that imports it.
 
-Nothing in the package depends on it; the tests and benchmarks compare with it.
+Tests and benchmarks compare with it; no command and no other module of the package imports this one.
 """
 
 from __future__ import annotations
