@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import StateSpace, balanced_truncation, discretise, lft_lower
+from avis_ctrl.lti import StateSpace, append, balanced_truncation, discretise, lft_lower
 from avis_ctrl.robust.fixed_order import _Form, _Problem, fixed_order
 from avis_ctrl.robust.frequency_grid import frequency_grid
 from avis_ctrl.robust.musyn import musyn
@@ -103,3 +103,29 @@ def test_wrong_order(order):
     P, blocks = table()
     with pytest.raises(InputError, match="order"):
         musyn(P, blocks, 1, 1, order=order)
+
+
+def test_decentralised_loops_see_their_own_signal_alone():
+    """Two tables whose sensors hear each other by a tenth; off the diagonal K is exactly zero."""
+    one, two = barely_known_table(0.5), barely_known_table(0.4)
+    both = append(one.renamed(["d1", "w1", "n1", "u1"], ["e1", "z1", "f1", "y1"]),
+                  two.renamed(["d2", "w2", "n2", "u2"], ["e2", "z2", "f2", "y2"]))
+    mixed = both.select(["e1", "e2", "z1", "f1", "z2", "f2", "y1", "y2"],
+                        ["d1", "d2", "w1", "n1", "w2", "n2", "u1", "u2"])
+    left = np.eye(8)
+    left[6, 7] = left[7, 6] = 0.1
+    P = mixed.scaled(left=left)
+    blocks = [ComplexFull(1, 1), ComplexFull(1, 1)]
+    made = musyn(P, blocks, 2, 2, max_iterations=3, order=4, structure="decentralised")
+    K = made.K
+    assert K.nstates <= 4 and made.guaranteed and any("decentralised" in note for note in made.notes)
+    response = K.frequency_response(np.geomspace(0.1, 1e4, 50))
+    assert np.max(np.abs(response[:, 0, 1])) == np.max(np.abs(response[:, 1, 0])) == 0.0
+    assert np.min(np.abs(response[:, [0, 1], [0, 1]])) > 0
+    loop = lft_lower(P, K)
+    square = BlockStructure.of([ComplexScalar(), ComplexScalar(), ComplexFull(4)])
+    assert 0.97 * made.mu_upper <= peak_by_slicot(loop, square) <= made.mu_upper * (1 + 1e-6)
+    with pytest.raises(InputError, match="as many outputs"):
+        musyn(P.select(slice(0, 7), slice(0, 8)), blocks, 1, 2, structure="decentralised")
+    with pytest.raises(InputError, match="'full' or 'decentralised'"):
+        musyn(P, blocks, 2, 2, structure="diagonal")
