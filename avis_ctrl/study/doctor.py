@@ -84,8 +84,8 @@ def _mu() -> str:
     from avis_ctrl.uncertainty.blocks import ComplexScalar, RealScalar
 
     M = np.outer([1.0, 2.0, 3.0], [1.0, -1.0j, 0.5])
-    found = mu(M, [ComplexScalar()] * 3).upper, mu(np.abs(M), [RealScalar()] * 3).upper
-    return _near(float(max(found, key=lambda one: abs(one - 4.5))), 4.5, 1e-4)
+    found = [float(mu(M, [ComplexScalar()] * 3).upper), float(mu(np.abs(M), [RealScalar()] * 3).upper)]
+    return _near(max(found, key=lambda one: abs(one - 4.5)), 4.5, 1e-4)
 
 
 def _simulation() -> str:
