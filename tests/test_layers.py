@@ -143,9 +143,12 @@ def users(library: str, at_once: bool = False) -> list[str]:
             for name, direct in imports(path) if name.split(".")[0] == library and (direct or not at_once)]
 
 
-def test_slycot_is_imported_in_one_module():
-    """It is GPL-2.0: one adapter."""
+def test_slycot_is_a_second_opinion_only():
+    """One adapter imports it, and only the analysis of a finished design uses that: no bound comes from there."""
     assert set(users("slycot")) == {"robust/slycot_adapter.py"}
+    users_of_adapter = {str(path.relative_to(PACKAGE)) for path in FILES for name, _ in imports(path)
+                        if "slycot_adapter" in name}
+    assert users_of_adapter == {"study/analysis.py"}
 
 
 @pytest.mark.parametrize("library", ["slycot", "control"])

@@ -19,6 +19,7 @@ from avis_ctrl.cli.gap import gap
 from avis_ctrl.cli.gap_axis import gap_axis
 from avis_ctrl.cli.identify import identify, predict, single_axis
 from avis_ctrl.cli.measure import convert, excite, simulate_campaign
+from avis_ctrl.cli.new import app as new
 from avis_ctrl.errors import AvisError, ComputationError
 from avis_ctrl.measurement.layouts import FORMATS
 
@@ -27,7 +28,7 @@ LAYOUTS = "\n\n".join(" ".join(part.split()) for part in FORMATS.split("\n\n"))
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 AGAIN_S = 3.0  # time to clean up after an interrupt that was heard
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False,
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False,
                   help="Workbench for active vibration isolation tables.")
 
 
@@ -68,6 +69,7 @@ for command, name in ((design, "design"), (compare, "compare"), (export, "export
                       (gap, "gap"), (predict, "predict"), (gap_axis, "gap-axis"), (excite, "excite"),
                       (simulate_campaign, "simulate-campaign"), (convert, "convert"), (single_axis, "single-axis")):
     app.command(name, epilog=LAYOUTS if name in ("identify", "gap", "convert") else None)(command)
+app.add_typer(new, name="new")
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

@@ -22,6 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from avis_ctrl.errors import ComputationError
+from avis_ctrl.export.intervals import log_slopes
+from avis_ctrl.export.realisation import balanced
 from avis_ctrl.export.sampled_response import SampledAxes
 from avis_ctrl.lti.connect import connect, summing_junction
 from avis_ctrl.lti.magnitude_fit import covering_fits
@@ -37,10 +39,12 @@ from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
 class CoverSettings:
     """Filters that cover the two errors.
 
-    lowest : first frequency of the grid over half the sample rate; below it both errors are constant.
-    points : of the logarithmic grid, about 0.7 % apart: neighbours differ by less than `margin`.
-    fitted : every so many points are fitted; the filter is then raised over all of them.
-    margin : relative; what the filters lie above the values of the grid at least.
+    lowest : as a fraction of half the sample rate, where the logarithmic intervals begin; below it the errors are
+        constant.
+    intervals : of the logarithmic grid, over each of which the errors are bounded; 0.4 % wide, so that Taylor's
+        remainder is small against `harmless`.
+    fitted : every so many intervals are fitted; the filter is then raised over all of them.
+    beyond, points_beyond : up to this multiple of half the sample rate a filter is kept from rising, at so many points.
     excess_dB : by which a filter may exceed the error; more order than that needs is not spent.
     harmless : errors below this fraction of the controller, or of the table, need not be followed closely: a thousandth
         of the loop gain moves mu by about as much.
@@ -48,12 +52,27 @@ class CoverSettings:
     """
 
     lowest: float = 1e-7
-    points: int = 2201
-    fitted: int = 10
-    margin: float = 0.02
+    intervals: int = 4000
+    fitted: int = 20
+    beyond: float = 30.0
+    points_beyond: int = 15
     excess_dB: float = 2.0
     harmless: float = 1e-3
     most: int = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Intervals |omega - centre| <= half that cover 0 to half the sample rate [rad/s], (n,) each."""
+
+    centre: np.ndarray
+    half: np.ndarray
+
+    @staticmethod
+    def of(half_rate: float, settings: CoverSettings) -> Grid:
+        ends = np.concatenate([np.linspace(0.0, settings.lowest, 9)[:-1],
+                               np.geomspace(settings.lowest, 1.0, settings.intervals + 1)]) * half_rate
+        return Grid((ends[1:] + ends[:-1]) / 2, (ends[1:] - ends[:-1]) / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +104,12 @@ def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Boun
     """
     folder, design = axes.folder, axes.folder.design
     plant, K = folder.plant, folder.controller(axes.controller.name)
-    grid = np.geomspace(settings.lowest * axes.half_rate, axes.half_rate, settings.points)
-    size = np.linalg.norm(K.frequency_response(grid), ord=2, axis=(1, 2))
-    W_a = _cover(grid, axes.controller_error(K, grid), settings.harmless * size, settings)
-    W_E = _cover(grid, axes.folding(grid), settings.harmless * _table(plant.synthesis, grid), settings)
+    K = balanced(K)
+    grid = Grid.of(axes.half_rate, settings)
+    size = np.linalg.norm(K.frequency_response(grid.centre), ord=2, axis=(1, 2))
+    W_a = _cover(grid, axes.controller_error(K, grid.centre, grid.half), settings.harmless * size, settings)
+    W_E = _cover(grid, axes.folding(grid.centre, grid.half),
+                 settings.harmless * _table(plant.synthesis, grid.centre), settings)
     below = (0.0, axes.half_rate)
     performance, blocks = _with_errors(plant.synthesis, K, W_a, W_E)
     motion, _ = _with_errors(plant.full.restricted(plant.floor_velocities, plant.velocities), K, W_a, W_E)
@@ -100,19 +121,19 @@ def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Boun
     return Bounds(mu_peak(performance, whole, band=below, slack=SLACK),
                   worst_case_gain(motion, blocks, band=below, slack=SLACK),
                   worst_case_gain(motion, blocks, band=(low, min(high, axes.half_rate)), slack=SLACK),
-                  *_between_samples(axes, K, W_a, W_E, grid, settings), _gain_above(axes, K, W_a, W_E))
+                  *_between_samples(axes, K, W_a, W_E, grid, settings), _gain_above(axes, K, W_a, W_E, settings))
 
 
-def _gain_above(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational) -> float:
+def _gain_above(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational, settings: CoverSettings) -> float:
     """Bound of the loop gain from half the sample rate on, both errors included."""
-    omega = axes.high_grid
+    omega = np.geomspace(1.0, settings.beyond, settings.intervals) * axes.half_rate
     size = np.linalg.norm(K.frequency_response(omega), ord=2, axis=(1, 2)) + W_a.magnitude(omega)
     table = axes.force_to_seen(omega)
     table[0] += W_E.magnitude(omega[:1])[0]  # the images belong to half the rate itself
     return float(np.max(size * table))
 
 
-def _between_samples(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational, grid: np.ndarray,
+def _between_samples(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational, grid: Grid,
                      settings: CoverSettings) -> tuple[float, float]:
     """Worst-case gains of the lifted loop from the floor up to half the sample rate, and above, to all of the payload.
 
@@ -121,9 +142,9 @@ def _between_samples(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Ratio
     """
     plant = axes.folder.plant
     part = plant.full.restricted(plant.floor_velocities, plant.velocities)
-    held, folded = axes.held_images(grid), axes.folded_floor(grid)
-    W_v = _cover(grid, held, settings.harmless * np.max(held) * np.ones(grid.size), settings)
-    W_f = _cover(grid, folded, settings.harmless * np.max(folded) * np.ones(grid.size), settings)
+    held, folded = axes.held_images(grid.centre, grid.half), axes.folded_floor(grid.centre, grid.half)
+    W_v = _cover(grid, held, settings.harmless * np.full(held.size, np.max(held)), settings)
+    W_f = _cover(grid, folded, settings.harmless * np.full(folded.size, np.max(folded)), settings)
     motion, blocks = _with_errors(part, K, W_a, W_E, W_v, W_f)
     n_w, n_d = blocks.n_w, len(part.w)
     found = [worst_case_gain(motion.select(None, [*range(n_w), *inputs]), blocks, band=(0.0, axes.half_rate),
@@ -139,18 +160,30 @@ def _table(plant: GeneralizedPlant, omega: np.ndarray) -> np.ndarray:
     return np.linalg.norm(G, ord=2, axis=(1, 2))
 
 
-def _cover(omega: np.ndarray, error: np.ndarray, harmless: np.ndarray, settings: CoverSettings) -> Rational:
-    """A filter with |W| >= error, of the lowest order that stays near it where it is not harmless."""
-    lower = (1 + settings.margin) * np.maximum(error, np.finfo(float).tiny)
+def _cover(grid: Grid, error: np.ndarray, harmless: np.ndarray, settings: CoverSettings) -> Rational:
+    """A filter with |W| >= error over all intervals, of the lowest order that is near it where it is not harmless."""
+    lower = np.maximum(error, np.finfo(float).tiny)
     upper = np.maximum(lower, harmless)
-    best, every = None, slice(None, None, settings.fitted)
-    for fit in covering_fits(omega[every], lower[every], upper[every], range(settings.most + 1)):
+    # Corners lie up to `reach` beyond the frequencies fitted: none below the first logarithmic interval.
+    reach = 10.0
+    every = slice(int(np.searchsorted(grid.centre, 1.01 * reach * grid.centre[8])), None, settings.fitted)
+    # Above half the rate nothing has to be covered: the filter must not rise there, where the proof of robust stability
+    # meets it, and may fall.
+    end = grid.centre[-1]
+    omega = np.concatenate([grid.centre[every], np.geomspace(1.1, settings.beyond, settings.points_beyond) * end])
+    most = np.concatenate([upper[every], np.full(settings.points_beyond, upper[-1])])
+    least = np.concatenate([lower[every], np.full(settings.points_beyond, upper[-1] / settings.beyond)])
+    best = None
+    for fit in covering_fits(omega, least, most, range(settings.most + 1), reach=reach):
         if best is None or fit.error_max_dB < best.error_max_dB:
             best = fit
         if fit.error_max_dB <= settings.excess_dB:
             break
     assert best is not None
-    return best.function.scaled(max(1.0, float(np.max(lower / best.function.magnitude(omega)))))
+    W = best.function
+    slope, _ = log_slopes([*W.zeros(), *W.poles()], grid.centre, grid.half)
+    reached = W.magnitude(grid.centre) * np.exp(-grid.half * slope)
+    return W.scaled(max(1.0, float(np.max(lower / reached))))
 
 
 def _with_errors(plant: GeneralizedPlant, K: StateSpace, W_a: Rational, W_E: Rational, W_v: Rational | None = None,

@@ -46,13 +46,13 @@ def _part(system: StateSpace, kept: np.ndarray) -> StateSpace:
 
 def _schur(part: StateSpace) -> StateSpace:
     """Balanced as far as the Gramians are regular, in real Schur form with the slowest poles first."""
-    part = _balanced(part)
+    part = balanced(part)
     T, Q = la.schur(part.A, output="real")
     T = np.triu(T, -1)
     return replace(part, A=T, B=Q.T @ part.B, C=part.C @ Q, states=())
 
 
-def _balanced(part: StateSpace) -> StateSpace:
+def balanced(part: StateSpace) -> StateSpace:
     """States with equal and diagonal Gramians; only evened out where a state is almost unreachable or unseen."""
     part = balance(part)
     Lc, Lo = gramian_factors(part)

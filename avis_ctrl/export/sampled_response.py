@@ -24,23 +24,32 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.export.design_folder import DesignFolder
+from avis_ctrl.export.intervals import delay_jet, roots_jet, sinc_jet, system_jet
 from avis_ctrl.export.sampled_controller import SampledController
-from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.lti.magnitude_fit import covering_fit
+from avis_ctrl.lti.rational import Rational
+from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.actuator import pade_delay
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rigid_body import COORDINATES
-from avis_ctrl.rigs.sensing import conditioning
+from avis_ctrl.rigs.sensing import Filter, conditioning
+from avis_ctrl.robust.mu_peak import worst_case_gain
 from avis_ctrl.robust.mu_upper import skewed_upper_bound
+from avis_ctrl.study.analysis import SLACK
+from avis_ctrl.uncertainty.blocks import BlockStructure
 
 
 @dataclass(frozen=True)
 class ResponseSettings:
     """images : pairs of images summed one by one; the rest is bounded by the decay of hold and table together, at least
-    as k^-2. points : of the grid of the table's gain above half the sample rate, where it falls smoothly; between two
-    points the larger value counts."""
+    as k^-2. points, order : of the function that bounds the table's gain above half the sample rate, where it falls
+    smoothly: the frequencies it is fitted to and its order. lowest : where it begins, as a fraction of half the rate:
+    the intervals of the grid reach a little beyond theirs."""
 
     images: int = 8
-    points: int = 40
+    points: int = 12
+    order: int = 3
+    lowest: float = 0.99
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,18 +133,31 @@ class SampledAxes:
         """(n_omega, n, n) R without the design model's delay: what stands in the place of its controller."""
         return (self.hold(omega) / self.pade(omega))[:, None, None] * (self.forces @ self.volts(omega))
 
-    def controller_error(self, K: StateSpace, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) bound of |R - K exp(-j omega tau)| and of what rounded decoding adds [N s/m].
+    def controller_error(self, K: StateSpace, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound over |omega - centre| <= half of |R - K exp(-j omega tau)| and of what rounded decoding adds
+        [N s/m].
 
         K : continuous, from seen velocities to forces; the delay is that of the design's model.
         """
-        direct = self.response(omega) - K.frequency_response(omega)
-        return np.linalg.norm(direct, ord=2, axis=(1, 2)) + self._beside(omega)
+        T, rig, own = self.period_s, self.folder.rig, self.controller.system
+        design_delay = pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, self.folder.design.loop.pade_order)
+        delay = design_delay.poles().tolist()
+        # The all-pass of the design's delay, inverted; its sign is 1 at rest.
+        no_pade = roots_jet(delay, [-one for one in delay], (-1.0) ** len(delay), centre, half)
+        channel = self._channel
+        unfiltered = roots_jet(channel.poles, channel.zeros, 1 / channel.leading, centre, half)
+        code = StateSpace(own.A, own.B @ (self.gains_V[:, None] * self.rows), self.forces @ own.C,
+                          self.forces @ own.D @ (self.gains_V[:, None] * self.rows), T)
+        held = sinc_jet(T, centre) * (delay_jet(T * (0.5 + self.controller.delay_samples), centre) * no_pade)
+        R = held * (unfiltered * system_jet(code, centre, half))
+        # What rounding sends beside the axes is some 1e-7 of R and as smooth: doubled for the interval.
+        return (R - system_jet(K, centre, half)).bound(half) + 2 * self._beside(centre)
 
-    def folding(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) bound of |E| [m/(N s)] for omega up to half the sample rate."""
-        terms = [self._filter(omega) / self._filter(image) * self._high_gain("force", "seen", image) * omega / image
-                 for image in self._images(omega)]
+    def folding(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound of |E| [m/(N s)] over |omega - centre| <= half, up to half the sample rate."""
+        own = self._filter(centre, half)[0]
+        terms = [own / self._filter(image, half)[1] * self._high_gain("force", "seen", image, half)
+                 * (centre + half) / (image - half) for image in self._images(centre)]
         # Hold and table together fall at least as k^-2: the sum over k > n of n^2 / k^2 is below n, on either side.
         return np.sum(terms, axis=0) + 2 * self.settings.images * terms[-1]
 
@@ -162,11 +184,18 @@ class SampledAxes:
         return found
 
     # -- images of the sample rate -------------------------------------------------------
-    def _filter(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) |F|, one for all sensors of the axes."""
+    @property
+    def _channel(self) -> Filter:
+        """F, one for all sensors of the axes."""
         used = np.any(np.abs(self.rows) > 0, axis=1)
-        first = next(one for one, in_use in zip(self._filters, used, strict=True) if in_use)
-        return np.ones(omega.size) if first is None else np.abs(first.frequency_response(omega)[:, 0, 0])
+        found = conditioning(self.folder.rig, self.folder.design.loop.integrator_corner_Hz)
+        return next(one for one, in_use in zip(found, used, strict=True) if in_use)
+
+    def _filter(self, centre: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) largest and least |F| over the intervals."""
+        one = self._channel
+        jet = roots_jet(one.zeros, one.poles, one.leading, centre, half)
+        return jet.size, np.abs(jet.value) ** 2 / jet.size
 
     def _images(self, omega: np.ndarray) -> list[np.ndarray]:
         """(n_omega,) frequencies that fold onto omega, the nearest first."""
@@ -178,46 +207,63 @@ class SampledAxes:
         1/k, so that the squares' rest is below the number of pairs times the last, on either side."""
         return np.sqrt(np.sum(np.square(terms), axis=0) + 2 * self.settings.images * terms[-1] ** 2)
 
-    def held_images(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) bound of the payload velocity at all images per force at omega, r.m.s. [m/(N s)]."""
-        return self._energy([self._high_gain("force", "velocity", image) * omega / image
-                             for image in self._images(omega)])
+    def held_images(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound over each interval of the payload velocity at all images per force, r.m.s. [m/(N s)]."""
+        return self._energy([self._high_gain("force", "velocity", image, half) * (centre + half) / (image - half)
+                             for image in self._images(centre)])
 
-    def folded_floor(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) bound of the seen velocity at omega per floor velocity at all images, r.m.s."""
-        return self._energy([self._high_gain("floor", "seen", image) * self._filter(omega) / self._filter(image)
-                             for image in self._images(omega)])
+    def folded_floor(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound over each interval of the seen velocity per floor velocity at all images, r.m.s."""
+        own = self._filter(centre, half)[0]
+        return self._energy([self._high_gain("floor", "seen", image, half) * own / self._filter(image, half)[1]
+                             for image in self._images(centre)])
 
     @property
     def high_grid(self) -> np.ndarray:
-        """(points,) rad/s from half the sample rate on."""
-        return np.geomspace(self.half_rate, (2 * self.settings.images + 1) * self.half_rate, self.settings.points)
+        """(points,) rad/s from half the sample rate on; the first image of half the rate lies there."""
+        ends = self.settings.lowest, 2 * self.settings.images + 1
+        return np.geomspace(*ends, self.settings.points) * self.half_rate
 
     def force_to_seen(self, omega: np.ndarray) -> np.ndarray:
         """(n_omega,) bound of the table's gain above half the sample rate [m/(N s)]."""
-        return self._high_gain("force", "seen", omega)
+        return self._high_gain("force", "seen", omega, np.zeros(omega.size))
 
     def passive_above(self) -> float:
         """Bound of payload over floor velocity above half the sample rate, where no controller acts."""
-        return float(self._high_gain("floor", "velocity", np.array([self.half_rate]))[0])
+        return self._proved("floor", "velocity", None)
 
-    def _high_gain(self, source: str, target: str, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) largest gain over the uncertainty set above half the rate, by the larger end of each interval."""
-        points, gains = self._high_gains(source, target)
-        return gains[np.clip(np.searchsorted(points, omega, side="right") - 1, 0, points.size - 1)]
+    def _high_gain(self, source: str, target: str, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound of the gain over the uncertainty set and over intervals above half the rate."""
+        bound = self._high_bound(source, target)
+        return roots_jet(bound.zeros(), bound.poles(), bound.gain, centre, half).size
 
     @cache  # noqa: B019 (one object per export)
-    def _high_gains(self, source: str, target: str) -> tuple[np.ndarray, np.ndarray]:
-        """Grid above half the sample rate, and the larger gain of each interval's ends."""
-        plant, blocks = self.folder.plant, self.folder.plant.full.blocks
-        names = {"force": plant.full.u, "floor": plant.floor_velocities, "seen": plant.full.y,
-                 "velocity": plant.velocities}
-        points = self.high_grid
-        P = plant.full.P
-        part = P.select([*P.outputs[:blocks.n_z], *names[target]], [*P.inputs[:blocks.n_w], *names[source]])
-        whole = blocks.with_performance(len(names[source]), len(names[target]))
-        gains = skewed_upper_bound(part.frequency_response(points)[:, None], whole).beta
+    def _high_bound(self, source: str, target: str) -> Rational:
+        """A function whose magnitude the worst-case gain does not exceed above half the rate: fitted to values, then
+        raised to what `worst_case_gain` proves between them."""
+        part, whole = self._part(source, target)
+        gains = skewed_upper_bound(part.frequency_response(self.high_grid)[:, None], whole).beta
         if not np.all(np.isfinite(gains)):
             raise ComputationError("the table above half the sample rate has no bounded gain over the uncertainty set",
                                    next_step="design with smaller uncertainty")
-        return points, np.maximum(gains, np.append(gains[1:], gains[-1]))
+        fitted = covering_fit(self.high_grid, gains, gains, self.settings.order).function
+        return fitted.scaled(self._proved(source, target, fitted))
+
+    def _proved(self, source: str, target: str, weight: Rational | None) -> float:
+        """Proved bound of the worst-case gain over |weight| above half the sample rate."""
+        part, whole = self._part(source, target)
+        n_z, blocks = part.noutputs - whole.blocks[-1].cols, BlockStructure(whole.blocks[:-1])
+        if weight is not None:
+            part = append(gain(np.eye(n_z)), *[weight.inverse().system()] * (part.noutputs - n_z)) @ part
+        found = worst_case_gain(part, blocks, band=(self.high_grid[0], np.inf), slack=SLACK)
+        if not (found.guaranteed and np.isfinite(found.upper)):
+            raise ComputationError("the table's gain above half the sample rate is not proved", measured=found.covers)
+        return found.upper
+
+    def _part(self, source: str, target: str) -> tuple[StateSpace, BlockStructure]:
+        """The open table with its blocks, from forces or floor to seen velocities or velocities."""
+        plant, blocks, P = self.folder.plant, self.folder.plant.full.blocks, self.folder.plant.full.P
+        names = {"force": plant.full.u, "floor": plant.floor_velocities, "seen": plant.full.y,
+                 "velocity": plant.velocities}
+        part = P.select([*P.outputs[:blocks.n_z], *names[target]], [*P.inputs[:blocks.n_w], *names[source]])
+        return part, blocks.with_performance(len(names[source]), len(names[target]))

@@ -8,7 +8,6 @@ and gain, and the GS-11D gives its corner first. An underscore stands for the de
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,36 +60,6 @@ def check_against_name(entry: CatalogueEntry, tolerance: float = 0.02) -> list[s
              ("normalisation factor", entry.normalisation, "what the poles imply", 1 / response, "")]
     return [f"{what} is {value:.4g} {unit}".rstrip() + f", {against} {other:.4g} {unit}".rstrip()
             for what, value, against, other, unit in pairs if abs(value - other) > tolerance * abs(other)]
-
-
-def loaded_gain_prediction(entry: CatalogueEntry, others: Sequence[CatalogueEntry]) -> float | None:
-    """The gain [V s/m] that the voltage divider coil/shunt predicts from other files of the same model and coil.
-
-    The shunt R loads the open-circuit gain G to G R / (R + coil). The median open-circuit gain of the other entries is
-    used; None where there are none. It tells which of two contradicting numbers is right.
-    """
-    def divider(e: CatalogueEntry) -> float:
-        return 1.0 if e.shunt_ohm is None else e.shunt_ohm / (e.shunt_ohm + (e.coil_ohm or 0.0))
-    opened = [e.gain_Vs_per_m / divider(e) for e in others
-              if e.file != entry.file and (e.model, e.coil_ohm) == (entry.model, entry.coil_ohm)]
-    return float(np.median(opened) * divider(entry)) if opened else None
-
-
-def read_catalogue(folder: str | Path) -> tuple[CatalogueEntry, ...]:
-    """Every RESP.* file of a folder, by name.
-
-    Raises InputError when the folder holds none, or a file cannot be read (naming file and field).
-    """
-    folder = Path(folder)
-    files = sorted(folder.glob("RESP.*")) if folder.is_dir() else []
-    if not files:
-        raise InputError("a folder with RESP.* files", file=folder)
-    return tuple(read_response(path) for path in files)
-
-
-def contradictions(entries: Sequence[CatalogueEntry]) -> dict[str, list[str]]:
-    """The files that contradict themselves, with what is wrong in each."""
-    return {entry.file: found for entry in entries if (found := check_against_name(entry))}
 
 
 def read_response(path: str | Path) -> CatalogueEntry:

@@ -23,6 +23,7 @@ from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
 from avis_ctrl.lti.bilinear import continuous_image, sampled_image
 from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.robust.dstep import PointwiseScalings, tightened
+from avis_ctrl.robust.fixed_order import fixed_order
 from avis_ctrl.robust.frequency_grid import frequency_grid
 from avis_ctrl.robust.hinf_plant import as_plant
 from avis_ctrl.robust.mu_peak import mu_peak
@@ -73,7 +74,7 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
           callback: Callable[[Iteration], Any] | None = None, target: float | None = None,
           max_iterations: int = 30, backoff: float = 0.01, polish: bool = True, max_added_states: int | None = None,
           starts: Sequence[StateSpace] = (), state: dict[str, Any] | None = None,
-          sample_rate_Hz: float | None = None) -> MuSynthesis:
+          sample_rate_Hz: float | None = None, order: int | None = None) -> MuSynthesis:
     """Controller u = K y of least peak mu.
 
     Parameters
@@ -96,6 +97,8 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
         controller of P; the result is never worse (in complex mu on the grid) than any that stabilises P.
     state : `saved_state` of an earlier result, to go on from. Of another plant with the same y and u (a changed weight,
         more uncertainty), its controllers are started from, as if given in `starts`.
+    order : most states of the controller: the one of full order is shortened, then improved by descent on mu over its
+        entries (`fixed_order`); mu is what that controller has. `saved_state` is that of the full order.
     sample_rate_Hz : the controller's fastest pole is compared with half of it, in `notes`.
 
     Raises
@@ -107,6 +110,8 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     P = as_plant(P, nmeas, ncon)
     uncertainty, structure = _structures(P, blocks, nmeas, ncon)
     cap = P.nstates + 20 if max_added_states is None else max_added_states
+    if order is not None and (isinstance(order, bool) or not isinstance(order, (int, np.integer)) or order < 0):
+        raise InputError("expected a whole number of at least 0, or None", field="order", value=order)
     options = _options(target, max_iterations, backoff, polish, cap, callback)
     problem = Problem(continuous_image(P), structure, nmeas, ncon)
     given = tuple(continuous_image(_named(P, as_system(K, "starts"), nmeas, ncon)) for K in starts)
@@ -115,7 +120,14 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
         if state is not None:
             current, known = State.from_dict(state, structure, problem.P, nmeas, ncon, P.dt)
         current, status = iterate(problem, current, (*known, *given), options)
-        return _result(P, problem, uncertainty, current, status, sample_rate_Hz)
+        assert current.best is not None
+        best, notes = current.best, tuple[str, ...]()
+        if order is not None and best.K.nstates > order:
+            K, peak = fixed_order(problem.P, structure, best.K, order)
+            notes = (f"order {K.nstates} instead of {best.K.nstates}: complex mu on the grid {peak:.4g} instead of "
+                     f"{best.mu:.4g}",)
+            best = Loop(K, best.scalings, np.nan, peak)
+        return _result(P, problem, uncertainty, current, best, status, sample_rate_Hz, notes)
 
 
 def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: int,
@@ -170,11 +182,9 @@ def _certificate(problem: Problem, best: Loop, closed: StateSpace) -> tuple[Scal
     return min(candidates, key=lambda pair: pair[1])
 
 
-def _result(P: StateSpace, problem: Problem, uncertainty: BlockStructure, state: State, status: str,
-            sample_rate_Hz: float | None) -> MuSynthesis:
+def _result(P: StateSpace, problem: Problem, uncertainty: BlockStructure, state: State, best: Loop, status: str,
+            sample_rate_Hz: float | None, said: tuple[str, ...]) -> MuSynthesis:
     """The best controller in the clock of P, with mu measured anew on its loop with P as given."""
-    best = state.best
-    assert best is not None
     K = sampled_image(best.K, P.dt) if P.dt else best.K
     closed = lft_lower(P, K)
     # The norm of the scaled loop holds between all frequencies; with real blocks taken as complex it bounds theirs.
@@ -184,7 +194,7 @@ def _result(P: StateSpace, problem: Problem, uncertainty: BlockStructure, state:
     mu_upper = min(peak.upper, gamma)
     complex_upper = gamma if has_real else mu_upper
     fastest = float(np.max(np.abs(best.K.poles()), initial=0.0))
-    notes = []
+    notes = [*said]
     if has_real:
         notes.append(f"real blocks were synthesised for as complex ones: peak mu {complex_upper:.4g} so, "
                      f"{mu_upper:.4g} with the real blocks real")

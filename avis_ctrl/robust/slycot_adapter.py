@@ -1,6 +1,6 @@
-"""SLICOT routines through slycot, as a second opinion: the only module that imports it (slycot is GPL-2.0).
+"""SLICOT routines through slycot, as a second opinion: the only module that imports it.
 
-Nothing in the package depends on it; the tests and benchmarks compare with it.
+The H-infinity norm of every design is computed by it once more; tests and benchmarks compare bounds of mu.
 """
 
 from __future__ import annotations

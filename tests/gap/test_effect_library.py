@@ -372,13 +372,13 @@ def _moving():
 
 
 MOVING, BLOCK = _moving()
+UNEVEN = 0.1, -0.2, 0.05, 0.12, -0.1, 0.15, -0.07
 VALUES = {"geophone_corner": [4.8, 0.5], "sensor_gain": [1.05], "sensor_misalignment": [2.0, -3.0],
-          "tilt_coupling": [9.8], "actuator_gain": [0.95], "actuator_lag": [2e-3], "loop_delay": [0.7e-3],
-          "actuator_saturation": [1.0, 0.1, -0.2, 0.05, 0.12, -0.1, 0.15, -0.07], "mount_relaxation": [0.3, 3.0],
-          "structural_damping": [0.06],
+          "tilt_coupling": [9.8], "actuator_gain": [0.95], "actuator_lag": [2e-3, *UNEVEN], "loop_delay": [0.7e-3],
+          "actuator_saturation": [1.0, *UNEVEN], "mount_relaxation": [0.3, 3.0], "structural_damping": [0.06],
           "mount_surge": [30.0, 0.45, 0.02, 0.01, -0.02, 0.03], "leveling_loop": [0.04, 0.5, -0.2],
           "cubic_stiffness": [1e13, 0.0, 0.0, 0.0], "stiffness_drift": [0.03, 3.0],
-          "contact_friction": [3e3, 1e-5, 0.1, -0.2, 0.05, 0.12, -0.1, 0.15, -0.07],
+          "contact_friction": [3e3, 1e-5, *UNEVEN],
           "base_compliance": [1000.0, 0.05, 9.0, 10.0, 14.0, 20.0, 25.0, 30.0, 0.4, 0.5, 0.6, -0.4, -0.1],
           "com_offset": [0.01, -0.02, 0.03],
           "product_of_inertia": [2.0], "payload_flexible_mode": [

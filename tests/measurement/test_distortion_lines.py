@@ -79,3 +79,19 @@ def test_records_without_detection_lines_are_refused(rng):
         distortion_levels(campaign([(np.ones((9, 1)), np.ones((9, 1)))], RATE), "00")
     with pytest.raises(InputError, match="record = '7'"):
         distortion_levels(full, "7")
+
+
+def test_the_identification_report_states_it():
+    """A table where lines are left out, of the output with most of it; none where every odd line is excited."""
+    from avis_ctrl.report.identification.measurements import distortion
+
+    rng = np.random.default_rng(1)
+    data = record(rng, lambda u: np.hstack([u + 0.1 * u ** 2, u]), 0.01)
+    shown = distortion(data)
+    [(name, even, odd)] = shown.rows
+    size, _, channel = even.partition(" % ")
+    square = np.fft.rfft(data.records[0].u[:N, 0] ** 2)[ODD[0]:ODD[-1] + 1] / N  # u itself has unit variance
+    assert float(size) == pytest.approx(10 * np.sqrt(2 * np.sum(np.abs(square) ** 2)), rel=0.05)
+    assert channel == "(y1)"
+    assert name == "00" and (odd == "below the noise" or float(odd.partition(" ")[0]) < 1.0)
+    assert distortion(record(rng, lambda u: np.hstack([u, u]), 0.01, detection=False)) is None

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, in_short
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.measurement.frequency_response.distortion_lines import Kind, distortion_levels
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.identification import Identification
+
+DISTORTIONS: tuple[Kind, ...] = ("even", "odd")
 
 
 def measurements(found: Identification) -> Section:
@@ -15,6 +21,8 @@ def measurements(found: Identification) -> Section:
     if isinstance(measured, FrequencyResponse):
         return Section("Measurements", "measurements", _response(measured))
     pieces: list[Piece] = [_records(found, measured), _channels(found, measured)]
+    if (levels := distortion(measured)) is not None:
+        pieces.append(levels)
     if in_short(measured.notes):
         pieces += [Heading("Notes on the measurement file"), Bullets(tuple(in_short(measured.notes)))]
     return Section("Measurements", "measurements", tuple(pieces))
@@ -38,6 +46,32 @@ def _records(found: Identification, campaign: Campaign) -> Table:
                  f"records at rest or with a shaken floor the drives are silent.{how}",
                  ("record", "excitation", "level", "duration", "periods", "floor measured", "used as"), rows,
                  "llrrrcl")
+
+
+def distortion(campaign: Campaign) -> Table | None:
+    """Even and odd distortion of the records that show it: odd multisines with detection lines."""
+    rows = []
+    for record in campaign.records:
+        if record.header.excitation != "multisine" or record.header.periods < 2:
+            continue
+        try:
+            levels = distortion_levels(campaign, record.header.name)
+        except InputError:  # every line is excited: nothing to detect distortion with
+            continue
+        linear = levels.rms("excited")
+        cells = []
+        for kind in DISTORTIONS:
+            ratio = np.divide(levels.rms(kind), linear, out=np.zeros_like(linear), where=linear > 0)
+            worst = int(np.argmax(ratio))
+            cells.append(f"{words.number(100 * ratio[worst], 2)} % ({levels.outputs[worst]})" if ratio[worst] > 0
+                         else "below the noise")
+        rows.append((record.header.name, *cells))
+    if not rows:
+        return None
+    return table("Distortion of the multisines that leave lines out: r.m.s. of the even and of the odd distortion over "
+                 "that of the excited lines, noise subtracted, for the output in which it is largest. Even distortion "
+                 "comes from asymmetry, odd distortion from stiffening, friction or saturation.",
+                 ("record", "even", "odd"), rows, "lrr")
 
 
 def _channels(found: Identification, campaign: Campaign) -> Table:

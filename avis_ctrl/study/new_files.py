@@ -1,0 +1,188 @@
+"""First versions of a rig file and of a design file, from a few answers, with a comment for whatever was assumed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.geophone_catalogue import check_against_name, read_response
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.study.design_file import Design, design_from_table
+from avis_ctrl.study.identification_design import default_design, design_toml
+
+
+@dataclass(frozen=True)
+class NewRig:
+    """A box on equal mounts near its lower corners, with a vertical and a horizontal drive and geophone at each.
+
+    Attributes
+    ----------
+    name : of the rig. mass_kg : of the payload. size_m : length, width, height along x, y, z.
+    mounts : 3 (two at one end, one in the middle of the other) or 4.
+    vertical_Hz, horizontal_Hz : natural frequencies of the payload on its mounts, without rotation.
+    damping : ratio, of all mounts. constant_N_per_V, limit_V : of a drive.
+    geophone : RESP file of the sensor; None for a 4.5 Hz geophone of 28.8 V s/m.
+    sample_rate_Hz : of the controller.
+    """
+
+    name: str
+    mass_kg: float
+    size_m: tuple[float, float, float]
+    mounts: int
+    vertical_Hz: float
+    horizontal_Hz: float
+    damping: float
+    constant_N_per_V: float
+    limit_V: float
+    geophone: Path | None
+    sample_rate_Hz: float
+
+
+def rig_text(new: NewRig) -> str:
+    """The rig file.
+
+    Raises
+    ------
+    InputError : not 3 or 4 mounts, a size, mass or frequency that is not positive, a name that is empty, a RESP file
+        that cannot be read or contradicts itself.
+    """
+    if new.mounts not in (3, 4):
+        raise InputError("expected 3 or 4; write more into the file afterwards", field="mounts", value=new.mounts)
+    for field in ("mass_kg", "vertical_Hz", "horizontal_Hz", "damping", "constant_N_per_V", "limit_V",
+                  "sample_rate_Hz"):
+        if not (np.isfinite(value := getattr(new, field)) and value > 0):
+            raise InputError("expected a positive number", field=field, value=value)
+    if len(new.size_m) != 3 or not all(np.isfinite(side) and side > 0 for side in new.size_m):
+        raise InputError("expected three positive lengths", field="size_m", value=new.size_m)
+    if not new.name.strip() or not new.name.isprintable() or set(new.name) & set('"\\'):
+        raise InputError("expected a name without quotes", field="name", value=new.name)
+    x, y, z = new.size_m
+    inertia = new.mass_kg / 12 * np.array([y ** 2 + z ** 2, x ** 2 + z ** 2, x ** 2 + y ** 2])
+    own = new.mass_kg / new.mounts
+    k = [own * (2 * np.pi * f) ** 2 for f in (new.horizontal_Hz, new.horizontal_Hz, new.vertical_Hz)]
+    c = [2 * new.damping * np.sqrt(own * stiffness) for stiffness in k]
+    places = _places(new)
+    text = (f"# {new.name}: a first rig file. Lines marked \"assumed\" follow from a homogeneous box on equal mounts:\n"
+            "# replace them by your own numbers. docs/rig_file.md explains every key; avis identify measures most.\n"
+            f'name = "{new.name}"\n\n[payload]\nmass_kg = {new.mass_kg:g}\n'
+            f"inertia_kgm2 = {_row(inertia)}             # assumed: homogeneous box, about the centre of mass\n"
+            "centre_of_mass_m = [0.0, 0.0, 0.0]   # assumed: in the geometric centre\n")
+    for place in places:
+        text += (f"\n[[isolator]]\nposition_m = {_row(place)}\n"
+                 f"stiffness_N_per_m = {_row(k)}   # from {new.horizontal_Hz:g} Hz along x and y, "
+                 f"{new.vertical_Hz:g} Hz along z\ndamping_Ns_per_m = {_row(c)}    # damping ratio {new.damping:g}\n")
+    text += f"\n[actuators]\nlimit_V = {new.limit_V:g}\n"
+    for n, (place, axis) in enumerate(zip(places, _horizontal(new), strict=True), 1):
+        for letter, direction in (("z", (0, 0, 1)), axis):
+            text += (f'\n[[drive]]\nname = "A{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
+                     f"direction = {_row(direction)}\nconstant_N_per_V = {new.constant_N_per_V:g}\n")
+    sensor = _geophone(new.geophone)
+    for n, (place, axis) in enumerate(zip(places, _horizontal(new), strict=True), 1):
+        for letter, direction in (("z", (0, 0, 1)), axis):
+            text += (f'\n[[geophone]]\nname = "S{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
+                     f"direction = {_row(direction)}\n{sensor}")
+    return text + (
+        f"\n[acquisition]\nsample_rate_Hz = {new.sample_rate_Hz:g}\nadc_bits = 16                        # assumed\n"
+        "adc_range_V = 10.0                   # assumed\n"
+        f"loop_delay_s = {1 / new.sample_rate_Hz:g}                 # assumed: one sample\n"
+        "\n[ambient]\nfloor_velocity_rms_m_per_s = 2e-6    # assumed: a quiet laboratory\n"
+        "sensor_noise_rms_V = 0.001           # assumed\n")
+
+
+def _row(values: object) -> str:
+    return f"[{', '.join(str(float(f'{value:.6g}')) for value in np.asarray(values, float))}]"
+
+
+def _places(new: NewRig) -> list[tuple[float, float, float]]:
+    """Mounts under the lower corners, a tenth of the length inside."""
+    x, y, z = 0.4 * new.size_m[0], 0.4 * new.size_m[1], -0.5 * new.size_m[2]
+    if new.mounts == 3:
+        return [(-x, -y, z), (x, -y, z), (0.0, y, z)]
+    return [(-x, -y, z), (x, -y, z), (x, y, z), (-x, y, z)]
+
+
+def _horizontal(new: NewRig) -> list[tuple[str, tuple[int, int, int]]]:
+    """Of each mount the horizontal direction of its drive and sensor: both directions, and the rotation about z."""
+    along_x, along_y = ("x", (1, 0, 0)), ("y", (0, 1, 0))
+    return [along_y, along_y, along_x] if new.mounts == 3 else [along_y, along_x, along_y, along_x]
+
+
+def _geophone(path: Path | None) -> str:
+    if path is None:
+        source, gain, corner, damping = "assumed: a common 4.5 Hz geophone", 28.8, 4.5, 0.56
+    else:
+        entry = read_response(path)
+        if wrong := check_against_name(entry):
+            raise InputError(f"the file contradicts itself: {'; '.join(wrong)}", file=path)
+        source, gain, corner, damping = f"from {entry.file}", entry.gain_Vs_per_m, entry.corner_Hz, entry.damping
+    return (f"sensitivity_Vs_per_m = {gain:.6g}          # {source}\nsuspension_Hz = {corner:.6g}\n"
+            f"suspension_damping = {damping:.6g}\ncompensated_Hz = {min(0.5, corner):g}   # assumed: by "
+            "an analogue filter\ncompensated_damping = 0.7\npreamplifier_gain = 100.0            # assumed\n")
+
+
+@dataclass(frozen=True)
+class NewDesign:
+    """keep : coordinates under one controller; empty for those that a default design has. band_Hz : in which the
+    transmissibility stays below band_dB [dB]; peak_dB : anywhere else. The spreads are in per cent of the rig file's
+    values: mass, stiffness and damping of every mount."""
+
+    title: str
+    keep: tuple[str, ...] = ()
+    band_Hz: tuple[float, float] = (1.0, 10.0)
+    band_dB: float = -7.0
+    peak_dB: float = 3.5
+    mass_percent: float = 10.0
+    stiffness_percent: float = 15.0
+    damping_percent: float = 30.0
+
+
+def new_design(new: NewDesign, rig: Rig, rig_name: str) -> Design:
+    """The design, checked.
+
+    Raises
+    ------
+    InputError : a coordinate that the drives or sensors do not reach, a band or spread that a design file refuses.
+    """
+    known = rig.parameters()
+    spreads = {"mass": new.mass_percent, "isolator*.k_*": new.stiffness_percent, "isolator*.c_*": new.damping_percent}
+    spreads = {name: value for name, value in spreads.items()
+               if name in known or (any(one.startswith(name.partition("*")[0]) for one in known) and "*" in name)}
+    start = default_design(rig, new.title, spreads)
+    shape = start.model_dump(exclude_none=True)
+    shape["rig"] = rig_name
+    shape["keep"] = list(new.keep) or shape["keep"]
+    shape["transmissibility"] |= {"band_Hz": list(new.band_Hz), "band_dB": new.band_dB, "peak_dB": new.peak_dB}
+    limits = {"worst_case_peak_transmissibility_dB": new.peak_dB + 0.5,
+              "worst_case_band_transmissibility_dB": new.band_dB + 1.0}
+    for one in shape["requirement"]:
+        if one["quantity"] in limits:
+            one["at_most"] = limits[one["quantity"]]
+    return design_from_table(shape)
+
+
+# What stands above a section of a new design file.
+_REMARKS = {
+    "[loop]": "Corner of the current amplifiers: replace it by yours.",
+    "[uncertainty.parameters_percent]": "By how much the rig file's values may be wrong; the bounds hold for all such "
+                                        "plants. After avis identify use its uncertainty.json instead.",
+    "[uncertainty.actuator_chains]": "Neglected dynamics of each drive: 100 % at the crossover frequency.",
+    "[transmissibility]": "The bound on floor to payload: peak_dB anywhere, band_dB inside band_Hz.",
+    "[control_effort]": "Voltages: drives are at their limit for a floor that moves this fast, up to this bandwidth.",
+    "[synthesis]": "The D-K iteration ends at target_mu or after so many steps.",
+    "[simulation]": "The check on the nonlinear table: random plants of the set, simulated for so long.",
+    "[[requirement]]": "What the report judges; a quantity with at_most or at_least. All of them: docs/design_file.md.",
+}
+
+
+def design_text(design: Design) -> str:
+    """The design file, with a remark above each section."""
+    lines, told = ["# A first design file; docs/design_file.md explains every key."], set()
+    for line in design_toml(design).splitlines():
+        if line in _REMARKS and line not in told:
+            lines.append(f"# {_REMARKS[line]}")
+            told.add(line)
+        lines.append(line)
+    return "\n".join(lines) + "\n"
