@@ -1,4 +1,43 @@
-"""avis_ctrl: a workbench for active vibration isolation tables.
+"""avis_ctrl: a workbench for active vibration isolation tables, and robust control of any plant.
+
+    import avis_ctrl as ac
+
+From measurements to a controller; results have .summary(), .plot_...() and .save(folder):
+
+rig                 a table: "avis", "halcyonics", "halcyonics_loaded" or a rig file
+campaign            measured records or responses from a file (HDF5, .mat, UFF 58, CSV)
+simulate_campaign   records of the simulated nonlinear table
+identify            the table's parameters and their uncertainty from a campaign
+gap                 the physical effect that a table's model misses
+design              certified controllers of a table, compared, simulated, with a report
+single_axis         a small model of one axis: seismometer, decay, drive, oscillator
+
+Linear systems and robust control of any plant:
+
+StateSpace          a linear system with named signals
+tf                  a system from the coefficients of a transfer function
+ss                  a system from A, B, C, D, whose entries may be uncertain
+connect             systems connected through signals of one name
+real                an uncertain real parameter
+complex_disk        an uncertain complex number
+dynamics            unknown stable dynamics of bounded size
+matrix              a matrix with uncertain entries
+RealScalar          block of a real parameter, repeated or not
+ComplexScalar       block of a complex number, repeated or not
+ComplexFull         block of a full complex matrix
+BlockStructure      the blocks of a structured perturbation
+uncertainty_weight  a filter that covers what responses differ by
+hinfsyn             H-infinity controller
+mixed_sensitivity   H-infinity controller for weights on S, KS and T
+musyn               mu controller (D-K iteration)
+mu                  bounds of the structured singular value of matrices
+mu_peak             its peak over frequency, proved between the points
+worst_case_gain     the largest gain over all perturbations
+robust_stability    the part of the uncertainty up to which a loop is stable
+robust_performance  the same with a bound on its gain
+disk_margin         gain and phase margins of all channels at once
+plot                bode, sigma, mu, transmissibility, dk_history, order, vc_curves
+InputError          what a wrong input raises: one line
 
 Names are loaded on first use, so that `import avis_ctrl` and `avis --help` answer at once.
 """
@@ -11,7 +50,21 @@ from typing import Any
 __version__ = "0.4.0"
 
 _PLACES = {
+    "rig": "avis_ctrl.interface.workflow",
+    "campaign": "avis_ctrl.interface.workflow",
+    "simulate_campaign": "avis_ctrl.interface.workflow",
+    "identify": "avis_ctrl.interface.workflow",
+    "design": "avis_ctrl.interface.workflow",
+    "single_axis": "avis_ctrl.interface.workflow",
     "StateSpace": "avis_ctrl.lti",
+    "tf": "avis_ctrl.lti",
+    "ss": "avis_ctrl.uncertainty.uncertain_models",
+    "connect": "avis_ctrl.uncertainty.uncertain_models",
+    "real": "avis_ctrl.uncertainty.uncertain_models",
+    "complex_disk": "avis_ctrl.uncertainty.uncertain_models",
+    "dynamics": "avis_ctrl.uncertainty.uncertain_models",
+    "matrix": "avis_ctrl.uncertainty.uncertain_models",
+    "InputError": "avis_ctrl.errors",
     "RealScalar": "avis_ctrl.uncertainty.blocks",
     "ComplexScalar": "avis_ctrl.uncertainty.blocks",
     "ComplexFull": "avis_ctrl.uncertainty.blocks",
@@ -20,13 +73,22 @@ _PLACES = {
     "musyn": "avis_ctrl.robust.musyn",
     "mu": "avis_ctrl.robust.mu",
     "mu_peak": "avis_ctrl.robust.mu_peak",
-    "worst_case_gain": "avis_ctrl.robust.mu_peak",
+    "worst_case_gain": "avis_ctrl.robust.robustness",
+    "robust_stability": "avis_ctrl.robust.robustness",
+    "robust_performance": "avis_ctrl.robust.robustness",
+    "disk_margin": "avis_ctrl.robust.disk_margin",
+    "mixed_sensitivity": "avis_ctrl.robust.mixed_sensitivity",
+    "uncertainty_weight": "avis_ctrl.uncertainty.uncertainty_weight",
 }
+# Packages that are names of the interface, too; `gap` can be called.
+_PACKAGES = ("gap", "plot")
 
-__all__ = ["__version__", *_PLACES]
+__all__ = ["__version__", *_PACKAGES, *_PLACES]
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return importlib.import_module(f"avis_ctrl.{name}")
     if name not in _PLACES:
         raise AttributeError(f"module 'avis_ctrl' has no attribute {name!r}")
     return getattr(importlib.import_module(_PLACES[name]), name)

@@ -1,4 +1,4 @@
-"""Upper bound of mu: time and value against LMI bisection (cvxpy, Clarabel) and SLICOT's AB13MD.
+"""Bounds of mu: time and value against LMI bisection (cvxpy, Clarabel) and SLICOT's AB13MD.
 
     python -m benchmarks.mu_upper
 """
@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from avis_ctrl.robust.mu import mu_upper
+from avis_ctrl.robust.mu import mu, mu_upper
 from avis_ctrl.robust.slycot_adapter import mu_upper_slicot
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
 from benchmarks.mu_by_bisection import mu_upper_by_bisection
@@ -25,12 +26,39 @@ CASES = {
 }
 
 
+SCALARS = (4, 8, 16, 24)
+
+
+def both_bounds(batch: int = 20, repeats: int = 5) -> None:
+    """Both bounds for complex scalar blocks beside AB13MD, which gives the upper one: the least of some times, ms."""
+    print(f"{'complex scalars':>15s} {'one':>8s} {'its upper':>9s} {'of a batch':>10s} {'AB13MD':>8s} "
+          f"{'ratio one':>9s} {'batch':>6s} {'upper / AB13MD - 1':>24s} {'lower / upper':>16s}")
+    rng = np.random.default_rng(0)
+    for n in SCALARS:
+        blocks = [ComplexScalar()] * n
+        M = rng.standard_normal((batch, n, n)) + 1j * rng.standard_normal((batch, n, n))
+        one, upper, many, slicot = (min(_seconds(call) for _ in range(repeats)) * 1e3 / batch for call in (
+            lambda M=M, blocks=blocks: [mu(m, blocks) for m in M],
+            lambda M=M, blocks=blocks: [mu_upper(m, blocks) for m in M], lambda M=M, blocks=blocks: mu(M, blocks),
+            lambda M=M, blocks=blocks: [mu_upper_slicot(m, blocks) for m in M]))
+        found, peer = mu(M, blocks), np.array([mu_upper_slicot(m, blocks) for m in M])
+        above, ratio = np.asarray(found.upper) / peer - 1, np.asarray(found.lower) / found.upper
+        print(f"{n:15d} {one:8.2f} {upper:9.2f} {many:10.2f} {slicot:8.2f} {slicot / one:9.1f} {slicot / many:6.1f} "
+              f"{above.min():11.1e} .. {above.max():8.1e} {ratio.min():7.4f} .. {ratio.max():6.4f}")
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
 def main(frequencies: int = 60, compared: int = 3) -> None:
     """Times per matrix; the LMI and SLICOT on the first `compared` matrices only."""
     rng = np.random.default_rng(0)
     print(f"{'blocks':38s} {'mu_upper':>9s} {'LMI':>9s} {'ratio':>7s} {'SLICOT':>9s} {'largest difference':>19s}")
     # Compiled code is loaded before the clock starts.
-    mu_upper(np.eye(1), [ComplexScalar()])
+    mu(np.eye(2), [ComplexScalar()] * 2)
     with threadpool_limits(1):
         for name, blocks in CASES.items():
             structure = BlockStructure.of(blocks)
@@ -51,6 +79,7 @@ def main(frequencies: int = 60, compared: int = 3) -> None:
             difference = np.max(np.abs(lmi / upper[:compared] - 1))
             print(f"{name:38s} {own * 1e3:6.1f} ms {slow * 1e3:6.0f} ms {slow / own:7.0f} {slicot:>9s} "
                   f"{difference:19.1e}")
+        both_bounds()
 
 
 if __name__ == "__main__":

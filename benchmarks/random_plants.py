@@ -1,10 +1,13 @@
 """Random problems for hinfsyn, mu, mu_peak and worst_case_gain, each answer recomputed by another route.
 
     python -m benchmarks.random_plants --out FILE.jsonl [--count N] [--seed S] [--first I] [--jobs J] [--sb10ad K]
+                                       [--sampled]
 
 Problem i of a seed is always the same one. Orders are 2 to 60; D11 and D22 are not zero, modes lie near the imaginary
 axis, signals and states are scaled by up to 1e8, parts are uncontrollable or unobservable, D12 or D21 loses rank,
-blocks are real, complex, repeated and not square, and some systems are sampled. One line of FILE is written for each
+blocks are real, complex, repeated and not square, and some systems are the bilinear image of a continuous one. With
+--sampled every problem is posed in discrete time: poles anywhere in the z plane, at zero (delays) and near z = -1, and
+musyn joins in. One line of FILE is written for each
 problem; a run on the same file goes on where the last one ended. The table counts how each ended.
 
 A problem is WRONG where
@@ -13,8 +16,10 @@ A problem is WRONG where
         SLICOT's AB13DD and from P(jw), K(jw) closed pointwise (the larger of the two; the tolerance is 1e-3);
     a bracket wider than 1 per cent is reported as the optimum;
     the bracket's lower end is above that norm, or the bracket misses that of the plant before it was scaled and
-        padded, or for every fourth problem that of the transposed plant or the optimum of the matrix inequalities;
+        padded, or for every fourth problem that of the transposed plant or the optimum of the matrix inequalities
+        (an upper end that a controller keeps by AB13DD is right whatever these say);
     I - M Delta is not singular, Delta has not its structure or its norm, or a bound of mu is passed by a perturbation;
+    musyn's bound is below mu of its loop at a frequency, by AB13MD where that takes the blocks;
     an exception is neither InputError nor ComputationError.
 
 --sb10ad K: every K-th synthesis of low order is also given to SLICOT's SB10AD (python-control's hinfsyn); its claims
@@ -41,11 +46,12 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, discretise
 from avis_ctrl.robust.hinf_lmi import lmi_gamma
-from avis_ctrl.robust.hinfsyn import Status, hinfsyn
+from avis_ctrl.robust.hinfsyn import Status, hinf_suboptimal, hinfsyn
 from avis_ctrl.robust.mu import mu
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
-from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
-from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
+from avis_ctrl.robust.musyn import musyn
+from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot, mu_upper_slicot
+from avis_ctrl.uncertainty.blocks import Block, BlockStructure, ComplexFull, ComplexScalar, RealScalar
 
 SAME = 1e-3  # relative difference from which two computations of one figure are called different
 SB10AD_ORDER = 12  # it takes minutes above
@@ -78,6 +84,31 @@ def dynamics(rng: np.random.Generator, n: int, stable: bool) -> np.ndarray:
     return Q.T @ A @ Q
 
 
+def sampled_dynamics(rng: np.random.Generator, n: int, stable: bool) -> np.ndarray:
+    """A in discrete time: modes of any frequency up to half the rate, radius up to 1 - 1e-6, real poles, delays."""
+    blocks: list[np.ndarray] = []
+    left = n
+    least = rng.choice([1e-1, 1e-2, 1e-4, 1e-6])
+    while left:
+        draw, outside = rng.uniform(), not stable and rng.uniform() < 0.15
+        away = 10.0 ** rng.uniform(np.log10(least), 0)
+        radius = 1 / (1 - 0.9 * away) if outside else 1 - 0.9 * away
+        if draw < 0.15:
+            # A delay of up to three samples: nilpotent, its poles all at zero.
+            k = min(left, int(rng.integers(1, 4)))
+            blocks.append(np.eye(k, k=1))
+        elif left == 1 or draw < 0.35:
+            blocks.append(np.array([[radius * rng.choice([-1.0, 1.0])]]))
+        else:
+            angle = np.pi * rng.uniform() ** rng.choice([1, 4])
+            c, s = radius * np.cos(angle), radius * np.sin(angle)
+            blocks.append(np.array([[c, s], [-s, c]]))
+        left -= blocks[-1].shape[0]
+    A = la.block_diag(*blocks)
+    Q = la.qr(rng.standard_normal((n, n)))[0]
+    return Q.T @ A @ Q
+
+
 def transformed(rng: np.random.Generator, P: StateSpace, u: int, y: int) -> tuple[StateSpace, list[str]]:
     """The same problem in other units and with superfluous states: its optimum is that of P."""
     done = []
@@ -92,7 +123,8 @@ def transformed(rng: np.random.Generator, P: StateSpace, u: int, y: int) -> tupl
         done.append("u and y scaled")
     if rng.uniform() < 0.3:
         # A copy of the states' own dynamics or other stable modes that no input moves, or that no output sees.
-        extra = P.A if rng.uniform() < 0.3 and P.is_stable() else dynamics(rng, int(rng.integers(1, 4)), True)
+        modes = sampled_dynamics if P.dt else dynamics
+        extra = P.A if rng.uniform() < 0.3 and P.is_stable() else modes(rng, int(rng.integers(1, 4)), True)
         k, n = extra.shape[0], P.nstates
         into, out = rng.standard_normal((n, k)), rng.standard_normal((k, n))
         kind = rng.choice(["uncontrollable", "unobservable"])
@@ -103,18 +135,19 @@ def transformed(rng: np.random.Generator, P: StateSpace, u: int, y: int) -> tupl
             A = np.block([[P.A, np.zeros((n, k))], [out, extra]])
             B, C = np.vstack([P.B, rng.standard_normal((k, P.ninputs))]), np.hstack([P.C, np.zeros((P.noutputs, k))])
         T = la.qr(rng.standard_normal((n + k, n + k)))[0] if rng.uniform() < 0.7 else np.eye(n + k)
-        P = StateSpace(T.T @ A @ T, T.T @ B, C @ T, P.D)
+        P = StateSpace(T.T @ A @ T, T.T @ B, C @ T, P.D, P.dt)
         done.append(str(kind))
     return P, done
 
 
-def plant(rng: np.random.Generator) -> tuple[StateSpace, StateSpace, int, int, list[str]]:
+def plant(rng: np.random.Generator, sampled: bool = False) -> tuple[StateSpace, StateSpace, int, int, list[str]]:
     """(P as posed, the plain plant with the same optimum, ncon, nmeas, what was done)."""
     n = order(rng)
+    modes, dt = (sampled_dynamics, 10.0 ** rng.uniform(-4, 1)) if sampled else (dynamics, 0.0)
     u, y = (int(k) for k in rng.integers(1, 4, 2))
     z, w = u + int(rng.integers(0, 4)), y + int(rng.integers(0, 4))
     tags = []
-    A = dynamics(rng, n, bool(rng.uniform() < 0.6))
+    A = modes(rng, n, bool(rng.uniform() < 0.6))
     B, C = rng.standard_normal((n, w + u)), rng.standard_normal((z + y, n))
     D = rng.standard_normal((z + y, w + u)) * 10.0 ** rng.uniform(-2, 1)
     D[:z, :w] *= rng.choice([0, 0, 0.1, 1])
@@ -135,9 +168,9 @@ def plant(rng: np.random.Generator) -> tuple[StateSpace, StateSpace, int, int, l
         A[np.ix_(~keep, keep)] = 0.0
         A[np.ix_(keep, ~keep)] = 0.0
         C[:z, ~keep], tags = 0.0, ["X singular"]
-    base = StateSpace(A, B, C, D)
+    base = StateSpace(A, B, C, D, dt)
     P, more = transformed(rng, base, u, y)
-    if rng.uniform() < 0.1:
+    if not sampled and rng.uniform() < 0.1:
         P = discretise(P, float(0.1 / np.max(np.abs(base.poles()))), "tustin")
         more = [*more, "sampled"]
     return P, base, u, y, tags + more
@@ -157,14 +190,15 @@ def structure(rng: np.random.Generator) -> BlockStructure:
     return BlockStructure.of(blocks)
 
 
-def loop(rng: np.random.Generator, n_out: int, n_in: int) -> StateSpace:
+def loop(rng: np.random.Generator, n_out: int, n_in: int, sampled: bool = False) -> StateSpace:
     """A stable system whose gain is of the order of one."""
     n = min(order(rng), 24)
-    A = dynamics(rng, n, True)
+    A = sampled_dynamics(rng, n, True) if sampled else dynamics(rng, n, True)
+    dt = 10.0 ** rng.uniform(-4, 1) if sampled else 0.0
     root = np.sqrt(np.abs(la.eigvals(A)).mean())
     N = StateSpace(A, root * rng.standard_normal((n, n_in)), root * rng.standard_normal((n_out, n)),
-                   rng.standard_normal((n_out, n_in)) * rng.choice([0, 0.1, 1]))
-    omega = np.abs(N.poles())
+                   rng.standard_normal((n_out, n_in)) * rng.choice([0, 0.1, 1]), dt)
+    omega = np.abs(np.angle(N.poles())) / dt if dt else np.abs(N.poles())
     size = float(np.max(np.linalg.norm(N.frequency_response(omega), 2, axis=(1, 2))))
     return N.scaled(left=10.0 ** rng.uniform(-1, 0.5) / size)
 
@@ -267,7 +301,7 @@ def judge_synthesis(P: StateSpace, base: StateSpace, u: int, y: int, r: Any, sec
     others: list[tuple[str, float, float]] = []
     references = [("plain", base, u, y)] if base is not P else []
     if second:
-        references.append(("transposed", StateSpace(base.A.T, base.C.T, base.B.T, base.D.T), y, u))
+        references.append(("transposed", StateSpace(base.A.T, base.C.T, base.B.T, base.D.T, base.dt), y, u))
     for name, other, a, b in references:
         try:
             s = hinfsyn(other, b, a)
@@ -284,9 +318,17 @@ def judge_synthesis(P: StateSpace, base: StateSpace, u: int, y: int, r: Any, sec
     for name, low, high in others:
         if lower > high * (1 + SAME) + tiny:
             wrong.append(f"lower bound {lower:.6g} above {high:.6g} reached: {name}")
-        if low > min(upper, norm) * (1 + SAME) + 100 * tiny:
+        if low > min(upper, norm) * (1 + SAME) + 100 * tiny and not confirmed(base, u, y, upper):
             wrong.append(f"upper bound {upper:.6g} (norm {norm:.6g}) below what is possible, {low:.6g}: {name}")
     return wrong
+
+
+def confirmed(base: StateSpace, u: int, y: int, upper: float) -> bool:
+    """Whether a controller at an upper bound keeps it by AB13DD: then it is the other opinion that is wrong."""
+    with contextlib.suppress(ComputationError):
+        loop = closed(base, hinf_suboptimal(base, y, u, upper * (1 + SAME / 2)).K)
+        return bool(loop.is_stable() and hinf_norm_slicot(loop) <= upper * (1 + SAME))
+    return False
 
 
 def judge_delta(N: np.ndarray, blocks: BlockStructure, lower: float, delta: np.ndarray | None) -> list[str]:
@@ -319,15 +361,18 @@ def passed_by_a_sample(M: np.ndarray, blocks: BlockStructure, rng: np.random.Gen
 
 # -- one problem ----------------------------------------------------------------------------------
 
-def solve(seed: int, index: int) -> dict[str, Any]:
-    """Pose, answer and judge problem `index`."""
-    rng = np.random.default_rng([seed, index])
-    kind = rng.choice(["hinfsyn", "mu", "mu_peak", "worst_case_gain"], p=[0.6, 0.2, 0.12, 0.08])
+def solve(seed: int, index: int, sampled: bool = False) -> dict[str, Any]:
+    """Pose, answer and judge problem `index`, of those in discrete time where `sampled`."""
+    rng = np.random.default_rng([seed, index, 1] if sampled else [seed, index])
+    # Matrices have no clock; their part goes to mu synthesis.
+    second = "musyn" if sampled else "mu"
+    kind = rng.choice(["hinfsyn", second, "mu_peak", "worst_case_gain"],
+                      p=[0.6, 0.05, 0.21, 0.14] if sampled else [0.6, 0.2, 0.12, 0.08])
     out: dict[str, Any] = {"index": index, "kind": str(kind), "wrong": []}
     began = time.perf_counter()
     try:
         if kind == "hinfsyn":
-            P, base, u, y, tags = plant(rng)
+            P, base, u, y, tags = plant(rng, sampled)
             out |= {"n": P.nstates, "tags": tags}
             r = hinfsyn(P, y, u, far_poles="gain" if index % 2 else "kept")
             said = ", gamma said to be round-off" if in_doubt(r) else ""
@@ -335,6 +380,12 @@ def solve(seed: int, index: int) -> dict[str, Any]:
                     "fastest": r.fastest_pole, "plant_fastest": float(np.max(np.abs(base.poles()))),
                     "seconds": time.perf_counter() - began}
             out["wrong"] = judge_synthesis(P, base, u, y, r, index % 4 == 0)
+        elif kind == "musyn":
+            P, blocks = uncertain_plant(rng)
+            r = musyn(P, blocks, 1, 1, max_iterations=4)
+            out |= {"n": P.nstates, "status": "proved" if r.guaranteed else "not proved", "gamma": r.mu_upper,
+                    "bounds": [r.mu_lower, r.mu_upper], "seconds": time.perf_counter() - began}
+            out["wrong"] = judge_mu_synthesis(P, r)
         elif kind == "mu":
             blocks = structure(rng)
             M = rng.standard_normal((blocks.n_z, blocks.n_w)) + 1j * rng.standard_normal((blocks.n_z, blocks.n_w))
@@ -360,8 +411,8 @@ def solve(seed: int, index: int) -> dict[str, Any]:
         else:
             blocks = structure(rng)
             extra = (int(rng.integers(1, 3)), int(rng.integers(1, 3))) if kind == "worst_case_gain" else (0, 0)
-            N = loop(rng, blocks.n_z + extra[0], blocks.n_w + extra[1])
-            if rng.uniform() < 0.15:
+            N = loop(rng, blocks.n_z + extra[0], blocks.n_w + extra[1], sampled)
+            if not sampled and rng.uniform() < 0.15:
                 N = discretise(N, float(0.1 / np.max(np.abs(N.poles()))), "tustin")
             out |= {"n": N.nstates}
             p = mu_peak(N, blocks) if kind == "mu_peak" else worst_case_gain(N, blocks)
@@ -373,6 +424,39 @@ def solve(seed: int, index: int) -> dict[str, Any]:
                 "said": str(error)[:300]}
     out.setdefault("seconds", time.perf_counter() - began)
     return out
+
+
+def uncertain_plant(rng: np.random.Generator) -> tuple[StateSpace, list[Block]]:
+    """A small sampled plant with one or two scalar blocks, one w, z = (error, effort), one u and one noisy y."""
+    n, k = int(rng.integers(2, 7)), int(rng.integers(1, 3))
+    A = sampled_dynamics(rng, n, bool(rng.uniform() < 0.7))
+    B, C = rng.standard_normal((n, k + 3)), rng.standard_normal((k + 3, n))
+    D = 0.1 * rng.standard_normal((k + 3, k + 3))
+    D[:k], D[:, :k], C[:k] = 0.1 * D[:k], 0.1 * D[:, :k], 0.1 * C[:k]
+    D[k + 1, k + 2], D[k + 2, k + 1] = 1.0, 0.3
+    return (StateSpace(A, B, C, D, 10.0 ** rng.uniform(-4, 1)),
+            [RealScalar() if rng.uniform() < 0.5 else ComplexScalar() for _ in range(k)])
+
+
+def judge_mu_synthesis(P: StateSpace, r: Any) -> list[str]:
+    """What is wrong with musyn's answer: its loop is formed here, its complex mu computed by AB13MD on a grid."""
+    own = closed(P, r.K)
+    margin = np.max(np.abs(own.poles())) - 1
+    wrong = [] if margin < 0 else [f"unstable: {margin:.2e}"]
+    if r.K.dt != P.dt:
+        wrong.append(f"sample time {r.K.dt}")
+    complexified = r.blocks.complexified()
+    # Its performance block is 1 x 2, which AB13MD takes only when it is filled up with zeros.
+    square = BlockStructure.of([*complexified.blocks[:-1], ComplexFull(2)])
+    reached = 0.0
+    for omega in frequencies(own, count=60):
+        M = at(own, omega)
+        reached = max(reached, mu_upper_slicot(np.hstack([M, np.zeros((M.shape[0], 1))]), square))
+    if reached > r.mu_upper_complex * (1 + SAME):
+        wrong.append(f"complex mu {reached:.6g} on the grid above the bound {r.mu_upper_complex:.6g}")
+    if r.mu_upper > r.mu_upper_complex * (1 + 1e-9) or r.mu_lower > r.mu_upper * (1 + 1e-6):
+        wrong.append(f"bounds {r.mu_lower:.6g}, {r.mu_upper:.6g}, {r.mu_upper_complex:.6g} out of order")
+    return wrong + (judge_delta(at(own, r.omega_peak), r.blocks, r.mu_lower, r.delta))
 
 
 def judge_peak(N: StateSpace, blocks: BlockStructure, p: Any, rng: np.random.Generator) -> list[str]:
@@ -426,13 +510,13 @@ def _alarm(_signal: int, _frame: Any) -> None:
     raise TimeoutError
 
 
-def timed(seed: int, index: int) -> dict[str, Any]:
+def timed(seed: int, index: int, sampled: bool) -> dict[str, Any]:
     """`solve` with a time limit; other exceptions are a result, a wrong one."""
     signal.signal(signal.SIGALRM, _alarm)
     signal.alarm(LIMIT_S)
     try:
         with np.errstate(all="ignore"):
-            return solve(seed, index)
+            return solve(seed, index, sampled)
     except TimeoutError:
         return {"index": index, "kind": "any", "status": "HUNG", "wrong": [f"longer than {LIMIT_S} s"]}
     except Exception as error:  # what nobody meant to raise is what this looks for
@@ -479,7 +563,7 @@ def sb10ad(seed: int, index: int, limit: float = 20.0) -> dict[str, Any]:
 
 # -- run ------------------------------------------------------------------------------------------
 
-def _work(task: tuple[int, int]) -> dict[str, Any]:
+def _work(task: tuple[int, int, bool]) -> dict[str, Any]:
     return timed(*task)
 
 
@@ -519,15 +603,16 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="index of the first problem")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--sb10ad", type=int, default=0, metavar="K", help="every K-th synthesis to SLICOT, too")
+    parser.add_argument("--sampled", action="store_true", help="problems in discrete time, in a file of their own")
     asked = parser.parse_args()
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     done = {row["index"] for row in read(asked.out)}
-    todo = [(asked.seed, k) for k in range(asked.first, asked.first + asked.count) if k not in done]
+    todo = [(asked.seed, k, asked.sampled) for k in range(asked.first, asked.first + asked.count) if k not in done]
     with asked.out.open("a") as file, multiprocessing.Pool(asked.jobs) as pool:
         for row in pool.imap_unordered(_work, todo):
             if (asked.sb10ad and row["kind"] == "hinfsyn" and row["index"] % asked.sb10ad == 0
-                    and row["n"] <= SB10AD_ORDER and "sampled" not in row["tags"]):
+                    and row["n"] <= SB10AD_ORDER and not asked.sampled and "sampled" not in row["tags"]):
                 row["sb10ad"] = sb10ad(asked.seed, row["index"])
             file.write(json.dumps(row) + "\n")
             file.flush()

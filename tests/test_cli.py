@@ -185,6 +185,6 @@ def test_an_interrupt_that_is_lost_comes_again():
 def test_public_names_load_on_first_use():
     assert set(avis_ctrl.__all__) >= {"hinfsyn", "musyn", "mu", "mu_peak", "worst_case_gain", "RealScalar",
                                       "ComplexScalar", "ComplexFull", "StateSpace"}
-    assert all(callable(getattr(avis_ctrl, name)) for name in avis_ctrl.__all__ if name != "__version__")
+    assert all(callable(getattr(avis_ctrl, name)) for name in set(avis_ctrl.__all__) - {"__version__", "plot"})
     with pytest.raises(AttributeError, match="no attribute 'musin'"):
         avis_ctrl.musin  # noqa: B018

@@ -12,7 +12,9 @@ from typing import Annotated, Any
 import typer
 
 import avis_ctrl
+from avis_ctrl.cli.compare import compare
 from avis_ctrl.cli.design import design
+from avis_ctrl.cli.export import export
 from avis_ctrl.cli.gap import gap
 from avis_ctrl.cli.gap_axis import gap_axis
 from avis_ctrl.cli.identify import identify, predict, single_axis
@@ -63,9 +65,9 @@ def doctor() -> None:
         raise typer.Exit(3)
 
 
-for command, name in ((design, "design"), (identify, "identify"), (gap, "gap"), (predict, "predict"),
-                      (gap_axis, "gap-axis"), (excite, "excite"), (simulate_campaign, "simulate-campaign"),
-                      (convert, "convert"), (single_axis, "single-axis")):
+for command, name in ((design, "design"), (compare, "compare"), (export, "export"), (identify, "identify"),
+                      (gap, "gap"), (predict, "predict"), (gap_axis, "gap-axis"), (excite, "excite"),
+                      (simulate_campaign, "simulate-campaign"), (convert, "convert"), (single_axis, "single-axis")):
     app.command(name, epilog=LAYOUTS if name in ("identify", "gap", "convert") else None)(command)
 app.add_typer(new, name="new")
 

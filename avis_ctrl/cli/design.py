@@ -18,8 +18,8 @@ def design(
     """Design certified controllers for a rig, check them in simulation, and write a report.
 
     Writes report.html, report.pdf, controllers/NAME.json, sampled_controller.json (the controller for the processor,
-    sensor volts to drive volts, all axes), plant.json and result.json into DIR. Exit code 3 if the closed loop is
-    unstable for any simulated plant; the first sentence names the cause.
+    sensor volts to drive volts, all axes), study.json (the inputs, for avis export), plant.json and result.json into
+    DIR. Exit code 3 if the closed loop is unstable for any simulated plant; the first sentence names the cause.
     """
     from rich.console import Console
 

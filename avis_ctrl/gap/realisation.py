@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.gap.effects.drives import time_constants
 from avis_ctrl.gap.effects.sensors import GRAVITY, suspensions
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.state_space import SETTINGS, ReducedTable, addition, chassis, has_addition
@@ -149,16 +150,18 @@ def _drives(model: TableModel) -> list[StateSpace]:
     """Volts commanded to volts that act, one system an actuator; the first lag and all delay belong to the loop."""
     factors = dict.fromkeys(model.actuators, 1.0)
     first = model.amplifier_corner_Hz is None
-    lags = []
+    found = [gain([[1.0]])] * len(model.actuators)
     for one in model.effects:
         if one.effect.name == "actuator_gain":
             factors[one.place] *= one.by_name["gain"]
-        if one.effect.name == "actuator_lag" and one.by_name["time_constant_s"] > 1e-9:
-            if not first:
-                lags.append(1 / one.by_name["time_constant_s"])
+        if one.effect.name == "actuator_lag" and (tau := one.by_name["time_constant_s"]) > 1e-9:
+            each = np.broadcast_to(time_constants(one.by_name), len(found))
+            common = [-1 / tau] if first else []
+            if len(one.values) > 1 or not first:
+                found = [cascade(common, [-1 / own], (tau if first else 1.0) / own) @ before
+                         for own, before in zip(each, found, strict=True)]
             first = False
-    lag = cascade([], [-w for w in lags], float(np.prod(lags))) if lags else gain([[1.0]])
-    return [lag.scaled(factors[name]) for name in model.actuators]
+    return [lag.scaled(factors[name]) for lag, name in zip(found, model.actuators, strict=True)]
 
 
 def _sensors(table: ReducedTable, names: list[str]) -> StateSpace:

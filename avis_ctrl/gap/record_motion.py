@@ -14,17 +14,37 @@ import scipy.fft
 class MotionSettings:
     """Of spectra of a record's motion.
 
-    most_kept : spectra kept for each record; those that have not been used for longest go first.
+    kept_bytes : of the spectra kept for each record; those that have not been used for longest go first. Enough for a
+        step of a fit with several effects; ten records of it are a fifth of the memory that a search may take.
     node_ratio : ratio of the values between which spectra are interpolated [1]. Of a contact's friction over its
         slip, cubic interpolation is then exact to a part in ten thousand, and its derivative to a part in five
         hundred.
     """
 
-    most_kept: int = 100
+    kept_bytes: int = 32_000_000
     node_ratio: float = 1.2
 
 
 SETTINGS = MotionSettings()
+
+
+class Kept:
+    """Arrays by key, up to so many bytes; those that have not been used for longest go first."""
+
+    def __init__(self, most_bytes: int):
+        self.most_bytes, self.bytes = most_bytes, 0
+        self.arrays: dict[tuple, np.ndarray] = {}
+
+    def of(self, key: tuple, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """The array of a key, made where it is not kept."""
+        found = self.arrays.pop(key, None)
+        if found is None:
+            found = make()
+            self.bytes += found.nbytes
+            while self.arrays and self.bytes > self.most_bytes:
+                self.bytes -= self.arrays.pop(next(iter(self.arrays))).nbytes
+        self.arrays[key] = found
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +84,7 @@ class RecordMotion:
     actuators: tuple[str, ...] = ()
     sensors: tuple[str, ...] = ()
     y: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    _spectra: dict[tuple, np.ndarray] = field(default_factory=dict, repr=False)
+    _spectra: Kept = field(default_factory=lambda: Kept(SETTINGS.kept_bytes), repr=False)
 
     @cached_property
     def time_s(self) -> np.ndarray:
@@ -87,18 +107,12 @@ class RecordMotion:
         if not len(own):
             return np.zeros((len(omega), samples.shape[1]), complex)
         lines = np.rint(omega * len(own) / (2 * np.pi * self.sample_rate_Hz)).astype(int)
-        return scipy.fft.rfft(own - own.mean(0), axis=0)[lines] / np.sqrt(len(own))
+        return scipy.fft.rfft(own, axis=0)[lines] / np.sqrt(len(own))
 
     def kept(self, key: str, omega: np.ndarray, samples: Callable[[], np.ndarray]) -> np.ndarray:
         """`spectrum` of samples that never change, under a key: computed once for each set of lines."""
         where = (key, len(omega), float(omega[0]), float(omega[-1]), float(np.sum(omega)))
-        found = self._spectra.pop(where, None)
-        if found is None:
-            found = self.spectrum(samples(), omega)
-            while len(self._spectra) >= SETTINGS.most_kept:
-                self._spectra.pop(next(iter(self._spectra)), None)
-        self._spectra[where] = found
-        return found
+        return self._spectra.of(where, lambda: self.spectrum(samples(), omega))
 
     def interpolated(self, key: str, value: float, omega: np.ndarray, samples: Callable[[float], np.ndarray]
                      ) -> np.ndarray:

@@ -19,11 +19,11 @@ from scipy.optimize import nnls
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.attached import elements
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
-from avis_ctrl.gap.effects.base import Values
+from avis_ctrl.gap.effects.base import Values, shares
 from avis_ctrl.gap.effects.cable import tie
 from avis_ctrl.gap.effects.chassis import of_chassis
 from avis_ctrl.gap.effects.flexible_mode import modes, shape_rows
-from avis_ctrl.gap.effects.mounts import campaign_clock, contacts, drift_over_stiffness, drifted, shares, surge_omega
+from avis_ctrl.gap.effects.mounts import campaign_clock, contacts, drift_over_stiffness, drifted, surge_omega
 from avis_ctrl.gap.effects.payload import place_of
 from avis_ctrl.gap.operators import mount_geometry
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel

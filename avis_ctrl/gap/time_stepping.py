@@ -16,7 +16,7 @@ import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.gap.effects.mounts import ContactFriction, dahl, pushed
+from avis_ctrl.gap.effects.mounts import ContactFriction, Contacts, pushed
 from avis_ctrl.gap.line_response import LineResponse
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect
@@ -133,34 +133,20 @@ class WindowForce:
 
 
 class FrictionForce(WindowForce):
-    """Dahl friction, its state kept from window to window.
-
-    The force depends on how the deflection changes alone, so that a deflection from which the law starts at rest stands
-    for the state: f = slip (1 - exp(-|a|/slip)) gives back a.
-    """
+    """Friction of contacts, their state kept from window to window."""
 
     def __init__(self, one: ActiveEffect, record: RecordMotion):
         super().__init__(one, record)
-        own = record.driven_rows
-        self.state, self.last = np.zeros(len(own)), np.zeros(len(own))
+        self.contacts = Contacts(record, one.by_name["slip_m"])
 
     def _is_local(self) -> bool:
         return False
 
-    def _friction(self, start: int, stop: int) -> np.ndarray:
-        """(stop - start, n_u) m, force over stiffness."""
-        slip = self.one.by_name["slip_m"]
-        share = np.minimum(np.abs(self.state) / slip, 1 - 1e-15)
-        origin = -np.sign(self.state) * slip * np.log1p(-share)
-        moved = self.record.deflection[start:stop, self.record.driven_rows] - self.last + origin
-        return dahl(np.ascontiguousarray(np.vstack([origin, moved])), slip)[1:]
-
     def __call__(self, start: int, stop: int) -> np.ndarray:
-        return pushed(self._friction(start, stop), self.record, self.one.by_name)
+        return pushed(self.contacts.friction(start, stop), self.record, self.one.by_name)
 
     def accept(self, start: int, stop: int) -> None:
-        self.state = self._friction(start, stop)[-1]
-        self.last = self.record.deflection[stop - 1, self.record.driven_rows].copy()
+        self.contacts.friction(start, stop, keep=True)
 
 
 def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError
+from avis_ctrl.lti.bilinear import continuous_image, sampled_frequency
 from avis_ctrl.lti.statespace import StateSpace
 
 # Angle [rad] from the imaginary axis within which an eigenvalue of the Hamiltonian is tried as a crossing.
@@ -37,10 +38,9 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
     if not system.is_stable():
         return PeakGain(np.inf, np.nan)
     if system.dt:
-        continuous = bilinear_to_continuous(system)
-        peak = hinf_norm(continuous, tolerance)
-        # arctan(inf) is pi/2: the direct term of the bilinear image is the Nyquist frequency.
-        return PeakGain(peak.gain, 2.0 / system.dt * float(np.arctan(peak.omega * system.dt / 2.0)))
+        # The direct term of the image is the response at the Nyquist frequency.
+        peak = hinf_norm(continuous_image(system), tolerance)
+        return PeakGain(peak.gain, float(sampled_frequency(peak.omega, system.dt)))
     if not system.ninputs or not system.noutputs:
         return PeakGain(0.0, 0.0)
     poles = system.poles()
@@ -118,17 +118,6 @@ def symplectic_scale(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
     _, (both, _) = la.matrix_balance(magnitude, permute=False, separate=True)
     logs = np.log2(both)
     return np.exp2(np.round((logs[:n] - logs[n:]) / 2))
-
-
-def bilinear_to_continuous(system: StateSpace) -> StateSpace:
-    """Continuous system with the same H-infinity norm (bilinear transform, s = 2/dt (z-1)/(z+1))."""
-    if not system.nstates:
-        return StateSpace(system.A, system.B, system.C, system.D, 0.0)
-    I = np.eye(system.nstates)
-    inverse = np.linalg.inv(I + system.A)
-    a = 2.0 / system.dt
-    return StateSpace(a * inverse @ (system.A - I), np.sqrt(2 * a) * inverse @ system.B,
-                      np.sqrt(2 * a) * system.C @ inverse, system.D - system.C @ inverse @ system.B, 0.0)
 
 
 def h2_norm(system: StateSpace) -> float:

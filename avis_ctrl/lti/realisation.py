@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti.bilinear import sampled_image
 from avis_ctrl.lti.statespace import StateSpace
 
 
@@ -118,6 +119,6 @@ def discretise(system: StateSpace, dt: float, method: Literal["zoh", "tustin"] =
     if method == "zoh":
         block = la.expm(np.block([[system.A, system.B], [np.zeros((m, n + m))]]) * dt)
         return replace(system, A=block[:n, :n], B=block[:n, n:], dt=dt)
-    inverse = np.linalg.inv(np.eye(n) - system.A * dt / 2)
-    return replace(system, A=inverse @ (np.eye(n) + system.A * dt / 2), B=inverse @ system.B * dt,
-                   C=system.C @ inverse, D=system.D + system.C @ inverse @ system.B * dt / 2, dt=dt)
+    # In the units of the continuous states, which the bilinear map alone would divide by sqrt(dt).
+    image = sampled_image(system, dt)
+    return replace(image, B=image.B * np.sqrt(dt), C=image.C / np.sqrt(dt))

@@ -139,6 +139,8 @@ class StateSpace:
     # -- algebra --------------------------------------------------------------------------
     def __matmul__(self, other: StateSpace) -> StateSpace:
         """Series connection: `self @ other` feeds other's outputs into self's inputs, in order."""
+        if not isinstance(other, StateSpace):
+            return NotImplemented
         if self.ninputs != other.noutputs:
             raise InputError(f"series connection of {other.noutputs} outputs into {self.ninputs} inputs")
         dt = _common_dt(self, other)
@@ -149,6 +151,8 @@ class StateSpace:
 
     def __add__(self, other: StateSpace) -> StateSpace:
         """Parallel connection of two systems with the same inputs and outputs."""
+        if not isinstance(other, StateSpace):
+            return NotImplemented
         if self.D.shape != other.D.shape:
             raise InputError(f"parallel connection of shapes {self.D.shape} and {other.D.shape}")
         return StateSpace(la.block_diag(self.A, other.A), np.vstack([self.B, other.B]),
@@ -159,6 +163,8 @@ class StateSpace:
         return replace(self, C=-self.C, D=-self.D)
 
     def __sub__(self, other: StateSpace) -> StateSpace:
+        if not isinstance(other, StateSpace):
+            return NotImplemented
         return self + (-other)
 
     def scaled(self, left: np.ndarray | float = 1.0, right: np.ndarray | float = 1.0) -> StateSpace:

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.lti.norms import bilinear_to_continuous
+from avis_ctrl.lti.bilinear import continuous_image
 from avis_ctrl.robust.hinf_plant import Plant, as_plant, check_stabilisable
 from avis_ctrl.robust.riccati import solve_riccati
 
@@ -50,7 +50,7 @@ def lmi_gamma(P: Any, nmeas: int, ncon: int) -> LmiOptimum:
     Arguments and input errors as in `hinfsyn`; ComputationError where the solver fails.
     """
     P = as_plant(P, nmeas, ncon)
-    plant = Plant.of(bilinear_to_continuous(P) if P.dt else P, nmeas, ncon)
+    plant = Plant.of(continuous_image(P), nmeas, ncon)
     check_stabilisable(plant)
     first = size = float(plant.size(plant.B1, plant.C1, plant.D11))
     best: LmiOptimum | None = None

@@ -19,7 +19,7 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, minimal
-from avis_ctrl.lti.norms import bilinear_to_continuous
+from avis_ctrl.lti.bilinear import continuous_image
 from avis_ctrl.robust.hinf_settings import SETTINGS
 
 
@@ -109,7 +109,7 @@ def check_stabilisable(plant: Plant) -> None:
 
 def posed_plant(P: StateSpace, nmeas: int, ncon: int) -> Plant:
     """The problem's continuous plant, known to be stabilisable (ComputationError), without hidden states."""
-    continuous = bilinear_to_continuous(P) if P.dt else P
+    continuous = continuous_image(P)
     plant = Plant.of(continuous, nmeas, ncon)
     check_stabilisable(plant)
     small = without_hidden_states(continuous, nmeas, ncon)

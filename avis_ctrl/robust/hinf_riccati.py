@@ -231,7 +231,11 @@ class _Search:
 
 
 def central_controller(form: NormalForm, test: GammaTest) -> StateSpace:
-    """The central (maximum entropy) controller of the original plant at a feasible gamma, state dimension n."""
+    """The central (maximum entropy) controller of the original plant at a feasible gamma, state dimension n.
+
+    Where its loop around D22 is nearly singular, another of the family F_l(M, Q), |Q| < gamma, with a constant Q is
+    taken. That happens in discrete time: entropy is measured at z = -1, where a K with a pole may cancel y altogether.
+    """
     assert test.X is not None and test.Y is not None
     P, gamma, X, Y = form.plant, test.gamma, test.X, test.Y
     m2, p2 = P.D12.shape[1], P.D21.shape[0]
@@ -246,6 +250,9 @@ def central_controller(form: NormalForm, test: GammaTest) -> StateSpace:
     D1111, D1112 = P.D11[:p1, :m1], P.D11[:p1, m1:]
     D1121, D1122 = P.D11[p1:, :m1], P.D11[p1:, m1:]
     D = -D1121 @ D1111.T @ np.linalg.solve(gamma ** 2 * np.eye(p1) - D1111 @ D1111.T, D1112) - D1122
+    left = np.eye(m2) - D1121 @ np.linalg.solve(gamma ** 2 * np.eye(m1) - D1111.T @ D1111, D1121.T)
+    right = np.eye(p2) - D1112.T @ np.linalg.solve(gamma ** 2 * np.eye(p1) - D1111 @ D1111.T, D1112)
+    D = D + _off_centre(form, D, left, right, gamma)
     inner = P.C2 + F12
     # Z = inv(I - Y X / gamma^2); the controller's states are chosen so that Z meets only its input matrix.
     B_hat = np.linalg.solve(np.eye(P.n) - Y @ X / gamma ** 2, (P.B2 + L12) @ D - L2)
@@ -254,10 +261,25 @@ def central_controller(form: NormalForm, test: GammaTest) -> StateSpace:
     return _restored(form, A_hat, B_hat, C_hat, D)
 
 
+def _off_centre(form: NormalForm, D: np.ndarray, left: np.ndarray, right: np.ndarray, gamma: float) -> np.ndarray:
+    """D12 Q D21 of the family (Glover and Doyle 1988), left = D12 D12', right = D21' D21, which lifts I + D_K D22.
+
+    Zero where the central controller's loop is well conditioned; else Q of norm `off_centre` gamma that raises all its
+    singular values most, to first order.
+    """
+    direct = form.T @ form.D22 @ form.S
+    U, sigma, Vt = la.svd(np.eye(D.shape[0]) + D @ direct)
+    if sigma[-1] * SETTINGS.well_posed > 1 + la.norm(D @ direct, 2):
+        return np.zeros_like(D)
+    L, R = la.cholesky(left, lower=True), la.cholesky(right)
+    q, _, pt = la.svd(L.T @ U @ Vt @ (R @ direct).T, full_matrices=False)
+    return SETTINGS.off_centre * gamma * L @ q @ pt @ R
+
+
 def _restored(form: NormalForm, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> StateSpace:
-    """Undo the scalings of u and y, then the shift of D22: u = K (y - D22 u)."""
-    B, C, D = B @ form.T, form.S @ C, form.S @ D @ form.T
-    loop = np.eye(D.shape[0]) + D @ form.D22
+    """Undo the shift of D22, u = K (y - D22 u), in normal coordinates, where units do not count; then the scalings."""
+    direct = form.T @ form.D22 @ form.S
+    loop = np.eye(D.shape[0]) + D @ direct
     if np.linalg.cond(loop) > 1e12:
         raise ComputationError("the controller's loop around D22 is not well posed",
                                measured=f"condition of I + D_K D22 is {np.linalg.cond(loop):.1e}",
@@ -265,8 +287,8 @@ def _restored(form: NormalForm, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: 
                                next_step="put a low-pass filter in the plant's actuators or sensors")
     M = np.linalg.inv(loop)
     C, D = M @ C, M @ D
-    return StateSpace(A - B @ form.D22 @ C, B @ (np.eye(B.shape[1]) - form.D22 @ D), C, D, 0.0,
-                      form.plant.y, form.plant.u)
+    return StateSpace(A - B @ direct @ C, B @ (np.eye(B.shape[1]) - direct @ D) @ form.T, form.S @ C,
+                      form.S @ D @ form.T, 0.0, form.plant.y, form.plant.u)
 
 
 def _row_terms(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray]:

@@ -30,6 +30,10 @@ class HinfSettings:
         and is not examined further.
     zero_gamma : gamma relative to the gain of the open channel w -> z, below which it counts as round-off.
     norm_accuracy : relative accuracy of a norm or a bound that is compared with gamma: that of `hinf_norm`.
+    well_posed : condition of I + D_K D22 from which another controller than the central one is taken, whose fast poles
+        would cost half of the digits.
+    off_centre : norm of the constant parameter Q of that controller, relative to gamma; at 1 the loop's norm may be
+        gamma, at 0 it is the central one.
     loop_accuracy : relative amount by which a closed loop's norm must pass a bound to contradict it: ten times the
         accuracy of the norm, to allow for the round-off of the loop.
     same_gamma : relative difference between two computations of gamma from which round-off is reported; a smaller one
@@ -51,6 +55,8 @@ class HinfSettings:
     negative: float = 1e-10
     zero_gamma: float = 1e-9
     norm_accuracy: float = 1e-6
+    well_posed: float = 1e6
+    off_centre: float = 0.3
     loop_accuracy: float = 1e-5
     same_gamma: float = 1e-4
     far_beyond: float = 10.0

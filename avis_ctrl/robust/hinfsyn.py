@@ -18,7 +18,8 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import StateSpace, balance, discretise, hinf_norm, lft_lower
+from avis_ctrl.lti import StateSpace, balance, hinf_norm, lft_lower
+from avis_ctrl.lti.bilinear import sampled_image
 from avis_ctrl.robust.hinf_bounds import pointwise_bound
 from avis_ctrl.robust.hinf_plant import (
     NormalForm,
@@ -39,6 +40,7 @@ from avis_ctrl.robust.hinf_riccati import (
 from avis_ctrl.robust.hinf_settings import SETTINGS
 from avis_ctrl.robust.reduction import residualise_fast
 from avis_ctrl.robust.riccati import INACCURATE, ON_AXIS
+from avis_ctrl.summary import Shown
 
 
 class Status(Enum):
@@ -54,8 +56,8 @@ class Status(Enum):
     SUBOPTIMAL = "a controller at the gamma asked for; the optimum was not sought"
 
 
-@dataclass(frozen=True)
-class Synthesis:
+@dataclass(frozen=True, repr=False)
+class Synthesis(Shown):
     """Result of an H-infinity synthesis.
 
     K : controller, inputs named as the plant's y, outputs as its u; positive feedback u = K y.
@@ -285,7 +287,7 @@ class _Problem:
         fastest = float(np.max(np.abs(K.poles()), initial=0.0))
         K = balance(K)
         if self.P.dt:
-            K = discretise(K, self.P.dt, "tustin")
+            K = sampled_image(K, self.P.dt)
         closed = lft_lower(self.P, K)
         return Synthesis(K, hinf_norm(closed).gain, (0.0, np.inf), Status.OPTIMAL, closed, fastest, "")
 

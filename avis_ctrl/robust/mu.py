@@ -12,17 +12,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.robust.mu_lmi import Array
 from avis_ctrl.robust.mu_lower import lower_bound
 from avis_ctrl.robust.mu_upper import UpperBound, upper_bound
+from avis_ctrl.robust.one_thread import one_thread
+from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 
-@dataclass(frozen=True, eq=False)
-class MuUpper:
+@dataclass(frozen=True, eq=False, repr=False)
+class MuUpper(Shown):
     """Upper bound of mu with its scalings; a leading frequency axis where M had one.
 
     upper : scalar or (n_omega,).
@@ -38,7 +39,7 @@ class MuUpper:
     G: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MuBounds(MuUpper):
     """Both bounds of mu; a leading frequency axis where M had one.
 
@@ -79,7 +80,7 @@ def mu_upper(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: floa
     InputError : shapes that do not fit the blocks, entries that are not finite.
     """
     stack, structure = checked(M, blocks)
-    with threadpool_limits(1):
+    with one_thread():
         bound = upper_bound(stack[:, None], structure, tolerance)
         return _with_roots(bound, np.ndim(M) == 2)
 
@@ -102,7 +103,7 @@ def mu(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: float = 1e
     """
     stack, structure = checked(M, blocks)
     single = np.ndim(M) == 2
-    with threadpool_limits(1):
+    with one_thread():
         bound = upper_bound(stack[:, None], structure, tolerance)
         found = lower_bound(stack, structure, bound.beta, bound.scalings)
         upper = _with_roots(bound, single)

@@ -24,6 +24,7 @@ import numpy as np
 
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.mu_lmi import Array, Scalings, dagger, residual
+from avis_ctrl.robust.mu_power_kernel import FULL, search_complex
 from avis_ctrl.robust.mu_upper import block_balance, expand, rescaled
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -38,11 +39,25 @@ class MuLowerSettings:
         M Delta is far from normal, a small singular value alone proves nothing: I - d J of a nilpotent J has the
         determinant 1 for every d, but a smallest singular value that falls as a power of 1/d. Dividing Delta by the
         eigenvalue makes I - M Delta singular, so this is the relative error of the bound, one in the printed digits.
+    round_off : a lower bound of a peak relative to the largest gain of N at any frequency, up to which it is given as
+        zero: half the sample rate of a sampled N is where its terms cancel, and leave round-off of that gain.
+    few, many : starts of a first and of a thorough search over complex blocks, from null vectors of the upper bound's
+        LMI and mixtures of the three least: with 16 scalars, six reach on average what fifteen undamped ones do.
+    sweeps : most steps from one start; settled : relative change of ||Delta|| that ends it before, its square that ends
+        the best one, which is continued.
+    damping : weight of the last Delta in the next one. Without it the iteration runs in cycles where mu is reached by
+        several eigenvalues, and ends 1 % lower with 16 scalars.
     """
 
     singular: float = 1e-9
     meaningless: float = 1e-6
     eigenvalue: float = 1e-6
+    round_off: float = 1e-14
+    few: int = 3
+    many: int = 6
+    sweeps: int = 40
+    settled: float = 1e-4
+    damping: float = 0.5
 
 
 SETTINGS = MuLowerSettings()
@@ -243,6 +258,13 @@ def made_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
 def starts(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure, count: int,
            rng: np.random.Generator) -> Array:
     """First perturbations (count, B, n_w, n_z) of norm 1/beta from the null vectors w of the upper bound's LMI."""
+    return np.stack([_aligned(w, (M @ w[..., None])[..., 0], structure) / beta[:, None, None]
+                     for w in null_vectors(M, scalings, beta, structure, count, rng)])
+
+
+def null_vectors(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure, count: int,
+                 rng: np.random.Generator) -> Array:
+    """Vectors w (count, B, n_w) that the upper bound's LMI nearly annuls: the three least, then mixtures of them."""
     batch = M.shape[0]
     F = residual(M[:, None], scalings, beta ** 2, np.ones(structure.n_w, bool))[:, 0]
     values, vectors = np.linalg.eigh(scalings.X_w)
@@ -253,8 +275,7 @@ def starts(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure,
     for k in range(count):
         few = min(3, structure.n_w)
         mix = rng.standard_normal((batch, few)) + 1j * rng.standard_normal((batch, few))
-        w = null[:, :, k] if k < few else np.einsum("bik,bk->bi", null[:, :, :few], mix)
-        made.append(_aligned(w, (M @ w[..., None])[..., 0], structure) / beta[:, None, None])
+        made.append(null[:, :, k] if k < few else np.einsum("bik,bk->bi", null[:, :, :few], mix))
     return np.stack(made)
 
 
@@ -299,11 +320,36 @@ def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Sca
     best = LowerBound(np.zeros(batch), np.zeros((batch, structure.n_w, structure.n_z), complex))
     # An upper bound that is round-off of M means mu = 0: nothing to search for.
     above_noise = upper > 1e-10 * np.linalg.norm(M, ord=2, axis=(1, 2))
+    if all(block.kind != "real" for block in structure.blocks):
+        live = np.flatnonzero(above_noise)
+        if live.size:
+            _search_complex(best, M, structure, upper, scalings, live, enough,
+                            SETTINGS.few if stages == 1 else SETTINGS.many, rng)
+        # What was found but not verified goes the slower way.
+        above_noise &= best.beta == 0.0
     for count, iterations, damping in ((3, 20, 0.0), (6, 30, 0.0), (6, 40, 0.5))[:stages]:
         live = np.flatnonzero(above_noise & (best.beta < enough * upper))
         if live.size:
             _search(best, M, structure, upper, scalings, live, count, iterations, damping, rng)
     return best
+
+
+def _search_complex(best: LowerBound, M: Array, structure: BlockStructure, upper: Array, scalings: Scalings,
+                    live: Array, enough: float, count: int, rng: np.random.Generator) -> None:
+    """The compiled search, for blocks none of which is real."""
+    size = upper[live]
+    unit = M[live] / size[:, None, None]
+    part = Scalings(scalings.X_z[live], scalings.X_w[live], scalings.G[live])
+    first = null_vectors(unit, part, np.ones(live.size), structure, count, rng)
+    kinds = np.array([FULL if block.kind == "full" else 0 for block in structure.blocks])
+    w, z = (np.cumsum([0, *sizes]) for sizes in zip(*((b.rows, b.cols) for b in structure.blocks), strict=True))
+    unit = np.ascontiguousarray(unit)
+    value, found, vector = search_complex(unit, first, kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, enough,
+                                          SETTINGS.settled)
+    # The best one to its end.
+    further, settled, _ = search_complex(unit, vector[None], kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, np.inf,
+                                         SETTINGS.settled ** 2)
+    _keep(best, live, size, unit, np.where((further > value)[:, None, None], settled, found), structure)
 
 
 def _search(best: LowerBound, M: Array, structure: BlockStructure, upper: Array, scalings: Scalings, live: Array,

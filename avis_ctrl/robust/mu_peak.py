@@ -14,18 +14,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance
-from avis_ctrl.lti.norms import bilinear_to_continuous
+from avis_ctrl.lti.bilinear import continuous_image, image_frequency, sampled_frequency
 from avis_ctrl.robust.mu_coupled import Coupled, coupled
 from avis_ctrl.robust.mu_cover import Cover, Interval, cover
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_lmi import Array, Scalings
-from avis_ctrl.robust.mu_lower import LowerBound, lower_bound, singular_frequency
+from avis_ctrl.robust.mu_lower import SETTINGS, LowerBound, lower_bound, singular_frequency
 from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
 from avis_ctrl.robust.mu_upper import UpperBound, skewed_upper_bound, upper_bound
+from avis_ctrl.robust.one_thread import one_thread
+from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 SLACK = 5e-4
@@ -33,8 +34,8 @@ KNOWN_SLACK = 5e-3
 ALL_FREQUENCIES: Interval = (0.0, np.inf)
 
 
-@dataclass(frozen=True, eq=False)
-class MuPeak:
+@dataclass(frozen=True, eq=False, repr=False)
+class MuPeak(Shown):
     """Bounds of a supremum over frequency.
 
     upper : never exceeded in the band if `guaranteed`; else proved at the frequencies computed only.
@@ -78,9 +79,9 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     if (system.noutputs, system.ninputs) != (structure.n_z, structure.n_w):
         raise InputError(f"the blocks need {structure.n_z} outputs and {structure.n_w} inputs, N has "
                          f"{system.noutputs} and {system.ninputs}", field="blocks")
-    with threadpool_limits(1):
+    with one_thread():
         part = _prepared(system, structure)
-        found = _mu_peak(part.N, part.structure, _continuous_band(system, band), slack, known_upper)
+        found = _mu_peak(part.N, part.structure, _continuous_band(system, band), slack, known_upper, system.dt)
         return _in_rad_s(system, part, found)
 
 
@@ -106,9 +107,10 @@ def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     if n_d < 1 or n_e < 1:
         raise InputError(f"the blocks take {structure.n_z} outputs and {structure.n_w} inputs of N's "
                          f"{system.noutputs} and {system.ninputs}: no performance channel is left", field="blocks")
-    with threadpool_limits(1):
+    with one_thread():
         part = _prepared(system, structure)
-        return _in_rad_s(system, part, _worst_case_gain(part.N, part.structure, _continuous_band(system, band), slack))
+        found = _worst_case_gain(part.N, part.structure, _continuous_band(system, band), slack, system.dt)
+        return _in_rad_s(system, part, found)
 
 
 def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block],
@@ -129,28 +131,24 @@ def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block],
 def _prepared(N: StateSpace, structure: BlockStructure) -> Coupled:
     """The blocks that matter with a balanced continuous-time system."""
     part = coupled(N, structure)
-    return replace(part, N=balance(bilinear_to_continuous(part.N) if N.dt else part.N))
+    return replace(part, N=balance(continuous_image(part.N)))
 
 
 def _continuous_band(N: StateSpace, band: Interval) -> Interval:
     low, high = float(band[0]), float(band[1])
     if not 0 <= low < high:
         raise InputError("expected 0 <= low < high in rad/s", field="band", value=band)
-    if not N.dt:
-        return low, high
-    nyquist = np.pi / N.dt
-    return (2 / N.dt * float(np.tan(low * N.dt / 2)),
-            np.inf if high >= nyquist else 2 / N.dt * float(np.tan(high * N.dt / 2)))
+    if low * N.dt >= np.pi:
+        raise InputError(f"expected a band that begins below half the sample rate, {np.pi / N.dt:.6g} rad/s",
+                         field="band", value=band)
+    return float(image_frequency(low, N.dt)), float(image_frequency(high, N.dt))
 
 
 def _in_rad_s(N: StateSpace, part: Coupled, result: MuPeak) -> MuPeak:
     """Delta of all blocks, and frequencies of the bilinear image of a sampled system turned back into its own."""
     result = replace(result, delta=part.restored(result.delta))
-    dt = N.dt
-    if not dt:
-        return result
-    return replace(result, omega=2 / dt * float(np.arctan(result.omega * dt / 2)),
-                   frequencies=2 / dt * np.arctan(result.frequencies * dt / 2))
+    return replace(result, omega=float(sampled_frequency(result.omega, N.dt)),
+                   frequencies=np.asarray(sampled_frequency(result.frequencies, N.dt)))
 
 
 @dataclass
@@ -194,7 +192,8 @@ def _tolerance(slack: float) -> float:
 
 
 def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: float,
-             known_upper: float | None = None) -> MuPeak:
+             known_upper: float | None = None, dt: float = 0.0) -> MuPeak:
+    """mu_peak of a continuous system, or of the image of one sampled at dt."""
     accuracy = _tolerance(slack)
     scan = _Scan.of(N, band, lambda M: upper_bound(M, structure, accuracy), slack)
     # One stage draws the curve; the search goes on at the peaks only.
@@ -209,7 +208,7 @@ def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: fl
         done = _cover_mu(N, structure, best * (1 + slack), band, np.array([at]), accuracy, slack)
     if best == 0.0:
         at = float(scan.peak[0])
-    return MuPeak(done.level, best, at, delta, not done.gaps, _in_words(done, band), scan.omega,
+    return MuPeak(done.level, best, at, delta, not done.gaps, _in_words(done, band, dt), scan.omega,
                   scan.bound.beta, lower.beta)
 
 
@@ -236,10 +235,12 @@ def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found
         moved = singular_frequency(N, structure, near, done.level, band)
         if moved is not None and moved[0] > best:
             best, at, delta = moved
-    return (best, at, delta) if best > 0 else (0.0, at, None)
+    noise = SETTINGS.round_off * float(np.max(np.linalg.norm(N.frequency_response(omega), 2, axis=(1, 2))))
+    return (best, at, delta) if best > noise else (0.0, at, None)
 
 
-def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, slack: float) -> MuPeak:
+def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, slack: float, dt: float) -> MuPeak:
+    """worst_case_gain of a continuous system, or of the image of one sampled at dt."""
     accuracy = _tolerance(slack)
     n_z, n_w = structure.n_z, structure.n_w
     n_e = N.noutputs - n_z
@@ -258,7 +259,7 @@ def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, s
         lower = worst_gain(M, structure)
         k = int(np.argmax(lower.gain))
         return MuPeak(done.level, float(lower.gain[k]), float(scan.omega[k]), lower.delta[k], not done.gaps,
-                      _in_words(done, band), scan.omega, scan.bound.beta, lower.gain)
+                      _in_words(done, band, dt), scan.omega, scan.bound.beta, lower.gain)
     robust = _mu_peak(N.select(range(n_z), range(n_w)), structure, ALL_FREQUENCIES, slack)
     words = f"robust stability is not proved: mu of the blocks is between {robust.lower:.6g} and {robust.upper:.6g}"
     # Only perturbations that provably keep the loop stable have a gain.
@@ -282,10 +283,13 @@ def _robustly_stable(N: StateSpace, structure: BlockStructure, band: Interval) -
     return not done.gaps and done.level < 1.0
 
 
-def _in_words(done: Cover, band: Interval) -> str:
-    span = "all frequencies from 0 to infinity" if band == ALL_FREQUENCIES else f"{band[0]:g} to {band[1]:g} rad/s"
+def _in_words(done: Cover, band: Interval, dt: float) -> str:
+    """What was proved; frequencies of the image of a system sampled at dt in those of the system."""
+    end = "half the sample rate" if dt else "infinity"
+    low, high = sampled_frequency(band[0], dt), sampled_frequency(band[1], dt)
+    span = f"all frequencies from 0 to {end}" if band == ALL_FREQUENCIES else f"{low:g} to {high:g} rad/s"
     if not done.gaps:
         return f"{span}: {done.intervals} intervals with constant scalings prove the upper bound between the points"
-    shown = ", ".join(f"{a:.6g} to {b:.6g}" for a, b in done.gaps[:3])
+    shown = ", ".join(f"{sampled_frequency(a, dt):.6g} to {sampled_frequency(b, dt):.6g}" for a, b in done.gaps[:3])
     return (f"the frequencies computed within {span}; not proved in {len(done.gaps)} gaps ({shown} rad/s) at the "
             f"level {done.level:.6g}")

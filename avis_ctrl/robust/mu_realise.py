@@ -8,13 +8,14 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, append, gain
+from avis_ctrl.lti.bilinear import image_frequency, sampled_image
 from avis_ctrl.robust.mu_lmi import Array
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 REAL = 1e-7
 
 
-def realise_delta(delta: Array, omega: float, blocks: BlockStructure | Sequence[Block]) -> StateSpace:
+def realise_delta(delta: Array, omega: float, blocks: BlockStructure | Sequence[Block], dt: float = 0.0) -> StateSpace:
     """Stable real-rational Delta(s) with the block structure and Delta(j omega) = delta, all-pass up to its size.
 
     A complex number |d| e^{j theta} becomes +-|d| (s - a)/(s + a), a > 0 (Zhou, Doyle and Glover, 1996, proof of
@@ -24,7 +25,9 @@ def realise_delta(delta: Array, omega: float, blocks: BlockStructure | Sequence[
     Parameters
     ----------
     delta : (n_w, n_z) with the structure; full blocks of rank one, as mu_peak and worst_case_gain return them.
-    omega : rad/s; at 0 and infinity only a real delta can be met.
+    omega : rad/s; at 0 and infinity (half the sample rate) only a real delta can be met.
+    dt : sample time [s] of the system that delta perturbs; 0 for a continuous one. A sampled delta is the image of a
+        continuous one under the bilinear map, which keeps its norm at all frequencies.
 
     Raises
     ------
@@ -35,6 +38,7 @@ def realise_delta(delta: Array, omega: float, blocks: BlockStructure | Sequence[
     delta = np.asarray(delta, complex)
     if not structure.contains(delta, 1e-7):
         raise InputError("expected a matrix with the structure of the blocks", field="delta", value=delta.shape)
+    omega = float(image_frequency(omega, dt))
     parts = []
     for block, w, z in structure.slices():
         if block.kind == "full":
@@ -45,7 +49,8 @@ def realise_delta(delta: Array, omega: float, blocks: BlockStructure | Sequence[
         parts.append(append(*[one] * block.rows))
     anonymous = [part.renamed([f"z{k}_{i}" for i in range(part.ninputs)], [f"w{k}_{i}" for i in range(part.noutputs)])
                  for k, part in enumerate(_unique(parts))]
-    return append(*anonymous)
+    whole = append(*anonymous)
+    return sampled_image(whole, dt) if dt else whole
 
 
 def _all_pass(value: complex, omega: float) -> StateSpace:

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from avis_ctrl.robust.mu_diagonal_kernel import SETTINGS as PATH
+from avis_ctrl.robust.mu_diagonal_kernel import balanced_squares, follow_diagonal
 from avis_ctrl.robust.mu_lmi import Array, Scalings, ScalingSpace, dagger, follow, least_level, residual
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -31,14 +33,9 @@ def block_balance(M: Array, structure: BlockStructure, sweeps: int = 20) -> Arra
     norm2 = np.stack([rows[:, :, w].sum(axis=2) for _, w, _ in places], axis=2)
     n = len(places)
     norm2[:, np.arange(n), np.arange(n)] = 0.0
-    d2 = np.ones((M.shape[0], n))
     # A floor keeps the scaling finite where a block is not coupled both ways.
     norm2 = norm2 + 1e-16 * np.max(norm2, axis=(1, 2), initial=0.0)[:, None, None] + 1e-300
-    for _ in range(sweeps):
-        for k in range(n):
-            row = d2[:, k] * np.sum(norm2[:, k] / d2, axis=1)
-            col = np.sum(norm2[:, :, k] * d2, axis=1) / d2[:, k]
-            d2[:, k] *= np.sqrt(col / row)
+    d2 = balanced_squares(norm2, sweeps)
     return np.sqrt(d2 / np.exp(np.mean(np.log(d2), axis=1, keepdims=True)))
 
 
@@ -62,8 +59,10 @@ def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5,
     Matrices along axis 1 share scalings. With `goal` > 0 the search stops where beta <= goal, at the analytic
     centre of the scalings that prove it: the ones with most room around them.
     """
-    n_chunk = max(1, int(BATCH_BYTES / (32 * ScalingSpace.of(structure).form.row.size ** 2 * M.shape[1])))
     goals = np.broadcast_to(goal, M.shape[:1])
+    if _is_diagonal(structure):
+        return _upper_chunk(M, structure, tolerance, goals)
+    n_chunk = max(1, int(BATCH_BYTES / (32 * ScalingSpace.of(structure).form.row.size ** 2 * M.shape[1])))
     parts = [_upper_chunk(M[k:k + n_chunk], structure, tolerance, goals[k:k + n_chunk])
              for k in range(0, M.shape[0], n_chunk)]
     return UpperBound(np.concatenate([p.beta for p in parts]),
@@ -71,22 +70,42 @@ def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5,
 
 
 def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Array) -> UpperBound:
-    space = ScalingSpace.of(structure)
     d_z, d_w = expand(structure, block_balance(M, structure))
     balanced = M * d_z[:, None, :, None] / d_w[:, None, None, :]
     size = np.max(np.linalg.norm(balanced, ord=2, axis=(2, 3)), axis=1)
     live = size > 0
     size = np.where(live, size, 1.0)
     unit = balanced / size[:, None, None, None]
-    theta = space.identity(M.shape[0])
     floor = np.where(goal > 0, (goal / size) ** 2, -1e-8)
-    if np.any(live):
-        found, _ = follow(space, unit[live], theta[live], np.full(live.sum(), 2.0), floor[live], tolerance)
-        theta[live] = found
-    scalings = space.scalings(theta)
-    lam = np.where(live, least_level(unit, scalings, space.level), 0.0)
+    if _is_diagonal(structure):
+        scalings = _diagonal(unit, structure, live, floor, tolerance)
+    else:
+        space = ScalingSpace.of(structure)
+        theta = space.identity(M.shape[0])
+        if np.any(live):
+            found, _ = follow(space, unit[live], theta[live], np.full(live.sum(), 2.0), floor[live], tolerance)
+            theta[live] = found
+        scalings = space.scalings(theta)
+    lam = np.where(live, least_level(unit, scalings, np.ones(structure.n_w, bool)), 0.0)
     beta = size * np.sqrt(np.maximum(lam, 0.0))
     return UpperBound(beta, rescaled(scalings, d_z, d_w, size))
+
+
+def _is_diagonal(structure: BlockStructure) -> bool:
+    """Whether every block has one number for its scaling."""
+    return all(block.kind == "full" or (block.kind == "complex" and block.rows == 1) for block in structure.blocks)
+
+
+def _diagonal(M: Array, structure: BlockStructure, live: Array, floor: Array, tolerance: float) -> Scalings:
+    """Scalings of one number a block, by the compiled path; 1 where M is zero (not live)."""
+    of_z, of_w = (np.repeat(np.arange(len(structure.blocks)), sizes)
+                  for sizes in zip(*((b.cols, b.rows) for b in structure.blocks), strict=True))
+    p = np.ones((M.shape[0], len(structure.blocks)))
+    if np.any(live):
+        p[live], _ = follow_diagonal(np.ascontiguousarray(M[live]), of_z, of_w, p[0], np.full(live.sum(), 2.0),
+                                     floor[live], tolerance / 5, PATH)
+    X_z, X_w = (p[:, of, None] * np.eye(of.size, dtype=complex) for of in (of_z, of_w))
+    return Scalings(X_z, X_w, np.zeros((M.shape[0], of_w.size, of_z.size), complex))
 
 
 def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5) -> UpperBound:

@@ -20,13 +20,17 @@ from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
-from avis_ctrl.robust.dstep import tightened
+from avis_ctrl.lti.bilinear import continuous_image, sampled_image
+from avis_ctrl.lti.interchange import as_system
+from avis_ctrl.robust.dstep import PointwiseScalings, tightened
+from avis_ctrl.robust.fixed_order import fixed_order
 from avis_ctrl.robust.frequency_grid import frequency_grid
 from avis_ctrl.robust.hinf_plant import as_plant
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.musyn_iteration import Options, Problem, iterate
-from avis_ctrl.robust.musyn_state import Iteration, Loop, State, analysed
+from avis_ctrl.robust.musyn_state import Iteration, Loop, State
 from avis_ctrl.robust.scalings import Scalings
+from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 # What the certificate may leave above mu of the final loop.
@@ -34,15 +38,17 @@ TIGHT = 0.003
 NORM_TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class MuSynthesis:
+@dataclass(frozen=True, eq=False, repr=False)
+class MuSynthesis(Shown):
     """The best controller of all iterations, and what was measured on it.
 
     mu_upper, mu_lower : bounds of the peak of mu over all frequencies with the blocks as given (real ones real).
     mu_upper_complex : the same upper bound with real blocks taken as complex, as the synthesis did.
     delta : the perturbation behind mu_lower, at omega_peak [rad/s].
     guaranteed : whether mu_upper is an upper bound between the frequencies computed, too.
-    gamma : measured norm of the loop scaled by `scalings`: no less than complex mu at any frequency.
+    scalings, gamma : measured norm of the scaled loop, no less than complex mu at any frequency. Those of a sampled
+        loop are functions of its continuous image's frequency (`lti.bilinear.image_frequency`).
+    fastest_pole : largest magnitude [rad/s] of a pole of K (of its continuous image where K is sampled).
     saved_state : JSON-able; `musyn(..., state=saved_state)` goes on from here.
     """
 
@@ -68,12 +74,14 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
           callback: Callable[[Iteration], Any] | None = None, target: float | None = None,
           max_iterations: int = 30, backoff: float = 0.01, polish: bool = True, max_added_states: int | None = None,
           starts: Sequence[StateSpace] = (), state: dict[str, Any] | None = None,
-          sample_rate_Hz: float | None = None) -> MuSynthesis:
+          sample_rate_Hz: float | None = None, order: int | None = None) -> MuSynthesis:
     """Controller u = K y of least peak mu.
 
     Parameters
     ----------
-    P : StateSpace (ours or python-control's), continuous, inputs (w_delta, w, u), outputs (z_delta, z, y).
+    P : StateSpace (ours or python-control's), inputs (w_delta, w, u), outputs (z_delta, z, y). Where it is sampled, K
+        is made for its continuous image (`lti.bilinear`) and is sampled at the same rate; every figure is measured
+        on the sampled loop.
     blocks : uncertainty in the order of w_delta; the rest of w and z is the performance block.
     nmeas, ncon : number of measurements y and controls u.
     callback : called with each `Iteration`; returning False or "stop" ends the iteration.
@@ -87,32 +95,44 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     max_added_states : most states that all scalings together may add to the plant.
     starts : controllers u = K y known already. The iteration starts from the best of them and of the H-infinity
         controller of P; the result is never worse (in complex mu on the grid) than any that stabilises P.
-    state : `saved_state` of an earlier result, to go on from.
+    state : `saved_state` of an earlier result, to go on from. Of another plant with the same y and u (a changed weight,
+        more uncertainty), its controllers are started from, as if given in `starts`.
+    order : most states of the controller: the one of full order is shortened, then improved by descent on mu over its
+        entries (`fixed_order`); mu is what that controller has. `saved_state` is that of the full order.
     sample_rate_Hz : the controller's fastest pole is compared with half of it, in `notes`.
 
     Raises
     ------
     InputError : blocks that do not fit P, counts or options that are wrong, controllers that do not fit, a state of
-        another problem.
+        other controllers.
     ComputationError : no stabilising controller (the mode is named), or none found.
     """
     P = as_plant(P, nmeas, ncon)
     uncertainty, structure = _structures(P, blocks, nmeas, ncon)
     cap = P.nstates + 20 if max_added_states is None else max_added_states
+    if order is not None and (isinstance(order, bool) or not isinstance(order, (int, np.integer)) or order < 0):
+        raise InputError("expected a whole number of at least 0, or None", field="order", value=order)
     options = _options(target, max_iterations, backoff, polish, cap, callback)
-    problem = Problem(P, structure, nmeas, ncon)
-    given = tuple(_named(P, K, nmeas, ncon) for K in starts)
+    problem = Problem(continuous_image(P), structure, nmeas, ncon)
+    given = tuple(continuous_image(_named(P, as_system(K, "starts"), nmeas, ncon)) for K in starts)
     with threadpool_limits(1, user_api="blas"):
-        current = State() if state is None else State.from_dict(state, structure, P, nmeas, ncon)
-        current, status = iterate(problem, current, given, options)
-        return _result(problem, uncertainty, current, status, sample_rate_Hz)
+        current, known = State(), tuple[StateSpace, ...]()
+        if state is not None:
+            current, known = State.from_dict(state, structure, problem.P, nmeas, ncon, P.dt)
+        current, status = iterate(problem, current, (*known, *given), options)
+        assert current.best is not None
+        best, notes = current.best, tuple[str, ...]()
+        if order is not None and best.K.nstates > order:
+            K, peak = fixed_order(problem.P, structure, best.K, order)
+            notes = (f"order {K.nstates} instead of {best.K.nstates}: complex mu on the grid {peak:.4g} instead of "
+                     f"{best.mu:.4g}",)
+            best = Loop(K, best.scalings, np.nan, peak)
+        return _result(P, problem, uncertainty, current, best, status, sample_rate_Hz, notes)
 
 
 def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: int,
                 ncon: int) -> tuple[BlockStructure, BlockStructure]:
     """The blocks as given with performance, and as the synthesis sees them (complex)."""
-    if P.dt:
-        raise InputError("expected a continuous plant (dt = 0); discretise K afterwards", field="P.dt", value=P.dt)
     uncertainty = BlockStructure.of(blocks)
     n_w, n_z = P.ninputs - ncon - uncertainty.n_w, P.noutputs - nmeas - uncertainty.n_z
     if n_w < 1 or n_z < 1:
@@ -126,8 +146,9 @@ def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: 
 
 def _named(P: StateSpace, K: StateSpace, nmeas: int, ncon: int) -> StateSpace:
     """A controller given, with the plant's names."""
-    if not isinstance(K, StateSpace) or (K.ninputs, K.noutputs) != (nmeas, ncon) or K.dt:
-        raise InputError(f"expected continuous controllers with {nmeas} inputs and {ncon} outputs", field="starts",
+    if not isinstance(K, StateSpace) or (K.ninputs, K.noutputs) != (nmeas, ncon) or K.dt != P.dt:
+        clock = f"sampled at {P.dt:g} s" if P.dt else "continuous"
+        raise InputError(f"expected {clock} controllers with {nmeas} inputs and {ncon} outputs", field="starts",
                          value=repr(K))
     return K.renamed(P.outputs[P.noutputs - nmeas:], P.inputs[P.ninputs - ncon:])
 
@@ -145,37 +166,35 @@ def _options(target: float | None, max_iterations: int, backoff: float, polish: 
     return Options(target, int(max_iterations), backoff, polish, int(cap), callback)
 
 
-def _certificate(problem: Problem, best: Loop) -> tuple[Scalings, float]:
-    """Realised scalings that bound mu of a loop at every frequency, and the bound.
+def _certificate(problem: Problem, best: Loop, closed: StateSpace) -> tuple[Scalings, float]:
+    """Realised scalings that bound mu of a loop (the image of the sampled one) at every frequency, and the bound.
 
     Those that K was made with, or others of the least peak where they leave more than `TIGHT` above mu on the grid.
     """
-    closed = lft_lower(problem.P, best.K)
-
     def bound(scalings: Scalings) -> float:
         return hinf_norm(scalings.scale(closed), NORM_TOLERANCE).gain * (1 + NORM_TOLERANCE)
     candidates = [(best.scalings, bound(best.scalings))]
     if candidates[0][1] > (1 + TIGHT) * best.mu:
-        points = analysed(problem.P, best.K, problem.structure, frequency_grid(closed))
+        omega = frequency_grid(closed)
+        points = PointwiseScalings.of(omega, closed.frequency_response(omega), problem.structure)
         tighter = tightened(points, closed, best.scalings, TIGHT, 10 * problem.P.nstates).scalings
         candidates.append((tighter, bound(tighter)))
     return min(candidates, key=lambda pair: pair[1])
 
 
-def _result(problem: Problem, uncertainty: BlockStructure, state: State, status: str,
-            sample_rate_Hz: float | None) -> MuSynthesis:
-    """The best controller, with mu of the plant as given measured anew on it."""
-    best = state.best
-    assert best is not None
-    closed = lft_lower(problem.P, best.K)
+def _result(P: StateSpace, problem: Problem, uncertainty: BlockStructure, state: State, best: Loop, status: str,
+            sample_rate_Hz: float | None, said: tuple[str, ...]) -> MuSynthesis:
+    """The best controller in the clock of P, with mu measured anew on its loop with P as given."""
+    K = sampled_image(best.K, P.dt) if P.dt else best.K
+    closed = lft_lower(P, K)
     # The norm of the scaled loop holds between all frequencies; with real blocks taken as complex it bounds theirs.
-    scalings, gamma = _certificate(problem, best)
+    scalings, gamma = _certificate(problem, best, continuous_image(closed))
     peak = mu_peak(closed, uncertainty, known_upper=gamma)
     has_real = any(block.kind == "real" for block in uncertainty.blocks)
     mu_upper = min(peak.upper, gamma)
     complex_upper = gamma if has_real else mu_upper
     fastest = float(np.max(np.abs(best.K.poles()), initial=0.0))
-    notes = []
+    notes = [*said]
     if has_real:
         notes.append(f"real blocks were synthesised for as complex ones: peak mu {complex_upper:.4g} so, "
                      f"{mu_upper:.4g} with the real blocks real")
@@ -183,6 +202,6 @@ def _result(problem: Problem, uncertainty: BlockStructure, state: State, status:
         ratio = fastest / (np.pi * sample_rate_Hz)
         notes.append(f"fastest controller pole {fastest:.4g} rad/s is {ratio:.2g} of half the sample rate")
     guaranteed = peak.guaranteed or mu_upper == gamma
-    return MuSynthesis(best.K, mu_upper, peak.lower, peak.omega, complex_upper, guaranteed, peak.delta, uncertainty,
+    return MuSynthesis(K, mu_upper, peak.lower, peak.omega, complex_upper, guaranteed, peak.delta, uncertainty,
                        scalings, gamma, closed, fastest, state.history, status, tuple(notes),
-                       state.as_dict(problem.P, problem.nmeas, problem.ncon))
+                       state.as_dict(problem.P, problem.structure, problem.nmeas, problem.ncon, P.dt))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,7 +16,7 @@ from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 FORMAT = "avis-musyn"
-VERSION = 3
+VERSION = 4
 DONE = "done"
 GIVEN = "given"
 NOMINAL = "nominal"
@@ -73,34 +75,51 @@ class State:
     history: tuple[Iteration, ...] = ()
     round_mu: float = np.inf
 
-    def as_dict(self, P: StateSpace, nmeas: int, ncon: int) -> dict[str, Any]:
-        """JSON form, with the sizes of the problem it belongs to."""
+    def as_dict(self, P: StateSpace, structure: BlockStructure, nmeas: int, ncon: int, dt: float) -> dict[str, Any]:
+        """JSON form, with what tells its problem from others."""
         assert self.last is not None and self.best is not None and self.path is not None and self.points is not None
-        return {"format": FORMAT, "version": VERSION, "problem": [P.nstates, P.ninputs, P.noutputs, nmeas, ncon],
-                "phase": self.phase, "round_mu": self.round_mu, "omega": self.points.omega.tolist(),
-                "last": self.last.as_dict(), "best": self.best.as_dict(),
+        return {"format": FORMAT, "version": VERSION, "controller": [nmeas, ncon, dt],
+                "problem": _digest(P, structure), "phase": self.phase, "round_mu": self.round_mu,
+                "omega": self.points.omega.tolist(), "last": self.last.as_dict(), "best": self.best.as_dict(),
                 "path": self.path.as_dict(), "history": [asdict(row) for row in self.history]}
 
     @staticmethod
-    def from_dict(saved: dict[str, Any], structure: BlockStructure, P: StateSpace, nmeas: int, ncon: int) -> State:
-        """Inverse of `as_dict`; InputError for a state of another format or problem."""
+    def from_dict(saved: dict[str, Any], structure: BlockStructure, P: StateSpace, nmeas: int, ncon: int,
+                  dt: float) -> tuple[State, tuple[StateSpace, ...]]:
+        """The state to go on from; of another problem (a changed weight, say) an empty one, and its controllers.
+
+        Nothing that was measured on another plant is carried over: its controllers are candidates to start from.
+        Raises InputError for another format, and for controllers of other sizes or sample time.
+        """
         if not isinstance(saved, dict) or saved.get("format") != FORMAT or saved.get("version") != VERSION:
             raise InputError(f"expected a saved state of format {FORMAT!r}, version {VERSION}", field="state")
-        problem = [P.nstates, P.ninputs, P.noutputs, nmeas, ncon]
-        if saved.get("problem") != problem:
-            raise InputError(f"the saved state belongs to another plant: sizes {saved.get('problem')}, not {problem}",
-                             field="state")
+        if saved.get("controller") != [nmeas, ncon, dt]:
+            raise InputError("the saved state belongs to another plant: its controllers have numbers of y and u, and a "
+                             f"sample time, of {saved.get('controller')}, not {[nmeas, ncon, dt]}", field="state")
         n_y, n_u = P.outputs[P.noutputs - nmeas:], P.inputs[P.ninputs - ncon:]
 
-        def loop(item: dict[str, Any]) -> Loop:
+        def controller(item: dict[str, Any]) -> StateSpace:
             A, B, C, D = (np.array(item["K"][key], float) for key in "ABCD")
-            return Loop(StateSpace(A, B, C, D, 0.0, n_y, n_u), Scalings.from_dicts(structure, item["scalings"]),
-                        float(item["gamma"]), float(item["mu"]))
+            return StateSpace(A, B, C, D, 0.0, n_y, n_u)
+
+        def loop(item: dict[str, Any]) -> Loop:
+            return Loop(controller(item), Scalings.from_dicts(structure, item["scalings"]), float(item["gamma"]),
+                        float(item["mu"]))
+        if saved["problem"] != _digest(P, structure):
+            different = {json.dumps(saved[name]["K"]): saved[name] for name in ("best", "path", "last")}
+            return State(), tuple(controller(item) for item in different.values())
         last = loop(saved["last"])
         points = analysed(P, last.K, structure, np.array(saved["omega"], float))
         return State(str(saved["phase"]), points, last, loop(saved["best"]), loop(saved["path"]),
-                     tuple(Iteration(**row) for row in saved["history"]),
-                     float(saved["round_mu"]))
+                     tuple(Iteration(**row) for row in saved["history"]), float(saved["round_mu"])), ()
+
+
+def _digest(P: StateSpace, structure: BlockStructure) -> str:
+    """Tells a problem from others: the same plant and blocks give the same digest."""
+    numbers = hashlib.sha256(repr([block.as_dict() | {"name": ""} for block in structure.blocks]).encode())
+    for matrix in (P.A, P.B, P.C, P.D):
+        numbers.update(repr(matrix.shape).encode() + np.ascontiguousarray(matrix).tobytes())
+    return numbers.hexdigest()
 
 
 def analysed(P: StateSpace, K: StateSpace, structure: BlockStructure, omega: np.ndarray) -> PointwiseScalings:

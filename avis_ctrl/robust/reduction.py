@@ -106,7 +106,7 @@ def split_stable(K: StateSpace) -> tuple[StateSpace, StateSpace]:
     # A margin relative to the fastest pole: a slow pole that round-off could move over is kept, not truncated.
     margin = 1e-12 * float(np.max(np.abs(K.poles()), initial=0.0))
     inside = (lambda re, im: np.hypot(re, im) < 1 - 1e-12) if K.dt else (lambda re, im: re < -margin)
-    return _split(K, inside)
+    return split(K, inside)
 
 
 def residualise_fast(K: StateSpace, limit: float, also_unstable: bool = False) -> StateSpace:
@@ -118,7 +118,7 @@ def residualise_fast(K: StateSpace, limit: float, also_unstable: bool = False) -
     """
     if K.dt:
         raise InputError("expected a continuous controller", field="K.dt", value=K.dt)
-    slow, fast = _split(K, lambda re, im: np.hypot(re, im) <= limit)
+    slow, fast = split(K, lambda re, im: np.hypot(re, im) <= limit)
     if not fast.nstates:
         return K
     if not fast.is_stable() and not also_unstable:
@@ -128,7 +128,7 @@ def residualise_fast(K: StateSpace, limit: float, also_unstable: bool = False) -
     return replace(slow, D=slow.D + fast.dcgain())
 
 
-def _split(K: StateSpace, first: Callable[[float, float], bool]) -> tuple[StateSpace, StateSpace]:
+def split(K: StateSpace, first: Callable[[float, float], bool]) -> tuple[StateSpace, StateSpace]:
     """K as a sum of the part with the poles that `first` picks (and the direct term), and the rest."""
     n = K.nstates
     if not n:

@@ -59,6 +59,8 @@ def sampled(system: StateSpace, period_s: float) -> StateSpace:
 
 def digital_controller(loop: SampledLoop) -> StateSpace:
     """Sensor volts to demanded drive volts, sampled: what the processor computes, limits aside."""
+    if loop.digital is not None:
+        return loop.digital
     rig, bank, T = loop.rig, loop.sensors, loop.period_s
     names = (*loop.axes, *loop.loops)
     if not names:  # nothing is controlled, and nothing need be told apart by the sensors
@@ -183,19 +185,26 @@ def period_map(loop: SampledLoop) -> np.ndarray:
 
     The state begins with q and q'.
     """
+    return disturbed_period_map(loop)[0]
+
+
+def disturbed_period_map(loop: SampledLoop) -> tuple[np.ndarray, np.ndarray]:
+    """`period_map`, and (n, n_c + n_u) what is added to the controller's next state and to its voltages makes of it."""
     arrays = step_arrays(loop)
     n, n_u = arrays.advance.shape[0], loop.n_drives
     n_c = arrays.control.shape[0] - n_u
     free = np.r_[:2 * N_Q, 3 * N_Q:n]  # the floor does not feel the loop
     whole, late = divmod(loop.delay_substeps, loop.substeps)
-    # State over a period: x, controller, voltages computed and not yet applied (newest first).
+    # State over a period: x, controller, voltages computed and not yet applied (newest first); then what is added.
     pending = whole + 1
     size = len(free) + n_c + n_u * pending
-    x, xc = np.eye(size)[:len(free)], np.eye(size)[len(free):len(free) + n_c]
-    queue = [np.eye(size)[len(free) + n_c + n_u * k:][:n_u] for k in range(pending)]
+    unit = np.eye(size + n_c + n_u)
+    x, xc = unit[:len(free)], unit[len(free):len(free) + n_c]
+    queue = [unit[len(free) + n_c + n_u * k:][:n_u] for k in range(pending)]
     Phi, Gamma = arrays.advance[np.ix_(free, free)], arrays.advance[free, n:n + n_u]
-    out = arrays.control @ np.vstack([xc, arrays.sense[:, free] @ x])
+    out = arrays.control @ np.vstack([xc, arrays.sense[:, free] @ x]) + unit[size:]
     queue = [out[n_c:], *queue]
     for j in range(loop.substeps):
         x = Phi @ x + Gamma @ (queue[whole] if j >= late else queue[whole + 1])
-    return np.vstack([x, out[:n_c], *queue[:pending]])
+    after = np.vstack([x, out[:n_c], *queue[:pending]])
+    return after[:, :size], after[:, size:]

@@ -83,6 +83,17 @@ def _put(out, start, values):
 
 
 @njit(cache=True)
+def _arrive(work, floor, k, j, substeps, step):
+    """Floor velocity over substep j of period k, and the voltages that arrive at its start."""
+    delay = work.line.shape[0] - 1
+    for i in range(6):
+        rise = (floor[k + 1, i] - floor[k, i]) / substeps
+        work.w[i], work.w_end[i] = floor[k, i] + rise * j, floor[k, i] + rise * (j + 1)
+    if delay > 0 and step >= delay and (step - delay) % substeps == 0:
+        _put(work.u, 0, work.line[step % (delay + 1)])
+
+
+@njit(cache=True)
 def _excess(arrays, work):
     """N: the nonlinear table's acceleration less the linear one's."""
     x, n, n_u = work.x, work.x.shape[0], work.u.shape[0]
@@ -96,8 +107,8 @@ def _excess(arrays, work):
 
 
 @njit(cache=True)
-def _sense_and_control(arrays, work, noise, adc, sensed_row):
-    """The converter's reading of sample noise (n_s,) and motion, and the controller's answer to it."""
+def _sense(arrays, work, noise, adc, sensed_row):
+    """The converter's reading of sample noise (n_s,) and motion, as the controller's input."""
     n, n_s = work.x.shape[0], work.sensed.shape[0]
     n_c = work.control_in.shape[0] - n_s
     _put(work.sense_in, 0, work.x)
@@ -108,6 +119,12 @@ def _sense_and_control(arrays, work, noise, adc, sensed_row):
         volts = work.sensed[i] + noise[i]
         sensed_row[i] = volts
         work.control_in[n_c + i] = _quantise(volts, adc[0], adc[1], adc[2]) if adc[0] > 0 else volts
+
+
+@njit(cache=True)
+def _control(arrays, work):
+    """The linear controller's next state and voltages."""
+    n_c = work.control_in.shape[0] - work.sensed.shape[0]
     _multiply(work.controlled, arrays.control, work.control_in)
     for i in range(n_c):
         work.control_in[i] = work.controlled[i]
@@ -158,18 +175,15 @@ def run(arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, ad
     adc : (lsb, lower, upper) V, lsb = 0 for none. limit_V : (n_u,) of the drives. far : (m, rad) beyond
     which the table has diverged.
     """
-    delay, step = work.line.shape[0] - 1, 0
+    step = 0
     for k in range(floor.shape[0] - 1):
         for j in range(substeps):
-            for i in range(6):
-                rise = (floor[k + 1, i] - floor[k, i]) / substeps
-                work.w[i], work.w_end[i] = floor[k, i] + rise * j, floor[k, i] + rise * (j + 1)
-            if delay > 0 and step >= delay and (step - delay) % substeps == 0:
-                _put(work.u, 0, work.line[step % (delay + 1)])
+            _arrive(work, floor, k, j, substeps, step)
             if nonlinear and acceleration:
                 _excess(arrays, work)
             if j == 0:
-                _sense_and_control(arrays, work, noise[k], adc, records.sensed[k])
+                _sense(arrays, work, noise[k], adc, records.sensed[k])
+                _control(arrays, work)
                 _demand(work, step, drive[k], limit_V, records.demanded[k])
                 _put(records.volts[k], 0, work.u)
                 _put(records.q[k], 0, work.x[:6])
@@ -178,6 +192,31 @@ def run(arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, ad
                 _excess(arrays, work)
             if step == 0:
                 _put(work.N_before, 0, work.N)
+            _advance(arrays, work)
+            step += 1
+        if _gone(work.x, far):
+            return k + 1
+    return floor.shape[0] - 1
+
+
+def run_stepwise(code, arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, adc, limit_V, far,
+                 records):
+    """`run` with a controller that is called once a sample: code (n_s,) -> (n_u,) volts."""
+    n_s, n_u, step = work.sensed.shape[0], work.u.shape[0], 0
+    for k in range(floor.shape[0] - 1):
+        for j in range(substeps):
+            _arrive(work, floor, k, j, substeps, step)
+            if nonlinear and acceleration:
+                _excess(arrays, work)
+            if j == 0:
+                _sense(arrays, work, noise[k], adc, records.sensed[k])
+                work.controlled[work.controlled.shape[0] - n_u:] = code(work.control_in[-n_s:])
+                _demand(work, step, drive[k], limit_V, records.demanded[k])
+                records.volts[k], records.q[k], records.q_dot[k] = work.u, work.x[:6], work.x[6:12]
+            if nonlinear and not acceleration:
+                _excess(arrays, work)
+            if step == 0:
+                work.N_before[:] = work.N
             _advance(arrays, work)
             step += 1
         if _gone(work.x, far):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from avis_ctrl.simulation import kernel
 from avis_ctrl.simulation.discrete import linear_part, step_arrays
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
 
+Code = Callable[[np.ndarray], np.ndarray]
 # No isolated table moves so far between its stops: beyond, the loop has diverged [m, rad].
 STOPS = np.array([0.02, 0.2])
 
@@ -73,7 +75,8 @@ def floor_velocity(loop: SampledLoop, samples: int, rng: np.random.Generator) ->
 
 def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int, ...] = 1, *, settle_s: float = 10.0,
              nonlinear: bool = True, extra_substeps: int = 1, floor: np.ndarray | None = None,
-             initial: np.ndarray | None = None, drive: np.ndarray | None = None) -> SimulationRecord:
+             initial: np.ndarray | None = None, drive: np.ndarray | None = None, code: Code | None = None
+             ) -> SimulationRecord:
     """Run the loop and keep the last `duration_s`.
 
     Parameters
@@ -86,6 +89,7 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
     initial : (12,) q and q' at the start.
     drive : (n, n_u) volts added to what the controller demands, before the limit; n samples in all, those of
         `settle_s` included. Zero by default.
+    code : called every sample in place of the loop's controller, from the converter's volts (n_s,) to volts (n_u,).
 
     Raises
     ------
@@ -112,8 +116,9 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
     records = kernel.Records(*(np.empty((samples, width)) for width in (6, 6, n_u, n_u, n_s)))
     arrays = step_arrays(loop, extra_substeps)
     work = kernel.workspace(arrays, state, loop.delay_substeps * extra_substeps)
-    done = kernel.run(arrays, work, floor, noise, drive, loop.substeps * extra_substeps, nonlinear,
-                      "acceleration" in loop.sensors.quantities, adc, loop.limits_V, STOPS, records)
+    run = kernel.run if code is None else partial(kernel.run_stepwise, code)
+    done = run(arrays, work, floor, noise, drive, loop.substeps * extra_substeps, nonlinear,
+               "acceleration" in loop.sensors.quantities, adc, loop.limits_V, STOPS, records)
     kept = slice(min(settle, done - 1), done)
     q, q_dot, volts, demanded, sensed = (record[kept].copy() for record in records)
     time = (np.arange(samples)[kept] - settle) * loop.period_s

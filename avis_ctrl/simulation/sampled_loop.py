@@ -160,6 +160,7 @@ class SampledLoop:
     loop_delay_s: float = _AS_RIG
     limit_V: float = _AS_RIG
     name: str = "nominal"
+    digital: StateSpace | None = None
     substeps: int = field(init=False, default=1)
 
     def __post_init__(self) -> None:
@@ -196,6 +197,9 @@ class SampledLoop:
                              *((f"sensor {k}", s) for k, s in enumerate(self.sensors.chains))):
             if system.D.shape != (1, 1):
                 raise InputError("one input and one output", field=name, value=system.D.shape)
+        if self.digital is not None and (self.digital.D.shape != (self.n_drives, n_s) or not self.digital.dt):
+            raise InputError(f"a sampled system of {n_s} inputs and {self.n_drives} outputs", field="digital",
+                             value=self.digital.D.shape)
         if self.drive_coupling is not None and self.drive_coupling.D.shape != (self.n_drives,) * 2:
             raise InputError(f"a system of {self.n_drives} inputs and outputs", field="drive_coupling",
                              value=self.drive_coupling.D.shape)

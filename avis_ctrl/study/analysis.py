@@ -16,6 +16,7 @@ from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.floor_motion import band_rms, third_octave_midbands, third_octave_rms
 from avis_ctrl.rigs.vibration_criteria import rating
 from avis_ctrl.robust.mu_peak import MuPeak, mu_peak, worst_case_gain
+from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Bound, ControllerKind, ControllerResult, SiteResponse, Transmissibility
 from avis_ctrl.study.plant import DesignPlant
@@ -65,7 +66,16 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
         bound(plant, blocks, mu_peak(performance.select(slice(n_z), slice(n_w)), blocks, slack=SLACK)),
         worst_peak, worst_band, transmissibility(motion, blocks, samples, omega),
         _compliance(plant, full, omega), site_response(plant, full, K is not None, design.floor.band_Hz),
-        hinf_norm(motion.select(slice(n_z, None), slice(n_w, None))).gain, fastest, notes)
+        hinf_norm(motion.select(slice(n_z, None), slice(n_w, None))).gain, fastest, notes,
+        _by_slicot(nominal))
+
+
+def _by_slicot(system: StateSpace) -> float | None:
+    """H-infinity norm by another code; None where it fails."""
+    try:
+        return hinf_norm_slicot(system)
+    except ComputationError:
+        return None
 
 
 def bound(plant: DesignPlant, blocks: BlockStructure, found: MuPeak) -> Bound:

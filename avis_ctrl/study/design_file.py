@@ -33,7 +33,7 @@ from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter
 
 def _different(axes: list[str]) -> list[str]:
     if len(set(axes)) != len(axes):
-        raise ValueError("expected each axis once")
+        raise ValueError("expected each name once")
     return axes
 
 
@@ -42,6 +42,7 @@ NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
 Percent = Annotated[float, Field(gt=0, lt=100)]
 Decibel = Annotated[float, Field(ge=-200, le=200)]
 Axis = Literal["x", "y", "z", "phi_x", "phi_y", "phi_z"]
+Rival = Literal["hinf", "skyhook_classical", "skyhook"]
 
 
 class _Section(BaseModel):
@@ -212,12 +213,16 @@ class RequirementSection(_Section):
 
 
 class Design(_Section):
-    """A whole design file. loaded : with the load of the rig file's [load] section on the table."""
+    """A whole design file. loaded : with the load of the rig file's [load] section on the table.
+
+    compare_with : controllers that the mu controller is compared with, beside the table without control.
+    """
 
     title: str
     rig: str
     loaded: bool = False
     keep: Annotated[list[Axis], Field(min_length=1), AfterValidator(_different)]
+    compare_with: Annotated[list[Rival], AfterValidator(_different)] = ["hinf", "skyhook_classical", "skyhook"]
     loop: LoopSection = LoopSection()
     uncertainty: UncertaintySection = UncertaintySection()
     transmissibility: TransmissibilitySection
@@ -246,12 +251,21 @@ def design_from_table(table: dict, file: object = None) -> Design:
     try:
         design = Design.model_validate(table)
         _require_band_below_crossovers(design)
+        _require_rival(design)
     except ValidationError as error:
         complaint = first_complaint(error, Design)
         raise (complaint.in_file(file) if file is not None else complaint) from None
     except InputError as complaint:
         raise (complaint.in_file(file) if file is not None else complaint) from None
     return design
+
+
+def _require_rival(design: Design) -> None:
+    """An advantage over a skyhook needs that skyhook."""
+    wanted = any(one.quantity == "advantage_over_skyhook_dB" for one in design.requirement)
+    if wanted and "skyhook" not in design.compare_with:
+        raise InputError('expected "skyhook" among them: the requirement advantage_over_skyhook_dB compares with it',
+                         field="compare_with", value=design.compare_with)
 
 
 def _require_band_below_crossovers(design: Design) -> None:

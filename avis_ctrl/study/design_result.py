@@ -86,7 +86,8 @@ class SiteResponse:
 class ControllerResult:
     """A controller and all that was measured on it.
 
-    gamma : H-infinity norm of the weighted performance channels of the nominal plant.
+    gamma : H-infinity norm of the weighted performance channels of the nominal plant. gamma_slicot : the same by
+        SLICOT's AB13DD, None where that routine fails.
     mu : robust performance of the weighted channels; stability : robust stability (mu of the uncertainty alone).
     worst_peak, worst_band : worst-case transmissibility over all frequencies, and over the design's band.
     compliance : (n,) largest singular value of force -> displacement [m/N] at `transmissibility.omega`, floor at rest.
@@ -110,6 +111,7 @@ class ControllerResult:
     peak_transmissibility: float
     fastest_pole_Hz: float
     notes: tuple[str, ...] = ()
+    gamma_slicot: float | None = None
 
     @property
     def order(self) -> int:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.gap.effects.drives import voltage_limits
 from avis_ctrl.gap.effects.mounts import contacts
 from avis_ctrl.gap.realisation import loop_lag, realise, sufficient_order, with_effects
 from avis_ctrl.gap.state_space import drift_at
@@ -97,7 +98,9 @@ def _loop(rig: Rig, design: Design, model: TableModel) -> tuple[Rig, Design]:
     The delay's order rises where the design's would be wrong within its bandwidth.
     """
     delay, corner = loop_lag(model)
-    limits = [one.by_name["limit_V"] for one in model.effects if one.effect.name == "actuator_saturation"]
+    # The lowest counts: the design's limit is one for all drives.
+    limits = [float(np.min(voltage_limits(one.by_name))) for one in model.effects
+              if one.effect.name == "actuator_saturation"]
     rig = rig.with_loop_delay(delay).with_drives_limited(min(limits, default=np.inf))
     order, _ = delay_order(design, rig)
     changes = {"pade_order": order} | ({} if corner is None else {"amplifier_corner_Hz": corner})

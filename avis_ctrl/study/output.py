@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,10 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.files import as_json
+from avis_ctrl.study.saved import STUDY, study_dict
 from avis_ctrl.study.verdict import first_sentence
 
-FILES = "plant.json", "sampled_controller.json", "report.html", "report.pdf", "result.json"
+FILES = STUDY, "plant.json", "sampled_controller.json", "report.html", "report.pdf", "result.json"
 FOLDERS = ("controllers",)
 
 
@@ -61,15 +63,15 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
     def dB(value: float) -> float:
         return 20 * float(np.log10(value)) if value > 0 else -np.inf
     return {"name": c.name, "kind": c.kind, "file": f"controllers/{c.name}.json" if c.K is not None else None,
-            "order": c.order, "gamma": c.gamma, "mu_upper": c.mu.upper, "mu_lower": c.mu.lower,
-            "mu_peak_Hz": c.mu.omega / (2 * np.pi), "stable": c.stable,
+            "order": c.order, "gamma": c.gamma, "gamma_slicot": c.gamma_slicot, "mu_upper": c.mu.upper,
+            "mu_lower": c.mu.lower, "mu_peak_Hz": c.mu.omega / (2 * np.pi), "stable": c.stable,
             "peak_transmissibility_dB": dB(c.peak_transmissibility),
             "worst_case_peak_transmissibility_dB": dB(c.worst_peak.upper), "note": "; ".join(c.notes)}
 
 
 def _failed_row(c: FailedController) -> dict[str, Any]:
     """A controller that could not be analysed: the reason is in its note."""
-    figures = ("gamma", "mu_upper", "mu_lower", "mu_peak_Hz", "peak_transmissibility_dB",
+    figures = ("gamma", "gamma_slicot", "mu_upper", "mu_lower", "mu_peak_Hz", "peak_transmissibility_dB",
                "worst_case_peak_transmissibility_dB")
     return {"name": c.name, "kind": c.kind, "file": None, "order": None, "stable": False, **dict.fromkeys(figures),
             "note": c.reason}
@@ -104,6 +106,8 @@ def write_study(result: DesignResult, folder: Path, html: bytes | None = None, p
     if result.loop is not None:
         contents["sampled_controller.json"] = as_json(sampled_controller_dict(result, result.loop))
     contents["plant.json"] = as_json(result.plant.synthesis.as_dict())
+    with contextlib.suppress(InputError):  # a rig of the user's own class has no file form, and no export
+        contents[STUDY] = as_json(study_dict(result.design, result.rig))
     contents |= {name: content for name, content in (("report.html", html), ("report.pdf", pdf)) if content is not None}
     contents["result.json"] = as_json(result_dict(result))
     # Files of an earlier study are removed.

@@ -62,19 +62,22 @@ class Compared:
 
 def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress = lambda text: None
                ) -> tuple[list[Candidate], list[FailedController], MuSynthesis]:
-    """The mu, nominal H-infinity and classical skyhook controllers, the table without control; and the D-K iteration.
+    """The mu controller and, of those it is compared with, nominal H-infinity and classical skyhook; the table without
+    control; the D-K iteration.
 
     A controller for comparison that cannot be made does not stop the design: it is returned among the failed.
     """
     with threadpool_limits(1):
-        progress("H-infinity synthesis of the nominal plant")
         rivals: list[Candidate] = []
         failed: list[FailedController] = []
-        try:
-            rivals.append(nominal_hinf(design, plant, rig))
-        except ComputationError as error:
-            failed.append(FailedController("hinf", "H-infinity, nominal", "hinf", str(error)))
-        rivals.append(classical_skyhook(plant, rig, design))
+        if "hinf" in design.compare_with:
+            progress("H-infinity synthesis of the nominal plant")
+            try:
+                rivals.append(nominal_hinf(design, plant, rig))
+            except ComputationError as error:
+                failed.append(FailedController("hinf", "H-infinity, nominal", "hinf", str(error)))
+        if "skyhook_classical" in design.compare_with:
+            rivals.append(classical_skyhook(plant, rig, design))
 
         def shown(row: Any) -> None:
             progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, "
@@ -110,7 +113,8 @@ ORDER = ("passive", "skyhook_classical", "skyhook", "hinf", "mu")
 
 def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[Candidate],
             failed: Sequence[FailedController] = (), progress: Progress = lambda text: None) -> Compared:
-    """Bounds of every controller, a skyhook tuned to the worst-case peak of mu, and the simulation of mu.
+    """Bounds of every controller, a skyhook tuned to the worst-case peak of mu where the design compares with one, and
+    the simulation of mu.
 
     Runs on two processes. The tuning of the skyhook and the simulation wait for the bounds of all the others, because
     the best of these is delivered as the mu controller.
@@ -137,12 +141,14 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
         # The best one found is delivered, whatever its name; the skyhook's limit follows from it.
         mu = best_of(mu, [one for one in found.values() if isinstance(one, ControllerResult)])
         simulation = workers.submit(simulate_study, design, rig, plant, mu)
-        jobs = {workers.submit(_tuned, design, plant, rig, skyhook_limit(design, mu), samples): "skyhook"}
+        jobs = {}
+        if "skyhook" in design.compare_with:
+            jobs = {workers.submit(_tuned, design, plant, rig, skyhook_limit(design, mu), samples): "skyhook"}
         gather()
         loop = simulation.result()
         progress(f"  done: {design.simulation.random_plants + 2} nonlinear plants")
         found["mu"] = mu
-        if isinstance(skyhook := found["skyhook"], ControllerResult) and best_of(mu, [skyhook]) is not mu:
+        if isinstance(skyhook := found.get("skyhook"), ControllerResult) and best_of(mu, [skyhook]) is not mu:
             found["mu"] = mu = best_of(mu, [skyhook])
             loop = simulate_study(design, rig, plant, mu)
     if isinstance(rest := found["passive"], FailedController):

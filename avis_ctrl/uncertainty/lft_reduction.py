@@ -23,20 +23,25 @@ def reduce_copies(M: np.ndarray, sizes: list[int], tolerance: float = 1e-10) -> 
     # Diagonal scalings of the copies commute with Delta.
     system = balance(StateSpace(M[:n, :n], M[:n, n:], M[n:, :n], M[n:, n:]))
     A, B, C = system.A, system.B, system.C
-    V, reached = _reached(A, B, sizes, tolerance)
+    # Relative to the LFT as given: what is left of an output that sees nothing is round-off, not a direction.
+    size = float(np.linalg.norm(A, 2)) if n else 0.0
+    limits = [tolerance * max(size, float(np.linalg.norm(one, 2)) if one.size else 0.0) for one in (B, C)]
+    V, reached = _reached(A, B, sizes, limits[0])
     A, B, C = V.T @ A @ V, V.T @ B, C @ V
-    W, left = _reached(A.T, C.T, reached, tolerance)
+    W, left = _reached(A.T, C.T, reached, limits[1])
     if left == list(sizes):
         return M, left
     return np.block([[W.T @ A @ W, W.T @ B], [C @ W, system.D]]), left
 
 
-def _reached(A: np.ndarray, B: np.ndarray, sizes: list[int], tolerance: float) -> tuple[np.ndarray, list[int]]:
-    """Orthonormal block-diagonal V, smallest with range B and A V inside, and its number of columns a block."""
+def _reached(A: np.ndarray, B: np.ndarray, sizes: list[int], limit: float) -> tuple[np.ndarray, list[int]]:
+    """Orthonormal block-diagonal V, smallest with range B and A V inside, and its number of columns a block.
+
+    limit : singular value up to which a direction counts as round-off.
+    """
     ends = [0, *np.cumsum(sizes)]
     blocks = [slice(start, stop) for start, stop in pairwise(ends)]
     bases = [np.zeros((size, 0)) for size in sizes]
-    limit = tolerance * max(np.linalg.norm(A, 2) if A.size else 0.0, np.linalg.norm(B, 2) if B.size else 0.0)
     step = B
     while True:
         fresh = []

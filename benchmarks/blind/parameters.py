@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from math import pi
 
@@ -23,13 +23,17 @@ NOMINAL_DELAY_S = 1e-3
 
 @dataclass(frozen=True)
 class Equivalent:
-    """reported = scale * hidden + offset, for an effect whose truth and report use other words."""
+    """reported = scale * hidden + offset, for an effect whose truth and report use other words.
+
+    beside : a parameter that truth and report must both have, of a law that is richer than the usual one.
+    """
 
     effect: str
     hidden: str
     reported: str
     scale: float = 1.0
     offset: float = 0.0
+    beside: str = ""
 
 
 # Words of the truth (tests/truth) for parameters of the library (avis_ctrl/gap/effects).
@@ -40,6 +44,7 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     *(Equivalent("product_of_inertia", "product_kgm2", f"{place}_kgm2") for place in ("Jxy", "Jxz", "Jyz")),
     *(Equivalent("com_offset", f"{axis}_m", f"offset_{axis}_m") for axis in "xyz"),
     # Mounts and contacts of the truth scatter by up to 10 and 20 % about these, their means.
+    Equivalent("cubic_stiffness", "k3_beside_k5_N_per_m3", "k3_N_per_m3", beside="k5_N_per_m5"),
     Equivalent("cubic_stiffness", "cubic_N_per_m3", "k3_N_per_m3"),
     Equivalent("contact_friction", "coulomb_N", "force_N"),
     Equivalent("stiffness_drift", "change", "relative_change"),
@@ -75,14 +80,15 @@ def unit_of(name: str) -> tuple[str, float | None]:
     return name, None
 
 
-def true_value(effect: str, reported: str, hidden: dict, table: Sequence[Equivalent] = EQUIVALENTS
-               ) -> tuple[str, float] | None:
+def true_value(effect: str, reported: str, hidden: dict, table: Sequence[Equivalent] = EQUIVALENTS,
+               beside: Collection[str] = ()) -> tuple[str, float] | None:
     """The truth of a reported parameter and the name it has there; None where there is none.
 
-    By the table, under the same name, or under its name with another unit.
+    By the table, under the same name, or under its name with another unit. beside : all that is reported.
     """
     for one in table:  # first, since a word can mean something else in the truth
-        if (one.effect, one.reported) == (effect, reported) and is_number(hidden.get(one.hidden)):
+        known = not one.beside or (one.beside in beside and one.beside in hidden)
+        if (one.effect, one.reported) == (effect, reported) and known and is_number(hidden.get(one.hidden)):
             return one.hidden, one.scale * hidden[one.hidden] + one.offset
     if is_number(hidden.get(reported)):
         return reported, float(hidden[reported])
@@ -112,7 +118,8 @@ def parameter_errors(cases: Sequence[Judged], table: Sequence[Equivalent] = EQUI
                 continue
             seen = set()
             for name, estimate in pair.named.parameters.items():
-                truth = true_value(pair.named.name, name, pair.hidden.parameters, table)
+                truth = true_value(pair.named.name, name, pair.hidden.parameters, table,
+                                   pair.named.parameters)
                 if truth is None or estimate.std is None:
                     unknown.append(f"{pair.named.name}.{name}")
                 elif truth[0] not in seen:

@@ -32,7 +32,9 @@ SHAPE = tuple(0.05 * np.random.default_rng(4).standard_normal(12))
 LINEAR = [
     ("geophone_corner", "Sz1", (4.0, 0.5)), ("sensor_gain", "Sz1", (1.2,)), ("sensor_misalignment", "Sz1", (5.0, -8.0)),
     ("tilt_coupling", "horizontal geophones", (9.8,)), ("actuator_gain", "Az1", (1.3,)),
-    ("actuator_lag", "actuators", (TAU,)), ("loop_delay", "loop", (2e-3,)),
+    ("actuator_lag", "actuators", (TAU,)),
+    ("actuator_lag", "actuators/each", (TAU, 0.1, -0.2, 0.05, 0.12, -0.1, 0.15, -0.07)),
+    ("loop_delay", "loop", (2e-3,)),
     ("com_offset", "payload", (0.02, 0.01, -0.03)),
     ("product_of_inertia", "Jxy", (5.0,)), ("mount_relaxation", "isolators z", (0.4, 3.0)),
     ("mount_surge", "isolators z", (40.0, 0.4, 0.03, 0.01, -0.02, 0.02)),

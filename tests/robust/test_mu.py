@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import InputError
 from avis_ctrl.robust.mu import mu, mu_upper
 from avis_ctrl.robust.mu_lower import is_singular
+from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.slycot_adapter import mu_upper_slicot
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
 from benchmarks.mu_by_bisection import mu_upper_by_bisection
@@ -316,3 +317,42 @@ def test_no_perturbation_makes_a_nilpotent_matrix_singular(n, block):
 def test_wrong_input_is_named(M, blocks):
     with pytest.raises(InputError):
         mu(M, blocks)
+
+
+@pytest.mark.parametrize("n", [4, 8, 16])
+def test_complex_scalars_against_slicot(n):
+    """AB13MD's upper bound to 1e-6, proved by D itself; the perturbation of the lower one is singular and has its norm.
+
+    Half of the entries of the second matrices span six decades, or are zero.
+    """
+    rng = np.random.default_rng(n)
+    M = rng.standard_normal((12, n, n)) + 1j * rng.standard_normal((12, n, n))
+    M[6:] *= 10.0 ** rng.uniform(-3, 3, M[6:].shape) * (rng.uniform(size=M[6:].shape) < 0.7)
+    found = mu(M, [ComplexScalar()] * n)
+    for k in range(12):
+        assert found.upper[k] <= mu_upper_slicot(M[k], [ComplexScalar()] * n) * (1 + 1e-6)
+        scaled = found.D[k] @ M[k] @ np.linalg.inv(found.D_w[k])
+        assert np.linalg.norm(scaled, 2) == pytest.approx(found.upper[k], rel=1e-9)
+        assert np.allclose(found.D[k], np.diag(np.diag(found.D[k])))
+        delta = found.delta[k]
+        assert np.array_equal(delta, np.diag(np.diag(delta)))
+        assert np.linalg.norm(delta, 2) == pytest.approx(1 / found.lower[k], rel=1e-9)
+        assert np.min(np.abs(np.linalg.eigvals(M[k] @ delta) - 1)) < 1e-6
+    assert np.median(found.lower / found.upper) > 0.98 and np.min(found.lower / found.upper) > 0.9
+
+
+def test_shared_scalings_of_full_blocks_hold_for_every_matrix():
+    """Blocks that are not square, three matrices with one D: the bound is their largest norm; no random D is better."""
+    rng = np.random.default_rng(3)
+    structure = BlockStructure.of([ComplexFull(2, 3), ComplexScalar(), ComplexFull(3, 1)])
+    M = rng.standard_normal((1, 3, structure.n_z, structure.n_w)) + 1j * rng.standard_normal((1, 3, 5, 6))
+    found = upper_bound(M, structure)
+
+    def peak(d):
+        d_z, d_w = np.repeat(d, [3, 1, 1]), np.repeat(d, [2, 1, 3])
+        return np.max(np.linalg.norm(M[0] * d_z[:, None] / d_w, 2, axis=(1, 2)))
+    d = np.sqrt(np.diag(found.scalings.X_w[0]).real[[0, 2, 3]])
+    assert peak(d) == pytest.approx(found.beta[0], rel=1e-9)
+    for size in (1e-3, 1e-2, 0.1, 1.0):
+        for _ in range(50):
+            assert peak(d * np.exp(size * rng.standard_normal(3))) >= found.beta[0] * (1 - 1e-6)

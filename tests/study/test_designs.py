@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from avis_ctrl.interface.workflow import study_inputs
 from avis_ctrl.study.design_file import read_study
 from avis_ctrl.study.runner import design_provenance
 
@@ -20,14 +21,22 @@ def test_every_design_file_has_its_script():
     assert sorted(path.stem for path in DESIGNS.glob("*.py")) == sorted([*NAMES, "single_axis"])
 
 
+@pytest.mark.parametrize("path", sorted(DESIGNS.glob("*.py")), ids=lambda path: path.stem)
+def test_a_script_is_short_and_imports_from_one_place(path):
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 35
+    assert {line for line in lines if "import" in line and "avis_ctrl" in line} == {"import avis_ctrl as ac"}
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_script_and_file_have_the_same_inputs(name):
     """Design and rig alike: the hash that the report prints as provenance is the same."""
     script = runpy.run_path(str(DESIGNS / f"{name}.py"))
     design, rig = read_study(DESIGNS / f"{name}.toml")
-    assert script["design"] == design
+    own, table = study_inputs(script["rig"], **script["sections"])
+    assert own == design
     by_script, by_file = (design_provenance(d, None, r, 0.0)["inputs_sha256"]
-                          for d, r in ((script["design"], script["rig"]), (design, rig)))
+                          for d, r in ((own, table), (design, rig)))
     assert by_script == by_file
 
 

@@ -182,7 +182,7 @@ def test_files_of_a_small_study_follow_the_contract(small, tmp_path):
     written = write_study(result, tmp_path, b"<html>", b"%PDF")
     assert written[-1] == tmp_path / "result.json"
     assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()} == {
-        "result.json", "plant.json", "controllers/skyhook_classical.json", "report.html", "report.pdf"}
+        "result.json", "study.json", "plant.json", "controllers/skyhook_classical.json", "report.html", "report.pdf"}
     stored = check_folder(tmp_path)
     assert [row["name"] for row in stored["controllers"]] == ["passive", "skyhook_classical"]
     passive_row, skyhook_row = stored["controllers"]

@@ -248,9 +248,13 @@ def cubic(d: Draw, p: Parameters, x: Details) -> None:
 
 
 def with_a_quintic(d: Draw, p: Parameters, x: Details) -> None:
-    """Statistical linearisation at the highest level gives the effective cubic stiffness: 3 k3 s^2 + 15 k5 s^4."""
+    """Statistical linearisation at the highest level gives the effective cubic stiffness: 3 k3 s^2 + 15 k5 s^4.
+
+    The coefficients of the law are told beside it, for a model that has both.
+    """
     share, stretch = float(d.rng.uniform(0.15, 0.5)), float(np.mean(d.high.stretch[:, 2]))
     x.update(cubic_left=1 - share, quintic_N_per_m5=share * p["cubic_N_per_m3"] / (5 * stretch**2))
+    p.update(k3_beside_k5_N_per_m3=(1 - share) * p["cubic_N_per_m3"], k5_N_per_m5=x["quintic_N_per_m5"])
 
 
 def a_little_asymmetric(d: Draw, p: Parameters, x: Details) -> None:

@@ -15,7 +15,7 @@ in them there, which the score test and the starting values use; the others shap
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -133,6 +133,18 @@ def differs_from_zero(values: Values, std: Values, names: Iterable[str]) -> bool
     return any(abs(values[name]) > 3 * std[name] for name in names)
 
 
+def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> Iterator[EffectParameter]:
+    """Of mounts, contacts or drives that differ from their mean; words with {} for the name."""
+    return (EffectParameter(f"uneven_{one}", "1", words.format(one), 0.0, -most, most, 0.1, False, (0.0,), True)
+            for one in names)
+
+
+def shares(values: Values) -> np.ndarray:
+    """(m,) of each mount, contact or drive over their mean, from the values uneven_ .. of all but the last."""
+    given = [value for name, value in values.items() if name.startswith("uneven_")]
+    return 1 + np.array([*given, -sum(given)])
+
+
 class Effect(ABC):
     """A piece of physics that a model may lack.
 
@@ -191,18 +203,24 @@ class Effect(ABC):
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         """What it adds to a record on lines omega; of a force in proportion to `strength`, that of a unit is kept."""
-        def on_lines(samples: np.ndarray | None) -> np.ndarray | None:
-            return None if samples is None else record.spectrum(samples, omega)
-        volts = on_lines(self.volts(record, place, values))
+        def on_lines(act: Callable[..., np.ndarray | None], values: Values) -> np.ndarray | None:
+            if getattr(Effect, act.__name__) is getattr(type(self), act.__name__):
+                return None
+
+            def samples() -> np.ndarray:
+                found = act(record, place, values)
+                return np.empty((len(record.volts), 0)) if found is None else found
+            found = record.kept(f"{self.name}@{place} {act.__name__} {values}", omega, samples)
+            return found if found.shape[1] else None
+        volts = on_lines(self.volts, values)
         if volts is not None:
             volts = volts - record.kept("volts", omega, lambda: record.volts)
         if self.strength:
-            unit = {**values, self.strength: 1.0}
-            force: np.ndarray | None = values[self.strength] * record.kept(
-                f"{self.name} {unit}", omega, lambda: np.asarray(self.force(record, place, unit)))
+            unit = on_lines(self.force, {**values, self.strength: 1.0})
+            force = None if unit is None else values[self.strength] * unit
         else:
-            force = on_lines(self.force(record, place, values))
-        return Added(volts, force, on_lines(self.reading(record, place, values)))
+            force = on_lines(self.force, values)
+        return Added(volts, force, on_lines(self.reading, values))
 
     def starts(self, model: Table, place: str) -> Sequence[np.ndarray]:
         """Starts of the search: (n_parameters,) each, shape parameters on their grid and the linear ones at none."""

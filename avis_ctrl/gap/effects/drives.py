@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, Values, register
+from avis_ctrl.gap.effects.base import (
+    Added,
+    Effect,
+    EffectParameter,
+    Reported,
+    Table,
+    Values,
+    register,
+    shares,
+    uneven,
+)
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
 
@@ -31,29 +41,38 @@ class ActuatorGain(Effect):
 
 @register
 class ActuatorLag(Effect):
-    """Every amplifier 1/(1 + s tau), corner 1/(2 pi tau)."""
+    """Every amplifier 1/(1 + s tau), corner 1/(2 pi tau): one tau for all, or each its own about their mean."""
 
     name = "actuator_lag"
     title = "the current amplifiers lag, first order"
     looks_like = "phase lag that grows with frequency, the same in every channel, with a loss of gain"
-    at = ("actuators",)
+    at = ("actuators", "actuators/each")
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        return (EffectParameter("time_constant_s", "s", "time constant of the amplifiers", 0.0, 0.0, 0.3, 1e-3),)
+        own = uneven(model.actuators[:-1], "that of drive {} over the mean, less one") if "/" in place else ()
+        return (EffectParameter("time_constant_s", "s", "time constant of the amplifiers", 0.0, 0.0, 0.3, 1e-3), *own)
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        tau = values["time_constant_s"]
-        if tau > 1e-9 and ops.amplifier_corner_Hz is None:
+        tau, each = values["time_constant_s"], time_constants(values)
+        if tau <= 1e-9:
+            return
+        common: np.ndarray | float = 1.0
+        if ops.amplifier_corner_Hz is None:  # else behind the lag that the model has already
             ops.amplifier_corner_Hz = 1 / (2 * np.pi * tau)
-        elif tau > 1e-9:  # behind the lag that the model has already
-            ops.drive = ops.drive / (1 + ops.s * tau)[:, None]
+            common = 1 + ops.s[:, None] * tau
+        ops.drive = ops.drive * common / (1 + ops.s[:, None] * each)
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         tau, std = values["time_constant_s"], float(np.sqrt(max(covariance[0, 0], 0.0)))
-        found = {"time_constant_s": Reported(tau, std, "s")}
+        found = super().reported(model, place, values, covariance)
         if tau <= 1e-9:  # at its bound there is no corner
             return found
         return {"corner_Hz": Reported(1 / (2 * np.pi * tau), std / (2 * np.pi * tau ** 2), "Hz"), **found}
+
+
+def time_constants(values: Values) -> np.ndarray:
+    """(n_u,) s of the amplifiers, or (1,) where all have the same."""
+    return values["time_constant_s"] * shares(values)
 
 
 @register
@@ -78,20 +97,37 @@ class LoopDelay(Effect):
 
 @register
 class ActuatorSaturation(Effect):
-    """Volts clipped at a limit below the rig file's."""
+    """Volts clipped at a limit below the rig file's, one for all drives or each at its own about their mean."""
 
     name = "actuator_saturation"
     title = "the drives clip below their nominal limit"
     looks_like = "less response than expected in records at high level only, and harmonics of the input"
-    at = ("actuators",)
+    at = ("actuators", "actuators/each")
     nonlinear = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         peaks = [float(np.max(np.abs(one.volts))) for one in model.motion.values()] or [model.rig.drive_limit_V]
         peak = min(max(peaks), model.rig.drive_limit_V) or model.rig.drive_limit_V
         grid = tuple(peak * share for share in (0.9, 0.7, 0.5, 0.35, 0.2))
-        return (EffectParameter("limit_V", "V", "voltage at which the drives clip", model.rig.drive_limit_V,
-                                peak / 50, peak, peak, False, grid),)
+        limit = EffectParameter("limit_V", "V", "voltage at which the drives clip", model.rig.drive_limit_V,
+                                peak / 50, peak, peak, False, grid)
+        own = uneven(model.actuators[:-1], "limit of drive {} over the mean, less one") if "/" in place else ()
+        return (limit, *own)
 
     def volts(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
-        return np.clip(record.volts, -values["limit_V"], values["limit_V"])
+        limits = voltage_limits(values)
+        return np.clip(record.volts, -limits, limits)
+
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
+        """As `volts`, drive by drive: most keep their limit where that of one is changed."""
+        limits = np.broadcast_to(voltage_limits(values), record.volts.shape[1])
+
+        def clipped(k: int, limit: float) -> np.ndarray:
+            return record.kept(f"{self.name} {k} {limit}", omega, lambda: np.clip(record.volts[:, [k]], -limit, limit))
+        volts = np.hstack([clipped(k, float(limit)) for k, limit in enumerate(limits)])
+        return Added(volts=volts - record.kept("volts", omega, lambda: record.volts))
+
+
+def voltage_limits(values: Values) -> np.ndarray:
+    """(n_u,) V at which the drives clip, or (1,) where all have the same."""
+    return values["limit_V"] * shares(values)

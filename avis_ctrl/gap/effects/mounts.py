@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-
 import numpy as np
 from numba import njit
 
@@ -17,6 +15,8 @@ from avis_ctrl.gap.effects.base import (
     Values,
     differs_from_zero,
     register,
+    shares,
+    uneven,
 )
 from avis_ctrl.gap.operators import Operators, mount_geometry
 from avis_ctrl.gap.record_motion import RecordMotion
@@ -34,12 +34,6 @@ def has_mounts(model: Table) -> bool:
 def vertical(rig: Rig) -> np.ndarray:
     """(n_g,) which mount rows are vertical."""
     return mount_geometry(rig).along("z")
-
-
-def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> Iterator[EffectParameter]:
-    """Of mounts or contacts that differ from their mean; words with {} for the name."""
-    return (EffectParameter(f"uneven_{one}", "1", words.format(one), 0.0, -most, most, 0.1, False, (0.0,), True)
-            for one in names)
 
 
 class OfMounts(Effect):
@@ -175,12 +169,6 @@ def surge_omega(values: Values) -> np.ndarray:
     return 2 * np.pi * values["frequency_Hz"] * shares(values)
 
 
-def shares(values: Values) -> np.ndarray:
-    """(m,) of each mount or contact over their mean, from the values uneven_ .. of all but the last."""
-    uneven = [value for name, value in values.items() if name.startswith("uneven_")]
-    return 1 + np.array([*uneven, -sum(uneven)])
-
-
 @register
 class LevelingLoop(OfMounts):
     """Every leveled mount k (1 + w/s), w = 2 pi rate, with a valve that lags k (1 + w/(s (1 + s tau))), or each with a
@@ -244,34 +232,48 @@ def leveled(rig: Rig) -> np.ndarray:
 
 @register
 class CubicStiffness(OfMounts):
-    """Force -k3 d^3 at every vertical mount; mounts may differ in k3 about their mean."""
+    """Force -k3 d^3 at every vertical mount, or -(k2 d^2 + k3 d^3 + k5 d^5); mounts may differ in k3 about their mean,
+    and in the other two by the same factors."""
 
     name = "cubic_stiffness"
     title = "the mounts stiffen with amplitude"
     looks_like = "vertical resonances rise with level, and third harmonics appear"
+    at = ("isolators z", "isolators z/polynomial")
     nonlinear = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model) ** 2
-        return (EffectParameter("k3_N_per_m3", "N/m^3", "cubic stiffness, mean of the mounts", 0.0, -1e4 * size,
-                                1e4 * size, size),
+        force, rms = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)), largest_rms(model)
+
+        def of_power(n: int, words: str) -> EffectParameter:
+            size = force / rms ** (n - 1)
+            return EffectParameter(f"k{n}_N_per_m{n}", f"N/m^{n}", f"{words} stiffness, mean of the mounts", 0.0,
+                                   -1e4 * size, 1e4 * size, size)
+        others = (of_power(2, "quadratic"), of_power(5, "quintic")) if "/" in place else ()
+        return (of_power(3, "cubic"), *others,
                 *uneven(range(1, int(np.sum(vertical(model.rig)))), "that of mount {} over the mean, less one"))
 
     def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
-        return stiffened(record.deflection[:, record.vertical] ** 3, record, values)
+        d = record.deflection[:, record.vertical]
+        return stiffened(sum(values[name] * d ** n for n, name in powers(values)), record, values)
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
-        """As `force`, from the spectra of the cubes."""
-        cubes = record.kept(self.name, omega, lambda: record.deflection[:, record.vertical] ** 3)
-        return Added(force=stiffened(cubes, record, values))
+        """As `force`, from the spectra of the powers."""
+        def of_power(n: int) -> np.ndarray:
+            return record.kept(f"{self.name} {n}", omega, lambda: record.deflection[:, record.vertical] ** n)
+        return Added(force=stiffened(sum(values[name] * of_power(n) for n, name in powers(values)), record, values))
 
     def implausible(self, values: Values, std: Values) -> str:
         return "mounts that soften with amplitude" if values["k3_N_per_m3"] < 0 else ""
 
 
-def stiffened(cubes: np.ndarray, record: RecordMotion, values: Values) -> np.ndarray:
-    """(n, 6) generalized force on the payload by cubes of the mounts' deflections, (n, m), in time or on lines."""
-    return -cubes @ (values["k3_N_per_m3"] * shares(values)[:, None] * record.rows[record.vertical])
+def powers(values: Values) -> list[tuple[int, str]]:
+    """Power of the deflection and name of each stiffness."""
+    return [(int(name[1]), name) for name in values if name.startswith("k")]
+
+
+def stiffened(pull: np.ndarray | int, record: RecordMotion, values: Values) -> np.ndarray:
+    """(n, 6) generalized force on the payload by the mean mounts' pull [N], (n, m), in time or on lines."""
+    return -pull @ (shares(values)[:, None] * record.rows[record.vertical])
 
 
 def largest_rms(model: Table) -> float:
@@ -290,7 +292,7 @@ class ContactFriction(Effect):
     """Dahl friction at every motor, along its axis: f' = sigma v (1 - sign(v) f/F_c), F_c = sigma times the slip.
 
     P. R. Dahl, A solid friction model (1968): stiff and lossless for motion far below the slip, Coulomb far above.
-    Contacts slip at the same displacement; how their stiffness is shared among them the last fit finds.
+    Contacts slip at the same displacement; how their stiffness is distributed among them the last fit finds.
     """
 
     name = "contact_friction"
@@ -311,11 +313,12 @@ class ContactFriction(Effect):
                 *uneven(model.actuators[:-1], "stiffness of the contact of {} over the mean, less one"))
 
     def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
-        return pushed(slipping(record, values["slip_m"]), record, values)
+        return pushed(Contacts(record, values["slip_m"]).friction(0, len(record.volts)), record, values)
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         """As `force`, interpolated between slips."""
-        f = record.interpolated(self.name, values["slip_m"], omega, lambda slip: slipping(record, slip))
+        f = record.interpolated(self.name, values["slip_m"], omega,
+                                lambda slip: Contacts(record, slip).friction(0, len(record.volts)))
         return Added(force=pushed(f, record, values))
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
@@ -331,9 +334,20 @@ def contacts(values: Values) -> np.ndarray:
     return values["stiffness_N_per_m"] * shares(values)
 
 
-def slipping(record: RecordMotion, slip: float) -> np.ndarray:
-    """(samples, m) m: friction of each contact over its stiffness."""
-    return dahl(np.ascontiguousarray(record.deflection[:, record.driven_rows]), slip)
+class Contacts:
+    """Friction of all contacts over their stiffness [m] along a record, from a state that is kept."""
+
+    def __init__(self, record: RecordMotion, slip: float):
+        self.record, self.slip = record, slip
+        self.state, self.last = np.zeros(len(record.driven_rows)), np.zeros(len(record.driven_rows))
+
+    def friction(self, start: int, stop: int, keep: bool = False) -> np.ndarray:
+        """(stop - start, m) m, after the samples up to which the state was kept."""
+        deflection = np.ascontiguousarray(self.record.deflection[start:stop, self.record.driven_rows])
+        found = dahl(deflection, self.last, self.slip, self.state)
+        if keep:
+            self.state, self.last = found[-1], deflection[-1]
+        return found
 
 
 def pushed(f: np.ndarray, record: RecordMotion, values: Values) -> np.ndarray:
@@ -342,15 +356,15 @@ def pushed(f: np.ndarray, record: RecordMotion, values: Values) -> np.ndarray:
 
 
 @njit(cache=True)
-def dahl(deflection, slip):
+def dahl(deflection, last, slip, state):
     """(samples, m) friction force over stiffness [m] for a deflection (samples, m), exact between samples.
 
-    While the motion keeps its direction, f -> +-slip as exp(-|dx|/slip).
+    While the motion keeps its direction, f -> +-slip as exp(-|dx|/slip). last, state : (m,) before the first sample.
     """
     n, m = deflection.shape
-    out = np.zeros((n, m))
+    out = np.empty((n, m))
     for j in range(m):
-        f, before = 0.0, 0.0
+        f, before = state[j], last[j]
         for k in range(n):
             step = deflection[k, j] - before
             before = deflection[k, j]

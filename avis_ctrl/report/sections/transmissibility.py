@@ -76,22 +76,25 @@ def _nominal(result: DesignResult) -> Figure:
     return Figure("transmissibility_nominal", caption + left_out(result), (_panel([*curves, _limit(result)], [], ""),))
 
 
+def _with_bounds(result: DesignResult) -> list[ControllerResult]:
+    """mu and the tuned skyhook; this one may have been left out, or have failed."""
+    return [c for name in ("mu", "skyhook") for c in result.controllers if c.name == name]
+
+
 def _uncertain(result: DesignResult) -> Figure:
     panels = []
-    for name in ("mu", "skyhook"):
-        c = result.controller(name)
+    for c in _with_bounds(result):
         T = c.transmissibility
-        style = controller_style(name)
+        style = controller_style(c.name)
         worst = upper_bound(c, "upper bound over the whole set")
         band = Band(_hz(c), decibels(T.low), decibels(T.high), f"{c.title}: range over sampled plants", style)
         panels.append(_panel([_sigma(c), worst, _limit(result)], [band], c.title))
-    return Figure("transmissibility_uncertain", _spread_words(result), tuple(panels), 2)
+    return Figure("transmissibility_uncertain", _spread_words(result), tuple(panels), len(panels))
 
 
 def _spread_words(result: DesignResult) -> str:
     parts = []
-    for name in ("mu", "skyhook"):
-        c = result.controller(name)
+    for c in _with_bounds(result):
         parts.append(f"{c.title}: sampled plants peak at {words.decibel(float(np.max(c.transmissibility.high)))}, the "
                      f"bound at {words.decibel(c.worst_peak.upper)}")
     return ("Largest singular value over the uncertainty set: nominal (line), range over the sampled plants (area), "

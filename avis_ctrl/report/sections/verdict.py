@@ -67,6 +67,7 @@ def comparison(result: DesignResult) -> Section:
     rows: list[tuple[str, Callable[[ControllerResult], Cell]]] = [
         ("order", lambda c: str(c.order)),
         ("gamma, nominal weighted loop", lambda c: words.bound(c.gamma)),
+        ("the same by SLICOT's AB13DD", lambda c: "failed" if c.gamma_slicot is None else words.bound(c.gamma_slicot)),
         ("mu, upper bound", lambda c: words.bound(c.mu.upper, 4)),
         ("mu, lower bound", lambda c: words.bound(c.mu.lower, 4)),
         ("mu peaks at", lambda c: words.hertz(c.mu.omega)),

@@ -1,0 +1,33 @@
+from avis_ctrl import plot as plot
+from avis_ctrl.errors import InputError as InputError
+from avis_ctrl.interface.workflow import campaign as campaign
+from avis_ctrl.interface.workflow import design as design
+from avis_ctrl.interface.workflow import gap as gap
+from avis_ctrl.interface.workflow import identify as identify
+from avis_ctrl.interface.workflow import rig as rig
+from avis_ctrl.interface.workflow import simulate_campaign as simulate_campaign
+from avis_ctrl.interface.workflow import single_axis as single_axis
+from avis_ctrl.lti import StateSpace as StateSpace
+from avis_ctrl.lti import tf as tf
+from avis_ctrl.robust.disk_margin import disk_margin as disk_margin
+from avis_ctrl.robust.hinfsyn import hinfsyn as hinfsyn
+from avis_ctrl.robust.mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
+from avis_ctrl.robust.mu import mu as mu
+from avis_ctrl.robust.mu_peak import mu_peak as mu_peak
+from avis_ctrl.robust.musyn import musyn as musyn
+from avis_ctrl.robust.robustness import robust_performance as robust_performance
+from avis_ctrl.robust.robustness import robust_stability as robust_stability
+from avis_ctrl.robust.robustness import worst_case_gain as worst_case_gain
+from avis_ctrl.uncertainty.blocks import BlockStructure as BlockStructure
+from avis_ctrl.uncertainty.blocks import ComplexFull as ComplexFull
+from avis_ctrl.uncertainty.blocks import ComplexScalar as ComplexScalar
+from avis_ctrl.uncertainty.blocks import RealScalar as RealScalar
+from avis_ctrl.uncertainty.uncertain_models import complex_disk as complex_disk
+from avis_ctrl.uncertainty.uncertain_models import connect as connect
+from avis_ctrl.uncertainty.uncertain_models import dynamics as dynamics
+from avis_ctrl.uncertainty.uncertain_models import matrix as matrix
+from avis_ctrl.uncertainty.uncertain_models import real as real
+from avis_ctrl.uncertainty.uncertain_models import ss as ss
+from avis_ctrl.uncertainty.uncertainty_weight import uncertainty_weight as uncertainty_weight
+
+__version__: str

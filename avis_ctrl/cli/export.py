@@ -1,0 +1,71 @@
+"""`avis export`: the controller that a rig's processor loads, with the certificate of its numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from avis_ctrl.cli.console import Progress
+
+
+def export(
+    design_dir: Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="folder that avis design wrote")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the controller's files")],
+    controller: Annotated[str, typer.Option("--controller", metavar="NAME", help="a controller of the design")] = "mu",
+    formats: Annotated[str, typer.Option("--format", metavar="LIST", help="some of c,mat,json; controller.json and "
+                                         "certificate.json are always written")] = "c,mat,json",
+    float32: Annotated[bool, typer.Option("--float32", help="numbers and arithmetic in single precision")] = False,
+    check: Annotated[bool, typer.Option("--check", help="write nothing: check that the files in DIR belong together "
+                                        "and compute their certificate again")] = False,
+) -> None:
+    """Write a controller for the rig's processor: sensor volts to drive volts, all axes.
+
+    Writes controller.json, avis_controller.h and .c (C99), controller.mat, test_vectors.csv and certificate.json into
+    DIR. The certificate is computed from the numbers in controller.json (docs/export.md).
+    """
+    from rich.console import Console
+
+    from avis_ctrl.errors import InputError
+    from avis_ctrl.export.design_folder import open_design
+    from avis_ctrl.export.package import FILES, check_package, formats_of, make_package
+    from avis_ctrl.files import write_together
+    from avis_ctrl.study.files import output_folder
+
+    console, asked = Console(highlight=False), formats_of(formats)
+    folder = open_design(design_dir)
+    if check:
+        with Progress(console) as progress:
+            wrong = check_package(folder, out, progress)
+        if wrong:
+            raise InputError("; ".join(wrong), file=out)
+        console.print(f"{out}: the files belong together, and the certificate is that of controller.json.")
+        return
+    folder.controller(controller)  # a wrong name is said before anything is created
+    with output_folder(out, FILES) as path, Progress(console) as progress:
+        made = make_package(folder, controller, "float32" if float32 else "float64", asked, progress)
+        files = write_together(path, made.contents, [path / name for name in FILES])
+    _summary(console, made)
+    console.print(f"{len(files)} files in {path}")
+
+
+def _summary(console, made) -> None:
+    from math import log10
+
+    from rich.table import Table
+
+    found = made.certificate.content
+    table = Table("of the emitted numbers", "", title="certificate")
+    rows = (("mu, upper bound", found["mu_upper"], ""), ("mu, lower bound", found["mu_lower"], ""),
+            ("worst-case transmissibility, peak", found["worst_case_peak_transmissibility_dB"], " dB"),
+            ("worst-case transmissibility in the band", found["worst_case_band_transmissibility_dB"], " dB"),
+            ("the same at all times, between the samples too", found["between_samples"]["worst_case_gain_dB"], " dB"),
+            ("worst plant replayed through the compiled code", made.replay and 20 * log10(made.replay.gain), " dB"),
+            ("payload velocity by rounding, bound", found["rounding_noise_m_per_s"], " m/s"),
+            ("time of one step on this machine", found["step_time_us"], " us"))
+    for name, value, unit in rows:
+        table.add_row(name, "not measured" if value is None else f"{value:.4g}{unit}")
+    console.print(table)
+    for reason in made.certificate.reasons:
+        console.print(f"Not proved: {reason}")

@@ -1,0 +1,215 @@
+"""Bounds of the loop that runs the emitted numbers: mu, worst-case transmissibility, stability.
+
+The design's uncertain plant stays in continuous time, and so does a rational controller K_s in its loop; what the
+emitted controller does beyond that is covered by two more uncertain blocks, of measured size (`sampled_response`):
+
+    force = K_s seen + W_a Delta_a seen        |W_a| >= |R - K_s exp(-j omega tau)|
+    seen  = G force + W_E Delta_E force        |W_E| >= |E|, the images of the sample rate
+
+Whatever the rounded, sampled and held controller does to frequencies below half the sample rate lies in this set, so
+that the bounds of `mu_peak` and `worst_case_gain` for it are bounds for the code. K_s is the design's own controller;
+any other function would do, with other W_a. A number of controller.json that is changed changes W_a and every bound.
+
+Stability of the sampled loop: det(I - L) does not vanish from frequency 0 to half the sample rate for any member of the
+set, so that its argument changes as that of the continuous loop with K_s, which is stable, provided that the loop gain
+is below 1 from half the rate on, where both arguments then end at zero (Nyquist, all parts stable by themselves).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.export.intervals import log_slopes
+from avis_ctrl.export.realisation import balanced
+from avis_ctrl.export.sampled_response import SampledAxes
+from avis_ctrl.lti.connect import connect, summing_junction
+from avis_ctrl.lti.magnitude_fit import covering_fits
+from avis_ctrl.lti.rational import Rational
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.robust.mu_peak import MuPeak, mu_peak, worst_case_gain
+from avis_ctrl.study.analysis import SLACK
+from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull
+from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
+
+
+@dataclass(frozen=True)
+class CoverSettings:
+    """Filters that cover the two errors.
+
+    lowest : as a fraction of half the sample rate, where the logarithmic intervals begin; below it the errors are
+        constant.
+    intervals : of the logarithmic grid, over each of which the errors are bounded; 0.4 % wide, so that Taylor's
+        remainder is small against `harmless`.
+    fitted : every so many intervals are fitted; the filter is then raised over all of them.
+    beyond, points_beyond : up to this multiple of half the sample rate a filter is kept from rising, at so many points.
+    excess_dB : by which a filter may exceed the error; more order than that needs is not spent.
+    harmless : errors below this fraction of the controller, or of the table, need not be followed closely: a thousandth
+        of the loop gain moves mu by about as much.
+    most : highest order of a filter.
+    """
+
+    lowest: float = 1e-7
+    intervals: int = 4000
+    fitted: int = 20
+    beyond: float = 30.0
+    points_beyond: int = 15
+    excess_dB: float = 2.0
+    harmless: float = 1e-3
+    most: int = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Intervals |omega - centre| <= half that cover 0 to half the sample rate [rad/s], (n,) each."""
+
+    centre: np.ndarray
+    half: np.ndarray
+
+    @staticmethod
+    def of(half_rate: float, settings: CoverSettings) -> Grid:
+        ends = np.concatenate([np.linspace(0.0, settings.lowest, 9)[:-1],
+                               np.geomspace(settings.lowest, 1.0, settings.intervals + 1)]) * half_rate
+        return Grid((ends[1:] + ends[:-1]) / 2, (ends[1:] - ends[:-1]) / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Upper bounds of the loop that runs the emitted numbers.
+
+    mu : robust performance of the weighted channels. peak, band : worst-case transmissibility, largest singular value,
+    up to half the sample rate and in the design's band.
+    all_times : worst-case r.m.s. gain from the floor's velocity up to half the sample rate to the payload's velocity at
+    all times, between the samples too. above : the same from the floor's velocity above half the rate, which the
+    samples show at other frequencies. Both inf where not proved.
+    gain_above : largest loop gain at and above half the sample rate; the proof of stability needs it below 1.
+    """
+
+    mu: MuPeak
+    peak: MuPeak
+    band: MuPeak
+    all_times: float
+    above: float
+    gain_above: float
+
+
+def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Bounds:
+    """Bounds of the loop that runs the emitted numbers.
+
+    Raises
+    ------
+    ComputationError : the emitted controller is so far from the design's that no loop with it can be proved stable.
+    """
+    folder, design = axes.folder, axes.folder.design
+    plant, K = folder.plant, folder.controller(axes.controller.name)
+    K = balanced(K)
+    grid = Grid.of(axes.half_rate, settings)
+    size = np.linalg.norm(K.frequency_response(grid.centre), ord=2, axis=(1, 2))
+    W_a = _cover(grid, axes.controller_error(K, grid.centre, grid.half), settings.harmless * size, settings)
+    W_E = _cover(grid, axes.folding(grid.centre, grid.half),
+                 settings.harmless * _table(plant.synthesis, grid.centre), settings)
+    below = (0.0, axes.half_rate)
+    performance, blocks = _with_errors(plant.synthesis, K, W_a, W_E)
+    motion, _ = _with_errors(plant.full.restricted(plant.floor_velocities, plant.velocities), K, W_a, W_E)
+    if not performance.is_stable():
+        raise ComputationError("the closed loop of the design's controller is unstable with the nominal plant",
+                               cause="files of different designs in one folder", next_step="run avis design again")
+    whole = blocks.with_performance(len(plant.synthesis.w), len(plant.synthesis.z))
+    low, high = (2 * np.pi * f for f in design.transmissibility.band_Hz)
+    return Bounds(mu_peak(performance, whole, band=below, slack=SLACK),
+                  worst_case_gain(motion, blocks, band=below, slack=SLACK),
+                  worst_case_gain(motion, blocks, band=(low, min(high, axes.half_rate)), slack=SLACK),
+                  *_between_samples(axes, K, W_a, W_E, grid, settings), _gain_above(axes, K, W_a, W_E, settings))
+
+
+def _gain_above(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational, settings: CoverSettings) -> float:
+    """Bound of the loop gain from half the sample rate on, both errors included."""
+    omega = np.geomspace(1.0, settings.beyond, settings.intervals) * axes.half_rate
+    size = np.linalg.norm(K.frequency_response(omega), ord=2, axis=(1, 2)) + W_a.magnitude(omega)
+    table = axes.force_to_seen(omega)
+    table[0] += W_E.magnitude(omega[:1])[0]  # the images belong to half the rate itself
+    return float(np.max(size * table))
+
+
+def _between_samples(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational, grid: Grid,
+                     settings: CoverSettings) -> tuple[float, float]:
+    """Worst-case gains of the lifted loop from the floor up to half the sample rate, and above, to all of the payload.
+
+    The held forces move the payload above half the rate by at most W_v times their r.m.s. The floor there acts on the
+    samples like a seen velocity of at most W_f times its r.m.s.; beside that the payload follows it as without control.
+    """
+    plant = axes.folder.plant
+    part = plant.full.restricted(plant.floor_velocities, plant.velocities)
+    held, folded = axes.held_images(grid.centre, grid.half), axes.folded_floor(grid.centre, grid.half)
+    W_v = _cover(grid, held, settings.harmless * np.full(held.size, np.max(held)), settings)
+    W_f = _cover(grid, folded, settings.harmless * np.full(folded.size, np.max(folded)), settings)
+    motion, blocks = _with_errors(part, K, W_a, W_E, W_v, W_f)
+    n_w, n_d = blocks.n_w, len(part.w)
+    found = [worst_case_gain(motion.select(None, [*range(n_w), *inputs]), blocks, band=(0.0, axes.half_rate),
+                             slack=SLACK)
+             for inputs in (range(n_w, n_w + n_d), range(n_w + n_d, motion.ninputs))]
+    first, second = (one.upper if one.guaranteed else np.inf for one in found)
+    return first, second + axes.passive_above()
+
+
+def _table(plant: GeneralizedPlant, omega: np.ndarray) -> np.ndarray:
+    """(n_omega,) gain of the nominal table from forces to seen velocities."""
+    G = plant.P.select(plant.y, plant.u).frequency_response(omega)
+    return np.linalg.norm(G, ord=2, axis=(1, 2))
+
+
+def _cover(grid: Grid, error: np.ndarray, harmless: np.ndarray, settings: CoverSettings) -> Rational:
+    """A filter with |W| >= error over all intervals, of the lowest order that is near it where it is not harmless."""
+    lower = np.maximum(error, np.finfo(float).tiny)
+    upper = np.maximum(lower, harmless)
+    # Corners lie up to `reach` beyond the frequencies fitted: none below the first logarithmic interval.
+    reach = 10.0
+    every = slice(int(np.searchsorted(grid.centre, 1.01 * reach * grid.centre[8])), None, settings.fitted)
+    # Above half the rate nothing has to be covered: the filter must not rise there, where the proof of robust stability
+    # meets it, and may fall.
+    end = grid.centre[-1]
+    omega = np.concatenate([grid.centre[every], np.geomspace(1.1, settings.beyond, settings.points_beyond) * end])
+    most = np.concatenate([upper[every], np.full(settings.points_beyond, upper[-1])])
+    least = np.concatenate([lower[every], np.full(settings.points_beyond, upper[-1] / settings.beyond)])
+    best = None
+    for fit in covering_fits(omega, least, most, range(settings.most + 1), reach=reach):
+        if best is None or fit.error_max_dB < best.error_max_dB:
+            best = fit
+        if fit.error_max_dB <= settings.excess_dB:
+            break
+    assert best is not None
+    W = best.function
+    slope, _ = log_slopes([*W.zeros(), *W.poles()], grid.centre, grid.half)
+    reached = W.magnitude(grid.centre) * np.exp(-grid.half * slope)
+    return W.scaled(max(1.0, float(np.max(lower / reached))))
+
+
+def _with_errors(plant: GeneralizedPlant, K: StateSpace, W_a: Rational, W_E: Rational, W_v: Rational | None = None,
+                 W_f: Rational | None = None) -> tuple[StateSpace, BlockStructure]:
+    """The loop closed with K, the two errors' blocks behind those of the plant.
+
+    W_v, W_f : of further outputs W_v force, and of further inputs that add W_f times them to what is seen.
+    """
+    P, blocks, n = plant.P, plant.blocks, plant.nmeas
+    force, seen = [f"{name} applied" for name in plant.u], [f"{name} alone" for name in plant.y]
+    parts = {"plant": P.renamed(dict(zip(plant.u, force, strict=True)), dict(zip(plant.y, seen, strict=True))),
+             "K": K.renamed(plant.y, plant.u)}
+    for k in range(n):
+        terms = [seen[k], f"w_E{k}"]
+        if W_f is not None and W_v is not None:
+            terms.append(f"folded {k}")
+            parts[f"W_f {k}"] = W_f.system(f"floor above {k}", f"folded {k}")
+            parts[f"W_v {k}"] = W_v.system(force[k], f"velocity above {k}")
+        parts[f"seen {k}"] = summing_junction(plant.y[k], terms)
+        parts[f"force {k}"] = summing_junction(force[k], [plant.u[k], f"w_a{k}"])
+        parts[f"W_a {k}"] = W_a.system(plant.y[k], f"z_a{k}")
+        parts[f"W_E {k}"] = W_E.system(force[k], f"z_E{k}")
+    added_w, added_z = ([f"{kind}{k}" for kind in (f"{letter}_a", f"{letter}_E") for k in range(n)]
+                        for letter in "wz")
+    above = range(n if W_f is not None else 0)
+    closed = connect(parts, [*P.inputs[:blocks.n_w], *added_w, *plant.w, *(f"floor above {k}" for k in above)],
+                     [*P.outputs[:blocks.n_z], *added_z, *plant.z, *(f"velocity above {k}" for k in above)])
+    return closed, BlockStructure((*blocks.blocks, ComplexFull(n, n, "sampled controller"),
+                                   ComplexFull(n, n, "images of the sample rate")))

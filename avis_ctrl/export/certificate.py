@@ -1,0 +1,123 @@
+"""The certificate of the shipped code: every figure from the numbers in controller.json."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from avis_ctrl.export.bounds import bounds
+from avis_ctrl.export.compiled import step_time_us
+from avis_ctrl.export.design_folder import DesignFolder
+from avis_ctrl.export.rounding import rounding_noise
+from avis_ctrl.export.sampled_controller import SampledController
+from avis_ctrl.export.sampled_response import SampledAxes
+from avis_ctrl.export.worst_plant import WorstPlant, mu_lower, worst_transmissibility
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.simulation.discrete import spectral_radius
+from avis_ctrl.simulation.sampled_loop import SampledLoop
+from avis_ctrl.study.random_plants import random_perturbations
+from avis_ctrl.study.simulation import with_delta
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class StabilitySettings:
+    """plants : random plants of the uncertainty set, of all axes, whose loops are checked beside the proof for the kept
+    axes. gains : between 0 and 1, at which the start must be stable: steps of 10 %, between which the poles of a loop
+    that is stable at both ends move little."""
+
+    plants: int = 20
+    gains: tuple[float, ...] = tuple(np.linspace(0.1, 1.0, 10))
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """content : certificate.json. loop : the emitted controller on the nominal rig. worst : worst plant of
+    transmissibility. reasons : what keeps `stable` or `guaranteed` from being true, in words."""
+
+    content: dict[str, Any]
+    loop: SampledLoop
+    worst: WorstPlant
+    reasons: tuple[str, ...]
+
+    def one_line(self) -> str:
+        """For the header of the C files."""
+        c = self.content
+        known = {"mu": c["mu_upper"], "peak": c["worst_case_peak_transmissibility_dB"],
+                 "band": c["worst_case_band_transmissibility_dB"]}
+        text = {name: "unbounded" if value is None or not np.isfinite(value) else f"{value:.4g}"
+                for name, value in known.items()}
+        proved = "proved between frequencies" if c["guaranteed"] else "not proved"
+        return (f"mu at most {text['mu']}, worst-case transmissibility at most {text['peak']} dB, in the band "
+                f"{text['band']} dB, {'stable' if c['stable'] else 'not stable'}, {proved}")
+
+
+def shipped_loop(folder: DesignFolder, controller: SampledController) -> SampledLoop:
+    """The emitted numbers on the design's nominal rig."""
+    return replace(folder.loop(folder.controller(controller.name)), digital=controller.system)
+
+
+def certify(folder: DesignFolder, controller: SampledController, files: Mapping[str, str] | None = None,
+            progress: Progress = lambda text: None, settings: StabilitySettings = StabilitySettings()) -> Certificate:
+    """Compute the certificate of a controller's numbers.
+
+    Parameters
+    ----------
+    files : C files whose step is timed; None for no time.
+
+    Raises
+    ------
+    ComputationError : a loop for which no figure exists: unstable with the nominal plant.
+    """
+    axes = SampledAxes.of(folder, controller)
+    with threadpool_limits(1):
+        loop = shipped_loop(folder, controller)
+        progress("stability of all axes and rounding noise")
+        noise = rounding_noise(controller, loop)
+        progress("bounds over the whole uncertainty set, from the emitted numbers")
+        found = bounds(axes)
+        worst = worst_transmissibility(axes, found)
+        lower = mu_lower(axes, found)
+        unstable = _unstable(folder, loop, worst, settings)
+    bounded = (found.mu, found.peak, found.band)
+    unproved = tuple(one.covers for one in bounded if not (one.guaranteed and np.isfinite(one.upper)))
+    if not found.gain_above < 1:
+        unproved += (f"the loop gain from half the sample rate on is bounded by {found.gain_above:.3g} only",)
+
+    def dB(value: float) -> float:
+        return 20 * float(np.log10(value))
+    content = {"format": "avis-certificate", "version": 1, "controller_sha256": controller.sha256,
+               "mu_upper": found.mu.upper, "mu_lower": lower, "guaranteed": not unproved,
+               "stable": not unstable and bool(np.isfinite(found.peak.upper)),
+               "worst_case_peak_transmissibility_dB": dB(found.peak.upper),
+               "worst_case_band_transmissibility_dB": dB(found.band.upper),
+               "rounding_noise_m_per_s": float(np.linalg.norm(noise)),
+               "step_time_us": None if files is None else step_time_us(files, controller),
+               "between_samples": {"worst_case_gain_dB": dB(found.all_times),
+                                   "floor_above_half_rate_dB": dB(found.above)}}
+    return Certificate(content, loop, worst, (*unstable, *unproved))
+
+
+def _unstable(folder: DesignFolder, nominal: SampledLoop, worst: WorstPlant, settings: StabilitySettings
+              ) -> tuple[str, ...]:
+    """The plants of all axes whose sampled linear loop with the emitted numbers is not stable, in words."""
+    K = nominal.digital
+    assert K is not None
+    rng = np.random.default_rng((folder.design.simulation.seed, 3))
+    deltas = [("worst case", worst.delta, worst.omega)]
+    deltas += [(f"random plant {k}", delta, 2 * np.pi * 10 ** rng.uniform(0.0, 2.0)) for k, delta in enumerate(
+        random_perturbations(folder.plant, settings.plants, folder.design.simulation.seed), 1)]
+    loops = [(f"nominal, gain {g:.0%}", replace(nominal, digital=_scaled(K, g))) for g in settings.gains]
+    loops += [(name, with_delta(folder.rig, folder.plant, nominal, name, delta, omega))
+              for name, delta, omega in deltas]
+    radii = [(name, spectral_radius(loop)) for name, loop in loops]
+    return tuple(f"{name}: spectral radius {radius:.6g}" for name, radius in radii if not radius < 1)
+
+
+def _scaled(K: StateSpace, gain: float) -> StateSpace:
+    return replace(K, C=gain * K.C, D=gain * K.D)

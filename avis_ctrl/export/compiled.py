@@ -1,0 +1,130 @@
+"""The C code compiled with gcc and called from Python."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.export.c_source import SOURCE
+from avis_ctrl.export.sampled_controller import SampledController
+from avis_ctrl.files import write_together
+
+# Every warning of the contract.
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wdouble-promotion", "-Werror")
+# Products and sums stay two roundings, as the certificate's error model counts them.
+BUILD = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
+
+
+@dataclass(frozen=True)
+class TimingSettings:
+    """runs : how often the clock is read; the median ignores interrupts. steps : between two readings, far longer
+    than the clock's resolution."""
+
+    runs: int = 31
+    steps: int = 2000
+
+
+def compiler() -> str | None:
+    """gcc, where it is installed."""
+    return shutil.which("gcc")
+
+
+class CompiledController:
+    """The shared library of a controller's C files, with one struct of its own.
+
+    Raises
+    ------
+    ComputationError : no compiler, or it refuses the source.
+    """
+
+    def __init__(self, files: Mapping[str, str], controller: SampledController, flags: Sequence[str] = BUILD):
+        gcc = compiler()
+        if gcc is None:
+            raise ComputationError("the C code was not compiled", cause="gcc is not installed",
+                                   next_step="install gcc, or compile the files on the target")
+        real = ctypes.c_float if controller.arithmetic == "float32" else ctypes.c_double
+
+        class State(ctypes.Structure):
+            _fields_ = (("x", real * max(controller.system.nstates, 1)), ("gain", real), ("wait", ctypes.c_uint32))
+
+        with tempfile.TemporaryDirectory() as folder:
+            write_together(Path(folder), {name: text.encode() for name, text in files.items()})
+            library = Path(folder) / "controller.so"
+            done = subprocess.run([gcc, *STRICT, *flags, str(Path(folder) / SOURCE), "-o", str(library)],
+                                  capture_output=True, text=True)
+            if done.returncode:
+                raise ComputationError("the C code does not compile", measured=done.stderr.strip().splitlines()[0])
+            self._library = ctypes.CDLL(str(library))  # stays loaded when its file is gone
+        self._step, self._init = self._library.avis_controller_step, self._library.avis_controller_init
+        self._step.restype = self._init.restype = None
+        self.dtype, self.state = controller.dtype, State()
+        self._y = np.zeros(controller.system.ninputs, controller.dtype)
+        self._u = np.zeros(controller.system.noutputs, controller.dtype)
+        self._arguments: tuple[Any, ...] = (ctypes.byref(self.state), self._y.ctypes.data_as(ctypes.c_void_p),
+                                            self._u.ctypes.data_as(ctypes.c_void_p))
+        self.reset()
+
+    def reset(self) -> None:
+        """`avis_controller_init`."""
+        self._init(self._arguments[0])
+
+    def step(self, y: np.ndarray) -> np.ndarray:
+        """Drive volts (n_u,) for sensor volts (n_y,)."""
+        self._y[:] = y
+        self._step(*self._arguments)
+        return self._u.astype(float)
+
+    def skip_start(self) -> None:
+        """The gain at 1, as after the start."""
+        self.state.gain, self.state.wait = 1.0, 0
+
+
+_TIMER = """\
+#include <time.h>
+#include "avis_controller.h"
+void time_steps(unsigned runs, unsigned steps, const real_t *y, double *seconds)
+{
+    avis_controller_t c;
+    real_t u[AVIS_CONTROLLER_OUTPUTS];
+    avis_controller_init(&c);
+    for (unsigned k = 0; k < runs; k++) {
+        struct timespec a, b;
+        clock_gettime(CLOCK_MONOTONIC, &a);
+        for (unsigned j = 0; j < steps; j++) {
+            avis_controller_step(&c, y + (j % 16u) * AVIS_CONTROLLER_INPUTS, u);
+        }
+        clock_gettime(CLOCK_MONOTONIC, &b);
+        seconds[k] = ((double)(b.tv_sec - a.tv_sec) + 1e-9 * (double)(b.tv_nsec - a.tv_nsec)) / (double)steps;
+    }
+}
+"""
+
+
+def step_time_us(files: Mapping[str, str], controller: SampledController, settings: TimingSettings = TimingSettings()
+                 ) -> float | None:
+    """Median time of one step on this machine [us], -O2; None without gcc."""
+    gcc = compiler()
+    if gcc is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        write_together(Path(folder), {name: text.encode() for name, text in {**files, "timer.c": _TIMER}.items()})
+        library = Path(folder) / "timer.so"
+        done = subprocess.run([gcc, "-std=gnu99", *BUILD, str(Path(folder) / SOURCE), str(Path(folder) / "timer.c"),
+                               "-o", str(library)], capture_output=True, text=True)
+        if done.returncode:
+            raise ComputationError("the C code does not compile", measured=done.stderr.strip().splitlines()[0])
+        loaded = ctypes.CDLL(str(library))
+    y = np.random.default_rng(0).normal(0, 1e-2, (16, controller.system.ninputs)).astype(controller.dtype)
+    seconds = np.zeros(settings.runs)
+    loaded.time_steps(ctypes.c_uint(settings.runs), ctypes.c_uint(settings.steps),
+                      y.ctypes.data_as(ctypes.c_void_p), seconds.ctypes.data_as(ctypes.c_void_p))
+    return float(1e6 * np.median(seconds))

@@ -1,0 +1,94 @@
+"""A folder that `avis design` wrote, read for export."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.export.realisation import processor_form
+from avis_ctrl.export.sampled_controller import Arithmetic, SampledController
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.simulation.discrete import digital_controller
+from avis_ctrl.simulation.sampled_loop import SampledLoop
+from avis_ctrl.study.companions import Companion
+from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.study.saved import read_json, read_saved
+from avis_ctrl.study.simulation import bare_loop
+
+
+@dataclass(frozen=True, eq=False)
+class DesignFolder:
+    """What a design's folder holds.
+
+    result : result.json. plant : the generalized plant of the design, built from its inputs.
+    """
+
+    path: Path
+    design: Design
+    rig: Rig
+    result: dict[str, Any]
+    plant: DesignPlant
+
+    @property
+    def names(self) -> list[str]:
+        """The controllers that have a file."""
+        return [row["name"] for row in self.result["controllers"] if row.get("file")]
+
+    def controller(self, name: str) -> StateSpace:
+        """The continuous controller of the logical axes. Raises InputError with the names that there are."""
+        if name not in self.names:
+            raise InputError(f"expected one of {', '.join(self.names)}", field="--controller", value=name)
+        path = self.path / "controllers" / f"{name}.json"
+        content = read_json(path, "avis-controller")
+        try:
+            A, B, C, D = (np.array(content[part], float) for part in "ABCD")
+            K = StateSpace(A, B, C, D, float(content["dt"]), tuple(content["inputs"]), tuple(content["outputs"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"expected a controller as avis design writes it; {error!r}", file=path) from None
+        if K.D.shape != (len(self.design.keep),) * 2:
+            raise InputError(f"expected {len(self.design.keep)} inputs and outputs", file=path, value=K.D.shape)
+        return K
+
+    def loop(self, K: StateSpace) -> SampledLoop:
+        """The controller on its nominal rig, the other axes under the loops that the design checked."""
+        loops = {one.axis: one.loop() for one in map(_companion, self.result["all_axes"].get("companions", ()))}
+        return replace(bare_loop(self.design, self.rig, self.plant, K), loops=loops)
+
+    def sampled(self, name: str, arithmetic: Arithmetic = "float64") -> SampledController:
+        """Sensor volts to drive volts, in the form and with the numbers that the processor holds."""
+        loop = self.loop(self.controller(name))
+        system = processor_form(digital_controller(loop))
+        names = loop.rig.sensor_rows()[0], loop.rig.equations_of_motion().actuators
+        return SampledController(name, system.renamed(*names), arithmetic, loop.limits_V,
+                                 loop.loop_delay_s * loop.sample_rate_Hz).rounded(arithmetic)
+
+
+def _companion(row: dict[str, Any]) -> Companion:
+    return Companion(row["axis"], row["gain"], row["tilt_corner_Hz"], row["roll_off_Hz"],
+                     row["modulus_margin"] if row["modulus_margin"] is not None else np.nan)
+
+
+def open_design(path: Path) -> DesignFolder:
+    """Read a folder of `avis design`.
+
+    Raises
+    ------
+    InputError : no such folder, or files that are missing or wrong.
+    ComputationError : the design's own simulation was unstable: such a controller is not exported.
+    """
+    if not path.is_dir():
+        raise InputError("expected a folder that avis design wrote", field="DESIGN_DIR", value=str(path))
+    result = read_json(path / "result.json", "avis-design")
+    design, rig = read_saved(path)
+    if result.get("stable") is not True:
+        raise ComputationError("the closed loop of this design was unstable in simulation, so it is not exported",
+                               cause=str(result.get("verdict", "")), next_step="design again with other weights")
+    if not isinstance(result.get("controllers"), list) or not isinstance(result.get("all_axes"), dict):
+        raise InputError("expected controllers and all_axes", file=path / "result.json")
+    return DesignFolder(path, design, rig, result, build_plant(design, rig))

@@ -1,0 +1,64 @@
+"""The worst plant of the certificate in closed loop with the compiled code, on the nonlinear table with six axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.export.certificate import Certificate
+from avis_ctrl.export.compiled import CompiledController
+from avis_ctrl.export.design_folder import DesignFolder
+from avis_ctrl.export.sampled_controller import SampledController
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.simulation.loop import SimulationRecord, simulate
+from avis_ctrl.simulation.sampled_loop import lever_arms
+from avis_ctrl.study.simulation import with_delta
+
+
+@dataclass(frozen=True)
+class ReplaySettings:
+    """settle_s : before the measurement; the start of the code and the slowest poles of such loops, some 0.02 Hz.
+    periods : of the sine that are measured, whole ones. velocity_rms : r.m.s. of the floor's sine as a multiple of the
+    site's velocity; the table is then as nonlinear as at the site."""
+
+    settle_s: float = 40.0
+    periods: int = 4
+    velocity_rms: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """gain : payload velocity over floor velocity of the kept axes, in the sine's worst direction. record : of the
+    measured periods."""
+
+    gain: float
+    record: SimulationRecord
+
+
+def replay_worst_plant(folder: DesignFolder, certificate: Certificate, controller: SampledController,
+                       files: Mapping[str, str], settings: ReplaySettings = ReplaySettings()) -> Replay:
+    """Move the floor of the worst plant with a sine at the worst frequency, in the worst direction.
+
+    Raises
+    ------
+    ComputationError : no compiler.
+    """
+    worst, design, rig = certificate.worst, folder.design, folder.rig
+    loop = with_delta(rig, folder.plant, certificate.loop, "worst case", worst.delta, worst.omega)
+    kept = [COORDINATES.index(name) for name in design.keep]
+    arms = lever_arms(rig)[kept]
+    rate = loop.sample_rate_Hz
+    settle = round(settings.settle_s * rate)
+    measured = round(settings.periods * 2 * np.pi / worst.omega * rate)
+    time = np.arange(settle + measured + 1) / rate
+    low, high = design.floor.band_Hz
+    size = settings.velocity_rms * np.sqrt(2) * folder.plant.floor.rms(low, high)
+    floor = np.zeros((time.size, len(COORDINATES)))
+    floor[:, kept] = size * np.real(worst.direction * np.exp(1j * worst.omega * time)[:, None]) / arms
+    code = CompiledController(files, controller)
+    record = simulate(loop, measured / rate, settle_s=settle / rate, floor=floor, code=code.step)
+    wave = np.exp(-1j * worst.omega * (record.time + settle / rate))[:, None]
+    moved = 2 * np.mean(record.q_dot[:, kept] * arms * wave, axis=0)
+    return Replay(float(np.linalg.norm(moved) / size), record)

@@ -1,0 +1,269 @@
+"""The controller as the continuous table feels it, and its distance from rational functions.
+
+From the seen velocities of the kept axes to the forces on them, at a frequency omega below half the sample rate,
+
+    R(omega) = hold(omega) exp(-j omega tau) T K(exp(j omega T_s)) diag(gain / F(j omega)) rows
+
+K are the numbers of controller.json, hold(omega) = (1 - exp(-j omega T_s)) / (j omega T_s), T turns drive volts into
+the axes' forces, rows turn axes into sensors, F is the filter that the design's model of the sensors has and the code
+does itself. R is exact for what the controller makes of the frequency omega at that frequency. A sampled loop also
+folds: the held force at omega + 2 pi k / T_s moves the table a little, and its sensors show that motion at omega. With
+G the table from forces to seen velocities, the controller sees (G + E) times its forces instead of G,
+
+    |E| <= sum over k != 0 of |F(omega) / F(omega_k)| |G(omega_k)| |omega / omega_k|,
+
+|G| taken over the whole uncertainty set, each image with a perturbation of its own, which the true ones cannot exceed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.export.design_folder import DesignFolder
+from avis_ctrl.export.intervals import delay_jet, roots_jet, sinc_jet, system_jet
+from avis_ctrl.export.sampled_controller import SampledController
+from avis_ctrl.lti.magnitude_fit import covering_fit
+from avis_ctrl.lti.rational import Rational
+from avis_ctrl.lti.statespace import StateSpace, append, gain
+from avis_ctrl.rigs.actuator import pade_delay
+from avis_ctrl.rigs.logical_axes import actuator_axes
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.rigs.sensing import Filter, conditioning
+from avis_ctrl.robust.mu_peak import worst_case_gain
+from avis_ctrl.robust.mu_upper import skewed_upper_bound
+from avis_ctrl.study.analysis import SLACK
+from avis_ctrl.uncertainty.blocks import BlockStructure
+
+
+@dataclass(frozen=True)
+class ResponseSettings:
+    """images : pairs of images summed one by one; the rest is bounded by the decay of hold and table together, at least
+    as k^-2. points, order : of the function that bounds the table's gain above half the sample rate, where it falls
+    smoothly: the frequencies it is fitted to and its order. lowest : where it begins, as a fraction of half the rate:
+    the intervals of the grid reach a little beyond theirs."""
+
+    images: int = 8
+    points: int = 12
+    order: int = 3
+    lowest: float = 0.99
+
+
+@dataclass(frozen=True, eq=False)
+class SampledAxes:
+    """The emitted controller between the kept axes of a design.
+
+    Attributes
+    ----------
+    forces : (n, n_u) axes' forces [N] per drive volt. rows : (n_y, n) motion along each sensor per axis.
+    gains_V : (n_y,) volts per unit of motion.
+    """
+
+    folder: DesignFolder
+    controller: SampledController
+    forces: np.ndarray
+    rows: np.ndarray
+    gains_V: np.ndarray
+    settings: ResponseSettings = ResponseSettings()
+
+    @staticmethod
+    def of(folder: DesignFolder, controller: SampledController) -> SampledAxes:
+        """Raises InputError where the axes are measured by sensors in space and against the chassis at once."""
+        rig, keep, plant = folder.rig, folder.design.keep, folder.plant
+        if plant.relative and len(plant.relative) != len(plant.axes):
+            raise InputError("expected axes that are all measured in space, or all against the chassis; a mixture has "
+                             "no certificate of its code", field="keep", value=keep)
+        kept = [COORDINATES.index(name) for name in keep]
+        lever = np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
+        names, H = rig.sensor_rows()
+        found = actuator_axes(rig, keep)
+        if controller.system.inputs != tuple(names) or controller.system.outputs != tuple(found.actuators):
+            raise InputError("expected the sensors and drives of the design's rig", field="inputs, outputs",
+                             value=[*controller.system.inputs, *controller.system.outputs])
+        alike = np.array([one.inertial != bool(plant.relative) for one in rig.sensors()])
+        filters = {one for one, used in zip(conditioning(rig, folder.design.loop.integrator_corner_Hz), alike,
+                                            strict=True) if used}
+        if len(filters) > 1:
+            raise InputError("expected sensors of one kind: several kinds have no certificate of their code",
+                             field="sensors", value=sorted({one.quantity for one in rig.sensors()}))
+        return SampledAxes(folder, controller, found.matrix[kept] / lever[:, None],
+                           H[:, kept] / lever * alike[:, None], np.array([one.gain for one in rig.sensors()]))
+
+    @property
+    def period_s(self) -> float:
+        return self.controller.system.dt
+
+    @property
+    def half_rate(self) -> float:
+        """Half the sample rate [rad/s]."""
+        return np.pi / self.period_s
+
+    def hold(self, omega: np.ndarray) -> np.ndarray:
+        """(n,) hold and delay."""
+        T = self.period_s
+        return np.sinc(omega * T / (2 * np.pi)) * np.exp(-1j * omega * T * (0.5 + self.controller.delay_samples))
+
+    def pade(self, omega: np.ndarray) -> np.ndarray:
+        """(n,) the design model's delay, which the plant holds already."""
+        rig = self.folder.rig
+        system = pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, self.folder.design.loop.pade_order)
+        return system.frequency_response(omega)[:, 0, 0]
+
+    @cached_property
+    def _filters(self) -> list[StateSpace | None]:
+        found = conditioning(self.folder.rig, self.folder.design.loop.integrator_corner_Hz)
+        systems = {one: None if one.is_one else one.system() for one in found}
+        return [systems[one] for one in found]
+
+    def sensor_volts(self, omega: np.ndarray) -> np.ndarray:
+        """(n_omega, n_y) volts per seen velocity along each sensor."""
+        known = {id(one): 1.0 / one.frequency_response(omega)[:, 0, 0] for one in self._filters if one is not None}
+        return np.stack([gain * (known[id(one)] if one is not None else np.ones(omega.size))
+                         for one, gain in zip(self._filters, self.gains_V, strict=True)], axis=1)
+
+    def volts(self, omega: np.ndarray) -> np.ndarray:
+        """(n_omega, n_u, n) drive volts computed per seen velocity of the axes."""
+        K = self.controller.system.frequency_response(omega)
+        return K @ (self.sensor_volts(omega)[:, :, None] * self.rows)
+
+    def response(self, omega: np.ndarray) -> np.ndarray:
+        """(n_omega, n, n) R without the design model's delay: what stands in the place of its controller."""
+        return (self.hold(omega) / self.pade(omega))[:, None, None] * (self.forces @ self.volts(omega))
+
+    def controller_error(self, K: StateSpace, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound over |omega - centre| <= half of |R - K exp(-j omega tau)| and of what rounded decoding adds
+        [N s/m].
+
+        K : continuous, from seen velocities to forces; the delay is that of the design's model.
+        """
+        T, rig, own = self.period_s, self.folder.rig, self.controller.system
+        design_delay = pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, self.folder.design.loop.pade_order)
+        delay = design_delay.poles().tolist()
+        # The all-pass of the design's delay, inverted; its sign is 1 at rest.
+        no_pade = roots_jet(delay, [-one for one in delay], (-1.0) ** len(delay), centre, half)
+        channel = self._channel
+        unfiltered = roots_jet(channel.poles, channel.zeros, 1 / channel.leading, centre, half)
+        code = StateSpace(own.A, own.B @ (self.gains_V[:, None] * self.rows), self.forces @ own.C,
+                          self.forces @ own.D @ (self.gains_V[:, None] * self.rows), T)
+        held = sinc_jet(T, centre) * (delay_jet(T * (0.5 + self.controller.delay_samples), centre) * no_pade)
+        R = held * (unfiltered * system_jet(code, centre, half))
+        # What rounding sends beside the axes is some 1e-7 of R and as smooth: doubled for the interval.
+        return (R - system_jet(K, centre, half)).bound(half) + 2 * self._beside(centre)
+
+    def folding(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound of |E| [m/(N s)] over |omega - centre| <= half, up to half the sample rate."""
+        own = self._filter(centre, half)[0]
+        terms = [own / self._filter(image, half)[1] * self._high_gain("force", "seen", image, half)
+                 * (centre + half) / (image - half) for image in self._images(centre)]
+        # Hold and table together fall at least as k^-2: the sum over k > n of n^2 / k^2 is below n, on either side.
+        return np.sum(terms, axis=0) + 2 * self.settings.images * terms[-1]
+
+    def _beside(self, omega: np.ndarray) -> np.ndarray:
+        """(n_omega,) what the chains' errors make of voltages and sensor signals that no axis stands for [N s/m].
+
+        With exact decoding and allocation it would be zero; rounded coefficients make it some 1e-7 of the controller.
+        """
+        plant, volts = self.folder.plant, self.volts(omega)
+        hold = np.abs(self.hold(omega))
+        found = np.zeros(omega.size)
+        allocation = np.zeros((self.forces.shape[1], len(plant.axes)))
+        allocation[[self.controller.system.outputs.index(name) for name in plant.actuators]] = plant.allocation
+        if (weight := plant.weights.get("actuator chain *")) is not None:
+            beside = volts - allocation @ (self.forces @ volts)
+            found += weight.magnitude(omega) * hold * np.linalg.norm(self.forces, 2) * np.linalg.norm(
+                beside, ord=2, axis=(1, 2))
+        if (weight := plant.weights.get("sensor chain *")) is not None:
+            by_sensor = self.forces @ (self.controller.system.frequency_response(omega)
+                                       * self.sensor_volts(omega)[:, None, :])
+            beside = by_sensor - by_sensor @ self.rows @ plant.decoding
+            found += weight.magnitude(omega) * hold * np.linalg.norm(self.rows, 2) * np.linalg.norm(
+                beside, ord=2, axis=(1, 2))
+        return found
+
+    # -- images of the sample rate -------------------------------------------------------
+    @property
+    def _channel(self) -> Filter:
+        """F, one for all sensors of the axes."""
+        used = np.any(np.abs(self.rows) > 0, axis=1)
+        found = conditioning(self.folder.rig, self.folder.design.loop.integrator_corner_Hz)
+        return next(one for one, in_use in zip(found, used, strict=True) if in_use)
+
+    def _filter(self, centre: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) largest and least |F| over the intervals."""
+        one = self._channel
+        jet = roots_jet(one.zeros, one.poles, one.leading, centre, half)
+        return jet.size, np.abs(jet.value) ** 2 / jet.size
+
+    def _images(self, omega: np.ndarray) -> list[np.ndarray]:
+        """(n_omega,) frequencies that fold onto omega, the nearest first."""
+        rate = 2 * np.pi / self.period_s
+        return [np.abs(omega + k * rate) for n in range(1, self.settings.images + 1) for k in (-n, n)]
+
+    def _energy(self, terms: list[np.ndarray]) -> np.ndarray:
+        """(n_omega,) root of the sum of squares over all images, given the terms of the nearest; they fall at least as
+        1/k, so that the squares' rest is below the number of pairs times the last, on either side."""
+        return np.sqrt(np.sum(np.square(terms), axis=0) + 2 * self.settings.images * terms[-1] ** 2)
+
+    def held_images(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound over each interval of the payload velocity at all images per force, r.m.s. [m/(N s)]."""
+        return self._energy([self._high_gain("force", "velocity", image, half) * (centre + half) / (image - half)
+                             for image in self._images(centre)])
+
+    def folded_floor(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound over each interval of the seen velocity per floor velocity at all images, r.m.s."""
+        own = self._filter(centre, half)[0]
+        return self._energy([self._high_gain("floor", "seen", image, half) * own / self._filter(image, half)[1]
+                             for image in self._images(centre)])
+
+    @property
+    def high_grid(self) -> np.ndarray:
+        """(points,) rad/s from half the sample rate on; the first image of half the rate lies there."""
+        ends = self.settings.lowest, 2 * self.settings.images + 1
+        return np.geomspace(*ends, self.settings.points) * self.half_rate
+
+    def force_to_seen(self, omega: np.ndarray) -> np.ndarray:
+        """(n_omega,) bound of the table's gain above half the sample rate [m/(N s)]."""
+        return self._high_gain("force", "seen", omega, np.zeros(omega.size))
+
+    def passive_above(self) -> float:
+        """Bound of payload over floor velocity above half the sample rate, where no controller acts."""
+        return self._proved("floor", "velocity", None)
+
+    def _high_gain(self, source: str, target: str, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) bound of the gain over the uncertainty set and over intervals above half the rate."""
+        bound = self._high_bound(source, target)
+        return roots_jet(bound.zeros(), bound.poles(), bound.gain, centre, half).size
+
+    @cache  # noqa: B019 (one object per export)
+    def _high_bound(self, source: str, target: str) -> Rational:
+        """A function whose magnitude the worst-case gain does not exceed above half the rate: fitted to values, then
+        raised to what `worst_case_gain` proves between them."""
+        part, whole = self._part(source, target)
+        gains = skewed_upper_bound(part.frequency_response(self.high_grid)[:, None], whole).beta
+        if not np.all(np.isfinite(gains)):
+            raise ComputationError("the table above half the sample rate has no bounded gain over the uncertainty set",
+                                   next_step="design with smaller uncertainty")
+        fitted = covering_fit(self.high_grid, gains, gains, self.settings.order).function
+        return fitted.scaled(self._proved(source, target, fitted))
+
+    def _proved(self, source: str, target: str, weight: Rational | None) -> float:
+        """Proved bound of the worst-case gain over |weight| above half the sample rate."""
+        part, whole = self._part(source, target)
+        n_z, blocks = part.noutputs - whole.blocks[-1].cols, BlockStructure(whole.blocks[:-1])
+        if weight is not None:
+            part = append(gain(np.eye(n_z)), *[weight.inverse().system()] * (part.noutputs - n_z)) @ part
+        found = worst_case_gain(part, blocks, band=(self.high_grid[0], np.inf), slack=SLACK)
+        if not (found.guaranteed and np.isfinite(found.upper)):
+            raise ComputationError("the table's gain above half the sample rate is not proved", measured=found.covers)
+        return found.upper
+
+    def _part(self, source: str, target: str) -> tuple[StateSpace, BlockStructure]:
+        """The open table with its blocks, from forces or floor to seen velocities or velocities."""
+        plant, blocks, P = self.folder.plant, self.folder.plant.full.blocks, self.folder.plant.full.P
+        names = {"force": plant.full.u, "floor": plant.floor_velocities, "seen": plant.full.y,
+                 "velocity": plant.velocities}
+        part = P.select([*P.outputs[:blocks.n_z], *names[target]], [*P.inputs[:blocks.n_w], *names[source]])
+        return part, blocks.with_performance(len(names[source]), len(names[target]))

@@ -1,0 +1,62 @@
+"""Lower bounds: plants of the uncertainty set that the emitted controller meets, found at single frequencies.
+
+The loop is closed frequency by frequency with the exact response of the emitted numbers, hold and delay included, the
+images of the sample rate left out: where a chain may be wrong by more than 100 % at half the rate, the set has plants
+that have none. The worst one is replayed through the compiled code in time.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from avis_ctrl.export.bounds import Bounds
+from avis_ctrl.export.sampled_response import SampledAxes
+from avis_ctrl.robust.mu import mu
+from avis_ctrl.robust.mu_gain import perturbed, worst_gain
+from avis_ctrl.robust.mu_peak import MuPeak
+from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
+
+
+class WorstPlant(NamedTuple):
+    """gain : from floor to payload velocity of the kept axes, rotations at the edge. omega : rad/s. delta : (n_w, n_z)
+    of the design's blocks. direction : (n_axes,) complex floor velocity of norm 1 that is amplified so."""
+
+    gain: float
+    omega: float
+    delta: np.ndarray
+    direction: np.ndarray
+
+
+def mu_lower(axes: SampledAxes, found: Bounds) -> float:
+    """A lower bound of mu of the loop, near the peaks of its upper bound."""
+    plant = axes.folder.plant.synthesis
+    M = _closed(plant, axes, _near(found.mu, axes.half_rate))
+    return float(np.max(mu(M, plant.all_blocks, tolerance=1e-3).lower))
+
+
+def worst_transmissibility(axes: SampledAxes, found: Bounds) -> WorstPlant:
+    """The worst plant of transmissibility, near the peaks of its upper bound."""
+    plant = axes.folder.plant
+    omega = _near(found.peak, axes.half_rate)
+    M = _closed(plant.full.restricted(plant.floor_velocities, plant.velocities), axes, omega)
+    worst = worst_gain(M, plant.full.blocks)
+    k = int(np.argmax(worst.gain))
+    _, _, Vh = np.linalg.svd(perturbed(M[k], worst.delta[k]))
+    return WorstPlant(float(worst.gain[k]), float(omega[k]), worst.delta[k], np.conj(Vh[0]))
+
+
+def _near(peak: MuPeak, half_rate: float, count: int = 12) -> np.ndarray:
+    """(n,) the frequencies of the highest upper bounds, and where the lower one was reached."""
+    order = np.argsort(peak.upper_curve)[::-1][:count]
+    return np.unique([one for one in (*peak.frequencies[order], peak.omega) if 0 < one < half_rate])
+
+
+def _closed(plant: GeneralizedPlant, axes: SampledAxes, omega: np.ndarray) -> np.ndarray:
+    """(n_omega, n_z + n_e, n_w + n_d) the loop with the emitted controller."""
+    P, n_y, n_u = plant.P.frequency_response(omega), plant.nmeas, plant.ncon
+    rows, cols = P.shape[1] - n_y, P.shape[2] - n_u
+    K = axes.response(omega)
+    return P[:, :rows, :cols] + P[:, :rows, cols:] @ K @ np.linalg.solve(
+        np.eye(n_y) - P[:, rows:, cols:] @ K, P[:, rows:, :cols])

@@ -1,0 +1,264 @@
+"""Results of the interface: a summary, plots, and the files of the command of the same name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl import plot, report
+from avis_ctrl.errors import AvisError
+from avis_ctrl.gap.result import Gap
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.plot.axes import axes_of, finish
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.study.design_file import Design, design_from_table
+from avis_ctrl.study.design_result import DesignResult, Requirement
+from avis_ctrl.study.files import open_folder
+from avis_ctrl.study.gap import GapFinding
+from avis_ctrl.study.gap_files import write_gap
+from avis_ctrl.study.gap_names import GAP_FILES
+from avis_ctrl.study.identification import Identification
+from avis_ctrl.study.identification_design import default_design, default_keep, design_start
+from avis_ctrl.study.identification_files import FILES as IDENTIFICATION_FILES
+from avis_ctrl.study.identification_files import RIG_FILE
+from avis_ctrl.study.identification_output import identified_toml, require_readable, write_identification
+from avis_ctrl.study.output import FILES, FOLDERS, write_study
+from avis_ctrl.study.verdict import all_axes, first_sentence
+from avis_ctrl.summary import html_table
+
+
+class DesignStudy:
+    """What `avis design` computes: controllers, bounds, simulation, verdict.
+
+    result : the whole `DesignResult`. controller : the delivered controller u = K y of the axes kept.
+    sampled_controller : the controller for the processor, sensor volts to drive volts, all axes (None if none was
+        simulated). requirements : lines of the verdict table.
+    """
+
+    def __init__(self, result: DesignResult) -> None:
+        self.result = result
+
+    @property
+    def controller(self) -> StateSpace:
+        K = self.result.controller("mu").K
+        assert K is not None  # only the table without control has none
+        return K
+
+    @property
+    def sampled_controller(self) -> StateSpace | None:
+        return self.result.loop.digital if self.result.loop is not None else None
+
+    @property
+    def requirements(self) -> tuple[Requirement, ...]:
+        return self.result.requirements
+
+    @property
+    def met(self) -> bool:
+        """Whether every requirement is met and every simulated plant is stable."""
+        return self.result.stable and all(one.met for one in self.requirements)
+
+    def summary(self) -> str:
+        """The verdict in words, and one line for each requirement."""
+        lines = [first_sentence(self.result)]
+        if self.result.stable:
+            lines.append(all_axes(self.result))
+        rows = self._rows()
+        widths = [max((len(row[k]) for row in rows), default=0) for k in range(3)]
+        lines += ["  " + "  ".join([name.ljust(widths[0]), limit.rjust(widths[1]), value.rjust(widths[2]), met])
+                  for name, limit, value, met in rows]
+        return "\n".join([*lines, *self.result.notes])
+
+    def _rows(self) -> list[tuple[str, str, str, str]]:
+        rows = []
+        for r in self.requirements:
+            unit = f" {r.unit}" if r.unit else ""
+            asked = "yes" if r.comparison == "is" else f"{r.comparison} {r.limit:.4g}{unit}"
+            rows.append((r.name, asked, f"{r.value:.4g}{unit}" if np.isfinite(r.value) else "-",
+                         "met" if r.met else "not met"))
+        return rows
+
+    def plot_transmissibility(self, ax: Any = None, controllers: Any = None) -> Any:
+        """Floor to payload of every controller; see `plot.transmissibility`."""
+        return plot.transmissibility(self.result, ax, controllers=controllers)
+
+    def plot_mu(self, ax: Any = None, controller: str = "mu") -> Any:
+        """Bounds of mu of one controller's loop; see `plot.mu`."""
+        return plot.mu(self.result.controller(controller).mu, ax)
+
+    def plot_dk_history(self, ax: Any = None) -> Any:
+        """The course of the mu synthesis; see `plot.dk_history`."""
+        return plot.dk_history(self.result.dk_history, ax)
+
+    def plot_controller(self, ax: Any = None) -> Any:
+        """Singular values of the controller; see `plot.sigma`."""
+        return plot.sigma(self.controller, ax=ax)
+
+    def plot_vibration(self, ax: Any = None) -> Any:
+        """Third-octave velocity of floor and payload (worst axis) against the vibration criteria."""
+        site = self.result.controller("mu").site
+        f = site.third_octave_Hz
+        return plot.vc_curves({"floor": (f, site.floor_third_octaves),
+                               "payload, mu": (f, np.max(site.payload_third_octaves, axis=1))}, ax)
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """The files of `avis design`, all or none: reports, controllers, plant.json, result.json.
+
+        Raises InputError for a folder that cannot be written, ComputationError for a full disk.
+        """
+        out = open_folder(folder, FILES, FOLDERS)
+        return write_study(self.result, out, report.render_html(self.result), report.render_pdf(self.result))
+
+    def __repr__(self) -> str:
+        met = sum(one.met for one in self.requirements)
+        return f"DesignStudy({self.result.design.title!r}: {met} of {len(self.requirements)} requirements met)"
+
+    def _repr_html_(self) -> str:
+        return html_table(self._rows(), ("requirement", "limit", "result", ""), first_sentence(self.result))
+
+
+class IdentificationStudy:
+    """What `avis identify` computes: the identified table, its uncertainty, the verdict on held-out records.
+
+    found : the whole `Identification`. rig : the table with the identified values.
+    """
+
+    def __init__(self, found: Identification) -> None:
+        self.found = found
+
+    @property
+    def rig(self) -> Rig:
+        return self.found.rig
+
+    @property
+    def values(self) -> dict[str, tuple[float, float, str]]:
+        """(value, standard deviation, unit) by parameter; infinite where it is determined only in combination."""
+        i = self.found.information
+        return {name: (float(v), float(s), u) for name, v, s, u in zip(i.names, i.values, i.standard_deviation, i.units,
+                                                                       strict=True)}
+
+    def _rows(self) -> list[tuple[str, str, str]]:
+        return [(name, f"{value:.6g} +- {sigma:.2g}" if np.isfinite(sigma) else f"{value:.6g}, only in combination",
+                 unit) for name, (value, sigma, unit) in self.values.items()]
+
+    def summary(self) -> str:
+        """The identified values, the verdict on held-out records, what the data do not determine."""
+        verdict, *more = self.found.validation.sentences
+        return "\n".join([f"{verdict[:1].upper()}{verdict[1:]}.",
+                          *(f"  {name:20s} {value:>26s} {unit}" for name, value, unit in self._rows()),
+                          *self.found.campaign_fit.notes, *more, *self.found.identifiability.sentences])
+
+    def plot_values(self, ax: Any = None) -> Any:
+        """Identified over starting value of each parameter, with its standard deviation."""
+        ax = axes_of(ax)
+        start = self.found.start.parameters()
+        rows = [(name, v, s, start[name].value) for name, (v, s, _) in self.values.items()
+                if name in start and start[name].value]
+        change = [100 * (v / old - 1) for _, v, _, old in rows]
+        bars = [100 * abs(s / old) if np.isfinite(s) else 0.0 for _, _, s, old in rows]
+        places = np.arange(len(rows))[::-1]
+        ax.errorbar(change, places, xerr=bars, fmt="o", color="#0072b2", markersize=4, capsize=2)
+        ax.axvline(0.0, color="#7a7a7a", linewidth=0.8)
+        ax.set_yticks(places, [name for name, *_ in rows], fontsize="x-small")
+        return finish(ax, "identified against starting value [%]", "", log=False)
+
+    def files(self, sections: Mapping[str, Any] | None = None) -> dict[str, str]:
+        """Texts of rig.toml, uncertainty.json and design.toml by name, from which a design starts.
+
+        sections : of the design, in place of those that are proposed. Raises as `design`.
+        """
+        require_readable(self.found)
+        return {RIG_FILE: identified_toml(self.found), **design_start(self.found, self._template(sections))[0]}
+
+    def _template(self, sections: Mapping[str, Any] | None) -> Design | None:
+        if not sections:
+            return None
+        given = dict(sections)
+        keep = given.get("keep") or default_keep(self.rig)
+        title = f"{self.rig.name}, identified: {' and '.join(keep)} under one controller"
+        proposed = default_design(self.rig, title).model_dump(exclude_none=True)
+        return design_from_table({**proposed, "keep": keep, **given, "rig": RIG_FILE})
+
+    def save(self, folder: str | Path, **sections: Any) -> list[Path]:
+        """The files of `avis identify`, all or none; sections : of design.toml, as for `files`.
+
+        Raises InputError for a folder that cannot be written or sections that do not fit.
+        """
+        out = open_folder(folder, IDENTIFICATION_FILES)
+        template, made = self._template(sections), None
+        more: dict[str, str] = {}
+        try:
+            require_readable(self.found)
+            more, made = design_start(self.found, template)
+        except AvisError:
+            # As in the command: the identification is valid without the files for design.
+            if sections:
+                raise
+        return write_identification(self.found, out, report.identification_html(self.found, made),
+                                    report.identification_pdf(self.found, made), more)
+
+    def __repr__(self) -> str:
+        information = self.found.information
+        return (f"IdentificationStudy({self.rig.name!r}: {information.rank} of {len(information.names)} combinations "
+                "of parameters determined)")
+
+    def _repr_html_(self) -> str:
+        return html_table(self._rows(), ("parameter", "value +- standard deviation", "unit"), self.rig.name)
+
+
+class GapStudy:
+    """What `avis gap` computes: the verdict, the named effects, both models.
+
+    found : the whole `GapFinding`. gap : its `Gap`. effects : the named effects.
+    """
+
+    def __init__(self, found: GapFinding) -> None:
+        self.found = found
+
+    @property
+    def gap(self) -> Gap:
+        return self.found.gap
+
+    @property
+    def effects(self) -> tuple[Any, ...]:
+        return tuple(self.gap.effects)
+
+    @property
+    def verdict(self) -> str:
+        """none, explained, partly explained or unexplained."""
+        return self.gap.verdict
+
+    def summary(self) -> str:
+        """The verdict and the sentences of the report."""
+        return "\n".join([f"{self.verdict}: {self.gap.sentences[0]}", *self.gap.sentences[1:]])
+
+    def _rows(self) -> list[tuple[str, str]]:
+        rows = [(stage.name, f"{100 * stage.nrmse:.3g} %") for stage in self.gap.stages]
+        return [*rows, ("noise alone", f"{100 * self.gap.noise_nrmse:.3g} %")]
+
+    def plot_stages(self, ax: Any = None) -> Any:
+        """Error of the predicted sensor signals on held-out records [%], by stage, with the noise."""
+        ax = axes_of(ax)
+        names = [stage.name for stage in self.gap.stages]
+        places = np.arange(len(names))[::-1]
+        ax.barh(places, [100 * stage.nrmse for stage in self.gap.stages], color="#0072b2", height=0.5)
+        ax.axvline(100 * self.gap.noise_nrmse, color="#b3261e", linestyle="--", linewidth=1, label="noise alone")
+        ax.set_yticks(places, names)
+        return finish(ax, "error of held-out signals, r.m.s. [%]", "", log=False)
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """The files of `avis gap`, all or none. Raises InputError for a folder that cannot be written."""
+        out = open_folder(folder, GAP_FILES)
+        return write_gap(out, self.gap, report.gap_html(self.found), report.gap_pdf(self.found), self.found.to_json())
+
+    def __repr__(self) -> str:
+        named = ", ".join(one.name for one in self.effects) or "no effect named"
+        return f"GapStudy({self.verdict}: {named})"
+
+    def _repr_html_(self) -> str:
+        return html_table(self._rows(), ("stage", "error on held-out records"), repr(self))
+
+
+__all__ = ["DesignStudy", "GapStudy", "IdentificationStudy"]

@@ -1,0 +1,13 @@
+"""Plots in matplotlib: each function takes a system or a result and, if wanted, axes, and returns the axes.
+
+bode, sigma : responses of any system (ours, python-control's StateSpace, TransferFunction or FRD).
+mu : both bounds over frequency, with the certified peak.
+transmissibility : floor to payload of the controllers of a design, with their certified worst cases.
+dk_history, order : the course of a mu synthesis; mu by the controller's order.
+vc_curves : generic vibration criteria, with third-octave spectra.
+"""
+
+from avis_ctrl.plot.results import dk_history, mu, order, transmissibility, vc_curves
+from avis_ctrl.plot.systems import bode, sigma
+
+__all__ = ["bode", "dk_history", "mu", "order", "sigma", "transmissibility", "vc_curves"]

@@ -1,0 +1,56 @@
+"""Axes in, axes out: what the plots share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+
+HERTZ = 2 * np.pi
+
+
+def axes_of(given: Any, rows: int = 1) -> Any:
+    """The axes given, or those of a new figure: one, or an array of `rows` under each other that share x.
+
+    Raises InputError where another number of axes is given.
+    """
+    if given is None:
+        from matplotlib import pyplot as plt
+
+        _, made = plt.subplots(rows, 1, sharex=True, figsize=(6.4, 2.2 + 2.2 * rows), layout="constrained")
+        return made
+    if rows > 1 and np.size(given) != rows:
+        raise InputError(f"expected {rows} axes", field="ax", value=np.size(given))
+    return given
+
+
+def finish(ax: Any, x: str, y: str, log: bool = True, above: bool = False) -> Any:
+    """Labels, a light grid, and a legend, inside or above, where something has a name."""
+    if log:
+        ax.set_xscale("log")
+    if x:
+        ax.set_xlabel(x)
+    ax.set_ylabel(y)
+    ax.grid(True, which="major", linewidth=0.5, color="#d8d8d8")
+    ax.set_axisbelow(True)
+    if ax.get_legend_handles_labels()[0]:
+        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 2} if above else {}
+        ax.legend(fontsize="small", framealpha=0.85, edgecolor="none", **place)
+    return ax
+
+
+def decibels(size: np.ndarray) -> np.ndarray:
+    """20 log10 |size|; nan where it is zero or not finite."""
+    size = np.abs(np.asarray(size))
+    known = np.isfinite(size) & (size > 0)
+    return np.where(known, 20 * np.log10(np.where(known, size, 1.0)), np.nan)
+
+
+def whole_numbers(ax: Any) -> None:
+    """Ticks of the x axis at whole numbers only."""
+    from matplotlib.ticker import MaxNLocator
+
+    ax.set_xscale("linear")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -1,0 +1,133 @@
+"""Plots of results: bounds of mu, transmissibility, the course of a synthesis, vibration criteria."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.plot.axes import HERTZ, axes_of, decibels, finish, whole_numbers
+from avis_ctrl.rigs.vibration_criteria import CRITERIA
+
+# Colours of Okabe and Ito; controllers look as in the report.
+COLOURS = {"passive": "#7a7a7a", "skyhook_classical": "#56b4e9", "skyhook": "#e69f00", "hinf": "#009e73",
+           "mu": "#0072b2"}
+LIMIT, LOWER = "#b3261e", "#e69f00"
+
+
+def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu"]) -> Any:
+    """Upper and lower bound of mu over frequency [Hz], with the bound of the peak and what it is worth.
+
+    peak : `MuPeak` (of `mu_peak` or `worst_case_gain`) or a design's `Bound`. Returns the axes.
+    """
+    ax = axes_of(ax)
+    f = np.asarray(peak.frequencies) / HERTZ
+    shown = f > 0
+    ax.plot(f[shown], peak.upper_curve[shown], ".-", markersize=4, color=color, label=f"{label}, upper bound")
+    lower = np.where(peak.lower_curve > 0, peak.lower_curve, np.nan)
+    ax.plot(f[shown], lower[shown], color=LOWER, linestyle="--", label=f"{label}, lower bound")
+    if np.isfinite(peak.upper):
+        worth = "proved between all points" if peak.guaranteed else "at the computed points only"
+        ax.axhline(peak.upper, color=color, linewidth=0.8, linestyle="--",
+                   label=f"peak below {peak.upper:.4g}, {worth}")
+    if np.isfinite(peak.lower) and peak.lower > 0 and peak.omega > 0:
+        ax.plot(peak.omega / HERTZ, peak.lower, "o", color=color, markersize=5, fillstyle="none",
+                label=f"reached: {peak.lower:.4g} at {peak.omega / HERTZ:.4g} Hz")
+    ax.set_ylim(bottom=0)
+    return finish(ax, "frequency [Hz]", label, above=True)
+
+
+def transmissibility(result: Any, ax: Any = None, *, controllers: Iterable[str] | None = None) -> Any:
+    """Largest singular value floor to payload [dB] over frequency [Hz], nominal, with the range of sampled plants.
+
+    Parameters
+    ----------
+    result : a design's result (of `avis_ctrl.design` or `run_design`).
+    controllers : names of those drawn; by default all. The certified worst-case peak of the last one is a dashed line.
+
+    Returns the axes. Raises InputError for a controller that the result does not have.
+    """
+    ax = axes_of(ax)
+    result = getattr(result, "result", result)
+    known = {one.name: one for one in result.controllers}
+    names = list(known if controllers is None else controllers)
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(f"expected some of {', '.join(known)}", field="controllers", value=unknown[0])
+    for name in names:
+        one, t = known[name], known[name].transmissibility
+        colour = COLOURS.get(name, "#222222")
+        ax.plot(t.omega / HERTZ, decibels(t.sigma), color=colour, label=one.title, linewidth=2 if name == "mu" else 1.3)
+        if name == names[-1]:
+            ax.fill_between(t.omega / HERTZ, decibels(t.low), decibels(t.high), color=colour, alpha=0.25, linewidth=0,
+                            label=f"{one.title}, sampled plants")
+            if np.isfinite(one.worst_peak.upper):
+                level = float(decibels(np.array(one.worst_peak.upper)))
+                ax.axhline(level, color=LIMIT, linewidth=0.9, linestyle="--",
+                           label=f"{one.title}, worst case {level:.1f} dB")
+    return finish(ax, "frequency [Hz]", "transmissibility [dB]")
+
+
+def dk_history(history: Any, ax: Any = None) -> Any:
+    """gamma and peak mu by iteration; `history` of a `MuSynthesis`, a design's result, or the rows themselves."""
+    ax = axes_of(ax)
+    rows = _rows(history)
+    steps = [row.iteration for row in rows]
+    ax.plot(steps, [row.gamma for row in rows], "s--", color="#e69f00", markersize=4, label="gamma of the scaled loop")
+    ax.plot(steps, [row.mu_upper for row in rows], "o-", color=COLOURS["mu"], markersize=4,
+            label="peak mu on the grid")
+    values = np.array([[row.gamma, row.mu_upper] for row in rows])
+    if values.max() > 10 * values.min():
+        ax.set_yscale("log")
+    ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
+    whole_numbers(ax)
+    return finish(ax, "iteration", "gamma, mu", log=False)
+
+
+def order(history: Any, ax: Any = None) -> Any:
+    """Peak mu of each controller over its number of states; `history` as for `dk_history`, or pairs (order, mu)."""
+    ax = axes_of(ax)
+    rows = history if isinstance(history, (list, tuple)) and history and isinstance(history[0], tuple) else [
+        (row.order, row.mu_upper) for row in _rows(history)]
+    states, values = (np.array(part, float) for part in zip(*sorted(rows), strict=True))
+    ax.plot(states, values, "o", color=COLOURS["mu"], markersize=4, label="controllers")
+    ax.step(states, np.minimum.accumulate(values), where="post", color=COLOURS["mu"], linewidth=1,
+            label="least mu up to this order")
+    if values.max() > 10 * values.min():
+        ax.set_yscale("log")
+    ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
+    whole_numbers(ax)
+    return finish(ax, "states of the controller", "peak mu", log=False)
+
+
+def vc_curves(spectra: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None, ax: Any = None) -> Any:
+    """The criteria VC-A to VC-G, and third-octave spectra by name: (midbands [Hz], r.m.s. velocity [m/s]), each (n,).
+
+    Returns the axes. Source of the criteria: `avis_ctrl.rigs.vibration_criteria`.
+    """
+    ax = axes_of(ax)
+    for one in CRITERIA:
+        f = one.midbands()
+        ax.plot(f, 1e6 * one.limit(f), color="#8a8a8a", linewidth=1)
+        ax.annotate(one.name, (f[-1], 1e6 * one.limit(f)[-1]), xytext=(4, 0), textcoords="offset points", va="center",
+                    fontsize="x-small", color="#555555")
+    for name, (f, rms) in (spectra or {}).items():
+        f, rms = np.asarray(f, float), np.asarray(rms, float)
+        if f.shape != rms.shape or f.ndim != 1:
+            raise InputError(f"expected two vectors of one length, got {f.shape} and {rms.shape}", field=name)
+        known = np.isfinite(rms) & (rms > 0)
+        ax.plot(f[known], 1e6 * rms[known], "o-", markersize=3, label=name)
+    ax.set_yscale("log")
+    ax.margins(x=0.08)
+    return finish(ax, "midband of the third octave [Hz]", "velocity, r.m.s. [µm/s]")
+
+
+def _rows(history: Any) -> list[Any]:
+    """Rows of the D-K history, those with finite numbers."""
+    for name in ("result", "dk_history", "history"):
+        history = getattr(history, name, history)
+    rows = [row for row in history if np.isfinite(row.gamma) and np.isfinite(row.mu_upper)]
+    if not rows:
+        raise InputError("expected at least one iteration with finite gamma and mu", field="history")
+    return rows

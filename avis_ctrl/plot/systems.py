@@ -1,0 +1,61 @@
+"""Responses of any linear system over frequency."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.lti.interchange import is_response, plot_frequencies, response_of
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.plot.axes import HERTZ, axes_of, decibels, finish
+
+
+def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label: str | None = None, **line: Any) -> Any:
+    """Magnitude [dB] and phase [degrees] over frequency [Hz], one curve for each input and output.
+
+    Parameters
+    ----------
+    system : StateSpace, or python-control's StateSpace, TransferFunction or FRD.
+    omega : (n,) frequencies [rad/s]; by default around the poles, or those of the FRD.
+    ax : two axes, magnitude and phase; by default those of a new figure.
+    label : of the curves in the legend; by default "output / input" where there are several.
+    line : options of matplotlib's `plot`.
+
+    Returns the two axes. Raises InputError for something that is no system.
+    """
+    top, bottom = axes = axes_of(ax, 2)
+    omega = plot_frequencies(system) if omega is None else np.asarray(omega, float)
+    H = response_of(system, omega)
+    for i in range(H.shape[1]):
+        for k in range(H.shape[2]):
+            names = f"{_name(system, 'outputs', i)} / {_name(system, 'inputs', k)}" if H[0].size > 1 else None
+            words = " ".join(part for part in (label, names) if part) or None
+            top.plot(omega / HERTZ, decibels(H[:, i, k]), label=words, **line)
+            bottom.plot(omega / HERTZ, np.degrees(np.unwrap(np.angle(H[:, i, k]))), **line)
+    finish(top, "", "magnitude [dB]")
+    finish(bottom, "frequency [Hz]", "phase [degrees]")
+    low, high = bottom.get_ylim()
+    step = 45 if high - low <= 270 else 90 * np.ceil((high - low) / 720)
+    bottom.set_yticks(np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step)
+    return axes
+
+
+def sigma(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label: str | None = None, **line: Any
+          ) -> Any:
+    """Singular values [dB] over frequency [Hz], in one colour; arguments as for `bode`, one pair of axes."""
+    ax = axes_of(ax)
+    omega = plot_frequencies(system) if omega is None else np.asarray(omega, float)
+    values = decibels(np.linalg.svd(response_of(system, omega), compute_uv=False))
+    for k in range(values.shape[1]):
+        if k:
+            line["color"] = ax.lines[-1].get_color()
+        ax.plot(omega / HERTZ, values[:, k], label=None if k else label, **line)
+    return finish(ax, "frequency [Hz]", "singular values [dB]" if values.shape[1] > 1 else "magnitude [dB]")
+
+
+def _name(system: Any, which: str, k: int) -> str:
+    if isinstance(system, StateSpace):
+        return getattr(system, which)[k]
+    labels = getattr(system, f"{which[:-1]}_labels", None)
+    return str(labels[k]) if labels is not None and not is_response(system) else f"{which[0]}{k}"

@@ -1,0 +1,77 @@
+"""Mixed-sensitivity H-infinity design: weights on S, K S and T, the generalized plant, and the controller.
+
+Skogestad and Postlethwaite, Multivariable Feedback Control, 2005, section 9.3.6; Zhou, Doyle and Glover, 1996, chapter
+6. Negative feedback, error e = r - G u, u = K e:
+
+    z = (W_S e, W_KS u, W_T G u),        gamma = || (W_S S, W_KS K S, W_T T) ||
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti import append, connect, gain
+from avis_ctrl.lti.interchange import as_system
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.robust.hinfsyn import Synthesis, hinfsyn
+from avis_ctrl.summary import Shown
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MixedSensitivity(Shown):
+    """K of u = K (r - y), gamma measured on the loop, and the loop's responses.
+
+    S, KS, T : from r to e, u and y. P : the generalized plant (r, u -> z, e). synthesis : the H-infinity result.
+    """
+
+    K: StateSpace
+    gamma: float
+    S: StateSpace
+    KS: StateSpace
+    T: StateSpace
+    P: StateSpace
+    synthesis: Synthesis
+
+
+def mixed_sensitivity(G: Any, W_S: Any = None, W_KS: Any = None, W_T: Any = None, **options: Any) -> MixedSensitivity:
+    """Controller that makes the largest of |W_S S|, |W_KS K S| and |W_T T| small.
+
+    Parameters
+    ----------
+    G : plant (ours or python-control's), continuous or sampled. W_S, W_KS, W_T : weights (systems, filters, numbers):
+        of one channel for all alike, or of as many inputs as they have signals to weigh; None leaves the term out.
+    options : of `hinfsyn`.
+
+    Raises
+    ------
+    InputError : no weight, or one that does not fit. ComputationError : no stabilising controller.
+    """
+    G = as_system(G, "G")
+    n_y, n_u = G.noutputs, G.ninputs
+    r, e, u, y = ([f"{name}{k}" for k in range(n)] for name, n in (("r", n_y), ("e", n_y), ("u", n_u), ("y", n_y)))
+    parts = {"G": G.renamed(u, y), "error": gain(np.hstack([np.eye(n_y), -np.eye(n_y)]), [*r, *y], e, G.dt)}
+    z: list[str] = []
+    for name, weight, seen in (("W_S", W_S, e), ("W_KS", W_KS, u), ("W_T", W_T, y)):
+        if weight is not None:
+            W = _for(weight, len(seen), name)
+            parts[name] = W.renamed(seen, own := [f"{name}{k}" for k in range(W.noutputs)])
+            z += own
+    if not z:
+        raise InputError("expected at least one weight", field="W_S, W_KS, W_T")
+    P = connect(parts, [*r, *u], [*z, *e])
+    made = hinfsyn(P, n_y, n_u, **options)
+    loop = connect({**{name: parts[name] for name in ("G", "error")}, "K": made.K.renamed(e, u)}, r, [*e, *u, *y])
+    return MixedSensitivity(made.K, made.gamma, loop.select(e), loop.select(u), loop.select(y), P, made)
+
+
+def _for(weight: Any, n: int, name: str) -> StateSpace:
+    W = as_system(weight, name)
+    if W.D.shape == (1, 1) and n > 1:
+        return append(*[W] * n)
+    if W.ninputs != n:
+        raise InputError(f"expected 1 or {n} inputs", field=name, value=W.ninputs)
+    return W

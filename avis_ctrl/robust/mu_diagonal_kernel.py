@@ -1,0 +1,251 @@
+"""The compiled path to the least level of `mu_lmi` where every scaling is one number a block.
+
+Single complex scalars and full blocks have scalings p_k > 0 alone. With W = S M^H, T = M S M^H and S the inverse of
+
+    F = lambda P_w - M^H P_z M,
+
+the barrier sum_k c_k p_k - log det F - sum_k c_k log p_k and its derivatives are sums of |S|^2, |W|^2 and
+|T|^2 over blocks: a Newton step costs three products of matrices. Matrices along axis 1 of M share p.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+
+class PathSettings(NamedTuple):
+    """central : Newton decrement below which a point counts as the analytic centre.
+    near : Newton decrement below which a full step is taken, for it converges quadratically there.
+    reach : fraction of the way to the boundary that lambda falls in one step: the nearer to 1, the fewer steps, but the
+        more Newton steps each.
+    first, shrink : first trial of that way, in units of the least that it can be, and the factor to the next trial.
+    newton, steps : most Newton steps to a centre, and most centres; both are never needed.
+    """
+
+    central: float = 0.3
+    near: float = 0.4
+    reach: float = 0.9
+    first: float = 3.0
+    shrink: float = 0.7
+    newton: int = 40
+    steps: int = 60
+
+
+SETTINGS = PathSettings()
+
+
+@njit(cache=True)
+def _level_matrix(M, p_z, p_w, F):
+    """F = diag(p_w) - M^H diag(p_z) M, lower triangle."""
+    n_z, n_w = M.shape
+    for i in range(n_w):
+        for j in range(i + 1):
+            F[i, j] = 0.0
+        F[i, i] = p_w[i]
+    for k in range(n_z):
+        for i in range(n_w):
+            m = p_z[k] * np.conj(M[k, i])
+            for j in range(i + 1):
+                F[i, j] -= m * M[k, j]
+
+
+@njit(cache=True)
+def _factor(F):
+    """Lower Cholesky factor in place of F; False where F is not positive definite."""
+    n = F.shape[0]
+    for j in range(n):
+        total = F[j, j].real
+        for k in range(j):
+            total -= F[j, k].real ** 2 + F[j, k].imag ** 2
+        if not total > 0.0:
+            return False
+        root = np.sqrt(total)
+        F[j, j] = root
+        for i in range(j + 1, n):
+            s = F[i, j]
+            for k in range(j):
+                s -= F[i, k] * np.conj(F[j, k])
+            F[i, j] = s / root
+    return True
+
+
+@njit(cache=True)
+def _invert(L):
+    """Inverse of L in place of the lower factor L."""
+    n = L.shape[0]
+    for j in range(n):
+        L[j, j] = 1.0 / L[j, j].real
+        for i in range(j + 1, n):
+            s = 0j
+            for k in range(j, i):
+                s -= L[i, k] * L[k, j]
+            L[i, j] = s / L[i, i].real
+
+
+@njit(cache=True)
+def _add_block_norms(X, rows, cols, weight, out):
+    """out[rows[i], cols[j]] += weight |X[i, j]|^2."""
+    for i in range(X.shape[0]):
+        for j in range(X.shape[1]):
+            out[rows[i], cols[j]] += weight * (X[i, j].real ** 2 + X[i, j].imag ** 2)
+
+
+@njit(cache=True)
+def _solve_positive(H, b):
+    """Solution of H x = b for positive definite H with its diagonal scaled to one, a ridge where it is singular."""
+    n = b.size
+    d, A = np.empty(n), np.empty((n, n))
+    for i in range(n):
+        d[i] = 1.0 / np.sqrt(max(H[i, i], 1e-300))
+    for i in range(n):
+        for j in range(i + 1):
+            A[i, j] = H[i, j] * d[i] * d[j]
+        A[i, i] += 1e-13
+    for j in range(n):
+        for k in range(j):
+            A[j, j] -= A[j, k] ** 2
+        A[j, j] = np.sqrt(max(A[j, j], 1e-30))
+        for i in range(j + 1, n):
+            for k in range(j):
+                A[i, j] -= A[i, k] * A[j, k]
+            A[i, j] /= A[j, j]
+    x = d * b
+    for i in range(n):
+        for k in range(i):
+            x[i] -= A[i, k] * x[k]
+        x[i] /= A[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= A[k, i] * x[k]
+        x[i] /= A[i, i]
+    return d * x
+
+
+@njit(cache=True)
+def _derivatives(M, p, lam, of_z, of_w, copies, gradient, slope, hessian, falling):
+    """Gradient, its derivative by lambda, and Hessian of the barrier at (p, lam); False outside.
+
+    falling (n_blocks + 1,) : tr(S P_w S dF/dp_k), and tr(S P_w S P_w), for the speed at which F falls.
+    """
+    n_b = p.size
+    n_z, n_w = M.shape[1:]
+    SS, WS, TS = np.zeros((n_b, n_b)), np.zeros((n_b, n_b)), np.zeros((n_b, n_b))
+    F = np.empty((n_w, n_w), np.complex128)
+    for k in range(n_b):
+        gradient[k], slope[k], falling[k] = copies[k] - copies[k] / p[k], 0.0, 0.0
+    falling[n_b] = 0.0
+    for s in range(M.shape[0]):
+        _level_matrix(M[s], p[of_z], lam * p[of_w], F)
+        if not _factor(F):
+            return False
+        _invert(F)
+        for i in range(n_w):
+            for j in range(i + 1, n_w):
+                F[i, j] = 0.0
+        # V = inv(L) M^H, hence S = inv(L)^H inv(L), W = inv(L)^H V, T = V^H V.
+        V = np.dot(F, np.conj(M[s]).T)
+        Lh = np.conj(F).T
+        S, W, T = np.dot(Lh, F), np.dot(Lh, V), np.dot(np.conj(V).T, V)
+        _add_block_norms(S, of_w, of_w, 1.0, SS)
+        _add_block_norms(W, of_w, of_z, 1.0, WS)
+        _add_block_norms(T, of_z, of_z, 1.0, TS)
+        for i in range(n_w):
+            gradient[of_w[i]] -= lam * S[i, i].real
+            slope[of_w[i]] -= S[i, i].real
+        for i in range(n_z):
+            gradient[of_z[i]] += T[i, i].real
+    for k in range(n_b):
+        for l in range(n_b):
+            hessian[k, l] = lam * lam * SS[k, l] - lam * (WS[k, l] + WS[l, k]) + TS[k, l]
+            falling[k] += p[l] * (lam * SS[k, l] - WS[l, k])
+            falling[n_b] += p[k] * p[l] * SS[k, l]
+        slope[k] += falling[k]
+        hessian[k, k] += copies[k] / p[k] ** 2
+    return True
+
+
+@njit(cache=True)
+def _inside(M, p, lam, of_z, of_w, F):
+    """Whether p > 0 and F > 0."""
+    for k in range(p.size):
+        if not p[k] > 0.0:
+            return False
+    for s in range(M.shape[0]):
+        _level_matrix(M[s], p[of_z], lam * p[of_w], F)
+        if not _factor(F):
+            return False
+    return True
+
+
+@njit(cache=True)
+def follow_diagonal(M, of_z, of_w, copies, lam, floor, tolerance, settings):
+    """Scalings (B, n_blocks) and the levels (B,) that they prove, from p = 1 at lam (B,) down to the least or `floor`.
+
+    M (B, n_shared, n_z, n_w) complex, of_z (n_z,) and of_w (n_w,) the block of each entry, copies (n_blocks,) how often
+    its scaling counts. Ends where the way to the boundary is below `tolerance` lambda, at the centre where `floor` > 0
+    ends it.
+    """
+    batch, n_b = M.shape[0], copies.size
+    found, level = np.ones((batch, n_b)), lam.copy()
+    gradient, slope, hessian, falling = np.empty(n_b), np.empty(n_b), np.empty((n_b, n_b)), np.empty(n_b + 1)
+    F = np.empty((M.shape[3], M.shape[3]), np.complex128)
+    for b in range(batch):
+        p, at = found[b].copy(), lam[b]
+        for _ in range(settings.steps):
+            sound = True
+            for _ in range(settings.newton):
+                if not _derivatives(M[b], p, at, of_z, of_w, copies, gradient, slope, hessian, falling):
+                    sound = False
+                    break
+                step = _solve_positive(hessian, gradient)
+                decrement = np.sqrt(max(np.dot(step, gradient), 0.0))
+                if decrement < settings.central:
+                    break
+                p = p - step * (1.0 if decrement < settings.near else 1.0 / (1.0 + decrement))
+            if not sound or not _inside(M[b], p, at, of_z, of_w, F):
+                # Round-off ended the path here; the last verified point stands.
+                break
+            found[b], level[b] = p, at
+            if floor[b] > 0 and at <= floor[b]:
+                break
+            towards = _solve_positive(hessian, slope)
+            # dF / d lambda in the metric of F, by its Frobenius norm, tells the way to the boundary to a small factor.
+            speed = falling[n_b]
+            for k in range(n_b):
+                speed += towards[k] * (slope[k] - 2 * falling[k]) - copies[k] * (towards[k] / p[k]) ** 2
+            whole = at - max(floor[b], 0.0)
+            fall = min(whole, settings.first / np.sqrt(max(speed, 1e-300)))
+            for _ in range(40):
+                # d p / d lambda = -towards: lambda falls, p moves along towards.
+                if _inside(M[b], p + fall * towards, at - fall, of_z, of_w, F):
+                    break
+                fall *= settings.shrink
+            else:
+                break
+            last = fall <= tolerance * at
+            if fall < whole:
+                fall *= settings.reach
+            p, at = p + fall * towards, at - fall
+            if last:
+                found[b], level[b] = p, at
+                break
+    return found, level
+
+
+@njit(cache=True)
+def balanced_squares(norm2, sweeps):
+    """Squares (B, n) of Osborne's scalings from the squared norms (B, n, n) of the blocks, the diagonal left out."""
+    batch, n = norm2.shape[:2]
+    d2 = np.ones((batch, n))
+    for b in range(batch):
+        for _ in range(sweeps):
+            for k in range(n):
+                row, col = 0.0, 0.0
+                for j in range(n):
+                    row += norm2[b, k, j] / d2[b, j]
+                    col += norm2[b, j, k] * d2[b, j]
+                d2[b, k] = np.sqrt(d2[b, k] ** 2 * (col / d2[b, k]) / (row * d2[b, k]))
+    return d2

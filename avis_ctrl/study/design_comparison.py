@@ -1,0 +1,114 @@
+"""Two designs side by side, from the folders of `avis design`: what was requested differently, and the results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.study.saved import STUDY, read_json
+from avis_ctrl.summary import html_table, in_short
+
+RESULT = "result.json"
+# Sections whose change makes mu a figure of another problem.
+WEIGHTS = ("rig", "loaded", "keep", "loop", "uncertainty", "transmissibility", "control_effort", "compliance", "floor")
+FIGURES = (("order", "states of the controller", ""), ("mu_upper", "mu, upper bound", ""),
+           ("mu_lower", "mu, lower bound", ""), ("peak_transmissibility_dB", "peak transmissibility, nominal", "dB"),
+           ("worst_case_peak_transmissibility_dB", "peak transmissibility, worst case", "dB"))
+
+
+@dataclass(frozen=True)
+class DesignComparison:
+    """titles : of both designs. requested : (key of the design file, first, second) where they differ.
+    found : (quantity with unit, first, second). note : what cannot be compared; empty if all can."""
+
+    titles: tuple[str, str]
+    requested: tuple[tuple[str, str, str], ...]
+    found: tuple[tuple[str, str, str], ...]
+    note: str
+
+    def _repr_html_(self) -> str:
+        return html_table([*self.requested, *self.found], ("", *self.titles), self.note)
+
+
+def compare_designs(first: str | Path, second: str | Path) -> DesignComparison:
+    """Compare the results of two designs.
+
+    Parameters
+    ----------
+    first, second : folders written by `avis design` or a design's `save`.
+
+    Raises
+    ------
+    InputError : a folder without such a result, in one line.
+    """
+    folders = Path(first), Path(second)
+    studies = [read_json(folder / STUDY, "avis-study") for folder in folders]
+    results = [read_json(folder / RESULT, "avis-design") for folder in folders]
+    asked = [dict(_leaves(study.get("design"), "")) for study in studies]
+    keys = list(dict.fromkeys([*asked[0], *asked[1]]))
+    requested = [(key, _said(asked[0].get(key)), _said(asked[1].get(key))) for key in keys
+                 if key != "title" and asked[0].get(key) != asked[1].get(key)]
+    if studies[0].get("rig") != studies[1].get("rig"):
+        requested.insert(0, ("rig file", _first_line(studies[0].get("rig")), _first_line(studies[1].get("rig"))))
+    rows = [_figures(result, folder) for result, folder in zip(results, folders, strict=True)]
+    found = [(name, _said(rows[0].get(name)), _said(rows[1].get(name)))
+             for name in dict.fromkeys([*rows[0], *rows[1]])]
+    other = sorted({key.partition(".")[0] for key, _, _ in requested} & {*WEIGHTS, "rig file"})
+    note = (f"mu of the two cannot be compared: it refers to different {', '.join(other)}; transmissibilities can"
+            if other else "")
+    titles = tuple(str(study.get("design", {}).get("title", folder)) for study, folder in zip(studies, folders,
+                                                                                             strict=True))
+    if titles[0] == titles[1]:
+        titles = str(folders[0]), str(folders[1])
+    return DesignComparison((titles[0], titles[1]), tuple(requested), tuple(found), note)
+
+
+def _leaves(table: Any, before: str) -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) of nested tables."""
+    if not isinstance(table, dict):
+        raise InputError("expected a design", field=STUDY)
+    for key, value in table.items():
+        name = f"{before}{key}"
+        if isinstance(value, dict) and key != "identified":
+            yield from _leaves(value, f"{name}.")
+        elif key == "requirement":
+            for one in value:
+                limit = "at_most" if one.get("at_most") is not None else "at_least"
+                yield f"requirement {one.get('quantity')}, {limit.replace('_', ' ')}", one.get(limit)
+        else:
+            yield name, value
+
+
+def _figures(result: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Value by quantity of the delivered controller and the verdict table."""
+    try:
+        mu = next(row for row in result["controllers"] if row["name"] == "mu")
+        figures: dict[str, Any] = {f"{words}{f' [{unit}]' if unit else ''}": mu[key] for key, words, unit in FIGURES}
+        figures["stable in every simulated plant"] = result["stable"]
+        for row in result["requirements"]:
+            unit = f" [{row['unit']}]" if row["unit"] else ""
+            figures[f"{row['name']}{unit}"] = row["value"]
+        figures["requirements met"] = f"{sum(row['met'] for row in result['requirements'])} of " \
+                                      f"{len(result['requirements'])}"
+    except (KeyError, TypeError, StopIteration) as error:
+        raise InputError(f"expected a result as avis design writes it; {error!r}", file=folder / RESULT) from None
+    return figures
+
+
+def _said(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, dict):
+        return "an identification"
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    return value if isinstance(value, str) else in_short(value)
+
+
+def _first_line(text: Any) -> str:
+    return next((line for line in str(text).splitlines() if line.startswith("name")), "another rig")

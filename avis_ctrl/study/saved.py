@@ -1,0 +1,66 @@
+"""Design and rig of a study as a file of its folder, so that later commands need nothing but the folder."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.file_errors import first_complaint
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_file import rig_from
+from avis_ctrl.rigs.rig_writer import rig_toml
+from avis_ctrl.study.design_file import Design, design_from_table
+from avis_ctrl.study.uncertainty_file import UncertaintyFile
+
+STUDY = "study.json"
+
+
+def study_dict(design: Design, rig: Rig) -> dict[str, Any]:
+    """The inputs of a study; the rig as the text of a rig file. Raises InputError for a rig that has no file form."""
+    return {"format": "avis-study", "version": 1, "design": design.model_dump(), "rig": rig_toml(rig),
+            "loaded": getattr(rig, "load", None) is not None}
+
+
+def read_json(path: Path, form: str) -> dict[str, Any]:
+    """The content of a JSON file of that format.
+
+    Raises
+    ------
+    InputError : no such file, no JSON, another format.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"expected a file of avis design ({error.strerror or error})", file=path) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"expected JSON; {' '.join(str(error).split())}", file=path) from None
+    found = content.get("format") if isinstance(content, dict) else None
+    if found != form:
+        raise InputError(f"expected {form!r}", file=path, field="format", value=found)
+    return content
+
+
+def read_saved(folder: Path) -> tuple[Design, Rig]:
+    """Design and rig of a study's folder. Raises InputError in one line for whatever is wrong with the file."""
+    path = folder / STUDY
+    content = read_json(path, "avis-study")
+    try:
+        table = dict(content["design"])
+        known = dict(table.get("uncertainty") or {})
+        if isinstance(known.get("identified"), dict):
+            known["identified"] = UncertaintyFile.model_validate(known["identified"])
+            table["uncertainty"] = known
+        design = design_from_table({key: value for key, value in table.items() if value is not None})
+        rig = rig_from(tomllib.loads(content["rig"]), bool(content.get("loaded")))
+    except ValidationError as error:
+        raise first_complaint(error, UncertaintyFile).in_file(path) from None
+    except InputError as error:
+        raise error.in_file(path) from None
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"expected a design and a rig as avis design writes them; {error!r}", file=path) from None
+    return design, rig

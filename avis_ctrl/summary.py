@@ -1,0 +1,48 @@
+"""Short texts of results: one line in a terminal, a table in a notebook, instead of raw arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import fields
+from html import escape
+from typing import Any
+
+LONGEST = 60
+
+
+def in_short(value: Any) -> str:
+    """A number to five digits, an array by its shape, a long text by its beginning."""
+    if isinstance(value, bool) or value is None:
+        return str(value)
+    if isinstance(value, (int, float)):
+        return f"{value:.5g}"
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return in_short(value.item()) if not value.shape else f"array{tuple(value.shape)}"
+    if isinstance(value, dict):
+        few = ", ".join(f"{key}: {in_short(one)}" for key, one in value.items())
+        return few if len(few) <= LONGEST else f"{len(value)} entries"
+    if isinstance(value, (list, tuple)) and len(value) > 2:
+        return f"{len(value)} items"
+    text = repr(value)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST - 3]}..."
+
+
+def html_table(rows: Iterable[Sequence[str]], head: Sequence[str] = (), title: str = "") -> str:
+    """A plain HTML table; everything is escaped."""
+    def line(cells: Sequence[str], tag: str) -> str:
+        return "".join(["<tr>", *(f"<{tag} style='text-align:left'>{escape(str(c))}</{tag}>" for c in cells), "</tr>"])
+    caption = f"<caption><b>{escape(title)}</b></caption>" if title else ""
+    return f"<table>{caption}{line(head, 'th') if head else ''}{''.join(line(row, 'td') for row in rows)}</table>"
+
+
+class Shown:
+    """Gives a dataclass (with repr=False) a short repr, and a table in notebooks."""
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{name}={text}' for name, text in self._facts())})"
+
+    def _repr_html_(self) -> str:
+        return html_table(self._facts(), title=type(self).__name__)
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [(one.name, in_short(getattr(self, one.name))) for one in fields(self)]  # type: ignore[arg-type]

@@ -1,0 +1,156 @@
+"""What uncertain systems are made of: numbers, disks, dynamics, matrices, state space, connections by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti import connect as connect_systems
+from avis_ctrl.lti.interchange import as_system
+from avis_ctrl.uncertainty.elements import ComplexDisk, Dynamics, Element, RealParameter
+from avis_ctrl.uncertainty.uncertain_system import (
+    STATES,
+    UncertainSystem,
+    above,
+    as_uncertain,
+    beside,
+    gathered,
+    reduced,
+)
+
+
+def real(name: str, nominal: float, *, percent: float | tuple[float, float] | None = None,
+         plus_minus: float | tuple[float, float] | None = None, range: tuple[float, float] | None = None
+         ) -> UncertainSystem:
+    """An uncertain real number: exactly one of percent, plus_minus and range.
+
+    percent, plus_minus : half the range, relative or absolute; a pair is (below, above). range : (low, high).
+    Where the range is not symmetric about the nominal value, delta = 0 is still the nominal value.
+
+    Raises InputError for a range that does not contain the nominal value.
+    """
+    if sum(one is not None for one in (percent, plus_minus, range)) != 1:
+        raise InputError("expected exactly one of percent, plus_minus and range", field=name)
+    try:
+        if range is not None:
+            low, high = (float(v) for v in range)
+        else:
+            down, up = np.broadcast_to(np.asarray(percent if percent is not None else plus_minus, float), 2).tolist()
+            unit = abs(nominal) / 100 if percent is not None else 1.0
+            low, high = nominal - abs(down) * unit, nominal + abs(up) * unit
+        element = RealParameter(name, 1, 1, float(nominal), low, high)
+    except (TypeError, ValueError) as error:
+        raise error if isinstance(error, InputError) else InputError("expected numbers", field=name) from None
+    return of_element(element, element.lft())
+
+
+def complex_disk(name: str, centre: float = 0.0, radius: float = 1.0) -> UncertainSystem:
+    """An uncertain complex number within `radius` of a real centre."""
+    element = ComplexDisk(name, 1, 1, float(centre), float(radius))
+    return of_element(element, element.lft())
+
+
+def dynamics(name: str, weight: Any = 1.0, shape: tuple[int, int] = (1, 1)) -> UncertainSystem:
+    """Unknown stable dynamics W(s) Delta(s) with a Delta of H-infinity norm at most 1.
+
+    weight : W, of one output or as many as shape[0]: a number, a system, or a filter of `uncertainty_weight`.
+    shape : (outputs, inputs) of Delta. A chain with 20 % to 300 %: G * (1 + dynamics("chain", W)).
+
+    Raises InputError for a weight that does not fit, or is not stable.
+    """
+    element = Dynamics(name, *shape)
+    rows, cols = shape
+    n = np.zeros((cols, rows)), np.eye(cols), np.eye(rows), np.zeros(shape)
+    Delta = UncertainSystem(*n, (element,), (1,))
+    W = as_system(weight, f"{name}: weight")
+    if not W.is_stable():
+        raise InputError("expected a stable weight", field=f"{name}: weight")
+    if W.D.shape not in ((1, 1), (rows, rows)):
+        raise InputError(f"expected one output and input, or {rows}", field=f"{name}: weight", value=W.D.shape)
+    return as_uncertain(W) * Delta
+
+
+def matrix(rows: Sequence[Sequence[Any]] | Any) -> UncertainSystem:
+    """A matrix of numbers, uncertain numbers, or blocks: matrix([[0, 1], [-k / m, -c / m]]).
+
+    Raises InputError for rows of different lengths, or blocks that do not fit.
+    """
+    if isinstance(rows, UncertainSystem):
+        return rows
+    table = [list(row) if isinstance(row, (list, tuple, np.ndarray)) else [row] for row in rows]
+    if not table or len({len(row) for row in table}) != 1:
+        raise InputError("expected rows of one length", field="matrix", value=[len(row) for row in table])
+    stacked = [beside([as_uncertain(one) for one in row]) for row in table]
+    return reduced(above(stacked))
+
+
+def ss(A: Any, B: Any, C: Any, D: Any = None, *, dt: float = 0.0, inputs: Sequence[str] = (),
+       outputs: Sequence[str] = ()) -> Any:
+    """A system x' = A x + B u, y = C x + D u whose matrices may have uncertain entries; D zero by default.
+
+    Each matrix is an array, nested lists with uncertain numbers, or of `matrix`. A StateSpace where nothing is
+    uncertain, otherwise an `UncertainSystem`. dt : sample time [s], 0 for continuous time.
+
+    Raises InputError for shapes that do not fit.
+    """
+    a, b, c = (_matrix(one) for one in (A, B, C))
+    d = as_uncertain(np.zeros((c.shape[0], b.shape[1]))) if D is None else _matrix(D)
+    n = a.shape[0]
+    if a.shape != (n, n) or b.shape[0] != n or c.shape[1] != n or d.shape != (c.shape[0], b.shape[1]):
+        raise InputError(f"shapes do not fit: A {a.shape}, B {b.shape}, C {c.shape}, D {d.shape}")
+    M = reduced(above([beside([a, b]), beside([c, d])]))
+    inner = np.block([[M.d[:n, :n], M.c[:n]], [M.b[:, :n], M.a]])
+    system = UncertainSystem(inner, np.vstack([M.d[:n, n:], M.b[:, n:]]), np.hstack([M.d[n:, :n], M.c[n:]]),
+                             M.d[n:, n:], (STATES, *M.elements), (n, *M.copies), float(dt), tuple(inputs),
+                             tuple(outputs))
+    return system if system.uncertain else system._certain()
+
+
+def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], outputs: Sequence[str]) -> Any:
+    """Interconnect parts through the signals that share a name: certain, uncertain, or of python-control.
+
+    Parameters
+    ----------
+    parts : systems; a dict names them in error messages. inputs : external signals. outputs : signals to bring out.
+
+    A StateSpace, or an UncertainSystem where a part is uncertain. Raises as `avis_ctrl.lti.connect`: InputError for a
+    signal driven twice or by nothing, ComputationError for an algebraic loop.
+    """
+    named = dict(parts) if isinstance(parts, Mapping) else {f"part {k}": one for k, one in enumerate(parts)}
+    whole, elements, w, z = {}, list[tuple[Element, int]](), list[str](), list[str]()
+    for key, part in named.items():
+        if not isinstance(part, UncertainSystem):
+            whole[key] = as_system(part, key)
+            continue
+        P, n_w, n_z = part.opened()
+        ws, zs = ([f"{key}|{name}" for name in names] for names in (P.inputs[:n_w], P.outputs[:n_z]))
+        whole[key] = P.renamed([*ws, *part.inputs], [*zs, *part.outputs])
+        elements += [(one, n) for one, n in zip(part.elements, part.copies, strict=True) if one != STATES]
+        w, z = w + ws, z + zs
+    if not elements:
+        return connect_systems(whole, inputs, outputs)
+    P = connect_systems(whole, [*w, *inputs], [*z, *outputs])
+    n, nw, nz = P.nstates, len(w), len(z)
+    parts_ = (np.block([[P.A, P.B[:, :nw]], [P.C[:nz], P.D[:nz, :nw]]]), np.vstack([P.B[:, nw:], P.D[:nz, nw:]]),
+              np.hstack([P.C[nz:], P.D[nz:, :nw]]), P.D[nz:, nw:])
+    kinds = [(STATES, n), *elements] if n else elements
+    return reduced(gathered(parts_, kinds, P.dt, tuple(inputs), tuple(outputs)))
+
+
+def of_element(element: Element, lft: np.ndarray) -> UncertainSystem:
+    return UncertainSystem(lft[:1, :1], lft[:1, 1:], lft[1:, :1], lft[1:, 1:], (element,), (1,))
+
+
+def _matrix(given: Any) -> UncertainSystem:
+    """An uncertain matrix without states; two dimensions, or a single number."""
+    if isinstance(given, np.ndarray) and given.dtype != object:
+        made = as_uncertain(given) if given.ndim in (0, 2) else None
+    else:
+        made = matrix([[given]]) if np.isscalar(given) else matrix(given)
+    if made is None or made.nstates:
+        raise InputError("expected a matrix: numbers or uncertain numbers in rows", field="matrix",
+                         value=np.shape(given) if isinstance(given, np.ndarray) else "a system with states")
+    return made

@@ -1,0 +1,524 @@
+"""Uncertain numbers, matrices and systems with arithmetic: linear fractional transformations, exact.
+
+    i_out = a i_in + b u        i_in = diag(1/s I, delta_1 I, ..., Delta_k) i_out
+    y     = c i_in + d u
+
+States and uncertain elements are treated alike, as blocks that close i_out onto i_in (Zhou, Doyle and Glover, Robust
+and Optimal Control, 1996, chapter 10). Sum, product, inverse and connection of such transformations are again some;
+copies of one element are gathered into one block, and those that no input reaches or no output sees are removed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti.interchange import as_system, plot_frequencies
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.summary import html_table
+from avis_ctrl.uncertainty.blocks import BlockStructure
+from avis_ctrl.uncertainty.elements import ComplexDisk, Element, RealParameter
+from avis_ctrl.uncertainty.lft_reduction import reduce_copies
+
+# The states among the elements: a block 1/s I (or z^-1 I). Equal to no uncertain element: these are of other classes.
+STATES = Element("states")
+Parts = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class UncertainSettings:
+    """singular : condition number from which on a matrix to invert counts as singular: round-off alone makes 1e15.
+    same : difference of two LFTs, relative to the size of their entries, up to which a reduction of copies is accepted:
+    a few hundred operations make as much.
+    inside : deltas at which they are compared, as a fraction of the range: away from a pole at its ends."""
+
+    singular: float = 1e13
+    same: float = 1e-12
+    inside: float = 0.7
+
+
+SETTINGS = UncertainSettings()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class UncertainSystem:
+    """An uncertain system; without states an uncertain matrix, of one entry an uncertain number.
+
+    Made by the functions of `uncertain_models` and by arithmetic: + - and whole powers; * and / by anything of one
+    entry multiply entries; @ (and * between matrices) is the product, or series connection. Numbers, arrays,
+    StateSpace and python-control systems may stand beside it.
+
+    a, b, c, d : the matrices above. elements, copies : the blocks in order, the states first where there are any.
+    """
+
+    a: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+    d: np.ndarray
+    elements: tuple[Element, ...] = ()
+    copies: tuple[int, ...] = ()
+    dt: float = 0.0
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+
+    # NumPy leaves `array * system` to this class.
+    __array_ufunc__ = None
+
+    def __post_init__(self) -> None:
+        for which, count, letter in (("inputs", self.d.shape[1], "u"), ("outputs", self.d.shape[0], "y")):
+            names = tuple(getattr(self, which))
+            if len(names) != count or len(set(names)) != count:
+                object.__setattr__(self, which, tuple(f"{letter}{k}" for k in range(count)))
+
+    # -- what it is --------------------------------------------------------------------------
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(outputs, inputs)."""
+        return self.d.shape
+
+    @property
+    def nstates(self) -> int:
+        return sum(n for one, n in zip(self.elements, self.copies, strict=True) if one == STATES)
+
+    @property
+    def uncertain(self) -> dict[str, Element]:
+        """The uncertain elements by name."""
+        return {one.name: one for one in self.elements if one != STATES}
+
+    def _slices(self) -> list[tuple[Element, int, slice, slice]]:
+        """(element, copies, its place in i_in, its place in i_out)."""
+        places, w, z = [], 0, 0
+        for one, n in zip(self.elements, self.copies, strict=True):
+            places.append((one, n, slice(w, w + n * one.rows), slice(z, z + n * one.cols)))
+            w, z = w + n * one.rows, z + n * one.cols
+        return places
+
+    def lft(self) -> tuple[StateSpace, BlockStructure]:
+        """(P, blocks): P with inputs (w_delta, u) and outputs (z_delta, y); what `mu_peak`, `musyn` and
+        `worst_case_gain` take. InputError for dynamics of several channels that appear more than once."""
+        blocks = BlockStructure(tuple(one.block(n) for one, n, _, _ in self._slices() if one != STATES))
+        return self.opened()[0], blocks
+
+    def opened(self) -> tuple[StateSpace, int, int]:
+        """P as in `lft`, and the numbers of its w_delta and z_delta."""
+        n = self.nstates
+        w, z = list[str](), list[str]()
+        for one, copies, _, _ in self._slices():
+            if one != STATES:
+                for names, letter, count in ((w, "w", copies * one.rows), (z, "z", copies * one.cols)):
+                    names += [f"{letter}:{one.name}" + (f"[{k}]" if count > 1 else "") for k in range(count)]
+        P = StateSpace(self.a[:n, :n], np.hstack([self.a[:n, n:], self.b[:n]]),
+                       np.vstack([self.a[n:, :n], self.c[:, :n]]),
+                       np.block([[self.a[n:, n:], self.b[n:]], [self.c[:, n:], self.d]]), self.dt,
+                       (*w, *self.inputs), (*z, *self.outputs))
+        return P, len(w), len(z)
+
+    # -- one system of the set ---------------------------------------------------------------
+    @property
+    def nominal(self) -> Any:
+        """Every element at its nominal value (dynamics zero): a StateSpace, an array (n_y, n_u) without states."""
+        return self._closed({name: 0.0 for name in self.uncertain})
+
+    def substitute(self, values: Mapping[str, Any] | None = None, **more: Any) -> Any:
+        """The same with some elements at given values; a StateSpace or an array once none is left.
+
+        A real parameter takes a number; a complex one a real number or a stable system (its value over frequency);
+        dynamics take a number, a matrix or a stable system in place of Delta, of norm at most 1.
+
+        Raises
+        ------
+        InputError : a name that is not there, a value of the wrong kind. ComputationError : a division by zero.
+        """
+        given = {**(values or {}), **more}
+        known = self.uncertain
+        deltas: dict[str, Any] = {}
+        for name, value in given.items():
+            if name not in known:
+                raise InputError(f"expected some of {', '.join(known) or 'none: nothing is uncertain'}",
+                                 field="substitute", value=name)
+            one = known[name]
+            if isinstance(one, RealParameter):
+                try:
+                    deltas[name] = one.delta(float(value))
+                except (TypeError, ValueError):
+                    raise InputError("expected a number", field=name, value=value) from None
+            elif isinstance(one, ComplexDisk):
+                deltas[name] = (as_system(value, name) + as_system(-one.centre)).scaled(1 / one.radius)
+            else:
+                deltas[name] = as_system(value, name)
+        return self._closed(deltas)
+
+    def values(self, n: int = 1, seed: int = 0) -> list[dict[str, Any]]:
+        """n random sets of values for `substitute`: real ones uniform over their range; complex ones and dynamics an
+        all-pass of first order times a gain of at most 1, with a corner among the system's own frequencies."""
+        rng = np.random.default_rng(seed)
+        grid = np.array([0.1, 10.0])
+        if self.nstates:
+            nominal = self.nominal
+            grid = plot_frequencies(nominal)[[0, -1]]
+        found: list[dict[str, Any]] = []
+        for _ in range(n):
+            one_set: dict[str, Any] = {}
+            for name, one in self.uncertain.items():
+                if isinstance(one, RealParameter):
+                    one_set[name] = float(rng.uniform(one.low, one.high))
+                    continue
+                Delta = _random_dynamics(one, rng, grid, self.dt)
+                one_set[name] = (Delta.scaled(one.radius) + as_system(one.centre) if isinstance(one, ComplexDisk)
+                                 else Delta)
+            found.append(one_set)
+        return found
+
+    def sample(self, n: int = 1, seed: int = 0) -> list[Any]:
+        """n random systems of the set, see `values`."""
+        return [self.substitute(one) for one in self.values(n, seed)]
+
+    def _closed(self, deltas: Mapping[str, Any]) -> Any:
+        """The elements named closed by their normalised deltas (numbers, or systems)."""
+        system = self
+        for name, delta in deltas.items():
+            place = next(k for k, one in enumerate(system.elements) if one.name == name and one != STATES)
+            element, n, w, z = system._slices()[place]
+            if isinstance(delta, StateSpace):
+                if delta.D.shape != (element.rows, element.cols):
+                    raise InputError(f"expected {element.rows} outputs and {element.cols} inputs", field=name,
+                                     value=delta.D.shape)
+                inner = as_uncertain(delta)
+                for _ in range(n - 1):
+                    inner = _diagonal(inner, as_uncertain(delta))
+            else:
+                inner = as_uncertain(delta * np.eye(n * element.rows, n * element.cols))
+            system = _close(system, place, inner, w, z)
+        return system if system.uncertain else system._certain()
+
+    def _certain(self) -> Any:
+        if not self.nstates:
+            return self.d
+        return StateSpace(self.a, self.b, self.c, self.d, self.dt, self.inputs, self.outputs)
+
+    # -- arithmetic --------------------------------------------------------------------------
+    def __add__(self, other: Any) -> UncertainSystem:
+        X, Y = self, as_uncertain(other)
+        if X.shape != Y.shape:
+            raise InputError(f"sum of shapes {X.shape} and {Y.shape}")
+        parts = la.block_diag(X.a, Y.a), np.vstack([X.b, Y.b]), np.hstack([X.c, Y.c]), X.d + Y.d
+        return _of_both(parts, X, Y, X.inputs, X.outputs)
+
+    def __neg__(self) -> UncertainSystem:
+        return replace(self, c=-self.c, d=-self.d)
+
+    def __sub__(self, other: Any) -> UncertainSystem:
+        return self + (-as_uncertain(other))
+
+    def __rsub__(self, other: Any) -> UncertainSystem:
+        return as_uncertain(other) - self
+
+    __radd__ = __add__
+
+    def __matmul__(self, other: Any) -> UncertainSystem:
+        X, Y = self, as_uncertain(other)
+        if X.shape == Y.shape == (1, 1) and not (X.nstates or Y.nstates):
+            # Numbers commute. Divisors act last, as a mass does on a sum of forces, so that entries of one row share
+            # them; and equal products of parameters come in one order.
+            X, Y = sorted((X, Y), key=lambda one: (not np.any(one.a), sorted(one.uncertain)))
+        if X.shape[1] != Y.shape[0]:
+            raise InputError(f"product of shapes {X.shape} and {Y.shape}")
+        parts = (np.block([[X.a, X.b @ Y.c], [np.zeros((Y.a.shape[0], X.a.shape[1])), Y.a]]),
+                 np.vstack([X.b @ Y.d, Y.b]), np.hstack([X.c, X.d @ Y.c]), X.d @ Y.d)
+        return _of_both(parts, X, Y, Y.inputs, X.outputs)
+
+    def __rmatmul__(self, other: Any) -> UncertainSystem:
+        return as_uncertain(other) @ self
+
+    def __mul__(self, other: Any) -> UncertainSystem:
+        X, Y = self, as_uncertain(other)
+        if Y.shape == (1, 1) and X.shape != (1, 1):
+            return X @ _repeated(Y, X.shape[1])
+        return X @ Y if X.shape != (1, 1) else _repeated(X, Y.shape[0]) @ Y
+
+    def __rmul__(self, other: Any) -> UncertainSystem:
+        return as_uncertain(other) * self
+
+    def inverse(self) -> UncertainSystem:
+        """The inverse. ComputationError where the nominal value has none."""
+        if self.shape[0] != self.shape[1]:
+            raise InputError("expected as many inputs as outputs", field="inverse", value=self.shape)
+        if np.linalg.cond(self.d) > SETTINGS.singular:
+            raise ComputationError("the nominal value cannot be inverted", measured=f"D = {self.d.tolist()}",
+                                   cause="a division by zero, or by a strictly proper system",
+                                   next_step="choose a nominal value other than zero")
+        inv = np.linalg.inv(self.d)
+        return replace(self, a=self.a - self.b @ inv @ self.c, b=self.b @ inv, c=-inv @ self.c, d=inv,
+                       inputs=self.outputs, outputs=self.inputs)
+
+    def __truediv__(self, other: Any) -> UncertainSystem:
+        return self * as_uncertain(other).inverse()
+
+    def __rtruediv__(self, other: Any) -> UncertainSystem:
+        return as_uncertain(other) * self.inverse()
+
+    def __pow__(self, power: int) -> UncertainSystem:
+        if isinstance(power, bool) or not isinstance(power, (int, np.integer)):
+            raise InputError("expected a whole number", field="power", value=power)
+        base = self if power >= 0 else self.inverse()
+        result = as_uncertain(np.eye(self.shape[0]))
+        for _ in range(abs(int(power))):
+            result = result @ base
+        return result
+
+    # -- connection --------------------------------------------------------------------------
+    def feedback(self, other: Any = 1.0, sign: int = -1) -> UncertainSystem:
+        """The loop closed by `other` from the outputs to the inputs, negative by default: (I + X Y)^-1 X."""
+        X, Y = self, as_uncertain(other)
+        if Y.shape == (1, 1) and X.shape[0] == X.shape[1]:
+            Y = _repeated(Y, X.shape[0])
+        if Y.shape != (X.shape[1], X.shape[0]):
+            raise InputError(f"feedback of shape {Y.shape} around {X.shape}")
+        loop = np.eye(X.shape[0]) - sign * X.d @ Y.d
+        if np.linalg.cond(loop) > SETTINGS.singular:
+            raise ComputationError("the nominal loop is not well posed", measured=f"I + X Y = {loop.tolist()} at "
+                                   "infinite frequency", cause="an algebraic loop of unit gain")
+        R = np.linalg.inv(loop)
+        # y and u = r + sign Y y from the internal signals of X and Y, and from r
+        y = R @ np.hstack([X.c, sign * X.d @ Y.c, X.d])
+        u = sign * Y.d @ y
+        u[:, X.a.shape[1]:] += np.hstack([sign * Y.c, np.eye(X.shape[1])])
+        out = np.vstack([X.b @ u, Y.b @ y])
+        n = X.a.shape[1] + Y.a.shape[1]
+        out[:, :n] += la.block_diag(X.a, Y.a)
+        return _of_both((out[:, :n], out[:, n:], y[:, :n], y[:, n:]), X, Y, X.inputs, X.outputs)
+
+    def select(self, outputs: Any = None, inputs: Any = None) -> UncertainSystem:
+        """Some outputs and inputs, by name or position."""
+        rows, cols = _chosen(self.outputs, outputs), _chosen(self.inputs, inputs)
+        return reduced(replace(self, b=self.b[:, cols], c=self.c[rows], d=self.d[np.ix_(rows, cols)],
+                                inputs=tuple(self.inputs[k] for k in cols),
+                                outputs=tuple(self.outputs[k] for k in rows)))
+
+    def __getitem__(self, key: tuple[Any, Any]) -> UncertainSystem:
+        rows, cols = key
+        return self.select(rows, cols)
+
+    def renamed(self, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None) -> UncertainSystem:
+        """The same under other signal names."""
+        given = {"inputs": tuple(inputs or self.inputs), "outputs": tuple(outputs or self.outputs)}
+        for which, count in (("inputs", self.shape[1]), ("outputs", self.shape[0])):
+            if len(given[which]) != count or len(set(given[which])) != count:
+                raise InputError(f"expected {count} different names", field=which, value=given[which])
+        return replace(self, inputs=given["inputs"], outputs=given["outputs"])
+
+    # -- words -------------------------------------------------------------------------------
+    def _rows(self) -> list[tuple[str, str]]:
+        return [(str(one), f"{n} {'copy' if n == 1 else 'copies'}") for one, n, _, _ in self._slices()
+                if one != STATES]
+
+    def __repr__(self) -> str:
+        what = "; ".join(f"{text}, {count}" for text, count in self._rows()) or "nothing uncertain"
+        if not self.nstates:
+            return f"UncertainSystem({'number' if self.shape == (1, 1) else f'matrix {self.shape}'}: {what})"
+        return f"UncertainSystem({self.nstates} states, {list(self.inputs)} -> {list(self.outputs)}: {what})"
+
+    def _repr_html_(self) -> str:
+        size = f"{self.nstates} states, {list(self.inputs)} -> {list(self.outputs)}" if self.nstates else self.shape
+        return html_table(self._rows(), ("uncertain", "copies"), f"uncertain system, {size}")
+
+
+# -- how it is done ------------------------------------------------------------------------------
+def as_uncertain(given: Any) -> UncertainSystem:
+    """Anything that may stand beside an uncertain system."""
+    if isinstance(given, UncertainSystem):
+        return given
+    P = as_system(given)
+    n = P.nstates
+    return UncertainSystem(P.A, P.B, P.C, P.D, (STATES,) * bool(n), (n,) * bool(n), P.dt, P.inputs, P.outputs)
+
+
+def _diagonal(X: UncertainSystem, Y: UncertainSystem) -> UncertainSystem:
+    parts = tuple(la.block_diag(p, q) for p, q in ((X.a, Y.a), (X.b, Y.b), (X.c, Y.c), (X.d, Y.d)))
+    return gathered(parts, _kinds(X, Y), _clock(X, Y), (), ())
+
+
+def _repeated(X: UncertainSystem, n: int) -> UncertainSystem:
+    """X I_n of a system with one input and one output."""
+    result = X
+    for _ in range(n - 1):
+        result = _diagonal(result, X)
+    return result
+
+
+def beside(systems: Sequence[UncertainSystem]) -> UncertainSystem:
+    """[X Y ...]: the sum of outputs, each with inputs of its own."""
+    result = systems[0]
+    for X in systems[1:]:
+        if X.shape[0] != result.shape[0]:
+            raise InputError("expected blocks of as many rows", field="matrix", value=[one.shape for one in systems])
+        parts = (la.block_diag(result.a, X.a), la.block_diag(result.b, X.b), np.hstack([result.c, X.c]),
+                 np.hstack([result.d, X.d]))
+        result = gathered(parts, _kinds(result, X), _clock(result, X), (), ())
+    return result
+
+
+def above(systems: Sequence[UncertainSystem]) -> UncertainSystem:
+    """[X; Y; ...]: outputs under each other, of the same inputs."""
+    result = systems[0]
+    for X in systems[1:]:
+        if X.shape[1] != result.shape[1]:
+            raise InputError("expected blocks of as many columns", field="matrix", value=[one.shape for one in systems])
+        parts = (la.block_diag(result.a, X.a), np.vstack([result.b, X.b]), la.block_diag(result.c, X.c),
+                 np.vstack([result.d, X.d]))
+        result = gathered(parts, _kinds(result, X), _clock(result, X), (), ())
+    return result
+
+
+def _kinds(*systems: UncertainSystem) -> list[tuple[Element, int]]:
+    return [pair for one in systems for pair in zip(one.elements, one.copies, strict=True)]
+
+
+def _clock(*systems: UncertainSystem) -> float:
+    clocks = {one.dt for one in systems if one.nstates} or {0.0}
+    if len(clocks) > 1:
+        raise InputError(f"systems of different sample times cannot be connected: {sorted(clocks)} s")
+    return clocks.pop()
+
+
+def _of_both(parts: Parts, X: UncertainSystem, Y: UncertainSystem, inputs: Sequence[str],
+              outputs: Sequence[str]) -> UncertainSystem:
+    return reduced(gathered(parts, _kinds(X, Y), _clock(X, Y), tuple(inputs), tuple(outputs)))
+
+
+def gathered(parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs: tuple[str, ...],
+            outputs: tuple[str, ...]) -> UncertainSystem:
+    """States first, then one block for each element, in the order in which they come."""
+    places: dict[str, tuple[Element, list[int], list[int]]] = {}
+    w = z = 0
+    for one, n in kinds:
+        # No element may have the empty name.
+        key = "" if one == STATES else one.name
+        known, ws, zs = places.setdefault(key, (one, [], []))
+        if known != one:
+            raise InputError(f"two different uncertain elements have this name: {known} and {one}", field=key)
+        ws += range(w, w + n * one.rows)
+        zs += range(z, z + n * one.cols)
+        w, z = w + n * one.rows, z + n * one.cols
+    order = sorted(places, key=lambda key: key != "")
+    ws, zs = [i for key in order for i in places[key][1]], [i for key in order for i in places[key][2]]
+    a, b, c, d = parts
+    return UncertainSystem(a[np.ix_(zs, ws)], b[zs], c[:, ws], d, tuple(places[key][0] for key in order),
+                           tuple(len(places[key][1]) // places[key][0].rows for key in order), dt, inputs, outputs)
+
+
+def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice, z: slice) -> UncertainSystem:
+    """The block at `place` closed by i_in = inner(i_out); the states of `inner` join those of the system."""
+    rest_w = [k for k in range(system.a.shape[1]) if not w.start <= k < w.stop]
+    rest_z = [k for k in range(system.a.shape[0]) if not z.start <= k < z.stop]
+    loop = np.eye(z.stop - z.start) - system.a[z, w] @ inner.d
+    if np.linalg.cond(loop) > SETTINGS.singular:
+        element = system.elements[place]
+        raise ComputationError("the system has no value here", measured=f"I - M Delta is singular at {element}",
+                               cause="a division by zero", next_step="choose a value inside the range")
+    # Everything from the remaining internal signals, the states of `inner` and the inputs: (i_r, i_s, u).
+    a, b, c, d = system.a, system.b, system.c, system.d
+    n, m = len(rest_w), inner.a.shape[1]
+    seen = np.linalg.solve(loop, np.hstack([a[z][:, rest_w], a[z, w] @ inner.c, b[z]]))
+    fed = inner.d @ seen
+    fed[:, n:n + m] += inner.c
+    rest, onto = np.ix_(rest_z, rest_w), a[rest_z][:, w] @ fed
+    out = np.vstack([np.hstack([a[rest], np.zeros((len(rest_z), m)), b[rest_z]]) + onto,
+                     np.hstack([np.zeros((m, n)), inner.a, np.zeros((m, b.shape[1]))]) + inner.b @ seen])
+    y = np.hstack([c[:, rest_w], np.zeros((c.shape[0], m)), d]) + c[:, w] @ fed
+    kinds = [pair for k, pair in enumerate(_kinds(system)) if k != place] + _kinds(inner)
+    return gathered((out[:, :n + m], out[:, n + m:], y[:, :n + m], y[:, n + m:]), kinds, _clock(system, inner),
+                   system.inputs, system.outputs)
+
+
+def reduced(system: UncertainSystem) -> UncertainSystem:
+    """The same with fewer copies of scalar elements, by `reduce_copies`, each channel scaled to size one before."""
+    slices = system._slices()
+    scalar = [k for k, (one, *_) in enumerate(slices) if one.scalar and one != STATES]
+    if not scalar:
+        return system
+    sizes = [slices[k][1] for k in scalar]
+    inner_w, inner_z = (np.concatenate([np.arange(s[k].start, s[k].stop) for k in scalar])
+                        for s in ([one[2] for one in slices], [one[3] for one in slices]))
+    outer_w = np.setdiff1d(np.arange(system.a.shape[1]), inner_w)
+    outer_z = np.setdiff1d(np.arange(system.a.shape[0]), inner_z)
+    A = system.a[np.ix_(inner_z, inner_w)]
+    B = np.hstack([system.a[np.ix_(inner_z, outer_w)], system.b[inner_z]])
+    C = np.vstack([system.a[np.ix_(outer_z, inner_w)], system.c[:, inner_w]])
+    D = np.block([[system.a[np.ix_(outer_z, outer_w)], system.b[outer_z]], [system.c[:, outer_w], system.d]])
+    rows, cols = _power_of_two(np.max(np.abs(C), axis=1)), _power_of_two(np.max(np.abs(B), axis=0))
+    M, kept = reduce_copies(np.block([[A, B / cols], [C / rows[:, None], D / np.outer(rows, cols)]]), sizes)
+    if kept == sizes:
+        return system
+    n = sum(kept)
+    small = M[:n, :n], M[:n, n:] * cols, M[n:, :n] * rows[:, None], D
+    if not _same((A, B, C, D), sizes, small, kept):
+        return system
+    p, q = len(outer_w), len(outer_z)
+    a, b, c, _ = small
+    parts = (np.block([[D[:q, :p], c[:q]], [b[:, :p], a]]), np.vstack([D[:q, p:], b[:, p:]]),
+             np.hstack([D[q:, :p], c[q:]]), D[q:, p:])
+    kinds = [(one, n_one) for k, (one, n_one, _, _) in enumerate(slices) if k not in scalar]
+    kinds += [(slices[k][0], n_one) for k, n_one in zip(scalar, kept, strict=True) if n_one]
+    return gathered(parts, kinds, system.dt, system.inputs, system.outputs)
+
+
+def _power_of_two(size: np.ndarray) -> np.ndarray:
+    return np.exp2(np.round(np.log2(np.where(size > 0, size, 1.0))))
+
+
+def _same(M: Parts, sizes: Sequence[int], small: Parts, kept: Sequence[int]) -> bool:
+    """Whether two LFTs agree at random deltas to round-off; a rank decided wrongly would show here."""
+    rng = np.random.default_rng(0)
+
+    def value(parts: Parts, counts: Sequence[int], delta: np.ndarray) -> np.ndarray:
+        a, b, c, d = parts
+        values = np.repeat(delta, counts)
+        return d + c @ (values[:, None] * np.linalg.solve(np.eye(len(values)) - a * values, b))
+    for _ in range(3):
+        delta = SETTINGS.inside * rng.uniform(-1, 1, len(sizes))
+        one, other = value(M, sizes, delta), value(small, kept, delta)
+        size = np.maximum(np.abs(one), np.abs(M[3]))
+        # An entry that is the difference of larger ones has their round-off.
+        largest = np.outer(np.max(np.abs(M[2]), axis=1, initial=0.0), np.max(np.abs(M[1]), axis=0, initial=0.0))
+        if np.any(np.abs(one - other) > SETTINGS.same * np.maximum(size, largest)):
+            return False
+    return True
+
+
+def _chosen(names: tuple[str, ...], given: Any) -> list[int]:
+    if given is None:
+        return list(range(len(names)))
+    if isinstance(given, slice):
+        return list(range(len(names)))[given]
+    wanted = [given] if isinstance(given, (str, int, np.integer)) else list(given)
+    places = []
+    for one in wanted:
+        if isinstance(one, str) and one not in names:
+            raise InputError(f"expected some of {', '.join(names)}", field="signal", value=one)
+        place = names.index(one) if isinstance(one, str) else int(one)
+        if not -len(names) <= place < len(names):
+            raise InputError(f"expected a number below {len(names)}", field="signal", value=place)
+        places.append(place)
+    return places
+
+
+def _random_dynamics(one: Element, rng: np.random.Generator, grid: np.ndarray, dt: float) -> StateSpace:
+    """gain U (s - p)/(s + p) V' with a gain of at most 1."""
+    corner = float(np.exp(rng.uniform(*np.log(grid))))
+    gain = float(rng.uniform(-1, 1))
+    U, _ = np.linalg.qr(rng.standard_normal((one.rows, one.rows)))
+    V, _ = np.linalg.qr(rng.standard_normal((one.cols, one.cols)))
+    k = min(one.rows, one.cols)
+    UV = gain * U[:, :k] @ V[:, :k].T
+    if dt:
+        r = np.exp(-corner * dt)
+        # (1 - r z)/(z - r)
+        return StateSpace(r * np.eye(one.cols), np.eye(one.cols), (1 - r * r) * UV, -r * UV, dt)
+    return StateSpace(-corner * np.eye(one.cols), np.eye(one.cols), -2 * corner * UV, UV)
+

@@ -1,0 +1,102 @@
+"""A filter that covers what a set of responses differs by from a nominal one.
+
+G_k = G (1 + W Delta) for every response, with |Delta| <= 1 at the frequencies given: W is stable, minimum phase and at
+or above the largest relative error (Skogestad and Postlethwaite, Multivariable Feedback Control, 2005, section 7.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti.interchange import frequencies_of, is_response, plot_frequencies, response_of
+from avis_ctrl.lti.rational import Rational
+from avis_ctrl.summary import Shown
+from avis_ctrl.uncertainty.weight_base import Role, Weight, smallest_cover
+
+Kind = Literal["output", "input", "additive"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class UncertaintyWeight(Shown, Weight):
+    """The filter W and the error that it covers.
+
+    omega, error : (n,) [rad/s] and the largest error of all responses there. order : states of W.
+    `system()` is W as a StateSpace, `magnitude(omega)` its size; `dynamics(name, weight)` takes it as it is.
+    """
+
+    omega: np.ndarray
+    error: np.ndarray
+    kind: Kind
+    tolerance_dB: float
+    max_order: int
+
+    role: ClassVar[Role] = "level"
+    unit: ClassVar[str] = "relative"
+
+    @cached_property
+    def shape(self) -> Rational:
+        # Errors far below the largest are covered, not followed.
+        floor = np.maximum(self.error, 1e-4 * np.max(self.error))
+        return smallest_cover(self.omega, floor, floor, self.tolerance_dB, self.max_order, "the error")
+
+    @property
+    def order(self) -> int:
+        return self.shape.order
+
+    @property
+    def meaning(self) -> str:
+        return (f"{self.kind} uncertainty of {np.min(self.error):.3g} to {np.max(self.error):.3g}, covered by order "
+                f"{self.order}")
+
+
+def uncertainty_weight(nominal: Any, responses: Sequence[Any] | Any, *, kind: Kind = "output",
+                       omega: np.ndarray | None = None, tolerance_dB: float = 2.0, max_order: int = 8
+                       ) -> UncertaintyWeight:
+    """The filter of lowest order that covers the error of every response about a nominal one.
+
+    Parameters
+    ----------
+    nominal, responses : systems, python-control FRDs, or an `UncertainSystem`'s `sample`; one response or a list.
+    kind : "output" (G_k - G) G^+ , "input" G^+ (G_k - G), both largest singular values, "additive" G_k - G.
+    omega : (n,) frequencies [rad/s]; by default those of the first FRD, or around the poles of the nominal system.
+    tolerance_dB : how far W may lie above the error. max_order : most states.
+
+    The cover is checked at these frequencies only.
+
+    Raises
+    ------
+    InputError : no responses, responses of another shape, a nominal response that is zero or not finite.
+    ComputationError : no filter of this order within the tolerance.
+    """
+    every = list(responses) if isinstance(responses, (list, tuple)) else [responses]
+    if not every or kind not in ("output", "input", "additive"):
+        raise InputError("expected responses, and output, input or additive", field="responses, kind",
+                         value=(len(every), kind))
+    if omega is None:
+        known = [frequencies_of(one) for one in (nominal, *every) if is_response(one)]
+        omega = known[0] if known else plot_frequencies(nominal, 120)
+    omega = np.asarray(omega, float)
+    omega = omega[omega > 0]
+    G = response_of(nominal, omega, "nominal")
+    error = np.zeros(omega.size)
+    for k, one in enumerate(every):
+        difference = response_of(one, omega, f"response {k}")
+        if difference.shape != G.shape:
+            raise InputError(f"expected responses of shape {G.shape[1:]}", field=f"response {k}",
+                             value=difference.shape[1:])
+        difference = difference - G
+        if kind != "additive":
+            inverse = np.linalg.pinv(G)
+            difference = difference @ inverse if kind == "output" else inverse @ difference
+        error = np.maximum(error, np.linalg.norm(difference, ord=2, axis=(1, 2)))
+    if not (np.all(np.isfinite(error)) and np.max(error) > 0 and np.all(np.abs(G).max(axis=(1, 2)) > 0)):
+        raise InputError("expected finite responses that differ from a nominal one that is not zero", field="nominal")
+    made = UncertaintyWeight(omega, error, kind, tolerance_dB, max_order)
+    _ = made.shape
+    return made

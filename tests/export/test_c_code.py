@@ -1,0 +1,189 @@
+"""The C code: compiled, run and compared with linear systems simulated by scipy."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from avis_ctrl.export.c_source import HEADER, SOURCE, Provenance, c_files, constants_of
+from avis_ctrl.export.compiled import STRICT, CompiledController, step_time_us
+from avis_ctrl.export.protection import Processor, protection
+from avis_ctrl.export.vectors import vectors
+from avis_ctrl.simulation.discrete import digital_controller
+
+ARITHMETIC = ("float64", "float32")
+
+
+def exported(folder, arithmetic, title="a design"):
+    controller = folder.sampled("skyhook_classical", arithmetic)
+    guard = protection(controller, folder.rig)
+    return controller, guard, c_files(controller, guard, Provenance((title,)))
+
+
+@pytest.mark.parametrize(("arithmetic", "tolerance"), [("float64", 1e-12), ("float32", 2e-5)])
+def test_code_is_the_simulated_controller(skyhook, gcc, rng, arithmetic, tolerance):
+    """After the start, and away from the limits: scipy's simulation of the controller that `simulate` runs."""
+    controller, _, files = exported(skyhook, arithmetic)
+    K = digital_controller(skyhook.loop(skyhook.controller("skyhook_classical")))
+    code = CompiledController(files, controller)
+    code.skip_start()
+    y = rng.normal(0, 0.02, (4000, K.ninputs)).astype(controller.dtype).astype(float)
+    expected = scipy.signal.dlsim((K.A, K.B, K.C, K.D, K.dt), y)[1]
+    u = np.array([code.step(row) for row in y])
+    largest = np.max(np.abs(expected))
+    assert 0 < largest < np.min(controller.limits_V)
+    assert np.max(np.abs(u - expected)) < tolerance * largest
+
+
+@pytest.mark.parametrize(("arithmetic", "tolerance"), [("float64", 1e-11), ("float32", 5e-4)])
+def test_test_vectors_reach_limits_and_fall_back(skyhook, gcc, arithmetic, tolerance):
+    controller, guard, files = exported(skyhook, arithmetic)
+    y, u = vectors(controller, guard)
+    assert len(y) == 2000
+    assert np.any(np.abs(u) == controller.limits_V)
+    assert np.any(np.abs(y) >= guard.input_limit_V)
+    code = CompiledController(files, controller)
+    assert np.max(np.abs(np.array([code.step(row) for row in y]) - u)) < tolerance
+
+
+@pytest.mark.parametrize("arithmetic", ARITHMETIC)
+def test_clean_under_warnings_and_sanitizers(skyhook, gcc, tmp_path, arithmetic):
+    """Any input, infinities and NaN among them, with every warning an error and both sanitizers watching."""
+    _, _, files = exported(skyhook, arithmetic)
+    main = """
+        #include <math.h>
+        #include <stdlib.h>
+        #include "avis_controller.h"
+        int main(void) {
+            avis_controller_t c;
+            real_t y[AVIS_CONTROLLER_INPUTS], u[AVIS_CONTROLLER_OUTPUTS];
+            avis_controller_init(&c);
+            for (long k = 0; k < 60000; k++) {
+                for (int i = 0; i < AVIS_CONTROLLER_INPUTS; i++) {
+                    y[i] = (real_t)(rand() % 2001 - 1000) / (real_t)(k < 20000 ? 50000 : 50);
+                }
+                if (k % 7001 == 5) y[0] = (real_t)NAN;
+                if (k % 9001 == 5) y[1] = (real_t)-INFINITY;
+                if (k % 9001 == 9) y[1] = (real_t)1e30;
+                avis_controller_step(&c, y, u);
+                for (int i = 0; i < AVIS_CONTROLLER_OUTPUTS; i++) {
+                    if (!(u[i] <= 10 && u[i] >= -10)) return 1;
+                }
+            }
+            for (int i = 0; i < AVIS_CONTROLLER_STATES; i++) if (!isfinite(c.x[i])) return 2;
+            return 0;
+        }"""
+    for name, text in {**files, "main.c": main}.items():
+        (tmp_path / name).write_text(text)
+    program = tmp_path / "program"
+    built = subprocess.run([gcc, *STRICT, "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all",
+                            "-c", SOURCE, "-o", "controller.o"], cwd=tmp_path, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    assert built.stderr == ""
+    subprocess.run([gcc, "-std=c99", "-fsanitize=address,undefined", "main.c", "controller.o", "-o", program, "-lm"],
+                   cwd=tmp_path, check=True, capture_output=True)
+    done = subprocess.run([program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_no_heap_and_no_globals(skyhook, gcc, tmp_path):
+    """The object file defines two functions and read-only data, and calls nothing."""
+    _, _, files = exported(skyhook, "float32")
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    subprocess.run([gcc, "-std=c99", "-O0", "-fno-stack-protector", "-c", SOURCE], cwd=tmp_path, check=True)
+    listed = subprocess.run(["nm", "avis_controller.o"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    kinds = {line.split()[-1]: line.split()[-2] for line in listed.stdout.splitlines()}
+    assert {name for name, kind in kinds.items() if kind == "T"} == {"avis_controller_init", "avis_controller_step"}
+    assert set(kinds.values()) <= {"T", "t", "r"}
+
+
+@pytest.mark.parametrize("arithmetic", ARITHMETIC)
+def test_source_holds_the_numbers_of_the_controller(skyhook, arithmetic):
+    controller, guard, files = exported(skyhook, arithmetic)
+    held = constants_of(files[SOURCE], controller.dtype)
+    for name, matrix in {**controller.matrices(), "L": guard.anti_windup}.items():
+        assert np.array_equal(held[name], matrix), name
+    single = arithmetic == "float32"
+    assert (f"typedef {'float' if single else 'double'} real_t;") in files[HEADER]
+    # No double constant in single precision.
+    body = files[SOURCE].split('#include "avis_controller.h"')[1]
+    assert bool(re.search(r"\d\.\d+(e[-+]\d+)?[,}; ]", body)) is not single
+
+
+@pytest.mark.parametrize("title", ["*/ int evil; /*", "ends with \\", "two\nlines", "??/", "Umlaut ä \x00"])
+def test_a_hostile_title_stays_a_comment(skyhook, gcc, title):
+    controller, _, files = exported(skyhook, "float32", title)
+    comment, rest = files[HEADER].split("*/", 1)
+    assert "evil" not in rest
+    assert all(" " <= one <= "~" or one == "\n" for one in comment)
+    CompiledController(files, controller)
+
+
+def test_start_is_bumpless(skyhook, gcc):
+    """A constant sensor offset is there from the first sample: voltages begin at zero and never step."""
+    controller, guard, files = exported(skyhook, "float64")
+    code = CompiledController(files, controller)
+    y = np.full(controller.system.ninputs, 0.1)
+    u = np.array([code.step(y) for _ in range(6000)])
+    linear = scipy.signal.dlsim((*controller.matrices().values(), controller.system.dt), np.tile(y, (6000, 1)))[1]
+    assert np.all(u[:guard.wait - 1] == 0)
+    jump_without = np.max(np.abs(linear[0]))
+    assert np.max(np.abs(np.diff(u, axis=0))) < 0.02 * jump_without
+    after = guard.wait + round(1 / guard.rise) + 1
+    assert np.max(np.abs(u[after:] - linear[after:])) < 1e-9 * np.max(np.abs(linear))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 20.0, -20.0])
+def test_an_invalid_input_brings_the_drives_to_zero_and_back(skyhook, gcc, rng, bad):
+    controller, guard, files = exported(skyhook, "float32")
+    code = CompiledController(files, controller)
+    code.skip_start()
+    y = rng.normal(0, 0.02, (8000, controller.system.ninputs))
+    for row in y[:1000]:
+        before = code.step(row)
+    y[1000:1500, 2] = bad
+    u = np.array([code.step(row) for row in y[1000:]])
+    fall = round(1 / guard.fall)
+    assert np.any(before != 0)
+    assert np.all(np.isfinite(u))
+    assert np.all(u[fall + 1:500 + guard.wait - 1] == 0)
+    assert np.all(np.any(u[500 + guard.wait:1000 + guard.wait] != 0, axis=0))
+    assert code.state.gain == 1.0
+
+
+@pytest.mark.parametrize("arithmetic", ARITHMETIC)
+def test_a_step_is_timed(skyhook, gcc, arithmetic):
+    controller, _, files = exported(skyhook, arithmetic)
+    assert 0 < step_time_us(files, controller) < 1e6 / controller.sample_rate_Hz
+
+
+def test_without_a_compiler_there_is_no_time_and_a_clear_error(skyhook, monkeypatch):
+    from avis_ctrl.errors import ComputationError
+
+    monkeypatch.setenv("PATH", "")
+    controller, _, files = exported(skyhook, "float32")
+    assert step_time_us(files, controller) is None
+    with pytest.raises(ComputationError, match="gcc is not installed"):
+        CompiledController(files, controller)
+
+
+def test_realisation_is_the_same_controller_in_schur_form(skyhook):
+    """python-control evaluates both transfer matrices."""
+    K = digital_controller(skyhook.loop(skyhook.controller("skyhook_classical")))
+    form = skyhook.sampled("skyhook_classical").system
+    omega = np.geomspace(1e-3, 0.99 * np.pi / K.dt, 60)
+    a, b = K.to_control()(np.exp(1j * omega * K.dt)), form.to_control()(np.exp(1j * omega * K.dt))
+    assert np.max(np.abs(a - b) / np.max(np.abs(a), axis=(0, 1))) < 1e-9
+    assert np.all(np.tril(form.A, -2) == 0)
+
+
+def test_anti_windup_is_stable_and_processor_is_the_code(skyhook):
+    controller, guard, _ = exported(skyhook, "float32")
+    A, C = controller.system.A, controller.system.C
+    assert np.max(np.abs(np.linalg.eigvals(A - guard.anti_windup @ C))) < 1
+    assert Processor(controller, guard).step(np.zeros(6)).shape == (8,)

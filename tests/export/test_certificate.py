@@ -1,0 +1,202 @@
+"""The certificate of the shipped AVIS design's code, against plants that are sampled and simulated on their own."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.export.c_source import Provenance, c_files
+from avis_ctrl.export.certificate import certify, shipped_loop
+from avis_ctrl.export.compiled import CompiledController
+from avis_ctrl.export.package import CERTIFICATE, CONTROLLER, check_package, make_package
+from avis_ctrl.export.protection import Processor, protection
+from avis_ctrl.export.rounding import rounding_noise
+from avis_ctrl.export.sampled_controller import parse_controller
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.simulation import simulate
+from avis_ctrl.simulation.discrete import spectral_radius
+from avis_ctrl.simulation.sampled_loop import lever_arms
+from avis_ctrl.study.random_plants import random_perturbations
+from avis_ctrl.study.simulation import with_delta
+
+
+@pytest.fixture(scope="module")
+def package(shipped):
+    return make_package(shipped, "mu", "float32")
+
+
+@pytest.fixture(scope="module")
+def stored(package):
+    return json.loads(package.contents[CONTROLLER])
+
+
+def ratio(dB: float) -> float:
+    return 10 ** (dB / 20)
+
+
+def vertices(folder, count: int, rng) -> list[np.ndarray]:
+    """Real parameters at their ends, chains of full size and any phase."""
+    blocks = folder.plant.synthesis.blocks
+    return [blocks.assemble([rng.choice([-1.0, 1.0]) if block.kind == "real" else np.exp(2j * np.pi * rng.uniform())
+                             for block in blocks.blocks]) for _ in range(count)]
+
+
+def sampled_transmissibility(folder, stored, deltas, omega, images: int = 20) -> np.ndarray:
+    """(n_delta, n_omega) largest singular value of floor to payload, of the loop that runs the stored numbers.
+
+    The design's continuous plant, its own Pade delay taken out, under hold and delay, with all images up to `images`
+    folded in; gains, places and lever arms of sensors and drives from the rig.
+    """
+    rig, plant, T = folder.rig, folder.plant, 1 / stored["sample_rate_Hz"]
+    A, B, C, D = (np.array(stored[name]) for name in "ABCD")
+    kept = [COORDINATES.index(name) for name in folder.design.keep]
+    arms = lever_arms(rig)[kept]
+    forces = rig.equations_of_motion().T[kept] / arms[:, None]
+    volts = np.array([one.gain for one in rig.sensors()])[:, None] * rig.sensor_rows()[1][:, kept] / arms
+    tau = rig.loop_delay_s + 0.5 * T
+    P, blocks, n = plant.full.P, plant.full.blocks, len(kept)
+    P = P.select([*P.outputs[:blocks.n_z], *plant.velocities, *plant.full.y],
+                 [*P.inputs[:blocks.n_w], *plant.floor_velocities, *plant.full.u])
+
+    def closed(at, delta):
+        s = 1j * at
+        M = P.frequency_response(np.abs(at))
+        M = np.where((at < 0)[:, None, None], M.conj(), M)
+        n_z, n_w = blocks.n_z, blocks.n_w
+        G = M[:, n_z:, n_w:] + M[:, n_z:, :n_w] @ delta @ np.linalg.solve(np.eye(n_z) - M[:, :n_z, :n_w] @ delta,
+                                                                       M[:, :n_z, n_w:])
+        pade = (1 - s * tau / 2 + (s * tau) ** 2 / 12) / (1 + s * tau / 2 + (s * tau) ** 2 / 12)
+        held = (1 - np.exp(-s * T)) / (s * T) * np.exp(-s * stored["delay_samples"] * T) / pade
+        G[:, :, n:] *= held[:, None, None]
+        return G
+    z = np.exp(1j * omega * T)
+    K = forces @ (C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B.astype(complex)) + D) @ volts
+    found = []
+    for delta in deltas:
+        base = closed(omega, delta)
+        loop = base[:, n:, n:] + sum(closed(omega + 2 * np.pi * k / T, delta)[:, n:, n:]
+                                     for k in range(-images, images + 1) if k)
+        u = np.linalg.solve(np.eye(n) - K @ loop, K @ base[:, n:, :n])
+        found.append(np.linalg.norm(base[:, :n, :n] + base[:, :n, n:] @ u, ord=2, axis=(1, 2)))
+    return np.array(found)
+
+
+def test_no_sampled_plant_exceeds_the_certificate(shipped, package, stored, rng):
+    certificate = package.certificate.content
+    omega = 2 * np.pi * np.geomspace(0.03, 120.0, 60)
+    deltas = [*random_perturbations(shipped.plant, 40, 5), *vertices(shipped, 40, rng), package.certificate.worst.delta]
+    sigma = sampled_transmissibility(shipped, stored, deltas, omega)
+    low, high = shipped.design.transmissibility.band_Hz
+    band = (omega >= 2 * np.pi * low) & (omega <= 2 * np.pi * high)
+    assert np.max(sigma) <= ratio(certificate["worst_case_peak_transmissibility_dB"])
+    assert np.max(sigma[:, band]) <= ratio(certificate["worst_case_band_transmissibility_dB"])
+    # The worst plant found is that bad: the bound is not loose.
+    at = sampled_transmissibility(shipped, stored, [package.certificate.worst.delta],
+                                  np.array([package.certificate.worst.omega]))[0, 0]
+    assert at == pytest.approx(package.certificate.worst.gain, rel=5e-3)
+    assert at > 0.97 * ratio(certificate["worst_case_peak_transmissibility_dB"])
+
+
+def test_all_axes_stay_stable_with_200_plants(shipped, package, stored, rng):
+    """Poles of the sampled loop of six degrees of freedom, hold and delay exact."""
+    nominal = shipped_loop(shipped, parse_controller(package.contents[CONTROLLER]))
+    deltas = [*random_perturbations(shipped.plant, 100, 7), *vertices(shipped, 100, rng)]
+    radii = [spectral_radius(with_delta(shipped.rig, shipped.plant, nominal, "one", delta,
+                                        2 * np.pi * 10 ** rng.uniform(0, 2))) for delta in deltas]
+    assert max(radii) < 1
+
+
+def test_figures_are_near_those_of_the_design(shipped, package):
+    """1 kHz and float32 cost this design little; what they cost is in the certificate."""
+    from avis_ctrl.study.analysis import analyse
+
+    K = shipped.controller("mu")
+    designed = analyse(shipped.design, shipped.plant, K, "mu", "mu", "mu", random_perturbations(shipped.plant, 1, 1))
+    found = package.certificate.content
+    assert designed.mu.lower <= found["mu_upper"] <= 1.01 * designed.mu.upper
+    assert found["mu_lower"] <= found["mu_upper"] <= 1.03 * found["mu_lower"]
+    assert found["stable"] and found["guaranteed"]
+    assert designed.worst_peak.lower <= ratio(found["worst_case_peak_transmissibility_dB"])
+    between = found["between_samples"]["worst_case_gain_dB"]
+    assert found["worst_case_peak_transmissibility_dB"] <= between + 0.01 < found[
+        "worst_case_peak_transmissibility_dB"] + 0.1
+
+
+def test_the_worst_plant_replayed_through_the_code(package, gcc):
+    """On the nonlinear table with six axes, in time: below the bound, and near what the frequency domain says."""
+    assert not package.replay.record.diverged
+    assert package.replay.gain == pytest.approx(package.certificate.worst.gain, rel=0.02)
+    assert package.replay.gain <= ratio(package.certificate.content["worst_case_peak_transmissibility_dB"])
+
+
+def test_rounding_stays_below_its_bound(shipped, package, gcc):
+    """The compiled float32 code against double arithmetic with the same numbers, in closed loop."""
+    controller = package.controller
+    guard = protection(controller, shipped.rig)
+    loop = shipped_loop(shipped, controller)
+    bound = rounding_noise(controller, loop)
+    loop = replace(loop, sensors=replace(loop.sensors, converter=None))
+    code = CompiledController(c_files(controller, guard, Provenance(())), controller)
+    exact = Processor(controller, guard)
+    code.skip_start()
+    exact.gain, exact.wait = 1.0, 0
+    rounded, smooth = (simulate(loop, 20.0, 3, settle_s=5.0, nonlinear=False, code=one.step) for one in (code, exact))
+    error = np.max(np.abs(rounded.q_dot - smooth.q_dot), axis=0) * lever_arms(shipped.rig)
+    assert np.all(error <= bound)
+    assert np.max(error) > 1e-4 * np.max(bound)  # a bound, not a wild guess
+    assert package.certificate.content["rounding_noise_m_per_s"] == pytest.approx(np.linalg.norm(bound), rel=1e-6)
+
+
+@pytest.mark.parametrize(("matrix", "place", "figure"), [("C", (1, 10), "mu_upper"), ("A", (12, 12), "no certificate"),
+                                                         ("D", (0, 0), "rounding_noise")])
+def test_a_changed_coefficient_is_found_by_hash_and_by_certificate(shipped, package, tmp_path, matrix, place, figure):
+    """One of the mu controller's coefficients; a pole, beyond the unit circle; one of the other axes' loops."""
+    for name, content in package.contents.items():
+        (tmp_path / name).write_bytes(content)
+    text = json.loads(package.contents[CONTROLLER])
+    text[matrix][place[0]][place[1]] = float(np.float32(1.05 * text[matrix][place[0]][place[1]]))
+    (tmp_path / CONTROLLER).write_text(json.dumps(text))
+    found = check_package(shipped, tmp_path)
+    assert any("hash" in one for one in found)
+    assert any(f"{matrix} in avis_controller.c" in one for one in found)
+    assert any(f"{matrix} in controller.mat" in one for one in found)
+    assert [one for one in found if one.startswith(figure)]
+
+
+def test_untouched_files_agree(shipped, package, tmp_path):
+    for name, content in package.contents.items():
+        (tmp_path / name).write_bytes(content)
+    assert check_package(shipped, tmp_path) == []
+    (tmp_path / CERTIFICATE).write_bytes(package.contents[CERTIFICATE].replace(b'"mu_upper": 0.8', b'"mu_upper": 0.7'))
+    assert [one for one in check_package(shipped, tmp_path) if one.startswith("mu_upper")]
+
+
+def test_an_unstable_controller_has_no_certificate(shipped, package):
+    """All gains times twenty."""
+    K = package.controller.system
+    loud = replace(package.controller, system=replace(K, C=20 * K.C, D=20 * K.D))
+    with pytest.raises(ComputationError, match="unstable"):
+        certify(shipped, loud)
+
+
+def test_anti_windup_shortens_the_recovery(shipped, package):
+    """A slow floor motion far beyond the drives for 20 s: in the second after it the table moves less than without."""
+    controller = package.controller
+    guard = replace(protection(controller, shipped.rig), input_limit_V=np.full(6, 1e6))
+    loop = shipped_loop(shipped, controller)
+    loop = replace(loop, sensors=replace(loop.sensors, converter=None))
+    time = np.arange(25001) * loop.period_s
+    floor = np.zeros((time.size, 6))
+    floor[:, 2] = np.where(time < 20, 6e-3 * np.sin(2 * np.pi * 0.1 * time), 0.0)
+    moved = []
+    for one in (guard, replace(guard, anti_windup=np.zeros_like(guard.anti_windup))):
+        processor = Processor(controller, one)
+        processor.gain, processor.wait = 1.0, 0
+        record = simulate(loop, 25.0, 1, settle_s=0.0, floor=floor, code=processor.step)
+        assert np.sum(np.any(np.abs(record.volts) >= controller.limits_V, axis=1)) > 5000
+        moved.append(np.max(np.abs(record.q_dot[20000:21000, 2])))
+    assert moved[0] < 0.7 * moved[1]

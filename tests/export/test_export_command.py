@@ -1,0 +1,129 @@
+"""`avis export` as a user meets it: its files, and what it says to wrong input."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+import scipy.io
+
+from avis_ctrl.export.design_folder import open_design
+from avis_ctrl.export.package import FILES
+from avis_ctrl.export.sampled_controller import read_controller
+from avis_ctrl.simulation.discrete import digital_controller
+
+ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
+CERTIFICATE_KEYS = {"format", "version", "controller_sha256", "mu_upper", "mu_lower", "guaranteed", "stable",
+                    "worst_case_peak_transmissibility_dB", "worst_case_band_transmissibility_dB",
+                    "rounding_noise_m_per_s", "step_time_us", "between_samples"}
+CONTROLLER_KEYS = {"format", "version", "name", "sample_rate_Hz", "arithmetic", "A", "B", "C", "D", "inputs", "outputs",
+                   "input_units", "output_units", "limits_V", "delay_samples"}
+
+
+def avis(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", "from avis_ctrl.cli import main; main()", *map(str, arguments)],
+                          capture_output=True, text=True, timeout=600, env=ENVIRONMENT, check=False)
+
+
+@pytest.fixture(scope="module")
+def out(skyhook_dir, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("out") / "new"
+    done = avis("export", skyhook_dir, "--controller", "skyhook_classical", "--out", folder, "--float32")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_files_follow_the_contract(out):
+    assert {one.name for one in out.iterdir()} == set(FILES)
+    controller, certificate = (json.loads((out / name).read_text()) for name in ("controller.json", "certificate.json"))
+    assert set(controller) == CONTROLLER_KEYS
+    assert set(certificate) == CERTIFICATE_KEYS
+    assert certificate["stable"] is True
+    for name in "ABCD":
+        matrix = np.array(controller[name])
+        assert np.array_equal(matrix, matrix.astype(np.float32).astype(float))
+    vectors = np.loadtxt(out / "test_vectors.csv", delimiter=",", skiprows=1)
+    assert vectors.shape == (2000, len(controller["inputs"]) + len(controller["outputs"]))
+
+
+def test_mat_file_and_python_control_have_the_same_numbers(out):
+    stored, controller = scipy.io.loadmat(out / "controller.mat"), read_controller(out / "controller.json")
+    for name, matrix in controller.matrices().items():
+        assert np.array_equal(stored[name], matrix)
+    assert [str(one[0]) for one in stored["inputs"][0]] == list(controller.system.inputs)
+    system = controller.system.to_control()
+    assert isinstance(system, control.StateSpace)
+    assert system.dt == 1 / controller.sample_rate_Hz
+
+
+def test_exported_numbers_are_those_of_the_simulated_controller(skyhook, out):
+    """float32 coefficients move the response by parts in ten thousand at most, at all frequencies that matter."""
+    K = digital_controller(skyhook.loop(skyhook.controller("skyhook_classical")))
+    omega = np.geomspace(0.1, 0.99 * np.pi / K.dt, 80)
+    a, b = K.frequency_response(omega), read_controller(out / "controller.json").system.frequency_response(omega)
+    assert np.max(np.abs(a - b)) < 1e-3 * np.max(np.abs(a))
+
+
+def test_header_says_where_it_comes_from(out):
+    text = (out / "avis_controller.h").read_text()
+    certificate = json.loads((out / "certificate.json").read_text())
+    for words in ("AVIS: z and phi_x", "'avis'", certificate["controller_sha256"], "mu at most", "SHA-256"):
+        assert words in text
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (("MISSING", "--out", "OUT"), "expected a folder that avis design wrote"),
+    (("DESIGN", "--controller", "mu2", "--out", "OUT"), "skyhook_classical"),
+    (("DESIGN", "--controller", "passive", "--out", "OUT"), "skyhook_classical"),
+    (("DESIGN", "--controller", "skyhook_classical", "--out", "OUT", "--format", "c,fortran"), "c,mat,json"),
+    (("DESIGN", "--controller", "skyhook_classical", "--out", "FILE"), "--out"),
+    (("DESIGN", "--controller", "skyhook_classical", "--out", "/proc/nothing"), "--out"),
+    (("EMPTY", "--out", "OUT"), "result.json"),
+    (("DESIGN", "--out", "OUT", "--check"), "certificate.json")])
+def test_wrong_input_is_one_line_and_writes_nothing(skyhook_dir, tmp_path, arguments, words):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "empty").mkdir()
+    places = {"MISSING": tmp_path / "missing", "DESIGN": skyhook_dir, "OUT": tmp_path / "out",
+              "FILE": tmp_path / "file", "EMPTY": tmp_path / "empty"}
+    done = avis("export", *(places.get(one, one) for one in arguments))
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("file", "change", "words"), [
+    ("result.json", {"stable": False, "verdict": "phi_y is unstable"}, "phi_y is unstable"),
+    ("result.json", {"format": "avis-plant"}, "format"),
+    ("study.json", {"rig": "name = 1"}, "study.json"),
+    ("study.json", {"design": {}}, "study.json"),
+    ("study.json", None, "study.json"),
+    ("controllers/skyhook_classical.json", {"A": [[1.0]]}, "skyhook_classical.json"),
+    ("controllers/skyhook_classical.json", {"A": "x"}, "skyhook_classical.json")])
+def test_a_damaged_design_folder(skyhook_dir, tmp_path, file, change, words):
+    folder = shutil.copytree(skyhook_dir, tmp_path / "design")
+    if change is None:
+        (folder / file).write_text("{")
+    else:
+        content = json.loads((folder / file).read_text())
+        (folder / file).write_text(json.dumps({**content, **change}))
+    done = avis("export", folder, "--controller", "skyhook_classical", "--out", tmp_path / "out")
+    assert done.returncode in (2, 3)
+    assert words in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_study_file_reads_back_design_and_rig(skyhook):
+    from avis_ctrl.study.design_file import read_study
+
+    design, rig = read_study(Path(__file__).resolve().parents[2] / "designs" / "avis_z_phix.toml")
+    assert open_design(skyhook.path).design == design
+    assert skyhook.rig == rig

@@ -1,0 +1,119 @@
+"""Plots: axes in, axes out, the right numbers on them, units on the axes."""
+
+from __future__ import annotations
+
+import control
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+
+from avis_ctrl import plot
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti import tf
+from avis_ctrl.lti.interchange import plot_frequencies
+from avis_ctrl.rigs.vibration_criteria import CRITERIA
+from avis_ctrl.robust.mu_peak import MuPeak
+from avis_ctrl.robust.musyn_state import Iteration
+
+matplotlib.use("Agg")
+LAG = control.tf([2.0], [0.5, 1.0])
+OMEGA = np.geomspace(0.01, 100, 50)
+
+
+@pytest.fixture(autouse=True)
+def closed_figures():
+    yield
+    plt.close("all")
+
+
+def curve(ax, k=0):
+    return tuple(np.asarray(part, float) for part in ax.lines[k].get_data())
+
+
+@pytest.mark.parametrize("system", [LAG, control.ss(LAG), tf([2.0], [0.5, 1.0]), control.frd(LAG, OMEGA)],
+                         ids=["TransferFunction", "StateSpace of python-control", "StateSpace", "FRD"])
+def test_bode_and_sigma_of_a_lag_in_closed_form(system):
+    top, bottom = plot.bode(system, None if hasattr(system, "frdata") else OMEGA)
+    f, dB = curve(top)
+    w = 2 * np.pi * f
+    np.testing.assert_allclose(w, OMEGA, rtol=1e-12)
+    np.testing.assert_allclose(dB, 20 * np.log10(2 / np.sqrt(1 + (0.5 * w) ** 2)), atol=1e-9)
+    np.testing.assert_allclose(curve(bottom)[1], -np.degrees(np.arctan(0.5 * w)), atol=1e-9)
+    assert top.get_ylabel() == "magnitude [dB]" and bottom.get_ylabel() == "phase [degrees]"
+    assert bottom.get_xlabel() == "frequency [Hz]" and top.get_xscale() == "log"
+    ax = plot.sigma(system, OMEGA, label="lag")
+    np.testing.assert_allclose(curve(ax)[1], dB, atol=1e-9)
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["lag"]
+
+
+def test_axes_given_are_the_axes_returned():
+    _, pair = plt.subplots(2)
+    assert plot.bode(LAG, ax=pair) is pair
+    for draw in (lambda ax: plot.sigma(LAG, ax=ax), lambda ax: plot.vc_curves(ax=ax), lambda ax: plot.mu(peak(), ax),
+                 lambda ax: plot.dk_history(history(), ax), lambda ax: plot.order([(3, 1.2)], ax)):
+        _, one = plt.subplots()
+        assert draw(one) is one
+    with pytest.raises(InputError, match="expected 2 axes"):
+        plot.bode(LAG, ax=plt.subplots()[1])
+
+
+def test_singular_values_of_several_channels():
+    G = control.ss(np.diag([-1.0, -2.0]), np.eye(2), np.diag([3.0, 1.0]), np.zeros((2, 2)))
+    ax = plot.sigma(G, OMEGA)
+    np.testing.assert_allclose(curve(ax, 0)[1], 20 * np.log10(3 / np.sqrt(1 + OMEGA ** 2)), atol=1e-9)
+    np.testing.assert_allclose(curve(ax, 1)[1], 20 * np.log10(1 / np.sqrt(4 + OMEGA ** 2)), atol=1e-9)
+    assert len(plot.bode(G, OMEGA)[0].get_legend().get_texts()) == 4
+
+
+def test_default_frequencies_show_a_narrow_resonance():
+    f, dB = curve(plot.bode(control.tf([1.0], [1.0, 2e-4 * 5.0, 25.0]))[0])
+    assert np.max(dB) == pytest.approx(20 * np.log10(1 / (2 * 1e-4 * 25.0)), abs=0.1)
+    assert f[0] < 0.3 and f[-1] > 3
+    assert plot_frequencies(control.ss([[0.5]], [[1]], [[1]], [[0]], 0.1))[-1] <= np.pi / 0.1
+
+
+def peak():
+    w = np.array([0.0, 1.0, 10.0])
+    return MuPeak(0.91, 0.9, 1.0, None, True, "", w, np.array([0.5, 0.905, 0.2]), np.array([0.0, 0.9, 0.1]))
+
+
+def history():
+    rows = [(3.0, 2.0, 4), (1.5, 1.2, 8), (1.1, 1.0, 6), (np.inf, np.nan, 9)]
+    return [Iteration(k, gamma, mu, order, 0.0, 0, 0.1, "D-K") for k, (gamma, mu, order) in enumerate(rows, 1)]
+
+
+def test_mu_says_what_its_bound_is_worth():
+    ax = plot.mu(peak())
+    words = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert "peak below 0.91, proved between all points" in words
+    f, upper = curve(ax)
+    np.testing.assert_allclose(f, np.array([1.0, 10.0]) / (2 * np.pi))  # zero has no place on a logarithmic axis
+    np.testing.assert_allclose(upper, [0.905, 0.2])
+
+
+def test_history_and_order():
+    ax = plot.dk_history(history())
+    np.testing.assert_allclose(curve(ax, 1), [[1, 2, 3], [2.0, 1.2, 1.0]])
+    ax = plot.order(history())
+    np.testing.assert_allclose(curve(ax, 0), [[4, 6, 8], [2.0, 1.0, 1.2]])
+    np.testing.assert_allclose(curve(ax, 1)[1], [2.0, 1.0, 1.0])
+    with pytest.raises(InputError, match="at least one iteration"):
+        plot.dk_history([])
+
+
+def test_vibration_criteria_are_those_of_the_table():
+    f = np.array([4.0, 8.0, 16.0])
+    ax = plot.vc_curves({"floor": (f, np.array([1e-6, 2e-6, 0.0]))})
+    assert [text.get_text() for text in ax.texts] == [one.name for one in CRITERIA]
+    np.testing.assert_allclose(curve(ax, len(CRITERIA)), [[4.0, 8.0], [1.0, 2.0]])
+    assert ax.get_ylabel() == "velocity, r.m.s. [µm/s]"
+    with pytest.raises(InputError, match="two vectors of one length"):
+        plot.vc_curves({"floor": (f, f[:2])})
+
+
+def test_what_is_no_system_is_refused():
+    with pytest.raises(InputError, match="expected a StateSpace"):
+        plot.bode("G")
+    with pytest.raises(InputError, match="frequencies of the frequency response"):
+        plot.sigma(control.frd(LAG, OMEGA), np.array([3.3]))

@@ -1,0 +1,129 @@
+"""Robust stability and performance of uncertain systems; mixed sensitivity; covering weights."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.lti import StateSpace, hinf_norm, tf
+from avis_ctrl.robust.mixed_sensitivity import mixed_sensitivity
+from avis_ctrl.robust.robustness import robust_performance, robust_stability, worst_case_gain
+from avis_ctrl.uncertainty.blocks import RealScalar
+from avis_ctrl.uncertainty.uncertain_models import dynamics, real, ss
+from avis_ctrl.uncertainty.uncertainty_weight import uncertainty_weight
+
+# Skogestad and Postlethwaite, Multivariable Feedback Control, 2005: plant of section 2.6, weights of example 2.17.
+PLANT = control.tf([200], np.polymul([10, 1], np.polymul([0.05, 1], [0.05, 1])))
+W_P = control.tf([1 / 1.5, 10], [1, 10 * 1e-4])
+
+
+def oscillator(percent=20.0):
+    k, c = real("k", 4.0, percent=percent), real("c", 0.4, percent=percent)
+    return ss([[0, 1], [-1 * k, -1 * c]], [[0], [1]], [[1, 0]])
+
+
+def test_stability_ends_where_routh_says():
+    """s^3 + 10 s^2 + 10 s + 10 + 25 k is stable for -0.4 < k < 3.6; k = 1 +- 20 %: first at k = -0.4, seven ranges."""
+    loop = (real("k", 1.0, percent=20) * tf([25.0], [1.0, 10.0, 10.0, 10.0])).feedback()
+    found = robust_stability(loop)
+    assert found.upper == pytest.approx(7.0, rel=1e-6) and found.lower == pytest.approx(7.0, rel=1e-3)
+    assert found.worst["k"] == pytest.approx(-0.4) and found.omega == pytest.approx(0.0, abs=1e-3) and found.robust
+    other = (real("k", 3.0, percent=20) * tf([25.0], [1.0, 10.0, 10.0, 10.0])).feedback()
+    edge = robust_stability(other)
+    assert edge.worst["k"] == pytest.approx(3.6, rel=1e-3) and edge.upper == pytest.approx(1.0, rel=1e-3)
+    assert edge.omega == pytest.approx(np.sqrt(10.0), rel=1e-2)
+
+
+def test_performance_at_its_own_margin_is_the_worst_case_gain():
+    """lower = a: for a times the uncertainty the gain is at most 1/a, and just reaches it."""
+    found = robust_performance(oscillator())
+    a = found.lower
+    scaled = worst_case_gain(oscillator(20.0 * a))
+    assert scaled.upper <= 1 / a * (1 + 2e-3) and scaled.lower >= 1 / found.upper * (1 - 1e-2)
+    assert found.robust is False  # the resonance has a gain above 1 with the declared uncertainty
+    assert robust_stability(oscillator()).robust is True
+
+
+def test_an_lft_with_blocks_is_the_same_as_the_system():
+    P, blocks = oscillator().lft()
+    assert robust_stability(P.to_control(), blocks).lower == robust_stability(oscillator()).lower
+    assert worst_case_gain(P, blocks).upper == worst_case_gain(oscillator()).upper
+
+
+@pytest.mark.parametrize("call, words", [
+    (lambda: robust_stability(tf([1.0], [1.0, 1.0])), "with its blocks"),
+    (lambda: robust_stability(oscillator(), [RealScalar(1)]), "expected no blocks"),
+    (lambda: robust_stability(tf([1.0], [1.0, 1.0]), []), "something uncertain"),
+    (lambda: robust_stability(tf([1.0], [1.0, 1.0]), [RealScalar(3)]), "the blocks need"),
+    (lambda: robust_performance(tf([1.0], [1.0, 1.0]), [RealScalar(1)]), "inputs d and outputs e"),
+    (lambda: mixed_sensitivity(PLANT), "at least one weight"),
+    (lambda: mixed_sensitivity(PLANT, np.ones((1, 2))), "expected 1 or 1 inputs"),
+    (lambda: uncertainty_weight(PLANT, []), "expected responses"),
+    (lambda: uncertainty_weight(PLANT, [PLANT]), "differ from a nominal one"),
+    (lambda: uncertainty_weight(PLANT, [np.ones((2, 2))]), "responses of shape"),
+])
+def test_wrong_input_is_one_line(call, words):
+    with pytest.raises(InputError, match=words) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_mixed_sensitivity_of_the_textbook():
+    """The optimum printed in example 2.17 is 1.37; python-control (SLICOT) finds the same problem's optimum."""
+    found = mixed_sensitivity(PLANT, W_P, 1.0, backoff=0.001)
+    assert round(found.gamma, 2) == 1.37
+    omega = np.geomspace(1e-5, 1e4, 4000)
+    S, KS, T = (one.frequency_response(omega)[:, 0, 0] for one in (found.S, found.KS, found.T))
+    stacked = np.sqrt(np.abs(W_P(1j * omega) * S) ** 2 + np.abs(KS) ** 2)
+    assert np.max(stacked) == pytest.approx(found.gamma, rel=1e-3) and np.max(stacked) <= found.gamma * (1 + 1e-6)
+    np.testing.assert_allclose(S + T, 1.0, atol=1e-8)
+    np.testing.assert_allclose(S * PLANT(1j * omega) * found.K.frequency_response(omega)[:, 0, 0], T, atol=1e-8)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_mixed_sensitivity_against_python_control():
+    *_, (gamma, _) = control.mixsyn(control.ss(PLANT), control.ss(W_P), control.ss([], [], [], [[1.0]]))
+    assert mixed_sensitivity(PLANT, W_P, 1.0, backoff=1e-4).gamma == pytest.approx(gamma, rel=2e-3)
+
+
+def test_mixed_sensitivity_of_two_channels():
+    G = StateSpace([[-1.0, 0.3], [0.0, -2.0]], np.eye(2), [[1.0, 0.5], [0.2, 1.0]], np.zeros((2, 2)))
+    found = mixed_sensitivity(G, tf([0.5, 2.0], [1.0, 0.02]), 0.1, tf([1.0, 1.0], [0.01, 20.0]))
+    assert found.P.noutputs == 8 and found.K.inputs == ("e0", "e1") and found.T.is_stable()
+    assert hinf_norm(found.S).gain < found.gamma / 0.5 * 1.01
+
+
+def family():
+    """Skogestad and Postlethwaite 2005, example 7.5: gain, delay and time constant from 2 to 3, here first order."""
+    return [control.tf([k], [tau, 1]) for k in (2, 2.5, 3) for tau in (2, 2.5, 3)]
+
+
+@pytest.mark.parametrize("kind", ["output", "input", "additive"])
+def test_a_weight_covers_every_response_and_not_much_more(kind):
+    nominal = control.tf([2.5], [2.5, 1])
+    found = uncertainty_weight(nominal, family(), kind=kind)
+    s = 1j * found.omega
+    error = np.max([np.abs(one(s) - nominal(s)) for one in family()], axis=0)
+    error = error if kind == "additive" else error / np.abs(nominal(s))
+    np.testing.assert_allclose(found.error, error, rtol=1e-9)
+    size = found.magnitude(found.omega)
+    assert np.all(size >= error * (1 - 1e-9))
+    followed = error > 1e-4 * error.max()
+    assert 20 * np.log10(np.max(size[followed] / error[followed])) <= 2.0 + 1e-6
+    assert np.all(found.shape.poles().real < 0) and np.all(found.shape.zeros().real < 0)
+
+
+def test_a_weight_from_measured_responses_goes_into_dynamics():
+    omega = np.geomspace(0.01, 100, 80)
+    nominal = tf([2.5], [2.5, 1.0])
+    responses = [control.frd(one, omega) for one in family()]
+    W = uncertainty_weight(nominal, responses)
+    np.testing.assert_array_equal(W.omega, omega)
+    loop = (nominal * (1 + dynamics("model", W))).feedback(2.0)
+    assert robust_stability(loop).robust is True
+    # Every member is G (1 + W Delta) with |Delta| <= 1.
+    Delta = [(np.squeeze(one(1j * omega)) / nominal.frequency_response(omega)[:, 0, 0] - 1) / W.shape(1j * omega)
+             for one in family()]
+    assert np.max(np.abs(Delta)) <= 1 + 1e-9
