@@ -24,7 +24,7 @@ from avis_ctrl.measurement.frequency_response.best_linear import best_linear_app
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 
 # What a method begins with that measures beside a model.
-BESIDE = "response of the model with what it leaves: "
+BESIDE = "response of the model plus its residual: "
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,7 +76,7 @@ def test_opens_with_the_sentence_of_the_finder_and_the_numbers(found):
     first = section(found, "result").pieces[0]
     assert isinstance(first, Paragraph) and first.text == found.gap.sentences[0] and first.good is True
     text = prose(section(found, "result"))
-    assert "31.0 %" in text and "12.0 %" in text and "1.04 %" in text and "noise alone would leave 1.01 %" in text
+    assert "31.0 %" in text and "12.0 %" in text and "1.04 %" in text and "that of noise alone is 1.01 %" in text
     assert "by 11.5" in text and "1.03 times the noise" in text  # 0.12/0.0104 and 0.0104/0.0101
 
 
@@ -120,7 +120,7 @@ def test_a_band_that_stands_out_of_a_closed_gap_is_not_denied(found):
 def test_a_group_is_said_to_be_one(found):
     effect = replace(found.gap.effects[0], indistinguishable_from=("product_of_inertia",))
     one = replace(found, gap=replace(found.gap, effects=(effect,), next_experiment="Shake the floor."))
-    assert "cannot tell these apart: com offset and product of inertia" in prose(section(one, "result"))
+    assert "cannot distinguish com offset and product of inertia" in prose(section(one, "result"))
     assert tables(section(one, "result"))[0].rows[0][-1] == "product of inertia"
     assert "Shake the floor." in prose(section(one, "remaining"))
 
@@ -270,7 +270,7 @@ def test_shares_of_power_are_drawn_and_tabled(found):
     alone = replace(top, how="one level", shares={k: v for k, v in top.shares.items() if k != "sensors"},
                     whole={k: v for k, v in top.whole.items() if k != "sensors"})
     text = prose(section(replace(found, gap=replace(found.gap, shares=(alone,))), "dependence"))
-    assert "cannot be told from nonlinearity" in text and "counts as unmeasured inputs" in text
+    assert "cannot be distinguished from nonlinearity" in text and "counts as unmeasured inputs" in text
 
 
 def test_none_says_from_which_size_on_an_effect_would_show(found):
@@ -284,7 +284,7 @@ def test_none_says_from_which_size_on_an_effect_would_show(found):
     assert tables(section(one, "remaining"))[0].rows == (
         ("actuator lag", "actuators", "time constant", "3.1e−5 s"), ("sensor gain", "Sz1", "gain", "at no size"),
         ("actuator gain", "Az1 (best) to Ax2", "gain", "1.0e−4 to 3.0e−4"))
-    assert "could be told from none" in prose(section(one, "result"))
+    assert "can be distinguished from zero" in prose(section(one, "result"))
 
 
 def test_terms_that_every_model_holds_are_no_effect(found):
@@ -333,7 +333,7 @@ def test_next_to_nothing_found(found, verdict, tmp_path):
     poor = Finds(stand_in.minimal(found.gap, verdict), found.measured)
     page = Reader(gap_html(poor).encode()).text
     assert "No map of channels and frequencies was computed." in page
-    assert "What each record leaves was not stated." in page and "No shares of power were computed" in page
+    assert "The residual of single records was not computed." in page and "No fractions of power were computed" in page
     assert "No other candidate was refitted." in page or "No candidate was refitted" in page
     if verdict == "none":
         text = pdf_text(gap_pdf(poor), tmp_path)

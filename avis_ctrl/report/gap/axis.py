@@ -28,25 +28,26 @@ def _finding(gap: AxisGap) -> Section:
             for one in gap.stages]
     return Section("What was found", "finding", (
         Paragraph(f"Verdict: {gap.verdict}. {first}", "verdict", good, half), Bullets(tuple(rest)),
-        table("What each model leaves of data that no fit has seen, r.m.s. over what was measured.",
+        table("Error of each model on data that no fit has used, r.m.s., relative to the measured signal.",
               ("model", "error", "chi-square per degree of freedom"), rows),
         figure_of("ladder", "The gap before and after each effect.", gap.pictures[:1])))
 
 
 def _effects(gap: AxisGap) -> Section:
     pieces: list[Piece] = []
-    for caption, several in (("Named effects, the largest share of the gap first.", gap.effects),
+    for caption, several in (("Named effects, the largest fraction of the gap first.", gap.effects),
                              ("Traces, below 1 % of the gap each.", gap.traces)):
         if several:
             rows = [(one.name, one.location, _sizes(one), f"{one.probability:.2f}", f"{100 * (one.share or 0):.3g} %",
                      ", ".join(one.indistinguishable_from) or "-") for one in several]
-            pieces.append(table(caption, ("effect", "place", "size", "probability", "share", "or"), rows, "lllrrl"))
+            pieces.append(table(caption, ("effect", "place", "size", "probability", "fraction of the gap", "or"), rows,
+                                "lllrrl"))
     if gap.runners_up:
         pieces.append(table("What else was fitted in the place of an effect.",
                             ("effect", "in the place of", "probability"),
                             [(one.name, one.instead_of, f"{one.probability:.2g}") for one in gap.runners_up], "llr"))
     if gap.next_experiment:
-        pieces.append(Paragraph(f"What would tell them apart: {gap.next_experiment}."))
+        pieces.append(Paragraph(f"What would distinguish them: {gap.next_experiment}."))
     return Section("Effects", "effects", tuple(pieces) or (Paragraph("None is named."),))
 
 
@@ -61,10 +62,10 @@ def _remaining(gap: AxisGap) -> Section:
     rows = [(f"{one['from_Hz']:.3g} to {one['to_Hz']:.3g} Hz", str(one["output"]), f"{100 * one['share']:.3g} %")
             for one in gap.where]
     return Section("What remains", "remaining", (
-        Paragraph(f"{100 * gap.stages[-1].nrmse:.3g} % of held-out data remains, {100 * gap.share_left:.3g} % of the "
-                  "power that the base model leaves beyond noise."),
-        table("Where most of it lies.", ("band", "output", "share"), rows, "llr"),
-        figure_of("lines", "What the base and the updated model leave.", gap.pictures[1:2])))
+        Paragraph(f"The residual on held-out data is {100 * gap.stages[-1].nrmse:.3g} % of the signal, r.m.s.; its "
+                  f"power beyond noise is {100 * gap.share_left:.3g} % of that of the base model."),
+        table("Where most of it lies.", ("band", "output", "fraction"), rows, "llr"),
+        figure_of("lines", "Residual of the base model and of the updated model.", gap.pictures[1:2])))
 
 
 def _sizes(one: NamedEffect) -> str:

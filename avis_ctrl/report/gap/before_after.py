@@ -44,8 +44,8 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
         curves.append(level(edges[0], edges[-1], 1.0, "noise alone", NOISE))
         panels.append(Panel(hertz(float(edges[0]), float(edges[-1])), Axis("residual / noise power [-]", "log"),
                             tuple(curves), (), title))
-    return Figure("gap_spectrum", "The gap on held-out data: power of what the model leaves over power of the "
-                  "measured noise, by frequency band. Of a model that lacks nothing the mean lies at 1, and the worst "
+    return Figure("gap_spectrum", "The gap on held-out data: power of the residual relative to that of the "
+                  "measured noise, by frequency band. For a model that lacks nothing the mean lies at 1, and the worst "
                   f"of {heat.before.shape[1]} channels a little above.", tuple(panels), 2, 0.95)
 
 
@@ -83,8 +83,8 @@ def ladder(gap: Gap) -> Figure:
                  Style("#8fbbdc"), line=False, bars=0.6)
     lines = [level(-0.5, len(values) - 0.5, noise, "noise alone", STYLES["limit"])] if noise > 0 else []
     ticks = tuple((float(k), textwrap.fill(rung(one.name, k), LETTERS)) for k, one in enumerate(gap.stages))
-    return Figure("ladder", "The ladder of stages: normalised r.m.s. error on held-out data, and what noise alone "
-                  "would leave. Logarithmic.",
+    return Figure("ladder", "The ladder of stages: normalised r.m.s. error on held-out data, and that of noise alone. "
+                  "Logarithmic.",
                   (Panel(Axis("", "linear", (-0.6, len(values) - 0.4), ticks),
                          Axis("n.r.m.s. error [%]", "log", (float(limits[0]), float(limits[1]))), (bars, *lines)),),
                   height=0.7)
@@ -104,8 +104,8 @@ def _stages(gap: Gap) -> Table:
     if np.isfinite(gap.noise_nrmse):
         rows.append(("noise alone", wording.percent(gap.noise_nrmse), "1", "1"))
     return table("The stages. Each model is fitted to the same records; the figures are of records or periods that no "
-                 f"fit has seen{f' ({gap.held_out})' if gap.held_out else ''}. Error: r.m.s. of what the model leaves "
-                 "over that of the measured outputs.",
+                 f"fit has seen{f' ({gap.held_out})' if gap.held_out else ''}. Error: r.m.s. of the residual "
+                 "relative to that of the measured outputs.",
                  ("stage", "n.r.m.s. error", "over noise", "chi-square / dof"), rows)
 
 
@@ -117,9 +117,8 @@ def responses(seen: GapOverlay, named: bool) -> list[Piece]:
             "standard deviations of the measured response; no two have the same output.")
     if seen.method.startswith(BESIDE):
         text += (" These records allow no response that is measured without a model: the points are the linear part "
-                 f"of the {who} model plus what it leaves in the records, regressed on the inputs in windows of lines. "
-                 "They lean on that model: an error of it that is narrower than a window does not show here, but in "
-                 "the residual above.")
+                 f"of the {who} model plus its residual, regressed on the inputs in windows of lines. They depend on "
+                 "that model: a model error narrower than a window is not visible here, but in the residual above.")
     if seen.simulated:
         text += (f" {words.joined(list(map(wording.titled, seen.simulated))).capitalize()} has no frequency response "
                  "of its own: that of the updated model is measured in the same way, from what the model simulates of "
@@ -128,7 +127,7 @@ def responses(seen: GapOverlay, named: bool) -> list[Piece]:
         names = words.joined(list(map(wording.titled, seen.left_out)))
         text += (f" The drawn response of the updated model is without {names}: what depends on amplitude or time has "
                  "no frequency response.")
-    points = (f"the {who} model's response plus what it leaves in the records, regressed on the inputs (points)"
+    points = (f"the {who} model's response plus its residual, regressed on the inputs (points)"
               if seen.method.startswith(BESIDE) else "measured (points)")
     models = [("re-identified", seen.baseline, BEFORE)] + ([("updated", seen.updated, AFTER)] if named else [])
     panels = [draw(seen, i, j, models) for i, j in pairs for draw in (magnitude, difference)]

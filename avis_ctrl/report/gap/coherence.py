@@ -1,4 +1,4 @@
-"""Coherence: which share of each output's power the model, noise, nonlinearity and unmeasured inputs account for."""
+"""Coherence: which fraction of each output's power the model, noise, nonlinearity and unmeasured inputs account for."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOOKS = {"model": ("model, linear in measured inputs", Style("#222222", "solid",
          "sensors": ("sensors' own noise", Style("#7a7a7a", "dot", 1.6))}
 COLUMNS = {"model": "model", "missing": "linear, not in the model", "nonlinear": "not linear",
            "unmeasured": "unmeasured inputs", "sensors": "sensors' noise"}
-# Shares below this are not drawn.
+# Fractions below this are not drawn.
 LEAST = 1e-9
 HOW = {"silent": "Noise and unmeasured inputs are measured on lines where the drives are silent; what the excited "
                  "lines hold beyond that and beyond any linear response is not linear.",
@@ -25,9 +25,9 @@ HOW = {"silent": "Noise and unmeasured inputs are measured on lines where the dr
                  "lowest level, the model's own nonlinear terms taken off: they do not grow with the drives, and "
                  "what is more at a higher level is not linear. Nonlinearity of the lowest level that the model lacks "
                  "counts as unmeasured inputs.",
-       "one level": "At a single level and without lines that are free of the drives, noise cannot be told from "
-                    "nonlinearity that the model lacks: \"not linear\" holds the model's own nonlinear terms only, and "
-                    "\"unmeasured inputs\" whatever else does not follow the drives linearly."}
+       "one level": "At a single level and without lines that are free of the drives, noise cannot be distinguished "
+                    "from nonlinearity that the model lacks: \"not linear\" holds the model's own nonlinear terms "
+                    "only, and \"unmeasured inputs\" whatever else does not follow the drives linearly."}
 
 
 def coherence(shares: tuple[PowerShares, ...]) -> list[Piece]:
@@ -50,7 +50,7 @@ def _explained(one: PowerShares) -> str:
 
 
 def figure(one: PowerShares, name: str) -> Figure:
-    """A panel an output, shares on a logarithmic axis."""
+    """A panel for each output, fractions on a logarithmic axis."""
     edges = np.asarray(one.bands_Hz, float)
     positive = np.concatenate([np.ravel(v) for v in one.shares.values()])
     positive = positive[np.isfinite(positive) & (positive > LEAST)]
@@ -60,11 +60,11 @@ def figure(one: PowerShares, name: str) -> Figure:
         curves = tuple(Curve(np.repeat(edges, 2)[1:-1], np.repeat(_drawn(one.shares[key][:, k]), 2), label, style)
                        for key, (label, style) in LOOKS.items() if key in one.shares)
         panels.append(Panel(hertz(float(edges[0]), float(edges[-1])),
-                            Axis("share of the power [-]", "log", (low, 2.0)), curves, (), output))
+                            Axis("fraction of the power [-]", "log", (low, 2.0)), curves, (), output))
     records = ", ".join(one.records)
     return Figure(name, f"What accounts for the power of each output at {words.number(one.level_V)} V r.m.s. "
-                  f"({one.excitation}, records {records}), by frequency; the shares of a band add up to 1. A line that "
-                  "breaks off is below what can be told.", tuple(panels), 2, 0.72)
+                  f"({one.excitation}, records {records}), by frequency; the fractions of a band add up to 1. A line "
+                  "that ends is below what can be determined.", tuple(panels), 2, 0.72)
 
 
 def _drawn(share: np.ndarray) -> np.ndarray:
@@ -72,9 +72,9 @@ def _drawn(share: np.ndarray) -> np.ndarray:
 
 
 def _whole(one: PowerShares) -> Table:
-    """Shares of the power of all bands together."""
+    """Fractions of the power of all bands together."""
     keys = [key for key in LOOKS if key in one.whole]
     rows = [(output, *(wording.percent(float(one.whole[key][k]), 5 if key == "model" else 2) for key in keys))
             for k, output in enumerate(one.outputs)]
-    return table(f"The whole band at {words.number(one.level_V)} V: shares of each output's power, most of which lies "
-                 "at the resonances.", ("output", *(COLUMNS[key] for key in keys)), rows, "l" + "r" * len(keys))
+    return table(f"The whole band at {words.number(one.level_V)} V: fractions of each output's power, most of which "
+                 "lies at the resonances.", ("output", *(COLUMNS[key] for key in keys)), rows, "l" + "r" * len(keys))

@@ -15,16 +15,17 @@ from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Section
 
 
 def dependence(found: Found) -> Section:
-    """What each record leaves by level and by time, and shares of power."""
+    """The residual of each record by level and by time, and fractions of power."""
     gap = found.gap
     pieces: list[Piece] = []
     if gap.records:
         pieces.append(by_record(gap))
     else:
-        pieces.append(Paragraph("What each record leaves was not stated.", "note"))
+        pieces.append(Paragraph("The residual of single records was not computed.", "note"))
     pieces.append(Heading("Coherence: what noise, nonlinearity and unmeasured inputs account for"))
     pieces += coherence(gap.shares) if gap.shares else [
-        Paragraph("No shares of power were computed: the driven records have too few lines for their inputs.", "note")]
+        Paragraph("No fractions of power were computed: the driven records have too few lines for their inputs.",
+                  "note")]
     return Section("Level, time and coherence", "dependence", tuple(pieces))
 
 
@@ -32,11 +33,11 @@ def by_record(gap: Gap) -> Figure:
     """Residual over noise of every record, by level and by time; held-out records filled."""
     panels = (_panel(gap, "By level", Axis("level of the drives, r.m.s. [V]"), lambda one: one.level_V),
               _panel(gap, "By time", Axis("start of the record, time [s]"), lambda one: one.start_s))
-    return Figure("gap_records", "What each record leaves, over the noise. Filled: held-out records; open: fitted. "
-                  "The error of a linear model that lacks something linear grows in proportion to the level; one that "
-                  "is the same at every level is noise, and one that bends away depends on amplitude. A slope over "
-                  "time is drift. The lines are drawn at random, dense where the resonances are, for all records "
-                  "alike: the figures differ from those of all lines in the ladder.", panels, 2, 0.85)
+    return Figure("gap_records", "Residual of each record, relative to the noise. Filled: held-out records; open: "
+                  "fitted. The error of a linear model that lacks something linear grows in proportion to the level. "
+                  "An error that is the same at every level is noise; one that grows otherwise depends on amplitude. "
+                  "A slope over time is drift. The lines are drawn at random, dense near resonances, and are the same "
+                  "for all records: these values differ from those of all lines in the ladder.", panels, 2, 0.85)
 
 
 def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> Panel:

@@ -82,17 +82,17 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
         return table("The rig's own parameters as re-identified.", ("parameter", "value", "± 1 σ", "unit"), rows,
                      "lrrl")
     return table("A model that lacks an effect bends its own parameters to make up for it; the change is what they "
-                 "give back. A large one is no error: it may lie along a direction that the data hardly know.",
+                 "give back. A large change is no error: it may lie along a direction that the data hardly determine.",
                  ("parameter", "re-identified", "updated", "± 1 σ", "change", "unit"), rows, "lrrrrl")
 
 
 def _together(groups: Sequence[Sequence[str]]) -> list[Piece]:
-    """What no record tells one by one."""
+    """Parameters that no record determines one by one."""
     if not groups:
         return []
     told = "; ".join(words.joined(list(group)) for group in groups)
-    return [Paragraph(f"Determined only together, whatever the records: {told}. How they share it is as the rig "
-                      "file has it, and not known.", "note")]
+    return [Paragraph(f"Only in combination can any record determine {told}. How the combination divides among them is "
+                      "taken from the rig file.", "note")]
 
 
 def _always(gap: Gap) -> list[Piece]:

@@ -1,4 +1,4 @@
-"""The answer: one sentence, what it rests on, and the named effects in one table."""
+"""The result: one sentence, what it rests on, and the named effects in one table."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ def opening(found: Found) -> Section:
         pieces.append(_named(gap))
     pieces += [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from]
     if gap.detectable:
-        pieces.append(Paragraph("How large an effect could be told from none stands in the section on what remains."))
+        pieces.append(Paragraph("The section on what remains lists the smallest effects that can be distinguished "
+                                "from zero."))
     open_still = gap.verdict in ("unexplained", "partly explained")
     if told := (*gap.sentences[1:], *([gap.next_experiment] if open_still and gap.next_experiment else [])):
         pieces.append(Bullets(tuple(map(wording.said, told))))
@@ -49,19 +50,19 @@ def sentence(gap: Gap) -> str:
 
 
 def in_numbers(gap: Gap) -> str:
-    """The gap before and after on held-out data, beside what noise leaves."""
+    """The gap before and after on held-out data, beside that of noise alone."""
     if not gap.stages:
         return ""
     told = [f"{wording.percent(one.nrmse)} {_stage(one.name)}" for one in gap.stages]
     text = f"Normalised r.m.s. error on held-out data: {words.joined(told)}"
     if np.isfinite(gap.noise_nrmse):
-        text += f"; noise alone would leave {wording.percent(gap.noise_nrmse)}"
+        text += f"; that of noise alone is {wording.percent(gap.noise_nrmse)}"
     first, last = _reference(gap), gap.stages[-1].nrmse
     if gap.effects and first > 0 and last > 0:
         text += f". Naming the effect{'s' * (len(gap.effects) > 1)} divides the re-identified error by "
         text += words.number(first / last)
         if gap.noise_nrmse > 0:
-            text += f" and leaves {words.number(last / gap.noise_nrmse)} times the noise"
+            text += f", to {words.number(last / gap.noise_nrmse)} times the noise"
     return text + "."
 
 
@@ -73,8 +74,8 @@ def _reference(gap: Gap) -> float:
 
 def _group(one: NamedEffect) -> str:
     names = [wording.titled(one.name), *map(wording.titled, one.indistinguishable_from)]
-    return (f"This data cannot tell these apart: {words.joined(names)}. The missing effect is one of them; the section "
-            "on what to measure next says what would tell.")
+    return (f"These records cannot distinguish {words.joined(names)}. The missing effect is one of them; the section "
+            "on what to measure next names the record that would decide.")
 
 
 def _stage(name: str) -> str:
@@ -88,9 +89,10 @@ def _named(gap: Gap) -> Table:
              wording.probability(one.probability),
              ", ".join(map(wording.titled, one.indistinguishable_from)) or "none")
             for one in (*gap.effects, *gap.traces)]
-    return table("What is named. Share: by how much the power that the updated model leaves of held-out records rises "
-                 "when this effect alone is taken out, over what the re-identified model leaves beyond noise; below "
-                 "1 % an effect is a trace. The probability counts the other candidates, the tolerances, and what "
-                 "has no name; that of hum, a converter and the floor's motion is one less the chance of such a signal "
-                 "without them. None is stated above 99 %. Sizes with one standard deviation.",
-                 ("effect", "place", "size", "share", "probability", "cannot be told from"), rows, "lllrrl")
+    return table("Named effects, with one standard deviation. Fraction of the gap: increase of the residual power on "
+                 "held-out records if this effect alone is removed, relative to the power of the re-identified model's "
+                 "residual beyond noise; below 1 % an effect is a trace. The probability takes into account the other "
+                 "candidates, the tolerances, and causes outside the library; for hum, a converter and floor motion it "
+                 "is one minus the p-value of the signal. No probability above 99 % is stated.",
+                 ("effect", "place", "size", "fraction of the gap", "probability", "indistinguishable from"), rows,
+                 "lllrrl")

@@ -52,7 +52,7 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
     panels = tuple(Panel(hertz(float(edges[0]), float(edges[-1])), rows, (), (), title,
                          Heat(edges, np.asarray(values, float).T, "residual / noise power [-]", (LOWEST, top)))
                    for title, values in sides)
-    return Figure("heat_map", "Power of what the model leaves on held-out data over power of the measured noise, by "
+    return Figure("heat_map", "Power of the residual on held-out data relative to that of the measured noise, by "
                   "channel and frequency band. White: noise alone. Grey: no data. Logarithmic colours.", panels,
                   len(panels), max(0.75, min(2.4, 0.085 * n + 0.25)))
 
@@ -63,12 +63,12 @@ def _short(name: str) -> str:
 
 
 def table_of(listed: Sequence[Where], caption: str) -> Table:
-    """Bands and paths with their share of the excess over noise."""
+    """Bands and paths with their fraction of the excess over noise."""
     rows = [(wording.place(one), wording.percent(one.share), _stated(one.excess), _chance(one.p_value))
             for one in listed]
-    return table(f"{caption}Share: of the power in excess of the noise. Over noise: power of the residual over that "
-                 "of the noise. Chance: of as much by noise alone anywhere (family-wise).",
-                 ("place", "share", "over noise", "chance"), rows)
+    return table(f"{caption}Fraction: of the power beyond noise. Over noise: power of the residual relative to "
+                 "that of the noise. p-value: of noise alone, over all places (family-wise).",
+                 ("place", "fraction", "over noise", "p-value"), rows)
 
 
 def _stated(value: float) -> str:

@@ -13,19 +13,19 @@ from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Section, Table, t
 
 
 def remaining(found: Found) -> Section:
-    """Places of what the updated model leaves, and the next experiment."""
+    """Where the residual of the updated model lies, and the next experiment."""
     gap = found.gap
     pieces: list[Piece] = [Paragraph(_left(gap))]
     if gap.remaining:
-        pieces.append(table_of(gap.remaining, "Places of what the updated model leaves on held-out data. "))
+        pieces.append(table_of(gap.remaining, "Where the residual of the updated model lies, on held-out data. "))
     if gap.detectable:
-        pieces += [Heading("How large an effect could be told from none"), detectable(gap)]
+        pieces += [Heading("The smallest effects that can be distinguished from zero"), detectable(gap)]
     pieces += [Heading("What to measure next"), Paragraph(gap.next_experiment or _nothing(found))]
     return Section("What remains, and what to measure next", "remaining", tuple(pieces))
 
 
 def detectable(gap: Gap) -> Table:
-    """The size at which each effect would differ from none by five standard deviations; its best and worst place."""
+    """The size at which each effect would differ from zero by five standard deviations; its best and worst place."""
     groups: dict[tuple[str, str, str], list[Detectable]] = {}
     for one in gap.detectable:
         groups.setdefault((one.name, one.parameter, one.unit), []).append(one)
@@ -36,11 +36,10 @@ def detectable(gap: Gap) -> Table:
         ends = [ordered[0]] if len(ordered) == 1 else [ordered[0], ordered[-1]]
         size = " to ".join(_seen(one) for one in ends)
         rows.append((wording.titled(name), where, spoken(parameter, unit), size))
-    return table("An effect that is absent, by itself at its place, would differ from none by five standard "
-                 "deviations of the fit at this size, at the best and at the worst of its places: about what the "
-                 "search asks for before it names one of so many. What is smaller may be there. \"At no size\": "
-                 "re-identification of the rig's own parameters would take it up. Effects that have a frequency or "
-                 "another shape of their own are not in this table.",
+    return table("The size at which an effect that is absent would differ from zero by five standard deviations of the "
+                 "fit, at the best and at the worst of its places; the search names about this size. Smaller effects "
+                 "may be present. \"At no size\": re-identified parameters of the rig would absorb the effect. Effects "
+                 "with a frequency or another shape of their own are not in this table.",
                  ("effect", "place", "parameter", "seen from about"), rows, "lllr")
 
 
@@ -60,18 +59,18 @@ def _left(gap: Gap) -> str:
     after = " with the named effects" if gap.effects else ""
     level = {True: "It grows faster than the drives: its cause is not linear.",
              False: "It does not grow faster than the drives.",
-             None: "Whether it grows faster than the drives these records do not tell."}[left.grows_with_level]
-    places = ("The places below hold it." if gap.remaining else
+             None: "These records do not show whether it grows faster than the drives."}[left.grows_with_level]
+    places = ("The table below lists where it lies." if gap.remaining else
               f"No band of any channel stands out of the measured noise{after}.")
-    return (f"On held-out records the updated model leaves {wording.percent(left.nrmse)} of the response, r.m.s., "
-            f"{words.number(left.over_noise)} times the noise, and {wording.percent(left.share)} of the power that "
-            f"the re-identified model leaves beyond noise. {level} {places}")
+    return (f"On held-out records the residual of the updated model is {wording.percent(left.nrmse)} of the response, "
+            f"r.m.s., which is {words.number(left.over_noise)} times the noise. Its power beyond noise is "
+            f"{wording.percent(left.share)} of that of the re-identified model. {level} {places}")
 
 
 def _nothing(found: Found) -> str:
     gap = found.gap
     if gap.effects and any(one.indistinguishable_from for one in gap.effects):
-        return "No experiment was found that would tell the inseparable effects apart."
+        return "No experiment was found that would distinguish the inseparable effects."
     if gap.verdict in ("partly explained", "unexplained"):
         return "No experiment was found that would tell more."
     if gap.effects and found.design is None:

@@ -14,12 +14,12 @@ from avis_ctrl.report import words
 # What each verdict claims, and what it does not.
 CLAIMS = {
     "none": "Verdict: none. With its own parameters re-identified and every value of the rig file within its "
-            "tolerance, the model leaves noise, or less than 1 % of the response, and no effect is named. An effect "
-            "that is too weak for this campaign, or that these records do not excite, would not show.",
+            "tolerance, the residual is noise, or less than 1 % of the response, and no effect is named. An effect "
+            "that is too weak for this campaign, or that these records do not excite, would not be visible.",
     "explained": "Verdict: explained. Tolerances and the effects named above account for at least 90 % of the power "
-                 "that the re-identified model leaves beyond noise on held-out records, or leave noise only.",
+                 "beyond noise of the re-identified model's residual on held-out records, or the rest is noise.",
     "partly explained": "Verdict: partly explained. What is named above is certain, but it and the tolerances account "
-                        "for less than 90 % of the power that the re-identified model leaves beyond noise. What "
+                        "for less than 90 % of the power beyond noise of the re-identified model's residual. What "
                         "remains is described below. The updated model is better, not complete.",
     "unexplained": "Verdict: unexplained. Model and held-out records disagree, tolerances do not account for it, and "
                    "no effect of the library does with certainty, so none is named. The updated model has tolerances "
@@ -27,9 +27,10 @@ CLAIMS = {
 }
 # What it claims where the noise of some sensors is all that has no name.
 RAISED = ("Verdict: {verdict}. The noise of {sensors} is above the rig file's ambient level, and the library has no "
-          "name for that. What the model{with_effects} leaves of the held-out data is the measured noise, as a whole.")
+          "name for that. The residual of the model{with_effects} on the held-out data is, as a whole, the measured "
+          "noise.")
 PERCENT = 100.0
-# Shares below this are told as that.
+# Fractions below this are stated as that.
 LEAST = 1e-5
 
 
@@ -66,7 +67,7 @@ def probability(value: float) -> str:
 
 
 def percent(share: float, digits: int = 3) -> str:
-    """A share in per cent."""
+    """A fraction in per cent."""
     if not np.isfinite(share):
         return "not computed"
     return "< 0.001 %" if 0 < share < LEAST else f"{words.number(PERCENT * share, digits)} %"

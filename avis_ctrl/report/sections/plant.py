@@ -71,7 +71,7 @@ def _blocks(result: DesignResult) -> Table:
             meaning = "direction in which the identified parameters are uncertain"
         elif isinstance(one, UncertainEquation):
             spread = "a row of the equations"
-            meaning = f"what a fit leaves uncertain of the equation of {one.coordinate}"
+            meaning = f"remaining uncertainty of the equation of {one.coordinate}"
         elif block.name == RESPONSE:
             spread, meaning = "|W| of the weight", "error of the identified model's response, of any phase"
         elif one is not None:
