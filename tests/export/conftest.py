@@ -72,3 +72,8 @@ def gcc() -> str:
     if found is None:
         pytest.skip("gcc is not installed: the C code is not compiled")
     return found
+
+
+@pytest.fixture(scope="session")
+def make_folder():
+    return write_folder

@@ -12,6 +12,7 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.export.c_source import Provenance, c_files
 from avis_ctrl.export.certificate import certify, shipped_loop
 from avis_ctrl.export.compiled import CompiledController
+from avis_ctrl.export.design_folder import open_design
 from avis_ctrl.export.package import CERTIFICATE, CONTROLLER, check_package, make_package
 from avis_ctrl.export.protection import Processor, protection
 from avis_ctrl.export.rounding import rounding_noise
@@ -20,6 +21,7 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation import simulate
 from avis_ctrl.simulation.discrete import spectral_radius
 from avis_ctrl.simulation.sampled_loop import lever_arms
+from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.simulation import with_delta
 
@@ -45,7 +47,8 @@ def vertices(folder, count: int, rng) -> list[np.ndarray]:
                              for block in blocks.blocks]) for _ in range(count)]
 
 
-def sampled_transmissibility(folder, stored, deltas, omega, images: int = 20) -> np.ndarray:
+def sampled_transmissibility(folder, stored, deltas, omega, images: int = 20, accelerometers: bool = False
+                             ) -> np.ndarray:
     """(n_delta, n_omega) largest singular value of floor to payload, of the loop that runs the stored numbers.
 
     The design's continuous plant, its own Pade delay taken out, under hold and delay, with all images up to `images`
@@ -58,6 +61,7 @@ def sampled_transmissibility(folder, stored, deltas, omega, images: int = 20) ->
     forces = rig.equations_of_motion().T[kept] / arms[:, None]
     volts = np.array([one.gain for one in rig.sensors()])[:, None] * rig.sensor_rows()[1][:, kept] / arms
     tau = rig.loop_delay_s + 0.5 * T
+    leak = 2 * np.pi * folder.design.loop.integrator_corner_Hz
     P, blocks, n = plant.full.P, plant.full.blocks, len(kept)
     P = P.select([*P.outputs[:blocks.n_z], *plant.velocities, *plant.full.y],
                  [*P.inputs[:blocks.n_w], *plant.floor_velocities, *plant.full.u])
@@ -72,6 +76,8 @@ def sampled_transmissibility(folder, stored, deltas, omega, images: int = 20) ->
         pade = (1 - s * tau / 2 + (s * tau) ** 2 / 12) / (1 + s * tau / 2 + (s * tau) ** 2 / 12)
         held = (1 - np.exp(-s * T)) / (s * T) * np.exp(-s * stored["delay_samples"] * T) / pade
         G[:, :, n:] *= held[:, None, None]
+        if accelerometers:  # what the code integrates itself
+            G[:, n:] *= (s + leak)[:, None, None]
         return G
     z = np.exp(1j * omega * T)
     K = forces @ (C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B.astype(complex)) + D) @ volts
@@ -202,3 +208,25 @@ def test_anti_windup_shortens_the_recovery(shipped, package):
         assert np.sum(np.any(np.abs(record.volts) >= controller.limits_V, axis=1)) > 5000
         moved.append(np.max(np.abs(record.q_dot[20000:21000, 2])))
     assert moved[0] < 0.7 * moved[1]
+
+
+@pytest.mark.slow
+def test_folding_of_accelerometers_is_in_the_certificate(make_folder, tmp_path, rng):
+    """The Halcyonics design: its worst plant is worse with the images folded in, and still below the code's bound."""
+    folder = open_design(make_folder(tmp_path / "design", "halcyonics_z_phix",
+                                     lambda design, plant, rig: mu_optimal(design, plant, rig)[0]))
+    controller = folder.sampled("mu", "float32")
+    found = certify(folder, controller)
+    stored = json.loads(controller.as_bytes())
+    worst = [found.worst.delta], np.array([found.worst.omega])
+    without, folded = (sampled_transmissibility(folder, stored, *worst, images=k, accelerometers=True)[0, 0]
+                       for k in (0, 30))
+    assert without == pytest.approx(found.worst.gain, rel=5e-3)
+    assert folded > 1.02 * without
+    omega = 2 * np.pi * np.geomspace(0.03, 120.0, 40)
+    deltas = [found.worst.delta, *random_perturbations(folder.plant, 15, 5), *vertices(folder, 15, rng)]
+    sigma = sampled_transmissibility(folder, stored, deltas, omega, accelerometers=True)
+    low, high = folder.design.transmissibility.band_Hz
+    band = (omega >= 2 * np.pi * low) & (omega <= 2 * np.pi * high)
+    assert np.max(sigma) <= ratio(found.content["worst_case_peak_transmissibility_dB"])
+    assert np.max(sigma[:, band]) <= ratio(found.content["worst_case_band_transmissibility_dB"])
