@@ -103,8 +103,8 @@ def _diagonal_part(K: StateSpace) -> StateSpace:
 def _improved(P: StateSpace, structure: BlockStructure, K: StateSpace, omega: Array, sharpness: float,
               decentralised: bool, settings: FixedOrderSettings) -> StateSpace:
     """K after one stage of descent on the frequencies omega."""
-    form = _Form.of(K, decentralised)
-    problem = _Problem(P, structure, form, omega, sharpness, settings.accuracy)
+    form = Entries.of(K, decentralised)
+    problem = Objective(P, structure, form, omega, sharpness, settings.accuracy)
     return form.controller(_bfgs(problem.value, form.start, settings))
 
 
@@ -174,7 +174,7 @@ def _with_peaks(closed: StateSpace, structure: BlockStructure, omega: Array,
 
 
 @dataclass(frozen=True, eq=False)
-class _Form:
+class Entries:
     """K with tridiagonal A (blocks of its modes), its free entries in units of their own size.
 
     rows, cols : places of the free entries of [A B; C D]; size : their units; start : their values in these units.
@@ -187,7 +187,7 @@ class _Form:
     start: Array
 
     @staticmethod
-    def of(K: StateSpace, decentralised: bool = False) -> _Form:
+    def of(K: StateSpace, decentralised: bool = False) -> Entries:
         A, B, C, rate, channel = _modal(K, decentralised)
         n = rate.size
         whole = np.block([[A, B], [C, K.D]])
@@ -203,7 +203,7 @@ class _Form:
         unit[n:, n:] = np.linalg.norm(K.D) + np.max(np.abs(C).sum(axis=0) * np.abs(B).sum(axis=1) / rate, initial=0.0)
         unit[unit == 0] = 1.0
         rows, cols = np.nonzero(free)
-        return _Form(K, rows, cols, unit[rows, cols], whole[rows, cols] / unit[rows, cols])
+        return Entries(K, rows, cols, unit[rows, cols], whole[rows, cols] / unit[rows, cols])
 
     def matrix(self, x: Array) -> Array:
         n = self.K.nstates
@@ -250,12 +250,12 @@ def _modal(K: StateSpace, decentralised: bool) -> tuple[Array, Array, Array, Arr
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class Objective:
     """The smoothed maximum of log mu over a frequency grid as a function of the entries of K, with its slope."""
 
     P: StateSpace
     structure: BlockStructure
-    form: _Form
+    form: Entries
     omega: Array
     sharpness: float
     accuracy: float
