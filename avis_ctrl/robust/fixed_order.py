@@ -84,8 +84,8 @@ def fixed_order(P: StateSpace, structure: BlockStructure, K: StateSpace, order: 
 def _improved(P: StateSpace, structure: BlockStructure, K: StateSpace, omega: Array, sharpness: float,
               settings: FixedOrderSettings) -> StateSpace:
     """K after one stage of descent on the frequencies omega."""
-    form = _Form.of(K)
-    problem = _Problem(P, structure, form, omega, sharpness, settings.accuracy)
+    form = Form.of(K)
+    problem = Problem(P, structure, form, omega, sharpness, settings.accuracy)
     return form.controller(_bfgs(problem.value, form.start, settings))
 
 
@@ -154,7 +154,7 @@ def _with_peaks(closed: StateSpace, structure: BlockStructure, omega: Array,
 
 
 @dataclass(frozen=True, eq=False)
-class _Form:
+class Form:
     """K with tridiagonal A (blocks of its modes), its free entries in units of their own size.
 
     rows, cols : places of the free entries of [A B; C D]; size : their units; start : their values in these units.
@@ -167,7 +167,7 @@ class _Form:
     start: Array
 
     @staticmethod
-    def of(K: StateSpace) -> _Form:
+    def of(K: StateSpace) -> Form:
         A, B, C, rate = _modal(K)
         n = rate.size
         whole = np.block([[A, B], [C, K.D]])
@@ -180,7 +180,7 @@ class _Form:
         unit[n:, n:] = np.linalg.norm(K.D) + np.max(np.abs(C).sum(axis=0) * np.abs(B).sum(axis=1) / rate, initial=0.0)
         unit[unit == 0] = 1.0
         rows, cols = np.nonzero(free)
-        return _Form(K, rows, cols, unit[rows, cols], whole[rows, cols] / unit[rows, cols])
+        return Form(K, rows, cols, unit[rows, cols], whole[rows, cols] / unit[rows, cols])
 
     def matrix(self, x: Array) -> Array:
         n = self.K.nstates
@@ -221,12 +221,12 @@ def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class Problem:
     """The smoothed maximum of log mu over a frequency grid as a function of the entries of K, with its slope."""
 
     P: StateSpace
     structure: BlockStructure
-    form: _Form
+    form: Form
     omega: Array
     sharpness: float
     accuracy: float

@@ -5,7 +5,7 @@ import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balanced_truncation, discretise, lft_lower
-from avis_ctrl.robust.fixed_order import _Form, _Problem, fixed_order
+from avis_ctrl.robust.fixed_order import Form, Problem, fixed_order
 from avis_ctrl.robust.frequency_grid import frequency_grid
 from avis_ctrl.robust.musyn import musyn
 from avis_ctrl.robust.reduction import split_stable
@@ -38,10 +38,10 @@ def test_slope_is_that_of_differences(full, states):
     P, _, made = full
     stable, unstable = split_stable(made.K)
     K = balanced_truncation(stable, states - unstable.nstates) + unstable
-    form = _Form.of(K)
+    form = Form.of(K)
     omega = frequency_grid(lft_lower(P, K))
     assert np.allclose(form.controller(form.start).frequency_response(omega), K.frequency_response(omega), rtol=1e-6)
-    problem = _Problem(P, SQUARE, form, omega, 20.0, 1e-5)
+    problem = Problem(P, SQUARE, form, omega, 20.0, 1e-5)
     _, slope = problem.value(form.start)
     rng = np.random.default_rng(0)
     for _ in range(5):
