@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
+from enum import Enum
 from html import escape
 from typing import Any
 
@@ -21,8 +22,10 @@ def in_short(value: Any) -> str:
     if isinstance(value, dict):
         few = ", ".join(f"{key}: {in_short(one)}" for key, one in value.items())
         return few if len(few) <= LONGEST else f"{len(value)} entries"
-    if isinstance(value, (list, tuple)) and len(value) > 2:
-        return f"{len(value)} items"
+    if isinstance(value, (list, tuple)):
+        return f"({', '.join(map(in_short, value))})" if len(value) <= 2 else f"{len(value)} items"
+    if isinstance(value, Enum):
+        return value.name
     text = repr(value)
     return text if len(text) <= LONGEST else f"{text[:LONGEST - 3]}..."
 

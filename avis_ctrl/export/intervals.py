@@ -50,11 +50,11 @@ def roots_jet(zeros: Iterable[complex], poles: Iterable[complex], leading: float
     """leading * prod(s - z) / prod(s - p) at s = j omega."""
     s = 1j * centre
     signed = [*((complex(one), 1.0) for one in zeros), *((complex(one), -1.0) for one in poles)]
+    S1, S2 = log_slopes([root for root, _ in signed], centre, half)  # first: it refuses a root on the axis
     value, first = np.full(centre.size, leading, complex), np.zeros(centre.size, complex)
     for root, sign in signed:
         value = value * (s - root) ** sign
         first = first + sign * 1j / (s - root)
-    S1, S2 = log_slopes([root for root, _ in signed], centre, half)
     size = np.abs(value) * np.exp(half * S1)
     return Jet(value, value * first, size, size * S1, size * (S1 ** 2 + S2))
 

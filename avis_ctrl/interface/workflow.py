@@ -134,12 +134,13 @@ def _identified(source: IdentificationStudy, sections: dict[str, Any]) -> tuple[
 
 def _changed(made: Design, sections: dict[str, Any]) -> Design:
     """A design with other sections; a mapping replaces the keys that it has, anything else the whole."""
-    table = made.model_dump(exclude_none=True)
-    known = made.uncertainty.identified
+    # The content of an uncertainty file is no key of a design file.
+    bare = made.model_copy(update={"uncertainty": made.uncertainty.model_copy(update={"identified": None})})
+    table = bare.model_dump(exclude_none=True)
     for name, value in sections.items():
         table[name] = {**table.get(name, {}), **value} if isinstance(value, Mapping) else value
-    table.get("uncertainty", {}).pop("identified", None)
     changed = design_from_table(table)
+    known = changed.uncertainty.identified or made.uncertainty.identified
     return changed.model_copy(update={"uncertainty": changed.uncertainty.model_copy(update={"identified": known})})
 
 

@@ -9,6 +9,10 @@ import numpy as np
 from avis_ctrl.lti.interchange import is_response, plot_frequencies, response_of
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.plot.axes import HERTZ, axes_of, decibels, finish
+from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
+
+# Random systems drawn of an uncertain one, and how.
+SAMPLES, FAINT = 20, {"color": "#0072b2", "alpha": 0.3, "linewidth": 0.8}
 
 
 def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label: str | None = None, **line: Any) -> Any:
@@ -16,7 +20,8 @@ def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label:
 
     Parameters
     ----------
-    system : StateSpace, or python-control's StateSpace, TransferFunction or FRD.
+    system : StateSpace, or python-control's StateSpace, TransferFunction or FRD; of an UncertainSystem the nominal one
+        and 20 random ones.
     omega : (n,) frequencies [rad/s]; by default around the poles, or those of the FRD.
     ax : two axes, magnitude and phase; by default those of a new figure.
     label : of the curves in the legend; by default "output / input" where there are several.
@@ -25,6 +30,8 @@ def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label:
     Returns the two axes. Raises InputError for something that is no system.
     """
     top, bottom = axes = axes_of(ax, 2)
+    if isinstance(system, UncertainSystem):
+        return _family(bode, system, omega, axes, label, line)
     omega = plot_frequencies(system) if omega is None else np.asarray(omega, float)
     H = response_of(system, omega)
     for i in range(H.shape[1]):
@@ -45,6 +52,8 @@ def sigma(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label
           ) -> Any:
     """Singular values [dB] over frequency [Hz], in one colour; arguments as for `bode`, one pair of axes."""
     ax = axes_of(ax)
+    if isinstance(system, UncertainSystem):
+        return _family(sigma, system, omega, ax, label, line)
     omega = plot_frequencies(system) if omega is None else np.asarray(omega, float)
     values = decibels(np.linalg.svd(response_of(system, omega), compute_uv=False))
     for k in range(values.shape[1]):
@@ -52,6 +61,15 @@ def sigma(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label
             line["color"] = ax.lines[-1].get_color()
         ax.plot(omega / HERTZ, values[:, k], label=None if k else label, **line)
     return finish(ax, "frequency [Hz]", "singular values [dB]" if values.shape[1] > 1 else "magnitude [dB]")
+
+
+def _family(draw: Any, system: UncertainSystem, omega: np.ndarray | None, ax: Any, label: str | None,
+            line: dict[str, Any]) -> Any:
+    nominal = system.nominal
+    omega = plot_frequencies(nominal) if omega is None else omega
+    for one in system.sample(SAMPLES):
+        draw(one, omega, ax, **FAINT)
+    return draw(nominal, omega, ax, label=label or "nominal", **{"color": "black", **line})
 
 
 def _name(system: Any, which: str, k: int) -> str:

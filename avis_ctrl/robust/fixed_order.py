@@ -22,7 +22,7 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.lti import StateSpace, balanced_truncation, lft_lower
+from avis_ctrl.lti import StateSpace, append, balanced_truncation, lft_lower
 from avis_ctrl.robust.frequency_grid import frequency_grid, merged
 from avis_ctrl.robust.mu_lmi import Array, dagger, residual
 from avis_ctrl.robust.mu_scan import refine_maxima
@@ -35,6 +35,8 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 class FixedOrderSettings:
     """sharpness : exponents of the smoothed maximum over frequency, one stage each: its error is log(frequencies) over
         it, so the last one leaves less than a per cent.
+    unneeded : Hankel singular values, relative to the largest, of the states that an entry of a decentralised
+        controller does not need.
     free : growth of mu for which balanced truncation may shorten the controller at once.
     costly : growth of mu by the removal of a mode from which the controller is improved before it is shortened.
     iterations : most BFGS steps of a stage.
@@ -46,6 +48,7 @@ class FixedOrderSettings:
     """
 
     sharpness: tuple[float, ...] = (20.0, 80.0, 300.0, 1000.0)
+    unneeded: float = 1e-6
     free: float = 0.01
     costly: float = 0.02
     iterations: int = 150
@@ -61,19 +64,26 @@ SETTINGS = FixedOrderSettings()
 SAME_POLE = 1e-9
 
 
-def fixed_order(P: StateSpace, structure: BlockStructure, K: StateSpace, order: int,
+def fixed_order(P: StateSpace, structure: BlockStructure, K: StateSpace, order: int, decentralised: bool = False,
                 settings: FixedOrderSettings = SETTINGS) -> tuple[StateSpace, float]:
     """A controller of at most an order with small peak complex mu, and that peak on its last frequency grid.
 
-    P continuous, u and y last; `structure` complex, performance last; K a controller of higher order that stabilises P.
-    ComputationError where no shortened controller stabilises P.
+    P continuous, u and y last; `structure` complex, performance last; K a controller that stabilises P. A decentralised
+    one moves u_k by y_k alone. ComputationError where no shortened controller, or not the diagonal part of K,
+    stabilises P.
     """
-    K = _shortened(P, structure, K, order, settings)
+    if decentralised:
+        K = _diagonal_part(K)
+        if not lft_lower(P, K).is_stable():
+            raise ComputationError("the diagonal part of the full controller does not stabilise the plant",
+                                   cause="the axes are too strongly coupled for loops of their own",
+                                   next_step="choose other coordinates for u and y")
+    K = _shortened(P, structure, K, order, decentralised, settings)
     closed = lft_lower(P, K)
     omega, beta = _with_peaks(closed, structure, frequency_grid(closed), settings)
     best, best_mu = K, float(np.max(beta))
     for sharpness in settings.sharpness:
-        K = _improved(P, structure, K, omega, sharpness, settings)
+        K = _improved(P, structure, K, omega, sharpness, decentralised, settings)
         closed = lft_lower(P, K)
         omega, beta = _with_peaks(closed, structure, merged(omega, frequency_grid(closed)), settings)
         if float(np.max(beta)) < best_mu:
@@ -81,15 +91,24 @@ def fixed_order(P: StateSpace, structure: BlockStructure, K: StateSpace, order: 
     return best, best_mu
 
 
+def _diagonal_part(K: StateSpace) -> StateSpace:
+    """K with its entries off the diagonal zero, each one on it without the states that it does not need."""
+    parts = []
+    for k in range(K.noutputs):
+        stable, unstable = split_stable(K.select([k], [k]))
+        parts.append(balanced_truncation(stable, tolerance=SETTINGS.unneeded) + unstable)
+    return append(*parts)
+
+
 def _improved(P: StateSpace, structure: BlockStructure, K: StateSpace, omega: Array, sharpness: float,
-              settings: FixedOrderSettings) -> StateSpace:
+              decentralised: bool, settings: FixedOrderSettings) -> StateSpace:
     """K after one stage of descent on the frequencies omega."""
-    form = Form.of(K)
+    form = Form.of(K, decentralised)
     problem = Problem(P, structure, form, omega, sharpness, settings.accuracy)
     return form.controller(_bfgs(problem.value, form.start, settings))
 
 
-def _shortened(P: StateSpace, structure: BlockStructure, K: StateSpace, order: int,
+def _shortened(P: StateSpace, structure: BlockStructure, K: StateSpace, order: int, decentralised: bool,
                settings: FixedOrderSettings) -> StateSpace:
     """K without all but `order` states: truncated while that is free, then mode by mode."""
     omega = frequency_grid(lft_lower(P, K))
@@ -110,7 +129,8 @@ def _shortened(P: StateSpace, structure: BlockStructure, K: StateSpace, order: i
         peaks = [peak(one) for one in fewer]
         least = int(np.argmin(peaks))
         if peaks[least] > (1 + settings.costly) * now and not improved:
-            K, improved = _improved(P, structure, K, omega, settings.sharpness[0], settings), True
+            K = _improved(P, structure, K, omega, settings.sharpness[0], decentralised, settings)
+            improved = True
             now = peak(K)
             continue
         if not np.isfinite(peaks[least]):
@@ -167,12 +187,15 @@ class Form:
     start: Array
 
     @staticmethod
-    def of(K: StateSpace) -> Form:
-        A, B, C, rate = _modal(K)
+    def of(K: StateSpace, decentralised: bool = False) -> Form:
+        A, B, C, rate, channel = _modal(K, decentralised)
         n = rate.size
         whole = np.block([[A, B], [C, K.D]])
         free = np.ones(whole.shape, bool)
         free[:n, :n] = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= 1
+        if decentralised:
+            label = np.r_[channel, np.arange(K.ninputs)], np.r_[channel, np.arange(K.noutputs)]
+            free &= np.equal.outer(label[1], label[0])
         unit = np.empty(whole.shape)
         unit[:n, :n] = np.sqrt(np.outer(rate, rate))
         unit[:n, n:] = np.linalg.norm(B, axis=1, keepdims=True)
@@ -197,17 +220,23 @@ class Form:
         return whole[self.rows, self.cols] * self.size
 
 
-def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array]:
-    """A of 2 x 2 blocks, real poles in pairs of neighbours, with rows of B as long as columns of C; and |poles|."""
-    n, vectors, sizes = K.nstates, [], []
+def _modal(K: StateSpace, decentralised: bool) -> tuple[Array, Array, Array, Array, Array]:
+    """A of 2 x 2 blocks, real poles in pairs of neighbours, with rows of B as long as columns of C; and |poles|.
+
+    Last the output (n,) that each state belongs to; the states are in the order of these where K is decentralised.
+    """
+    n, vectors, sizes, channels = K.nstates, [], [], []
     values, V = la.eig(K.A)
-    for k in np.argsort(np.abs(values), kind="stable"):
+    output = np.argmax(np.abs(K.C @ V), axis=0) * decentralised
+    for k in np.lexsort((np.abs(values), output)):
         if values[k].imag > 0:
             vectors += [V[:, k].real, V[:, k].imag]
             sizes += [abs(values[k])] * 2
+            channels += [output[k]] * 2
         elif values[k].imag == 0:
             vectors.append(V[:, k].real)
             sizes.append(abs(values[k]))
+            channels.append(output[k])
     S = np.array(vectors).T.reshape(n, n)
     A, B, C = np.linalg.solve(S, K.A @ S), np.linalg.solve(S, K.B), K.C @ S
     rows, cols = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
@@ -217,7 +246,7 @@ def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array]:
         if A[k, k + 1] * A[k + 1, k] < 0 and sizes[k] == sizes[k + 1]:
             scale[k:k + 2] = np.sqrt(scale[k] * scale[k + 1])
     rate = np.maximum(np.array(sizes), 1e-6 * max(sizes, default=1.0))
-    return A / scale[:, None] * scale, B / scale[:, None], C * scale, rate
+    return A / scale[:, None] * scale, B / scale[:, None], C * scale, rate, np.array(channels, int)
 
 
 @dataclass(frozen=True, eq=False)

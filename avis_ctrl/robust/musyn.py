@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -74,7 +74,8 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
           callback: Callable[[Iteration], Any] | None = None, target: float | None = None,
           max_iterations: int = 30, backoff: float = 0.01, polish: bool = True, max_added_states: int | None = None,
           starts: Sequence[StateSpace] = (), state: dict[str, Any] | None = None,
-          sample_rate_Hz: float | None = None, order: int | None = None) -> MuSynthesis:
+          sample_rate_Hz: float | None = None, order: int | None = None,
+          structure: Literal["full", "decentralised"] = "full") -> MuSynthesis:
     """Controller u = K y of least peak mu.
 
     Parameters
@@ -99,6 +100,7 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
         more uncertainty), its controllers are started from, as if given in `starts`.
     order : most states of the controller: the one of full order is shortened, then improved by descent on mu over its
         entries (`fixed_order`); mu is what that controller has. `saved_state` is that of the full order.
+    structure : "decentralised": u_k is moved by y_k alone, K is of the given order (by default that of the full one).
     sample_rate_Hz : the controller's fastest pole is compared with half of it, in `notes`.
 
     Raises
@@ -108,24 +110,30 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     ComputationError : no stabilising controller (the mode is named), or none found.
     """
     P = as_plant(P, nmeas, ncon)
-    uncertainty, structure = _structures(P, blocks, nmeas, ncon)
+    if structure not in ("full", "decentralised"):
+        raise InputError("expected 'full' or 'decentralised'", field="structure", value=structure)
+    apart = structure == "decentralised"
+    if apart and nmeas != ncon:
+        raise InputError("a decentralised controller has as many outputs as inputs", field="nmeas, ncon",
+                         value=(nmeas, ncon))
+    uncertainty, complexified = _structures(P, blocks, nmeas, ncon)
     cap = P.nstates + 20 if max_added_states is None else max_added_states
     if order is not None and (isinstance(order, bool) or not isinstance(order, (int, np.integer)) or order < 0):
         raise InputError("expected a whole number of at least 0, or None", field="order", value=order)
     options = _options(target, max_iterations, backoff, polish, cap, callback)
-    problem = Problem(continuous_image(P), structure, nmeas, ncon)
+    problem = Problem(continuous_image(P), complexified, nmeas, ncon)
     given = tuple(continuous_image(_named(P, as_system(K, "starts"), nmeas, ncon)) for K in starts)
     with threadpool_limits(1, user_api="blas"):
         current, known = State(), tuple[StateSpace, ...]()
         if state is not None:
-            current, known = State.from_dict(state, structure, problem.P, nmeas, ncon, P.dt)
+            current, known = State.from_dict(state, complexified, problem.P, nmeas, ncon, P.dt)
         current, status = iterate(problem, current, (*known, *given), options)
         assert current.best is not None
         best, notes = current.best, tuple[str, ...]()
-        if order is not None and best.K.nstates > order:
-            K, peak = fixed_order(problem.P, structure, best.K, order)
-            notes = (f"order {K.nstates} instead of {best.K.nstates}: complex mu on the grid {peak:.4g} instead of "
-                     f"{best.mu:.4g}",)
+        if apart or (order is not None and best.K.nstates > order):
+            K, peak = fixed_order(problem.P, complexified, best.K, best.K.nstates if order is None else order, apart)
+            notes = (f"{structure}, order {K.nstates} instead of {best.K.nstates}: complex mu on the grid {peak:.4g} "
+                     f"instead of {best.mu:.4g}",)
             best = Loop(K, best.scalings, np.nan, peak)
         return _result(P, problem, uncertainty, current, best, status, sample_rate_Hz, notes)
 

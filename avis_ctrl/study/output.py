@@ -37,6 +37,7 @@ def result_dict(result: DesignResult) -> dict[str, Any]:
         "verdict": first_sentence(result), "stable": result.stable,
         "controllers": [*(_controller_row(c) for c in result.controllers),
                         *(_failed_row(c) for c in result.failed or ())],
+        "gamma_slicot": {c.name: c.gamma_slicot for c in result.controllers},
         "dk_history": [{"iteration": row.iteration, "gamma": row.gamma, "mu_upper": row.mu_upper, "order": row.order,
                         "d_fit_error": row.d_fit_error, "seconds": row.seconds} for row in result.dk_history],
         "requirements": [{"name": r.name, "limit": r.limit, "value": r.value, "unit": r.unit, "met": r.met}
@@ -63,15 +64,15 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
     def dB(value: float) -> float:
         return 20 * float(np.log10(value)) if value > 0 else -np.inf
     return {"name": c.name, "kind": c.kind, "file": f"controllers/{c.name}.json" if c.K is not None else None,
-            "order": c.order, "gamma": c.gamma, "gamma_slicot": c.gamma_slicot, "mu_upper": c.mu.upper,
-            "mu_lower": c.mu.lower, "mu_peak_Hz": c.mu.omega / (2 * np.pi), "stable": c.stable,
+            "order": c.order, "gamma": c.gamma, "mu_upper": c.mu.upper, "mu_lower": c.mu.lower,
+            "mu_peak_Hz": c.mu.omega / (2 * np.pi), "stable": c.stable,
             "peak_transmissibility_dB": dB(c.peak_transmissibility),
             "worst_case_peak_transmissibility_dB": dB(c.worst_peak.upper), "note": "; ".join(c.notes)}
 
 
 def _failed_row(c: FailedController) -> dict[str, Any]:
     """A controller that could not be analysed: the reason is in its note."""
-    figures = ("gamma", "gamma_slicot", "mu_upper", "mu_lower", "mu_peak_Hz", "peak_transmissibility_dB",
+    figures = ("gamma", "mu_upper", "mu_lower", "mu_peak_Hz", "peak_transmissibility_dB",
                "worst_case_peak_transmissibility_dB")
     return {"name": c.name, "kind": c.kind, "file": None, "order": None, "stable": False, **dict.fromkeys(figures),
             "note": c.reason}

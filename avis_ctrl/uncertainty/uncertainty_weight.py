@@ -49,6 +49,9 @@ class UncertaintyWeight(Shown, Weight):
     def order(self) -> int:
         return self.shape.order
 
+    def __repr__(self) -> str:
+        return f"UncertaintyWeight({self.meaning})"
+
     @property
     def meaning(self) -> str:
         return (f"{self.kind} uncertainty of {np.min(self.error):.3g} to {np.max(self.error):.3g}, covered by order "

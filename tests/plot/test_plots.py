@@ -15,6 +15,7 @@ from avis_ctrl.lti.interchange import plot_frequencies
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
 from avis_ctrl.robust.mu_peak import MuPeak
 from avis_ctrl.robust.musyn_state import Iteration
+from avis_ctrl.uncertainty.uncertain_models import real
 
 matplotlib.use("Agg")
 LAG = control.tf([2.0], [0.5, 1.0])
@@ -64,6 +65,16 @@ def test_singular_values_of_several_channels():
     np.testing.assert_allclose(curve(ax, 0)[1], 20 * np.log10(3 / np.sqrt(1 + OMEGA ** 2)), atol=1e-9)
     np.testing.assert_allclose(curve(ax, 1)[1], 20 * np.log10(1 / np.sqrt(4 + OMEGA ** 2)), atol=1e-9)
     assert len(plot.bode(G, OMEGA)[0].get_legend().get_texts()) == 4
+
+
+def test_an_uncertain_system_is_drawn_with_its_family():
+    G = real("k", 2.0, percent=20) * tf([1.0], [0.5, 1.0])
+    top, _ = plot.bode(G, OMEGA)
+    curves = np.array([curve(top, k)[1] for k in range(len(top.lines))])
+    assert len(curves) == 21
+    np.testing.assert_allclose(curves[-1], 20 * np.log10(2 / np.sqrt(1 + (0.5 * OMEGA) ** 2)), atol=1e-9)
+    assert np.all(np.abs(curves - curves[-1]) <= -20 * np.log10(0.8) + 1e-9) and np.ptp(curves[:, 0]) > 1.0
+    assert len(plot.sigma(G).lines) == 21
 
 
 def test_default_frequencies_show_a_narrow_resonance():

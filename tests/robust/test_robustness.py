@@ -127,3 +127,13 @@ def test_a_weight_from_measured_responses_goes_into_dynamics():
     Delta = [(np.squeeze(one(1j * omega)) / nominal.frequency_response(omega)[:, 0, 0] - 1) / W.shape(1j * omega)
              for one in family()]
     assert np.max(np.abs(Delta)) <= 1 + 1e-9
+
+
+def test_results_are_short_in_a_terminal_and_tables_in_a_notebook():
+    found = robust_performance(oscillator())
+    weight = uncertainty_weight(tf([1.0], [1.0, 1.0]), [tf([1.2], [1.0, 1.0])])
+    assert repr(weight) == "UncertaintyWeight(output uncertainty of 0.2 to 0.2, covered by order 0)"
+    for one in (found, found.mu, mixed_sensitivity(PLANT, W_P, 1.0), weight):
+        assert "\n" not in repr(one) and len(repr(one)) < 700 and repr(one).startswith(type(one).__name__)
+        assert one._repr_html_().count("<tr>") >= 5
+    assert f"lower={found.lower:.5g}" in repr(found) and "k: " in repr(found)

@@ -135,6 +135,7 @@ def check_folder(folder: Path) -> dict[str, Any]:
     assert (result["format"], result["version"], result["plant"]) == ("avis-design", 1, "plant.json")
     check_plant(plant)
     for row in result["controllers"]:
+        assert result["gamma_slicot"][row["name"]] == pytest.approx(row["gamma"], rel=1e-4)
         assert set(row) == ROW_KEYS
         assert row["kind"] in ("mu", "hinf", "skyhook", "passive")
         assert (row["file"] is None) == (row["kind"] == "passive")
