@@ -13,7 +13,7 @@ import numpy as np
 
 from avis_ctrl.lti.statespace import gain
 
-LIBRARIES = ("numpy", "scipy", "control", "cvxpy", "clarabel", "matplotlib", "plotly", "typst", "numba")
+LIBRARIES = ("numpy", "scipy", "control", "slycot", "cvxpy", "clarabel", "matplotlib", "plotly", "typst", "numba")
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ def examine() -> list[Check]:
     """All checks; a failure is a line, never an exception."""
     checks = [Check("python", platform.python_version(), True)]
     checks += [_attempt(name, partial(metadata.version, name)) for name in LIBRARIES]
-    checks += [_attempt("processors and BLAS threads", _threads), _attempt("clarabel solves an LMI", _clarabel),
-               _attempt("mu bounds (compiled)", _mu),
+    checks += [_attempt("processors and BLAS threads", _threads), _attempt("SLICOT H-infinity norm", _slicot),
+               _attempt("clarabel solves an LMI", _clarabel), _attempt("mu bounds (compiled)", _mu),
                _attempt("nonlinear simulation (compiled)", _simulation),
                _attempt("typst compiles a PDF", _typst), _attempt("own H-infinity synthesis", _synthesis)]
     return checks
@@ -54,6 +54,15 @@ def _threads() -> str:
 
     pools = ", ".join(f"{pool['internal_api']} {pool['num_threads']}" for pool in threadpool_info())
     return f"{os.cpu_count()} processors; {pools or 'no pools'} (avis limits them to 1)"
+
+
+def _slicot() -> str:
+    """A resonance of damping zeta peaks at 1/(2 zeta sqrt(1 - zeta^2))."""
+    from avis_ctrl.lti.statespace import tf
+    from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
+
+    zeta = 0.1
+    return _near(hinf_norm_slicot(tf([1.0], [1.0, 2 * zeta, 1.0])), 1 / (2 * zeta * np.sqrt(1 - zeta ** 2)), 1e-6)
 
 
 def _clarabel() -> str:

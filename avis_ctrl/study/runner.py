@@ -188,4 +188,5 @@ def skyhook_limit(design: Design, mu: ControllerResult) -> float:
 
 def design_provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:
     return provenance(rig, design.model_dump_json(), design.simulation.seed, seconds,
-                      ("numpy", "scipy", "cvxpy", "clarabel", "numba"), design_file=source.name if source else None)
+                      ("numpy", "scipy", "slycot", "cvxpy", "clarabel", "numba"),
+                      design_file=source.name if source else None)
