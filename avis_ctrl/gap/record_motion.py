@@ -84,7 +84,7 @@ class RecordMotion:
     actuators: tuple[str, ...] = ()
     sensors: tuple[str, ...] = ()
     y: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    _spectra: Kept = field(default_factory=lambda: Kept(SETTINGS.kept_bytes), repr=False)
+    _spectra: Kept = field(init=False, default_factory=lambda: Kept(SETTINGS.kept_bytes), repr=False)
 
     @cached_property
     def time_s(self) -> np.ndarray:

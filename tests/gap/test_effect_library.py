@@ -348,6 +348,17 @@ def test_saturation_clips_the_commanded_volts():
     np.testing.assert_array_equal(volts, np.where(np.abs(u) > 0.7, 0.7 * np.sign(u), u))
 
 
+def test_spectra_that_are_kept_belong_to_one_motion():
+    """A copy of a record with other volts does not get the spectrum of the first."""
+    rng = np.random.default_rng(3)
+    first = motion(np.zeros((50, 12)), rng.standard_normal((50, 8)))
+    omega, values = 2 * np.pi * np.arange(1, 9) * 1000 / 50, {"limit_V": 0.7}
+    for record in (first, replace(first, volts=2 * first.volts)):
+        added = OWN["actuator_saturation"].spectra(record, "actuators", values, omega).volts
+        true = np.clip(record.volts, -0.7, 0.7) - record.volts
+        np.testing.assert_allclose(added, np.fft.rfft(true, axis=0)[1:9] / np.sqrt(50), atol=1e-12)
+
+
 def test_drives_clip_each_at_its_own_limit_about_the_mean():
     u = 2.0 * np.random.default_rng(3).standard_normal((50, 8))
     limits = np.array([0.7, 0.8, 0.6, 0.9, 0.5, 0.75, 0.65, 0.7])
