@@ -93,7 +93,7 @@ def certify(folder: DesignFolder, controller: SampledController, files: Mapping[
         return 20 * float(np.log10(value))
     content = {"format": "avis-certificate", "version": 1, "controller_sha256": controller.sha256,
                "mu_upper": found.mu.upper, "mu_lower": lower, "guaranteed": not unproved,
-               "stable": not unstable and bool(np.isfinite(found.peak.upper)),
+               "stable": not unstable and bool(np.isfinite(found.peak.upper)) and found.gain_above < 1,
                "worst_case_peak_transmissibility_dB": dB(found.peak.upper),
                "worst_case_band_transmissibility_dB": dB(found.band.upper),
                "rounding_noise_m_per_s": float(np.linalg.norm(noise)),

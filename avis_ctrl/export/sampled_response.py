@@ -158,8 +158,8 @@ class SampledAxes:
         own = self._filter(centre, half)[0]
         terms = [own / self._filter(image, half)[1] * self._high_gain("force", "seen", image, half)
                  * (centre + half) / (image - half) for image in self._images(centre)]
-        # Hold and table together fall at least as k^-2: the sum over k > n of n^2 / k^2 is below n, on either side.
-        return np.sum(terms, axis=0) + 2 * self.settings.images * terms[-1]
+        # Hold and table together fall at least as k^-2.
+        return np.sum(terms, axis=0) + self._rest(terms)
 
     def _beside(self, omega: np.ndarray) -> np.ndarray:
         """(n_omega,) what the chains' errors make of voltages and sensor signals that no axis stands for [N s/m].
@@ -202,21 +202,30 @@ class SampledAxes:
         rate = 2 * np.pi / self.period_s
         return [np.abs(omega + k * rate) for n in range(1, self.settings.images + 1) for k in (-n, n)]
 
-    def _energy(self, terms: list[np.ndarray]) -> np.ndarray:
-        """(n_omega,) root of the sum of squares over all images, given the terms of the nearest; they fall at least as
-        1/k, so that the squares' rest is below the number of pairs times the last, on either side."""
-        return np.sqrt(np.sum(np.square(terms), axis=0) + 2 * self.settings.images * terms[-1] ** 2)
+    def _rest(self, terms: list[np.ndarray]) -> np.ndarray:
+        """(n_omega,) bound of the sum beyond the n nearest pairs of images, given terms that fall at least as k^-2.
+
+        Images lie at k + x and k - x, x at most 1/2. The sum of 1/(k - 1/2)^2 over k > n is below 1/n (midpoint rule),
+        and the last terms are at most (n + 1/2)^2 times smaller than that function at 1.
+        """
+        n = self.settings.images
+        return (n + 0.5) ** 2 / n * (terms[-2] + terms[-1])
 
     def held_images(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
         """(n,) bound over each interval of the payload velocity at all images per force, r.m.s. [m/(N s)]."""
-        return self._energy([self._high_gain("force", "velocity", image, half) * (centre + half) / (image - half)
-                             for image in self._images(centre)])
+        terms = [np.square(self._high_gain("force", "velocity", image, half) * (centre + half) / (image - half))
+                 for image in self._images(centre)]
+        return np.sqrt(np.sum(terms, axis=0) + self._rest(terms))
 
     def folded_floor(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-        """(n,) bound over each interval of the seen velocity per floor velocity at all images, r.m.s."""
+        """(n,) bound over each interval of the seen velocity per floor velocity at the nearest images, r.m.s.
+
+        An accelerometer without a filter shows motion at every image alike: over all of them there is no bound.
+        """
         own = self._filter(centre, half)[0]
-        return self._energy([self._high_gain("floor", "seen", image, half) * own / self._filter(image, half)[1]
-                             for image in self._images(centre)])
+        terms = [np.square(self._high_gain("floor", "seen", image, half) * own / self._filter(image, half)[1])
+                 for image in self._images(centre)]
+        return np.sqrt(np.sum(terms, axis=0))
 
     @property
     def high_grid(self) -> np.ndarray:

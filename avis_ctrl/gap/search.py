@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.effects.base import Effect
+from avis_ctrl.gap.effects.base import Effect, shares
 from avis_ctrl.gap.effects.flexible_mode import resonance
 from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.probability import Step, name_of, probability_of
@@ -315,6 +315,8 @@ def forbidden(fitted: Fitted, one: ActiveEffect) -> str:
     """Why physics forbids the values of an effect; empty where it does not."""
     std = np.sqrt(np.maximum(np.diag(fitted.covariance_of(one.names)), 0))
     values = dict(zip((p.name for p in one.parameters), std, strict=True))
+    if np.any(shares(one.by_name) <= 0):
+        return "elements that differ so much that one of them would have the opposite sign"
     return str(one.effect.implausible(one.by_name, values) or at_the_edge(one))
 
 

@@ -115,8 +115,9 @@ def _margin(peak: MuPeak, skew: float) -> DiskMargin:
 
 
 def _gains(alpha: float, skew: float) -> tuple[float, float]:
-    """Real factors inside the disk; high is infinite where the disk is a half plane or more."""
-    low = 0.0 if np.isinf(alpha) else (2 - alpha * (1 - skew)) / (2 + alpha * (1 + skew))
+    """Real factors inside the disk; an end is infinite where the disk is a half plane or more."""
+    below = 2 + alpha * (1 + skew) if np.isfinite(alpha) else 1.0
+    low = -np.inf if below <= 0 else 0.0 if np.isinf(alpha) else (2 - alpha * (1 - skew)) / below
     room = 2 - alpha * (1 + skew)
     high = (2 + alpha * (1 - skew)) / room if room > 0 else np.inf
     return float(low), float(high)
@@ -124,7 +125,10 @@ def _gains(alpha: float, skew: float) -> tuple[float, float]:
 
 def _phase(low: float, high: float) -> float:
     """Phase of a factor of gain 1 at the edge of the disk [degrees]: cos = (1 + low high)/(low + high)."""
-    cosine = low if np.isinf(high) else (1 + low * high) / (low + high) if low + high > 0 else -1.0
+    if np.isinf(low) or np.isinf(high):
+        cosine = high if np.isinf(low) else low
+    else:
+        cosine = (1 + low * high) / (low + high) if low + high > 0 else -1.0
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 

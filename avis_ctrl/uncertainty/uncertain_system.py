@@ -222,6 +222,7 @@ class UncertainSystem:
 
     def __matmul__(self, other: Any) -> UncertainSystem:
         X, Y = self, as_uncertain(other)
+        inputs, outputs = Y.inputs, X.outputs
         if X.shape == Y.shape == (1, 1) and not (X.nstates or Y.nstates):
             # Numbers commute. Divisors act last, as a mass does on a sum of forces, so that entries of one row share
             # them; and equal products of parameters come in one order.
@@ -230,7 +231,7 @@ class UncertainSystem:
             raise InputError(f"product of shapes {X.shape} and {Y.shape}")
         parts = (np.block([[X.a, X.b @ Y.c], [np.zeros((Y.a.shape[0], X.a.shape[1])), Y.a]]),
                  np.vstack([X.b @ Y.d, Y.b]), np.hstack([X.c, X.d @ Y.c]), X.d @ Y.d)
-        return _of_both(parts, X, Y, Y.inputs, X.outputs)
+        return _of_both(parts, X, Y, inputs, outputs)
 
     def __rmatmul__(self, other: Any) -> UncertainSystem:
         return as_uncertain(other) @ self

@@ -20,6 +20,8 @@ from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.weight_base import Role, Weight, smallest_cover
 
 Kind = Literal["output", "input", "additive"]
+# Relative size below which what the nominal system cannot make of an error is round-off.
+ROUND_OFF = 1e-8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,7 +76,8 @@ def uncertainty_weight(nominal: Any, responses: Sequence[Any] | Any, *, kind: Ki
 
     Raises
     ------
-    InputError : no responses, responses of another shape, a nominal response that is zero or not finite.
+    InputError : no responses, responses of another shape, a nominal response that is zero or not finite, an error that
+        the nominal system cannot make from this side (fewer inputs than outputs, say).
     ComputationError : no filter of this order within the tolerance.
     """
     every = list(responses) if isinstance(responses, (list, tuple)) else [responses]
@@ -95,8 +98,12 @@ def uncertainty_weight(nominal: Any, responses: Sequence[Any] | Any, *, kind: Ki
                              value=difference.shape[1:])
         difference = difference - G
         if kind != "additive":
-            inverse = np.linalg.pinv(G)
-            difference = difference @ inverse if kind == "output" else inverse @ difference
+            inverse, whole = np.linalg.pinv(G), difference
+            difference = whole @ inverse if kind == "output" else inverse @ whole
+            rest = whole - (difference @ G if kind == "output" else G @ difference)
+            if np.linalg.norm(rest) > ROUND_OFF * np.linalg.norm(whole):
+                raise InputError(f"no error at the {kind} of the nominal system makes this response; expected kind "
+                                 f"additive or {'input' if kind == 'output' else 'output'}", field=f"response {k}")
         error = np.maximum(error, np.linalg.norm(difference, ord=2, axis=(1, 2)))
     if not (np.all(np.isfinite(error)) and np.max(error) > 0 and np.all(np.abs(G).max(axis=(1, 2)) > 0)):
         raise InputError("expected finite responses that differ from a nominal one that is not zero", field="nominal")

@@ -17,6 +17,8 @@ from avis_ctrl.uncertainty.uncertainty_weight import uncertainty_weight
 # Skogestad and Postlethwaite, Multivariable Feedback Control, 2005: plant of section 2.6, weights of example 2.17.
 PLANT = control.tf([200], np.polymul([10, 1], np.polymul([0.05, 1], [0.05, 1])))
 W_P = control.tf([1 / 1.5, 10], [1, 10 * 1e-4])
+# One output: what differs between its two inputs cannot be made at the output.
+ROW, TWO_INPUTS = np.array([[1.0, 1.0]]), np.array([[1.0, 0.01]])
 
 
 def oscillator(percent=20.0):
@@ -63,6 +65,7 @@ def test_an_lft_with_blocks_is_the_same_as_the_system():
     (lambda: uncertainty_weight(PLANT, []), "expected responses"),
     (lambda: uncertainty_weight(PLANT, [PLANT]), "differ from a nominal one"),
     (lambda: uncertainty_weight(PLANT, [np.ones((2, 2))]), "responses of shape"),
+    (lambda: uncertainty_weight(ROW, [2 * TWO_INPUTS], kind="output"), "additive or input"),
 ])
 def test_wrong_input_is_one_line(call, words):
     with pytest.raises(InputError, match=words) as caught:

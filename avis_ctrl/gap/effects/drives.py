@@ -41,7 +41,11 @@ class ActuatorGain(Effect):
 
 @register
 class ActuatorLag(Effect):
-    """Every amplifier 1/(1 + s tau), corner 1/(2 pi tau): one tau for all, or each its own about their mean."""
+    """Every amplifier 1/(1 + s tau), corner 1/(2 pi tau): one tau for all, or each its own about their mean.
+
+    What the sample rate folds back passes the mean corner: with corners that differ by a factor of two this is wrong by
+    0.1 % of the response at a tenth of the sample rate, and by 1 % at a fifth.
+    """
 
     name = "actuator_lag"
     title = "the current amplifiers lag, first order"
