@@ -54,7 +54,11 @@ def sweep(
                 bar.update(shown, completed=done, total=total)
                 if text or not console.is_terminal:
                     console.print(f"[dim]{done} of {total}[/]", *([text] if text else []), soft_wrap=True)
-            found = run_sweep(plan, backend, progress)
+            try:
+                found = run_sweep(plan, backend, progress)
+            except KeyboardInterrupt:
+                console.print("Finished points are kept; the same command goes on where it was.")
+                raise
         files = write_sweep(found, folder)
     rows, front = found.rows, front_of(found)
     count = {status: sum(row.status == status for row in rows) for status in ("done", "failed", "lost")}

@@ -55,7 +55,7 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
         by_name = {f"avis-sweep-{os.fspath(task.folder)}-{task.identity}": task for task in tasks}
         futures = [client.submit(perform, task, key=name) for name, task in by_name.items()]
         for future in as_completed(futures, loop=client.loop):
-            yield _content(future, by_name[future.key], client)
+            yield _content(future, by_name[future.key])
             future.release()
 
 
@@ -79,15 +79,16 @@ def _connected(client_of: Any, address: str, patience_s: float) -> Iterator[Any]
             client.close(timeout=5)
 
 
-def _content(future: Any, task: Task, client: Any) -> dict[str, Any]:
-    from distributed import KilledWorker
+def _content(future: Any, task: Task) -> dict[str, Any]:
+    from distributed import CancelledError, KilledWorker
 
-    if future.status == "finished":
+    try:
+        # It also waits where a worker died with a result that nobody had fetched: another one reads the point's file.
         return future.result()
-    if future.status in ("cancelled", "lost") or client.status != "running":
-        raise ComputationError("the scheduler was lost", next_step="run the same command again: finished points are "
-                               "kept")
-    error = future.exception()
-    if isinstance(error, KilledWorker):
+    except KilledWorker:
         return lost(task, "every process that computed it died; likely cause: memory, or a fault in compiled code")
-    return lost(task, f"{type(error).__name__}: {' '.join(str(error).split())}")
+    except CancelledError:
+        raise ComputationError("the scheduler was lost", next_step="run the same command again: finished points are "
+                               "kept") from None
+    except Exception as error:  # a worker that cannot load the package, for example
+        return lost(task, f"{type(error).__name__}: {' '.join(str(error).split())}")

@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from avis_ctrl.sweep.design_points import DesignBase
-from avis_ctrl.sweep.function_points import FunctionBase
-from avis_ctrl.sweep.gap_points import GapBase
+from avis_ctrl.sweep.job import Job
 from avis_ctrl.sweep.points_file import PointsFile
-
-
-class Job(Protocol):
-    """A point with everything that its result depends on; goes to another process whole."""
-
-    @property
-    def inputs(self) -> str:
-        """Everything that the result depends on, as text."""
-
-    def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Figures for the table, and what else is kept. Raises AvisError."""
 
 
 class Base(Protocol):
@@ -44,6 +31,15 @@ class Base(Protocol):
 
 def open_base(file: PointsFile, folder: Path) -> Base:
     """The base of a file of points in a folder. Raises InputError where it does not exist or is wrong."""
-    kinds: dict[str, Callable[[PointsFile, Path], Base]] = {
-        "design": DesignBase.read, "skyhook": DesignBase.read, "gap": GapBase.read, "function": FunctionBase.read}
-    return kinds[file.kind](file, folder)
+    # Late: a process that computes one kind loads nothing of the others.
+    if file.kind == "gap":
+        from avis_ctrl.sweep.gap_points import GapBase
+
+        return GapBase.read(file, folder)
+    if file.kind == "function":
+        from avis_ctrl.sweep.function_points import FunctionBase
+
+        return FunctionBase.read(file, folder)
+    from avis_ctrl.sweep.design_points import DesignBase
+
+    return DesignBase.read(file, folder)

@@ -55,8 +55,8 @@ def points_of(file: PointsFile, expand: Callable[[str], Sequence[str]], settings
                          value=sorted(counts))
     sizes = [len(listed), *(len(one.values or ()) for one in grids), *counts]
     if (total := math.prod(sizes)) > settings.most_points:
-        raise InputError(f"expected at most {settings.most_points} points", field="points",
-                         value=f"{' x '.join(map(str, sizes))} = {total}")
+        raise InputError(f"expected at most {settings.most_points}; here are {' x '.join(map(str, sizes))}",
+                         field="points", value=total)
     keys = [key for point in file.point for key in _flat(point)]
     _require_single([*dict.fromkeys(keys), *(one.key for one in file.vary)])
     for key in (*keys, *(one.key for one in grids)):
