@@ -41,9 +41,12 @@ def pareto(values: np.ndarray, labels: Sequence[str], names: Sequence[str] = (),
             "points")
     ax.step(*values[front].T, "o-", where="post", markersize=5, linewidth=1.2, color=FRONT,
             label=f"Pareto front, {front.size}")
-    for k in front if len(names) else ():
-        ax.annotate(names[k], values[k], textcoords="offset points", xytext=(6, 5), fontsize="x-small", color=FRONT)
     ax.margins(0.08)
+    for k in front if len(names) else ():
+        # Below and left of a point of the front there is none; the first ones have no room there.
+        late = ax.transAxes.inverted().transform(ax.transData.transform(values[k]))[0] > 0.5
+        ax.annotate(names[k], values[k], textcoords="offset points", fontsize="x-small", color=FRONT,
+                    **({"xytext": (-6, -4), "ha": "right", "va": "top"} if late else {"xytext": (6, 5)}))
     if title:
         ax.set_title(title, fontsize="medium")
     return finish(ax, labels[0], labels[1], log=False)

@@ -40,8 +40,10 @@ def write_sweep(sweep: Sweep, folder: Path) -> list[Path]:
     drawn = sweep.pareto is not None and bool(front)
     if drawn:
         assert sweep.pareto is not None
+        # Two values of a few points can be read; else a point is the number of its row.
+        in_words = len(front) <= 12 and len(columns(sweep)[0]) <= 2
         names = [", ".join(f"{key.rpartition('.')[2]} {_short(row.point[key])}" for key in row.point)
-                 if len(row.point) < 3 else str(k + 1) for k, row in enumerate(sweep.rows)]
+                 if in_words else str(k + 1) for k, row in enumerate(sweep.rows)]
         labels = [sweep.quantities.get(name, name) for name in sweep.pareto]
         contents["pareto.png"] = pareto_png(_values(sweep), labels, names, sweep.file.title)
     contents["sweep.html"] = _page(sweep, front, contents.get("pareto.png")).encode()

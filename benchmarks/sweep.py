@@ -1,0 +1,73 @@
+"""Throughput of a sweep against the number of processes: joblib, and dask workers, on this machine.
+
+    python -m benchmarks.sweep [--points 12] [--design designs/avis_z_phix.toml]
+
+Each point is the analysis of a skyhook on a table drawn at random. What counts are ratios: the seconds depend on what
+else the machine does. The start of the processes is part of it. Where processors are taken by others, the ratio says
+little; the load is printed beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from avis_ctrl.sweep.cluster import on_cluster
+from avis_ctrl.sweep.local import available, on_this_machine
+from avis_ctrl.sweep.run import POINTS, Backend, plan_sweep, run_sweep
+
+FILE = """
+kind = "skyhook"
+base = {base!r}
+[[vary]]
+key = "rig_factor.isolator*.k_z"
+random = {{ count = {points}, seed = 1, low = 0.8, high = 1.25, scale = "log" }}
+"""
+
+
+def seconds(points: Path, backend: Backend) -> float:
+    """Of a whole sweep into a new folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, POINTS).mkdir()
+        plan = plan_sweep(points, Path(folder))
+        began = time.perf_counter()
+        found = run_sweep(plan, backend)
+        took = time.perf_counter() - began
+    if wrong := [row.message for row in found.rows if row.status != "done"]:
+        raise SystemExit(f"{len(wrong)} points were not done: {wrong[0]}")
+    return took
+
+
+def cases() -> Iterator[tuple[str, int, Backend]]:
+    """Name, processes, backend."""
+    for n in (1, 2):
+        yield "joblib", n, lambda tasks, n=n: on_this_machine(tasks, n)
+    for n in (1, 2):
+        yield "dask", n, lambda tasks, n=n: on_cluster(tasks, None, n)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--points", type=int, default=12)
+    parser.add_argument("--design", type=Path, default=Path("designs/avis_z_phix.toml"))
+    given = parser.parse_args()
+    print(f"{given.points} skyhooks of {given.design.name} on {available()} processors; others' load "
+          f"{os.getloadavg()[0]:.1f}")
+    print(f"{'':8s} {'processes':>9s} {'s':>7s} {'points per min':>14s} {'ratio to one':>12s} {'load':>5s}")
+    one: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        points = Path(folder, "points.toml")
+        points.write_text(FILE.format(base=str(given.design.resolve()), points=given.points))
+        for name, n, backend in cases():
+            took = seconds(points, backend)
+            one.setdefault(name, took)
+            print(f"{name:8s} {n:9d} {took:7.1f} {60 * given.points / took:14.1f} {one[name] / took:12.2f} "
+                  f"{os.getloadavg()[0]:5.1f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
