@@ -42,9 +42,10 @@ def pareto(values: np.ndarray, labels: Sequence[str], names: Sequence[str] = (),
     ax.step(*values[front].T, "o-", where="post", markersize=5, linewidth=1.2, color=FRONT,
             label=f"Pareto front, {front.size}")
     ax.margins(0.08)
+    middle = (np.nanmin(values[:, 0]) + np.nanmax(values[:, 0])) / 2 if front.size else np.nan
     for k in front if len(names) else ():
         # Below and left of a point of the front there is none; the first ones have no room there.
-        late = ax.transAxes.inverted().transform(ax.transData.transform(values[k]))[0] > 0.5
+        late = values[k, 0] > middle
         ax.annotate(names[k], values[k], textcoords="offset points", fontsize="x-small", color=FRONT,
                     **({"xytext": (-6, -4), "ha": "right", "va": "top"} if late else {"xytext": (6, 5)}))
     if title:
