@@ -3,8 +3,8 @@
     python -m benchmarks.sweep [--points 12] [--design designs/avis_z_phix.toml]
 
 Each point is the analysis of a skyhook on a table drawn at random. What counts are ratios: the seconds depend on what
-else the machine does. The start of the processes is part of it. Where processors are taken by others, the ratio says
-little; the load is printed beside it.
+else the machine does; the load is printed beside them. The first ratio is that of whole sweeps, in which each process
+starts and loads compiled code; the second that of the points after the first one of each process.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ random = {{ count = {points}, seed = 1, low = 0.8, high = 1.25, scale = "log" }}
 """
 
 
-def seconds(points: Path, backend: Backend) -> float:
-    """Of a whole sweep into a new folder."""
+def seconds(points: Path, backend: Backend) -> list[float]:
+    """When each point of a sweep into a new folder was finished, from its beginning."""
+    ends: list[float] = []
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, POINTS).mkdir()
         plan = plan_sweep(points, Path(folder))
         began = time.perf_counter()
-        found = run_sweep(plan, backend)
-        took = time.perf_counter() - began
+        found = run_sweep(plan, backend, lambda done, total, text: ends.append(time.perf_counter() - began))
     if wrong := [row.message for row in found.rows if row.status != "done"]:
         raise SystemExit(f"{len(wrong)} points were not done: {wrong[0]}")
-    return took
+    return ends[1:]  # the first call says that nothing was there
 
 
 def cases() -> Iterator[tuple[str, int, Backend]]:
@@ -57,15 +57,17 @@ def main() -> None:
     given = parser.parse_args()
     print(f"{given.points} skyhooks of {given.design.name} on {available()} processors; others' load "
           f"{os.getloadavg()[0]:.1f}")
-    print(f"{'':8s} {'processes':>9s} {'s':>7s} {'points per min':>14s} {'ratio to one':>12s} {'load':>5s}")
-    one: dict[str, float] = {}
+    print(f"{'':8s} {'processes':>9s} {'s':>7s} {'ratio to one':>12s} {'points per min, later':>21s} "
+          f"{'ratio to one':>12s} {'load':>5s}")
+    one: dict[str, tuple[float, float]] = {}
     with tempfile.TemporaryDirectory() as folder:
         points = Path(folder, "points.toml")
         points.write_text(FILE.format(base=str(given.design.resolve()), points=given.points))
         for name, n, backend in cases():
-            took = seconds(points, backend)
-            one.setdefault(name, took)
-            print(f"{name:8s} {n:9d} {took:7.1f} {60 * given.points / took:14.1f} {one[name] / took:12.2f} "
+            ends = seconds(points, backend)
+            whole, rate = ends[-1], 60 * (len(ends) - n) / (ends[-1] - ends[n - 1])
+            first, slow = one.setdefault(name, (whole, rate))
+            print(f"{name:8s} {n:9d} {whole:7.1f} {first / whole:12.2f} {rate:21.1f} {rate / slow:12.2f} "
                   f"{os.getloadavg()[0]:5.1f}", flush=True)
 
 

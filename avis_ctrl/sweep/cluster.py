@@ -48,7 +48,7 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
                                              "distributed.comm.timeouts.connect": settings.patience_s}))
         if address is None:
             cluster = stack.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, processes=True,
-                                                       dashboard_address=None, silence_logs=logging.CRITICAL))
+                                                       dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL))
             address = cluster.scheduler_address
         client = stack.enter_context(_connected(Client, address, settings.patience_s))
         # A task has its identity for name: a resumed sweep joins what still runs of the one before.

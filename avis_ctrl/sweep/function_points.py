@@ -49,7 +49,10 @@ class FunctionBase:
 
 @dataclass(frozen=True, eq=False)
 class FunctionJob:
-    """NAME(point), which returns figures by name. The code runs with the rights of the user."""
+    """NAME(point), which returns figures by name, or these and details that only the point's file keeps.
+
+    The code runs with the rights of the user.
+    """
 
     source: str
     path: Path
@@ -76,12 +79,13 @@ class FunctionJob:
         return found
 
     def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The figures that the function returns."""
-        figures = self.function()(dict(self.point))
+        """The figures that the function returns, and what else it returns beside them."""
+        found = self.function()(dict(self.point))
+        figures, details = found if isinstance(found, tuple) and len(found) == 2 else (found, None)
         if not isinstance(figures, dict) or not all(isinstance(name, str) for name in figures):
             raise InputError("expected figures by name", field=self.name, value=type(figures).__name__)
         try:
-            as_json(figures)
+            as_json({"figures": figures, "details": details})
         except (TypeError, ValueError) as error:
             raise InputError(f"expected numbers and text: {error}", field=self.name) from None
-        return figures, {}
+        return figures, {} if details is None else {"details": details}

@@ -75,6 +75,9 @@ def plan_sweep(path: Path, folder: Path, settings: SweepSettings | None = None) 
         points = points_of(file, base.expand, settings or SweepSettings())
     except InputError as error:
         raise error.in_file(path) from None
+    known = [*base.quantities, *dict.fromkeys(key for point in points for key in point)]
+    if base.quantities and (wrong_names := [name for name in file.pareto or () if name not in known]):
+        raise InputError(f"expected some of {', '.join(known)}", file=path, field="pareto", value=wrong_names[0])
     where = (folder / POINTS).absolute()
     tasks: list[Task | InputError] = []
     for point in points:

@@ -23,7 +23,7 @@ from avis_ctrl.study.workers import alone
 from avis_ctrl.sweep.job import Job
 
 FORMAT = "avis-sweep-point"
-# Computed and kept; a process that died, a full disk or memory may go better next time.
+# Computed and kept; a process that died, a full disk or memory, a missing library may go better next time.
 LASTING = ("done", "failed")
 # The kernels keep state in their modules: a cluster's process with several threads computes one point at a time.
 _one_at_a_time = threading.Lock()
@@ -71,7 +71,7 @@ def _computed(task: Task) -> dict[str, Any]:
             figures, details = task.job.compute()
     except AvisError as error:
         status, message = "failed", _one_line(error)
-    except (MemoryError, OSError) as error:
+    except (MemoryError, OSError, ImportError) as error:
         return lost(task, f"{type(error).__name__}: {_one_line(error)}")
     except Exception as error:
         status, message = "failed", f"{type(error).__name__}: {_one_line(error)}"

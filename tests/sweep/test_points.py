@@ -133,6 +133,8 @@ def test_the_identity_is_that_of_the_resolved_input(tmp_path):
      '[[vary]]\nkey = "rig.com_x"\nrandom = {count = 3, seed = 1, low = 1.0, high = 2.0}', "one count"),
     ('base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nrandom = {count = 200000000, seed = 1, low = 1.0, high = 2.0}',
      "points = 200000000: expected at most 20000; here are 1 x 200000000"),
+    ('base = "small.toml"\npareto = ["mu_upper", "band"]', "pareto = 'band': expected some of mu_upper, mu_lower"),
+    ('base = "small.toml"\npareto = ["mu_upper"]', "at least 2 items"),
     ('base = "small.toml"\nkind = "gap"', "rig: this key is missing"),
     ('base = "nowhere.h5"\nkind = "gap"\nrig = "avis"', "nowhere.h5"),
     ('base = "small.toml"\nrig = "avis"', "the design file names it"),

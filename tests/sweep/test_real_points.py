@@ -11,9 +11,15 @@ from helpers import COMMAND, environment, rows_of
 from test_points import SMALL
 
 from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.measurement.formats import write_campaign
+from avis_ctrl.rigs import load_rig
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
+from avis_ctrl.simulation.rehearsal import rehearse
 from avis_ctrl.study.design_file import read_study
+from avis_ctrl.study.plan_file import read_plan
 from avis_ctrl.study.plant import build_plant
+from avis_ctrl.sweep.local import on_this_machine
+from avis_ctrl.sweep.run import plan_sweep, run_sweep
 
 SHORT = "\n[synthesis]\nmax_iterations = 2\n[simulation]\nduration_s = 15.0\nrandom_plants = 0\n"
 
@@ -54,3 +60,46 @@ values = [1.1]
     motion = plant.full.restricted([*plant.floor_velocities], [*plant.velocities]).closed(K)
     worst = 20 * np.log10(worst_case_gain(motion, plant.synthesis.blocks).upper)
     assert row["figures"]["worst_case_peak_transmissibility_dB"] == pytest.approx(worst, abs=0.1)
+
+
+LAG_HZ = 120.0
+PLAN = f"""
+duration_s = 25.0
+settle_s = 5.0
+band_Hz = [0.5, 60.0]
+amplifier_corner_Hz = {LAG_HZ}
+[floor_sensor]
+recorded = false
+[[record]]
+excitation = "noise"
+level_V = 0.08
+records = 2
+[[record]]
+excitation = "noise"
+level_V = 0.3
+records = 2
+"""
+
+
+@pytest.mark.slow
+def test_the_gap_of_a_simulated_lag(tmp_path):
+    """Named where the sweep's point does not know of it, and not where it does."""
+    table = load_rig("avis")
+    (tmp_path / "plan.toml").write_text(PLAN)
+    write_campaign(tmp_path / "campaign.h5", rehearse(table, read_plan(tmp_path / "plan.toml"), 1).campaign)
+    (tmp_path / "points.toml").write_text(f"""
+kind = "gap"
+base = "campaign.h5"
+rig = "avis"
+[[point]]
+seed = 1
+[[point]]
+amplifier_corner_Hz = {LAG_HZ}
+""")
+    (tmp_path / "out" / "points").mkdir(parents=True)
+    plan = plan_sweep(tmp_path / "points.toml", tmp_path / "out")
+    found = run_sweep(plan, lambda tasks: on_this_machine(tasks, 1))
+    assert [row.status for row in found.rows] == ["done", "done"], [row.message for row in found.rows]
+    unknown, known = (row.figures for row in found.rows)
+    assert "actuator_lag" in unknown["effects"] and "actuator_lag" not in known["effects"]
+    assert unknown["nrmse"] < 0.5 * unknown["nrmse_identified"]
