@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
+import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -47,8 +49,10 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
         stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": settings.deaths - 1,
                                              "distributed.comm.timeouts.connect": settings.patience_s}))
         if address is None:
-            cluster = stack.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, processes=True,
-                                                       dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL))
+            with _deaf_to_interrupts():
+                cluster = stack.enter_context(LocalCluster(
+                    n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
+                    silence_logs=logging.CRITICAL))
             address = cluster.scheduler_address
         client = stack.enter_context(_connected(Client, address, settings.patience_s))
         # A task has its identity for name: a resumed sweep joins what still runs of the one before.
@@ -57,6 +61,19 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
         for future in as_completed(futures, loop=client.loop):
             yield _content(future, by_name[future.key])
             future.release()
+
+
+@contextlib.contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Processes that are started in it do not hear Ctrl-C, which a terminal sends to all: the parent ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

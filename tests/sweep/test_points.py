@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -171,6 +174,16 @@ def test_a_point_that_cannot_be_made_is_a_task_less(tmp_path):
     made, refused = plan_sweep(tmp_path / "p.toml", tmp_path / "out").tasks
     assert isinstance(refused, InputError) and "below peak_dB = 6" in str(refused)
     assert not isinstance(made, InputError)
+
+
+def test_the_guide_s_examples_are_points(tmp_path):
+    root = Path(__file__).resolve().parents[2]
+    grid, listed = re.findall(r"```toml\n(.*?)```", (root / "docs" / "sweep.md").read_text(), re.DOTALL)
+    for text, count in ((grid, 30), (f'base = "avis_z_phix.toml"\n{listed}', 2)):
+        (tmp_path / "p.toml").write_text(text.replace('base = "', f'base = "{root / "designs"}/'))
+        plan = plan_sweep(tmp_path / "p.toml", tmp_path / "out")
+        assert len(plan.tasks) == count and not any(isinstance(one, InputError) for one in plan.tasks)
+        assert len({one.identity for one in plan.tasks}) == count
 
 
 def test_keys_are_those_of_the_design_file():
