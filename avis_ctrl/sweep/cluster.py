@@ -49,7 +49,7 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
         stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": settings.deaths - 1,
                                              "distributed.comm.timeouts.connect": settings.patience_s}))
         if address is None:
-            with _deaf_to_interrupts():
+            with _ignored_interrupts():
                 cluster = stack.enter_context(LocalCluster(
                     n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
                     silence_logs=logging.CRITICAL))
@@ -64,8 +64,8 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
 
 
 @contextlib.contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """Processes that are started in it do not hear Ctrl-C, which a terminal sends to all: the parent ends them."""
+def _ignored_interrupts() -> Iterator[None]:
+    """Processes that are started in it ignore Ctrl-C, which a terminal sends to all: the parent ends them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -82,7 +82,7 @@ def _flat(table: dict[str, Any], before: str = "") -> Point:
 
 
 def _column(axis: VarySection, key: str) -> list[tuple[str, float]]:
-    asked = axis.random
-    assert asked is not None  # as points_of chose them
-    fractions = np.random.default_rng([asked.seed, *key.encode()]).random(asked.count)
-    return [(key, asked.between(float(fraction))) for fraction in fractions]
+    drawn = axis.random
+    assert drawn is not None  # as points_of chose them
+    fractions = np.random.default_rng([drawn.seed, *key.encode()]).random(drawn.count)
+    return [(key, drawn.between(float(fraction))) for fraction in fractions]

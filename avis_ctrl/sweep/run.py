@@ -96,7 +96,8 @@ def run_sweep(plan: Plan, backend: Backend = lambda tasks: on_this_machine(tasks
               progress: Progress = lambda done, total, text: None) -> Sweep:
     """Compute the points that are not finished, each into its file, and gather all.
 
-    The folder of the points must exist. A kill at any moment leaves the finished points; the same call goes on.
+    The folder of the points must exist. After a kill at any moment the same call goes on with the points that are not
+    finished.
 
     Raises
     ------

@@ -16,8 +16,8 @@ where blind.toml is, with an absolute path if it lies elsewhere (workers need th
     values = [0.5]
 
 Beside `seed` a point may have duration_s, kind, effect, strength, unseen, cluttered, truth and finder. Other than
-`python -m benchmarks.blind`, cases share a process one after the other, so that memory is that of its largest case so
-far, and no case is ended after a time. A point's identity is not that of the code of the checkout: take a new folder
+`python -m benchmarks.blind`, cases run in one process one after the other, so that memory is that of its largest case
+so far, and no case is ended after a time. A point's identity is not that of the code of the checkout: take a new folder
 for another commit.
 """
 

@@ -1,4 +1,4 @@
-"""Files of points that call a function; every call leaves a line in a log, so that executions can be counted."""
+"""Files of points that call a function; every call writes a line into a log, so that executions can be counted."""
 
 from __future__ import annotations
 

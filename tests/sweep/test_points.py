@@ -184,6 +184,7 @@ def test_the_guide_s_examples_are_points(tmp_path):
         plan = plan_sweep(tmp_path / "p.toml", tmp_path / "out")
         assert len(plan.tasks) == count and not any(isinstance(one, InputError) for one in plan.tasks)
         assert len({one.identity for one in plan.tasks}) == count
+    assert len(plan_sweep(root / "designs" / "points" / "avis_bandwidth.toml", tmp_path).tasks) == 12
 
 
 def test_keys_are_those_of_the_design_file():
