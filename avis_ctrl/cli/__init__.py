@@ -20,6 +20,7 @@ from avis_ctrl.cli.gap_axis import gap_axis
 from avis_ctrl.cli.identify import identify, predict, single_axis
 from avis_ctrl.cli.measure import convert, excite, simulate_campaign
 from avis_ctrl.cli.new import app as new
+from avis_ctrl.cli.sweep import sweep
 from avis_ctrl.errors import AvisError, ComputationError
 from avis_ctrl.measurement.layouts import FORMATS
 
@@ -67,7 +68,8 @@ def doctor() -> None:
 
 for command, name in ((design, "design"), (compare, "compare"), (export, "export"), (identify, "identify"),
                       (gap, "gap"), (predict, "predict"), (gap_axis, "gap-axis"), (excite, "excite"),
-                      (simulate_campaign, "simulate-campaign"), (convert, "convert"), (single_axis, "single-axis")):
+                      (simulate_campaign, "simulate-campaign"), (convert, "convert"), (single_axis, "single-axis"),
+                      (sweep, "sweep")):
     app.command(name, epilog=LAYOUTS if name in ("identify", "gap", "convert") else None)(command)
 app.add_typer(new, name="new")
 

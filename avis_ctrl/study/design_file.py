@@ -286,8 +286,14 @@ def read_study(path: str | Path) -> tuple[Design, Rig]:
     ------
     InputError : as `read_design`; a rig that is not there or wrong, an uncertain parameter that it does not have.
     """
-    path = Path(path)
-    design = read_design(path)
+    return study_of(read_design(path), Path(path))
+
+
+def study_of(design: Design, path: Path) -> tuple[Design, Rig]:
+    """A design with the content of its uncertainty file, and its rig; files are relative to the design file's path.
+
+    Raises InputError as `read_study`.
+    """
     beside = path.parent / design.rig
     if design.rig not in SHIPPED and not beside.is_file():
         raise InputError(f"expected one of {', '.join(SHIPPED)}, or the path of a rig file relative to the design file",

@@ -12,17 +12,19 @@ import avis_ctrl
 from avis_ctrl.rigs.rig import Rig
 
 
-def provenance(rig: Rig, inputs: str, seed: int, seconds: float, libraries: tuple[str, ...], /, **own: Any
+def provenance(rig: Rig | None, inputs: str, seed: int | None, seconds: float, libraries: tuple[str, ...], /, **own: Any
                ) -> dict[str, Any]:
     """The section `provenance` of a result file.
 
     Parameters
     ----------
-    rig : its parameters count among the hashed inputs. inputs : everything else that the result depends on, as text.
+    rig : its parameters count among the hashed inputs; None where these name it. inputs : everything else that the
+        result depends on, as text.
     seconds : of computing. libraries : distributions whose versions may change the last digits. own : further entries
         of this kind of result, which stand first.
     """
-    text = repr(sorted((name, one.value) for name, one in rig.parameters().items())) + inputs
+    values = [] if rig is None else sorted((name, one.value) for name, one in rig.parameters().items())
+    text = repr(values) + inputs
     return {"avis_ctrl": avis_ctrl.__version__, **own, "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
             "seed": seed, "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
             "python": platform.python_version(), **{name: metadata.version(name) for name in libraries}}

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from typing import Any
 
@@ -15,8 +16,9 @@ MOST = 2
 WATCH_S = 1.0
 
 
-def _as_worker(parent: int) -> None:
-    """Ctrl-C and SIGTERM end a worker at once and silently (the parent speaks); so does the parent's own death."""
+def as_worker(parent: int) -> None:
+    """Make this process a worker: Ctrl-C and SIGTERM end it at once and silently (the parent speaks); so does the
+    parent's own death."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)
 
@@ -27,17 +29,32 @@ def _as_worker(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
+_alone = False
+
+
+@contextlib.contextmanager
+def alone() -> Iterator[None]:
+    """Within it, `Workers` and `each` compute in this process: for one of many processes that fill the machine."""
+    global _alone
+    before, _alone = _alone, True
+    try:
+        yield
+    finally:
+        _alone = before
+
+
 class Workers:
     """A pool where there are processors for one, else the same calls one after the other in this process."""
 
     def __init__(self, count: int | None = None):
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self._count = min(MOST, available) if count is None else count
+        most = 1 if _alone else MOST
+        self._count = min(most, available) if count is None else count
 
     def __enter__(self) -> Workers:
         # A forked child has the compiled code and the libraries already.
         method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-        self._pool = (ProcessPoolExecutor(self._count, multiprocessing.get_context(method), _as_worker, (os.getpid(),))
+        self._pool = (ProcessPoolExecutor(self._count, multiprocessing.get_context(method), as_worker, (os.getpid(),))
                       if self._count > 1 else None)
         self._others = set(multiprocessing.active_children())
         return self

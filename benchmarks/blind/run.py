@@ -119,19 +119,20 @@ class Pool:
         return done
 
 
-def line_of(one: _Running, settings: Settings) -> Line | None:
-    """The line of an ended case; None where it is the truth that failed, which is not the finder's fault."""
-    told = dict(one.told)
+def line_of(seed: int, known: dict[str, Any], settings: Settings, exitcode: int | None = None) -> Line | None:
+    """The line of an ended case from what its worker has told; None where it is the truth that failed, which is not
+    the finder's fault; known["truth_failed"] then says why."""
+    told = dict(known)
     if "simulation_seconds" not in told:
         return None
     if "answer" in told:
         told.pop("crash", None)  # the answer stands, whatever happened to the prediction after it
     elif "crash" not in told:
-        told["crash"] = f"the worker ended with code {one.process.exitcode} before it answered"
+        told["crash"] = f"the worker ended with code {exitcode} before it answered"
     told.pop("truth_failed", None)
     absent: dict[str, Any] = dict.fromkeys(("answer", "crash", "seconds", "cpu_seconds", "memory_MB", "unseen",
                                             "unseen_error"))
-    content = absent | told | {"seed": one.seed, "settings": settings.model_dump()}
+    content = absent | told | {"seed": seed, "settings": settings.model_dump()}
     try:
         return Line.model_validate(content)
     except ValueError as error:
@@ -140,7 +141,7 @@ def line_of(one: _Running, settings: Settings) -> Line | None:
         # An answer that is no gap.json is a crash of the finder; a description of the truth that is wrong is not.
         return Line.model_validate(content | {"answer": None, "unseen": None, "crash": told.get("crash", wrong)})
     except ValueError as error:
-        one.told["truth_failed"] = str(error)
+        known["truth_failed"] = str(error)
         return None
 
 
@@ -162,7 +163,7 @@ def run(settings: Settings, seeds: Iterable[int], out: Path, *, resume: bool = F
             while waiting and len(pool.running) < settings.jobs:
                 pool.start(waiting.pop(0))
             for one in pool.ended():
-                line, count = line_of(one, settings), count + 1
+                line, count = line_of(one.seed, one.told, settings, one.process.exitcode), count + 1
                 if line is None:
                     failed.append(one.seed)
                     text = one.told.get("truth_failed", one.told.get("crash", "its worker was killed")).strip()

@@ -237,3 +237,32 @@ def test_memory_of_parent_and_child_counts_shared_pages_once():
     """In a process of its own, whose memory nobody else changes."""
     done = subprocess.run([sys.executable, "-c", HOLDER], cwd=ROOT, capture_output=True, text=True, check=True)
     assert 220 < float(done.stdout) < 300
+
+
+def test_cases_as_points_of_a_sweep(modules, tmp_path, capsys):
+    """The same lines as the runner's, but for what was measured; a truth that fails is a row that says why."""
+    from avis_ctrl.sweep.local import on_this_machine
+    from avis_ctrl.sweep.output import write_sweep
+    from avis_ctrl.sweep.run import plan_sweep, run_sweep
+    from benchmarks.blind import sweep
+
+    out = tmp_path / "out"
+    (out / "points").mkdir(parents=True)
+    (tmp_path / "blind.toml").write_text(
+        f'kind = "function"\nbase = "{ROOT}/benchmarks/blind/sweep.py:case"\n' + "".join(
+            f'[[vary]]\nkey = "{key}"\nvalues = {values!r}\n' for key, values in {
+                "seed": [1, 2, 8, 90], "duration_s": [0.1], **{name: [one] for name, one in modules.items()}}.items()))
+    found = run_sweep(plan_sweep(tmp_path / "blind.toml", out), lambda tasks: on_this_machine(tasks, 1))
+    write_sweep(found, out)
+    assert [row.status for row in found.rows] == ["done", "done", "done", "failed"]
+    assert found.rows[3].message == "seed = 90: the truth failed: ValueError: no such case"
+    assert [row.figures["named"] for row in found.rows[:3]] == ["", "crash", ""]
+    sweep.main([str(out), "--out", str(tmp_path / "swept.jsonl")])
+    measured = {"seconds", "cpu_seconds", "memory_MB", "simulation_seconds", "crash", "settings"}
+    run(settings(jobs=1), [1, 2, 8], tmp_path / "run.jsonl", **modules)
+    both = [[line.model_dump(exclude=measured) for line in read_lines(tmp_path / name)]
+            for name in ("swept.jsonl", "run.jsonl")]
+    assert sorted(both[0], key=lambda line: line["seed"]) == sorted(both[1], key=lambda line: line["seed"])
+    with pytest.raises(SystemExit) as stopped:
+        sweep.main([str(tmp_path), "--out", str(tmp_path / "none.jsonl")])
+    assert stopped.value.code == 2 and "expected the folder of a sweep" in capsys.readouterr().err

@@ -1,0 +1,73 @@
+"""`avis sweep`: many designs, skyhooks or gaps from one file of points."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def sweep(
+    points: Annotated[Path, typer.Argument(metavar="POINTS.toml", help="a base and what varies (docs/sweep.md)")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the table, the picture and the points")],
+    scheduler: Annotated[str | None, typer.Option("--scheduler", metavar="ADDRESS", help="a dask scheduler of a "
+                                                  "cluster, such as tcp://HOST:8786")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, metavar="N", help="start a dask scheduler with N "
+                                                "workers on this machine")] = None,
+    jobs: Annotated[int | None, typer.Option("--jobs", min=1, metavar="N", help="processes without dask; by default "
+                                             "one for each processor")] = None,
+) -> None:
+    """Compute many points, each kept in a file of its own, and write a table and their Pareto front.
+
+    Writes points/HASH.json as each point is finished, then sweep.csv, pareto.png, sweep.html and sweep.json into DIR.
+    After a kill at any moment the same command goes on where it was. A point that fails is a row that says why.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from avis_ctrl.errors import ComputationError, InputError
+    from avis_ctrl.study.files import open_folder, output_folder
+    from avis_ctrl.sweep.cluster import on_cluster, require_distributed
+    from avis_ctrl.sweep.local import available, on_this_machine
+    from avis_ctrl.sweep.output import FILES, front_of, write_sweep
+    from avis_ctrl.sweep.run import POINTS, plan_sweep, run_sweep
+
+    if sum(one is not None for one in (scheduler, workers, jobs)) > 1:
+        raise InputError("expected one of --scheduler, --workers and --jobs at most", field="options")
+    if scheduler is not None or workers is not None:
+        require_distributed()
+        backend = partial(on_cluster, address=scheduler, workers=workers or 0)
+    else:
+        backend = partial(on_this_machine, jobs=jobs or available())
+    console = Console(highlight=False)
+    plan = plan_sweep(points, out)
+    with output_folder(out, FILES, (POINTS,)) as folder:
+        open_folder(folder / POINTS)
+        bar = Progress(TextColumn("points"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+                       console=console, disable=not console.is_terminal)
+        with bar:
+            shown = bar.add_task("points", total=None)
+
+            def progress(done: int, total: int, text: str) -> None:
+                bar.update(shown, completed=done, total=total)
+                if text or not console.is_terminal:
+                    console.print(f"[dim]{done} of {total}[/]", *([text] if text else []), soft_wrap=True)
+            try:
+                found = run_sweep(plan, backend, progress)
+            except KeyboardInterrupt:
+                console.print("Finished points are kept; the same command goes on where it was.")
+                raise
+        files = write_sweep(found, folder)
+    rows, front = found.rows, front_of(found)
+    count = {status: sum(row.status == status for row in rows) for status in ("done", "failed", "lost")}
+    console.print(f"{len(rows)} points: {', '.join(f'{n} {status}' for status, n in count.items() if n)}; "
+                  f"{found.computed} computed now; {len(front)} on the Pareto front")
+    console.print(f"{len(files)} files in {folder}; open {folder / 'sweep.html'} or {folder / 'sweep.csv'}")
+    if count["lost"]:
+        why = next(row.message for row in rows if row.status == "lost")
+        raise ComputationError(f"{count['lost']} points are not finished", cause=why,
+                               next_step="run the same command again: finished points are kept")
+    if not count["done"]:
+        raise ComputationError("every point failed", cause=rows[0].message)

@@ -1,0 +1,64 @@
+"""Two figures of many points, less of both is better: the front of those that no other point beats."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.plot.axes import axes_of, finish
+
+POINT, FRONT = "#56b4e9", "#0072b2"
+
+
+def pareto_front(values: np.ndarray) -> np.ndarray:
+    """Indices of the points (n, 2) that no other is at most equal to in both and below in one, in order of the first.
+
+    Equal points are all in the front; those with a nan are not.
+    """
+    known = np.flatnonzero(np.all(np.isfinite(values), axis=1))
+    order = known[np.lexsort(values[known].T[::-1])]
+    best, last, front = np.inf, None, []
+    for k in order:
+        if values[k, 1] < best or (last is not None and np.array_equal(values[k], last)):
+            front.append(k)
+            best, last = values[k, 1], values[k]
+    return np.array(front, dtype=int)
+
+
+def pareto(values: np.ndarray, labels: Sequence[str], names: Sequence[str] = (), ax: Any = None, title: str = ""
+           ) -> Any:
+    """The points (n, 2), the front as a line, its points with their names.
+
+    labels : of both axes, with units. names : (n,) of the points. Returns the axes.
+    """
+    ax = axes_of(ax)
+    values = np.asarray(values, dtype=float)
+    front = pareto_front(values)
+    ax.plot(*values.T, "o", markersize=4, color=POINT, label=f"{int(np.sum(np.all(np.isfinite(values), axis=1)))} "
+            "points")
+    ax.step(*values[front].T, "o-", where="post", markersize=5, linewidth=1.2, color=FRONT,
+            label=f"Pareto front, {front.size}")
+    ax.margins(0.08)
+    middle = (np.nanmin(values[:, 0]) + np.nanmax(values[:, 0])) / 2 if front.size else np.nan
+    for k in front if len(names) else ():
+        # Below and left of a point of the front there is none; the first ones have no room there.
+        late = values[k, 0] > middle
+        ax.annotate(names[k], values[k], textcoords="offset points", fontsize="x-small", color=FRONT,
+                    **({"xytext": (-6, -4), "ha": "right", "va": "top"} if late else {"xytext": (6, 5)}))
+    if title:
+        ax.set_title(title, fontsize="medium")
+    return finish(ax, labels[0], labels[1], log=False)
+
+
+def pareto_png(values: np.ndarray, labels: Sequence[str], names: Sequence[str] = (), title: str = "") -> bytes:
+    """`pareto` as the bytes of a PNG file."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.2, 4.8), layout="constrained")
+    pareto(values, labels, names, figure.subplots(), title)
+    stored = io.BytesIO()
+    figure.savefig(stored, format="png", dpi=150)
+    return stored.getvalue()

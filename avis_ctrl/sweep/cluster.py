@@ -1,0 +1,111 @@
+"""Tasks on a cluster, by dask.distributed: on a scheduler that runs, or on one with workers on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.sweep.points import SweepSettings
+from avis_ctrl.sweep.task import Task, lost, perform
+
+
+def require_distributed() -> None:
+    """Raises InputError, with what to do, where dask.distributed is not installed."""
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError("expected dask.distributed: pip install \"avis_ctrl[cluster]\"; without --scheduler and "
+                         "--workers a sweep needs nothing more", field="--scheduler or --workers") from None
+
+
+def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, settings: SweepSettings | None = None
+               ) -> Iterator[dict[str, Any]]:
+    """Contents of the points as they are finished, in any order.
+
+    Points of a worker that dies go to the others.
+
+    Parameters
+    ----------
+    address : of a scheduler; None starts one with `workers` processes here.
+
+    Raises
+    ------
+    InputError : no scheduler at the address, or none with a worker. ComputationError : the scheduler was lost.
+    """
+    require_distributed()
+    settings = settings or SweepSettings()
+    import dask
+    from distributed import Client, LocalCluster, as_completed
+
+    # A worker that is killed, or a scheduler that ends, is said in a row or in one line, not in the library's log.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": settings.deaths - 1,
+                                             "distributed.comm.timeouts.connect": settings.patience_s}))
+        if address is None:
+            with _ignored_interrupts():
+                cluster = stack.enter_context(LocalCluster(
+                    n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
+                    silence_logs=logging.CRITICAL))
+            address = cluster.scheduler_address
+        client = stack.enter_context(_connected(Client, address, settings.patience_s))
+        # A task has its identity for name: a resumed sweep joins what still runs of the one before.
+        by_name = {f"avis-sweep-{os.fspath(task.folder)}-{task.identity}": task for task in tasks}
+        futures = [client.submit(perform, task, key=name) for name, task in by_name.items()]
+        for future in as_completed(futures, loop=client.loop):
+            yield _content(future, by_name[future.key])
+            future.release()
+
+
+@contextlib.contextmanager
+def _ignored_interrupts() -> Iterator[None]:
+    """Processes that are started in it ignore Ctrl-C, which a terminal sends to all: the parent ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _connected(client_of: Any, address: str, patience_s: float) -> Iterator[Any]:
+    try:
+        client = client_of(address, timeout=patience_s, set_as_default=False)
+    except (OSError, ValueError, TypeError, KeyError, ImportError) as error:
+        raise InputError(f"expected the address of a dask scheduler, such as tcp://HOST:8786 "
+                         f"({' '.join(str(error).split()) or type(error).__name__})", field="--scheduler",
+                         value=address) from None
+    try:
+        try:
+            client.wait_for_workers(1, timeout=patience_s)
+        except TimeoutError:
+            raise InputError(f"expected a scheduler with a worker; none came within {patience_s:g} s; start one with "
+                             f"dask worker {address} --nthreads 1", field="--scheduler", value=address) from None
+        yield client
+    finally:
+        with contextlib.suppress(TimeoutError, OSError):
+            client.close(timeout=5)
+
+
+def _content(future: Any, task: Task) -> dict[str, Any]:
+    from distributed import CancelledError, KilledWorker
+
+    try:
+        # It also waits where a worker died with a result that nobody had fetched: another one reads the point's file.
+        return future.result()
+    except KilledWorker:
+        return lost(task, "every process that computed it died; likely cause: memory, or a fault in compiled code")
+    except CancelledError:
+        raise ComputationError("the scheduler was lost", next_step="run the same command again: finished points are "
+                               "kept") from None
+    except Exception as error:  # a worker that cannot load the package, for example
+        return lost(task, f"{type(error).__name__}: {' '.join(str(error).split())}")

@@ -1,0 +1,116 @@
+"""Points that are designs: the certified mu controller, or the skyhook of the classical rule, which takes seconds."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.file_errors import read_toml
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_writer import rig_toml
+from avis_ctrl.study.analysis import analyse
+from avis_ctrl.study.design_file import Design, design_from_table, study_of
+from avis_ctrl.study.design_result import ControllerResult
+from avis_ctrl.study.output import controller_dict
+from avis_ctrl.study.plant import build_plant
+from avis_ctrl.study.random_plants import random_perturbations
+from avis_ctrl.study.runner import run_design
+from avis_ctrl.study.skyhooks import classical_skyhook
+from avis_ctrl.sweep.keys import FACTOR, VALUE, expanded, keys_of, put, with_rig_keys
+from avis_ctrl.sweep.points_file import PointsFile
+
+KEYS = {**keys_of(Design), "base": False}
+BAND = "worst_case_band_transmissibility_dB"
+
+
+@dataclass(frozen=True, eq=False)
+class DesignBase:
+    """A design file. The key `base` of a point names another one: another structure."""
+
+    path: Path
+    skyhook: bool
+    table: dict[str, Any]
+    rig: Rig
+    others: dict[str, DesignBase] = field(default_factory=dict)
+    quantities: Mapping[str, str] = field(default_factory=lambda: {
+        "mu_upper": "mu, upper bound [1]", "mu_lower": "mu, lower bound [1]", "guaranteed": "bounds proved",
+        "worst_case_peak_transmissibility_dB": "worst-case transmissibility, peak [dB]",
+        BAND: "worst-case transmissibility in the band [dB]", "order": "states of the controller [1]"})
+    pareto: tuple[str, str] | None = ("mu_upper", BAND)
+
+    @classmethod
+    def read(cls, file: PointsFile, folder: Path) -> DesignBase:
+        """Raises InputError for a base that is not there or is no design file."""
+        if file.rig is not None:
+            raise InputError("expected no rig: the design file names it; vary the key \"rig\"", field="rig",
+                             value=file.rig)
+        return cls.of(folder / file.base, file.kind == "skyhook")
+
+    @classmethod
+    def of(cls, path: Path, skyhook: bool) -> DesignBase:
+        """The base of a path."""
+        table = read_toml(path, "a design file such as designs/avis_z_phix.toml")
+        return cls(path, skyhook, table, study_of(design_from_table(table, path), path)[1])
+
+    def expand(self, key: str) -> Sequence[str]:
+        """Keys of a design file, and parameters of its rig."""
+        return expanded(key, KEYS, self.rig)
+
+    def job(self, point: Mapping[str, Any]) -> DesignJob:
+        """The design and the rig of a point."""
+        if (other := point.get("base")) is not None:
+            if not isinstance(other, str):
+                raise InputError("expected the name of a design file", field="base", value=other)
+            if other not in self.others:
+                self.others[other] = DesignBase.of(self.path.parent / other, self.skyhook)
+            return self.others[other].job({key: value for key, value in point.items() if key != "base"})
+        table = copy.deepcopy(self.table)
+        for key, value in point.items():
+            if not key.startswith((VALUE, FACTOR)):
+                put(table, key, value, KEYS)
+        design, rig = study_of(design_from_table(table), self.path)
+        return DesignJob(design, with_rig_keys(rig, point), self.skyhook)
+
+
+@dataclass(frozen=True, eq=False)
+class DesignJob:
+    """One design on one rig."""
+
+    design: Design
+    rig: Rig
+    skyhook: bool
+
+    @property
+    def inputs(self) -> str:
+        """The design without its title, and the rig file."""
+        return self.design.model_dump_json(exclude={"title"}) + rig_toml(self.rig)
+
+    def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Figures of the controller, and the controller itself."""
+        found, further = self._skyhook() if self.skyhook else self._mu()
+        return figures_of(found) | further, {"controller": controller_dict(found)}
+
+    def _mu(self) -> tuple[ControllerResult, dict[str, Any]]:
+        result = run_design(self.design, self.rig)
+        return result.controller("mu"), {"stable": result.stable,
+                                         "requirements_met": all(one.met for one in result.requirements)}
+
+    def _skyhook(self) -> tuple[ControllerResult, dict[str, Any]]:
+        plant = build_plant(self.design, self.rig)
+        made = classical_skyhook(plant, self.rig, self.design)
+        samples = random_perturbations(plant, 0, self.design.simulation.seed)
+        return analyse(self.design, plant, made.K, made.name, made.title, made.kind, samples, made.notes), {}
+
+
+def figures_of(found: ControllerResult) -> dict[str, Any]:
+    """What the table shows of a controller."""
+    return {"mu_upper": found.mu.upper, "mu_lower": found.mu.lower,
+            "guaranteed": found.mu.guaranteed and found.worst_peak.guaranteed and found.worst_band.guaranteed,
+            "worst_case_peak_transmissibility_dB": 20 * float(np.log10(found.worst_peak.upper)),
+            BAND: 20 * float(np.log10(found.worst_band.upper)), "order": found.order}

@@ -1,0 +1,91 @@
+"""Points that are calls of a function of the user's own, from a Python file."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.study.files import as_json
+from avis_ctrl.sweep.points_file import PointsFile
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionBase:
+    """FILE.py:NAME. Its source goes to the workers, so that they need no copy of the file."""
+
+    source: str
+    path: Path
+    name: str
+    quantities: Mapping[str, str] = field(default_factory=dict)
+    pareto: tuple[str, str] | None = None
+
+    @classmethod
+    def read(cls, file: PointsFile, folder: Path) -> FunctionBase:
+        """Raises InputError for a file that is not there or has no such function. The file is run."""
+        where, _, name = file.base.partition(":")
+        if not where.endswith(".py") or not name:
+            raise InputError("expected FILE.py:NAME", field="base", value=file.base)
+        path = (folder / where).resolve()
+        try:
+            made = cls(path.read_text(encoding="utf-8"), path, name)
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"expected a Python file ({getattr(error, 'strerror', None) or error})", file=path
+                             ) from None
+        FunctionJob(made.source, path, name, {}).function()
+        return made
+
+    def expand(self, key: str) -> Sequence[str]:
+        """Any key is one of the function's."""
+        return [key]
+
+    def job(self, point: Mapping[str, Any]) -> FunctionJob:
+        """The call of a point."""
+        return FunctionJob(self.source, self.path, self.name, dict(point))
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionJob:
+    """NAME(point), which returns figures by name, or these and details that only the point's file keeps.
+
+    The code runs with the rights of the user.
+    """
+
+    source: str
+    path: Path
+    name: str
+    point: dict[str, Any]
+
+    @property
+    def inputs(self) -> str:
+        """The source, the name and the values."""
+        return f"{self.source}\n{self.name}\n{self.point!r}"
+
+    def function(self) -> Any:
+        """Run the file. Raises InputError where it does not run or has no such function."""
+        module = types.ModuleType(f"avis_sweep_{self.path.stem}")
+        module.__file__ = str(self.path)
+        try:
+            exec(compile(self.source, str(self.path), "exec"), module.__dict__)
+        except (Exception, SystemExit) as error:
+            raise InputError(f"expected a Python file that runs: {type(error).__name__}: "
+                             f"{' '.join(str(error).split())}", file=self.path) from None
+        if not callable(found := getattr(module, self.name, None)):
+            raise InputError("expected the name of a function in the file", file=self.path, field="base",
+                             value=self.name)
+        return found
+
+    def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The figures that the function returns, and what else it returns beside them."""
+        found = self.function()(dict(self.point))
+        figures, details = found if isinstance(found, tuple) and len(found) == 2 else (found, None)
+        if not isinstance(figures, dict) or not all(isinstance(name, str) for name in figures):
+            raise InputError("expected figures by name", field=self.name, value=type(figures).__name__)
+        try:
+            as_json({"figures": figures, "details": details})
+        except (TypeError, ValueError) as error:
+            raise InputError(f"expected numbers and text: {error}", field=self.name) from None
+        return figures, {} if details is None else {"details": details}

@@ -1,0 +1,122 @@
+"""Points that are searches for what a model misses: campaigns, rigs, options of `avis gap`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.campaign import Campaign, digest
+from avis_ctrl.measurement.formats import read_measurements
+from avis_ctrl.rigs.file_errors import first_complaint
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_file import SHIPPED, load_rig
+from avis_ctrl.rigs.rig_writer import rig_toml
+from avis_ctrl.study.gap import GapOptions, find_gap
+from avis_ctrl.sweep.keys import FACTOR, VALUE, expanded, keys_of, with_rig_keys
+from avis_ctrl.sweep.points_file import PointsFile
+
+Hertz = Annotated[float, Field(gt=0)]
+
+
+class Options(BaseModel):
+    """The options of `avis gap` that may vary, checked."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+    seed: Annotated[int, Field(ge=0)] = 1
+    band_Hz: Annotated[list[Hertz], Field(min_length=2, max_length=2)] | None = None
+    gates: bool = True
+    despite_gates: bool = False
+    amplifier_corner_Hz: Hertz | None = None
+
+
+KEYS = {**keys_of(Options), "base": False, "rig": False}
+
+
+@dataclass(frozen=True, eq=False)
+class GapBase:
+    """A campaign and a rig; the keys `base` and `rig` of a point name others."""
+
+    folder: Path
+    campaign: str
+    rig_name: str
+    rig: Rig
+    digests: dict[Path, str] = field(default_factory=dict)
+    quantities: Mapping[str, str] = field(default_factory=lambda: {
+        "verdict": "verdict", "effects": "named effects", "nrmse_nominal": "gap before [1]",
+        "nrmse_identified": "gap after identification [1]", "nrmse": "gap with the named effects [1]",
+        "noise_nrmse": "noise [1]", "search_seconds": "time of the search [s]"})
+    pareto: tuple[str, str] | None = ("search_seconds", "nrmse")
+
+    @classmethod
+    def read(cls, file: PointsFile, folder: Path) -> GapBase:
+        """Raises InputError for a campaign or a rig that is not there."""
+        if file.rig is None:
+            raise InputError("this key is missing: the rig of the campaign", field="rig")
+        made = cls(folder, file.base, file.rig, _rig(folder, file.rig))
+        made.job({})
+        return made
+
+    def expand(self, key: str) -> Sequence[str]:
+        """Options of `avis gap`, and parameters of the rig."""
+        return expanded(key, KEYS, self.rig)
+
+    def job(self, point: Mapping[str, Any]) -> GapJob:
+        """The campaign, the rig and the options of a point."""
+        names = {"base": self.campaign, "rig": self.rig_name} | {key: point[key] for key in ("base", "rig")
+                                                                if key in point}
+        if wrong := [key for key, name in names.items() if not isinstance(name, str)]:
+            raise InputError("expected the name of a file", field=wrong[0], value=names[wrong[0]])
+        given = {key: value for key, value in point.items() if key not in names and
+                 not key.startswith((VALUE, FACTOR))}
+        try:
+            options = Options.model_validate(given)
+        except ValidationError as error:
+            raise first_complaint(error, Options) from None
+        path = (self.folder / names["base"]).resolve()
+        if path not in self.digests:
+            self.digests[path] = digest(_campaign(path))
+        return GapJob(path, self.digests[path], with_rig_keys(_rig(self.folder, names["rig"]), point), options)
+
+
+@dataclass(frozen=True, eq=False)
+class GapJob:
+    """One search; the campaign is read where it is computed, because it may be large."""
+
+    campaign: Path
+    digest: str
+    rig: Rig
+    options: Options
+
+    @property
+    def inputs(self) -> str:
+        """The samples' hash, the options and the rig file."""
+        return self.digest + self.options.model_dump_json() + rig_toml(self.rig)
+
+    def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Figures of the finding, and gap.json."""
+        o = self.options
+        band = None if o.band_Hz is None else (o.band_Hz[0], o.band_Hz[1])
+        found = find_gap(_campaign(self.campaign), self.rig,
+                         GapOptions(o.seed, band, o.gates, o.despite_gates, o.amplifier_corner_Hz))
+        gap, errors = found.gap, [stage.nrmse for stage in found.gap.stages]
+        figures = {"verdict": gap.verdict, "effects": "; ".join(f"{one.name} at {one.location}" for one in gap.effects),
+                   "nrmse_nominal": errors[0], "nrmse_identified": errors[1], "nrmse": errors[-1],
+                   "noise_nrmse": gap.noise_nrmse, "search_seconds": gap.seconds}
+        return figures, {"gap": found.to_json()}
+
+
+def _campaign(path: Path) -> Campaign:
+    measured = read_measurements(path)
+    if not isinstance(measured, Campaign):
+        raise InputError("expected records, found frequency responses", file=path)
+    return measured
+
+
+def _rig(folder: Path, name: str) -> Rig:
+    return load_rig(name if name in SHIPPED else folder / name)

@@ -1,0 +1,16 @@
+"""What is computed at a point."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+
+class Job(Protocol):
+    """A point with everything that its result depends on; goes to another process whole."""
+
+    @property
+    def inputs(self) -> str:
+        """Everything that the result depends on, as text."""
+
+    def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Figures for the table, and what else is kept. Raises AvisError."""

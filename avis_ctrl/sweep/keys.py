@@ -1,0 +1,82 @@
+"""Keys that may vary: those of a file's sections, and the parameters of its rig."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from typing import Any, get_args, get_origin
+
+from pydantic import BaseModel
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.rig import Rig
+
+# What stands before a parameter's name: its value, or a factor of the rig file's value.
+VALUE, FACTOR = "rig.", "rig_factor."
+
+
+def keys_of(model: type[BaseModel], before: str = "") -> dict[str, bool]:
+    """Dotted keys of a file's model; True for a table whose own keys are free, such as parameters_percent."""
+    found: dict[str, bool] = {}
+    for name, field in model.model_fields.items():
+        kinds = [one for one in (field.annotation, *get_args(field.annotation)) if one is not type(None)]
+        found[f"{before}{name}"] = any(get_origin(one) is dict for one in kinds)
+        inner = [one for one in kinds if isinstance(one, type) and issubclass(one, BaseModel)]
+        if inner and str not in kinds and get_origin(field.annotation) is not list:
+            found |= keys_of(inner[0], f"{before}{name}.")
+    return found
+
+
+def parts_of(key: str, known: Mapping[str, bool]) -> list[str]:
+    """The way to a key: a free key ("isolator*.k_z") keeps its dots."""
+    for table in (name for name, free in known.items() if free and key.startswith(f"{name}.")):
+        return [*table.split("."), key[len(table) + 1:]]
+    return key.split(".")
+
+
+def put(table: dict[str, Any], key: str, value: Any, known: Mapping[str, bool]) -> None:
+    """Set a key in a table of tables."""
+    *parents, last = parts_of(key, known)
+    for name in parents:
+        table = table.setdefault(name, {})
+    table[last] = value
+
+
+def expanded(key: str, known: Mapping[str, bool], rig: Rig) -> list[str]:
+    """The keys that one with wildcards stands for.
+
+    Raises InputError with the nearest keys that there are.
+    """
+    if key in known or any(free and key.startswith(f"{name}.") for name, free in known.items()):
+        return [key]
+    names = [f"{before}{name}" for before in (VALUE, FACTOR) for name in rig.parameters()]
+    if found := [name for name in names if fnmatchcase(name, key)]:
+        return found
+    every = [*known, *names]
+    last = {name.rpartition(".")[2]: name for name in reversed(every)}
+    near = [*difflib.get_close_matches(key, every, n=3),
+            *(last[one] for one in difflib.get_close_matches(key.rpartition(".")[2], last, n=2))]
+    hint = f"did you mean {' or '.join(dict.fromkeys(near))}?" if near else f"expected one of {', '.join(known)}"
+    raise InputError(f"unknown key; {hint}", field="key", value=key)
+
+
+def with_rig_keys(rig: Rig, point: Mapping[str, Any]) -> Rig:
+    """The rig with the values and factors of a point. Raises InputError for a name or value that does not fit."""
+    changes: dict[str, float] = {}
+    for key, value in point.items():
+        before = next((one for one in (VALUE, FACTOR) if key.startswith(one)), None)
+        if before is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise InputError("expected a number", field=key, value=value)
+        for name in _names(rig, key, before):
+            if name in changes:
+                raise InputError(f"{name} is set twice", field=key, value=value)
+            changes[name] = value * (rig.parameters()[name].value if before == FACTOR else 1.0)
+    return rig.with_parameters(changes) if changes else rig
+
+
+def _names(rig: Rig, key: str, before: str) -> Sequence[str]:
+    pattern = key.removeprefix(before)
+    return [name for name in rig.parameters() if fnmatchcase(name, pattern)] or [pattern]

@@ -1,0 +1,67 @@
+"""Tasks on the processors of this machine, by joblib."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import joblib
+from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+from avis_ctrl.study.workers import as_worker
+from avis_ctrl.sweep.task import Task, lost, perform
+
+_parent: int | None = None
+
+
+def available() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def on_this_machine(tasks: Sequence[Task], jobs: int) -> Iterator[dict[str, Any]]:
+    """Contents of the points as they are finished, in any order.
+
+    If a process is killed, the points under way are computed again, each alone; only a point whose process dies then,
+    too, is lost.
+    """
+    if jobs == 1:
+        yield from map(perform, tasks)
+        return
+    waiting, suspects = list(tasks), list[Task]()
+    while waiting or suspects:
+        batch = waiting or [suspects.pop(0)]
+        handed_out: list[Task] = []
+        finished: set[str] = set()
+        try:
+            for content in _parallel(batch, jobs, handed_out):
+                finished.add(content["identity"])
+                yield content
+            waiting = []
+        except TerminatedWorkerError:
+            if not waiting:
+                yield lost(batch[0], "its process was killed twice; likely cause: memory, or a fault in compiled code")
+                continue
+            suspects += [task for task in handed_out if task.identity not in finished]
+            waiting = waiting[len(handed_out):]
+
+
+def _parallel(tasks: Sequence[Task], jobs: int, handed_out: list[Task]) -> Iterator[dict[str, Any]]:
+    def calls() -> Iterator[Any]:
+        for task in tasks:
+            handed_out.append(task)
+            yield joblib.delayed(_in_worker)(task, os.getpid())
+    # One task at a time to each process, and none before a process is free: what is under way is known.
+    parallel = joblib.Parallel(jobs, backend="loky", return_as="generator_unordered", batch_size=1,
+                               pre_dispatch=jobs, max_nbytes=None)
+    yield from parallel(calls())
+
+
+def _in_worker(task: Task, parent: int) -> dict[str, Any]:
+    """`perform` in a process that ends with its parent."""
+    global _parent
+    if _parent != parent:
+        as_worker(parent)
+        _parent = parent
+    return perform(task)

@@ -1,0 +1,112 @@
+"""Files of a sweep: table, JSON, Pareto picture, a page."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import json
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avis_ctrl.errors import InputError
+from avis_ctrl.files import write_together
+from avis_ctrl.plot.pareto import pareto_front, pareto_png
+from avis_ctrl.study.files import as_json
+from avis_ctrl.summary import html_table
+from avis_ctrl.sweep.run import Row, Sweep
+
+FILES = "sweep.csv", "pareto.png", "sweep.html", "sweep.json"
+
+
+def front_of(sweep: Sweep) -> list[int]:
+    """Places of the rows on the Pareto front. Raises InputError for a quantity that no row has."""
+    return [] if sweep.pareto is None else pareto_front(_values(sweep)).tolist()
+
+
+def columns(sweep: Sweep) -> tuple[list[str], list[str]]:
+    """Names of what varies and of the figures, in the order of their first row."""
+    keys = dict.fromkeys(key for row in sweep.rows for key in row.point)
+    figures = dict.fromkeys([*sweep.quantities, *(name for row in sweep.rows for name in row.figures)])
+    return [*keys], [*figures]
+
+
+def write_sweep(sweep: Sweep, folder: Path) -> list[Path]:
+    """All files or none, sweep.json last. Raises InputError as `front_of`, ComputationError where the disk refuses."""
+    front, contents = front_of(sweep), {"sweep.csv": _csv(sweep).encode()}
+    drawn = sweep.pareto is not None and bool(front)
+    if drawn:
+        assert sweep.pareto is not None
+        # Two values of a few points can be read; else a point is the number of its row.
+        in_words = len(front) <= 12 and len(columns(sweep)[0]) <= 2
+        names = [", ".join(f"{key.rpartition('.')[2]} {_short(row.point[key])}" for key in row.point)
+                 if in_words else str(k + 1) for k, row in enumerate(sweep.rows)]
+        labels = [sweep.quantities.get(name, name) for name in sweep.pareto]
+        contents["pareto.png"] = pareto_png(_values(sweep), labels, names, sweep.file.title)
+    contents["sweep.html"] = _page(sweep, front, contents.get("pareto.png")).encode()
+    contents["sweep.json"] = as_json(_dict(sweep, front))
+    return write_together(folder, contents, [folder / name for name in FILES])
+
+
+def _values(sweep: Sweep) -> np.ndarray:
+    assert sweep.pareto is not None
+    known = columns(sweep)[1] + columns(sweep)[0]
+    for name in sweep.pareto:
+        if name not in known:
+            raise InputError(f"expected some of {', '.join(known)}", field="pareto", value=name)
+    return np.array([[_number(row, name) for name in sweep.pareto] for row in sweep.rows])
+
+
+def _number(row: Row, name: str) -> float:
+    value = {**row.point, **row.figures}.get(name)
+    return float(value) if row.status == "done" and isinstance(value, (int, float)) else float("nan")
+
+
+def _cells(sweep: Sweep, row: Row) -> list[Any]:
+    keys, figures = columns(sweep)
+    return [*(row.point.get(key) for key in keys), *(row.figures.get(name) for name in figures), row.seconds,
+            row.status, row.message, row.identity]
+
+
+def _head(sweep: Sweep) -> list[str]:
+    keys, figures = columns(sweep)
+    return [*keys, *figures, "seconds", "status", "message", "identity"]
+
+
+def _csv(sweep: Sweep) -> str:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(_head(sweep))
+    for row in sweep.rows:
+        table.writerow(["" if cell is None else cell if isinstance(cell, str) else json.dumps(cell, default=str)
+                        for cell in _cells(sweep, row)])
+    return text.getvalue()
+
+
+def _dict(sweep: Sweep, front: list[int]) -> dict[str, Any]:
+    rows = [{"identity": row.identity or None, "parameters": row.point, "status": row.status, "message": row.message,
+             "seconds": row.seconds, "figures": row.figures} for row in sweep.rows]
+    pareto = None if sweep.pareto is None else {"quantities": sweep.pareto, "front": [k + 1 for k in front]}
+    return {"format": "avis-sweep", "version": 1, "title": sweep.file.title, "kind": sweep.file.kind,
+            "quantities": sweep.quantities, "points": rows, "pareto": pareto, "computed": sweep.computed,
+            "provenance": sweep.provenance}
+
+
+def _page(sweep: Sweep, front: list[int], png: bytes | None) -> str:
+    picture = f'<p><img alt="Pareto front" src="data:image/png;base64,{base64.b64encode(png).decode()}" ' \
+              'style="max-width:100%"></p>' if png else ""
+    rows = [[f"{k + 1}{' *' if k in front else ''}", *("" if cell is None else _short(cell)
+                                                       for cell in _cells(sweep, row)[:-1])]
+            for k, row in enumerate(sweep.rows)]
+    said = "<p>* on the Pareto front</p>" if front else ""
+    return ("<!doctype html><meta charset=utf-8>"
+            "<style>body{font:14px sans-serif;margin:2em}td,th{padding:2px 8px;border-bottom:1px solid #ddd}</style>"
+            f"<title>{escape(sweep.file.title)}</title><h1>{escape(sweep.file.title)}</h1>{picture}"
+            f"{html_table(rows, ['point', *_head(sweep)[:-1]])}{said}")
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

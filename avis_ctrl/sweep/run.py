@@ -1,0 +1,132 @@
+"""A whole sweep: points, what is finished of them, the rest computed, a table."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from avis_ctrl.errors import AvisError, InputError
+from avis_ctrl.study.provenance import provenance
+from avis_ctrl.sweep.kinds import Base, open_base
+from avis_ctrl.sweep.local import on_this_machine
+from avis_ctrl.sweep.points import Point, SweepSettings, points_of
+from avis_ctrl.sweep.points_file import PointsFile, read_points_file
+from avis_ctrl.sweep.task import LASTING, Task, identity_of, read_point, save_point
+
+Backend = Callable[[Sequence[Task]], Iterator[dict[str, Any]]]
+# Points finished, of how many, and what is known of the last one.
+Progress = Callable[[int, int, str], None]
+POINTS = "points"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A point of the table. status : done, failed (the message says why), lost (computed again next time)."""
+
+    identity: str
+    point: Point
+    status: str
+    message: str
+    seconds: float | None
+    figures: Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """All rows in the order of the file of points.
+
+    quantities : labels of the figures. pareto : the two of the picture; None where there are none. computed : points
+    that this run computed, the others were there.
+    """
+
+    file: PointsFile
+    rows: tuple[Row, ...]
+    quantities: Mapping[str, str]
+    pareto: tuple[str, str] | None
+    computed: int
+    provenance: Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A checked file of points: a task for each of them, or why there is none."""
+
+    path: Path
+    file: PointsFile
+    base: Base
+    points: tuple[Point, ...]
+    tasks: tuple[Task | InputError, ...]
+
+
+def plan_sweep(path: Path, folder: Path, settings: SweepSettings | None = None) -> Plan:
+    """Check a file of points before anything is computed or written.
+
+    Raises
+    ------
+    InputError : a file, a base or a key that is wrong; values with which no point at all can be made.
+    """
+    file = read_points_file(path)
+    base = open_base(file, path.parent)
+    try:
+        points = points_of(file, base.expand, settings or SweepSettings())
+    except InputError as error:
+        raise error.in_file(path) from None
+    known = [*base.quantities, *dict.fromkeys(key for point in points for key in point)]
+    if base.quantities and (wrong_names := [name for name in file.pareto or () if name not in known]):
+        raise InputError(f"expected some of {', '.join(known)}", file=path, field="pareto", value=wrong_names[0])
+    where = (folder / POINTS).absolute()
+    tasks: list[Task | InputError] = []
+    for point in points:
+        try:
+            job = base.job(point)
+            tasks.append(Task(identity_of(file.kind, job.inputs), where, job))
+        except InputError as error:
+            tasks.append(error)
+    wrong = [one for one in tasks if isinstance(one, InputError)]
+    if len(wrong) == len(tasks):
+        raise wrong[0].in_file(wrong[0].file or path)
+    return Plan(path, file, base, tuple(points), tuple(tasks))
+
+
+def run_sweep(plan: Plan, backend: Backend = lambda tasks: on_this_machine(tasks, 1),
+              progress: Progress = lambda done, total, text: None) -> Sweep:
+    """Compute the points that are not finished, each into its file, and gather all.
+
+    The folder of the points must exist. After a kill at any moment the same call goes on with the points that are not
+    finished.
+
+    Raises
+    ------
+    ComputationError : a point's file could not be written, a cluster was lost.
+    """
+    began = time.monotonic()
+    known: dict[str, dict[str, Any]] = {}
+    tasks = {task.identity: task for task in plan.tasks if isinstance(task, Task)}
+    for identity, task in tasks.items():
+        if (kept := read_point(task.folder, identity)) is not None:
+            known[identity] = kept
+    waiting = [task for identity, task in tasks.items() if identity not in known]
+    progress(len(known), len(tasks), f"{len(known)} were finished before" if known else "")
+    for content in backend(waiting) if waiting else ():
+        if content["status"] in LASTING:
+            save_point(tasks[content["identity"]].folder, content)
+        known[content["identity"]] = content
+        progress(len(known), len(tasks), content["message"])
+    rows = tuple(_row(plan, k, known) for k in range(len(plan.points)))
+    pareto = plan.file.pareto
+    about = provenance(None, "".join(tasks), None, time.monotonic() - began, ("numpy", "scipy", "numba", "joblib"),
+                       points_file=plan.path.name, points_sha256=hashlib.sha256(plan.path.read_bytes()).hexdigest())
+    return Sweep(plan.file, rows, plan.base.quantities, (pareto[0], pareto[1]) if pareto else plan.base.pareto,
+                 len(waiting), about)
+
+
+def _row(plan: Plan, k: int, known: Mapping[str, dict[str, Any]]) -> Row:
+    task, point = plan.tasks[k], plan.points[k]
+    if isinstance(task, AvisError):
+        return Row("", point, "failed", str(task), None, {})
+    found = known[task.identity]
+    return Row(task.identity, point, found["status"], found["message"], found["seconds"], found["figures"])
