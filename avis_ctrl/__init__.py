@@ -38,6 +38,7 @@ robust_performance  the same with a bound on its gain
 disk_margin         gain and phase margins of all channels at once
 plot                bode, sigma, mu, transmissibility, dk_history, order, vc_curves
 InputError          what a wrong input raises: one line
+ComputationError    what a computation that fails raises: one line
 
 Names are loaded on first use, so that `import avis_ctrl` and `avis --help` answer at once.
 """
@@ -65,6 +66,7 @@ _PLACES = {
     "dynamics": "avis_ctrl.uncertainty.uncertain_models",
     "matrix": "avis_ctrl.uncertainty.uncertain_models",
     "InputError": "avis_ctrl.errors",
+    "ComputationError": "avis_ctrl.errors",
     "RealScalar": "avis_ctrl.uncertainty.blocks",
     "ComplexScalar": "avis_ctrl.uncertainty.blocks",
     "ComplexFull": "avis_ctrl.uncertainty.blocks",

@@ -1,4 +1,5 @@
 from avis_ctrl import plot as plot
+from avis_ctrl.errors import ComputationError as ComputationError
 from avis_ctrl.errors import InputError as InputError
 from avis_ctrl.interface.workflow import campaign as campaign
 from avis_ctrl.interface.workflow import design as design

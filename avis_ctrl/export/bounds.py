@@ -48,7 +48,7 @@ class CoverSettings:
     excess_dB : by which a filter may exceed the error; more order than that needs is not spent.
     harmless : errors below this fraction of the controller, or of the table, need not be followed closely: a thousandth
         of the loop gain moves mu by about as much.
-    most : highest order of a filter.
+    most : highest order of a filter: what a slow controller pole and hold at half the rate ask for together.
     """
 
     lowest: float = 1e-7
@@ -58,7 +58,7 @@ class CoverSettings:
     points_beyond: int = 15
     excess_dB: float = 2.0
     harmless: float = 1e-3
-    most: int = 4
+    most: int = 6
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,9 +63,10 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     plain = c_files(controller, guard, Provenance(()))
     certificate = certify(folder, controller, plain, progress)
     if not certificate.content["stable"]:
+        other = "double precision (without --float32)" if arithmetic == "float32" else "single precision (--float32)"
         raise ComputationError(f"the loop of the exported controller {name!r} is not proved stable; nothing was "
-                               "written", measured="; ".join(certificate.reasons),
-                               next_step="export without --float32, or another controller of the folder")
+                               "written", measured="; ".join(dict.fromkeys(certificate.reasons)),
+                               next_step=f"try {other}, or another controller of the folder")
     replay = None
     if compiler() is not None:
         progress("replay of the worst plant through the compiled code, on the nonlinear table")

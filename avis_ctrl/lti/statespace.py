@@ -137,9 +137,13 @@ class StateSpace:
         return self(1.0 if self.dt else 0.0).real
 
     # -- algebra --------------------------------------------------------------------------
-    def __matmul__(self, other: StateSpace) -> StateSpace:
+    # numpy arrays and numbers on the left leave the operation to this class.
+    __array_ufunc__ = None
+
+    def __matmul__(self, other: Any) -> StateSpace:
         """Series connection: `self @ other` feeds other's outputs into self's inputs, in order."""
-        if not isinstance(other, StateSpace):
+        other = _operand(other)
+        if other is None:
             return NotImplemented
         if self.ninputs != other.noutputs:
             raise InputError(f"series connection of {other.noutputs} outputs into {self.ninputs} inputs")
@@ -149,9 +153,23 @@ class StateSpace:
         return StateSpace(A, np.vstack([self.B @ other.D, other.B]), np.hstack([self.C, self.D @ other.C]),
                           self.D @ other.D, dt, other.inputs, self.outputs, self.states + other.states)
 
-    def __add__(self, other: StateSpace) -> StateSpace:
-        """Parallel connection of two systems with the same inputs and outputs."""
-        if not isinstance(other, StateSpace):
+    def __rmatmul__(self, other: Any) -> StateSpace:
+        left = _operand(other)
+        return NotImplemented if left is None else left @ self
+
+    def __mul__(self, factor: Any) -> StateSpace:
+        """All outputs times a number; systems are multiplied by `@`."""
+        return self.scaled(float(factor)) if isinstance(factor, (int, float, np.number)) else NotImplemented
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, factor: Any) -> StateSpace:
+        return self.scaled(1 / float(factor)) if isinstance(factor, (int, float, np.number)) else NotImplemented
+
+    def __add__(self, other: Any) -> StateSpace:
+        """Parallel connection of two systems with the same inputs and outputs; a number where there is one of each."""
+        other = _operand(other)
+        if other is None:
             return NotImplemented
         if self.D.shape != other.D.shape:
             raise InputError(f"parallel connection of shapes {self.D.shape} and {other.D.shape}")
@@ -162,10 +180,31 @@ class StateSpace:
     def __neg__(self) -> StateSpace:
         return replace(self, C=-self.C, D=-self.D)
 
-    def __sub__(self, other: StateSpace) -> StateSpace:
-        if not isinstance(other, StateSpace):
-            return NotImplemented
-        return self + (-other)
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> StateSpace:
+        other = _operand(other)
+        return NotImplemented if other is None else self + (-other)
+
+    def __rsub__(self, other: Any) -> StateSpace:
+        return -self + other
+
+    def feedback(self, other: Any = 1.0, sign: int = -1) -> StateSpace:
+        """Closed loop from r to y of y = self u, u = r + sign other y. Raises InputError where it is not well posed."""
+        K = _operand(other)
+        if K is None or K.D.shape != self.D.shape[::-1] or sign not in (-1, 1):
+            raise InputError(f"expected {self.noutputs} inputs and {self.ninputs} outputs, and sign -1 or 1",
+                             field="other, sign", value=(np.shape(K.D) if K else type(other).__name__, sign))
+        E = np.eye(self.ninputs) - sign * K.D @ self.D
+        if np.linalg.cond(E) > 1 / np.finfo(float).eps:
+            raise InputError("the loop is not well posed: an algebraic loop without a solution", field="other")
+        u = np.linalg.solve(E, np.hstack([sign * K.D @ self.C, sign * K.C, np.eye(self.ninputs)]))
+        n = self.nstates + K.nstates
+        y = np.hstack([self.C, np.zeros((self.noutputs, u.shape[1] - self.nstates))]) + self.D @ u
+        motion = np.vstack([self.B @ u, K.B @ y])
+        motion[:, :n] += la.block_diag(self.A, K.A)
+        return StateSpace(motion[:, :n], motion[:, n:], y[:, :n], y[:, n:], _common_dt(self, K), self.inputs,
+                          self.outputs, self.states + K.states)
 
     def scaled(self, left: np.ndarray | float = 1.0, right: np.ndarray | float = 1.0) -> StateSpace:
         """`left @ self @ right` with vectors read as diagonals, scalars as multiples of identity.
@@ -278,6 +317,17 @@ def append(*systems: StateSpace) -> StateSpace:
                       la.block_diag(*(s.C for s in systems)), la.block_diag(*(s.D for s in systems)),
                       _common_dt(*systems), joined(s.inputs for s in systems),
                       joined(s.outputs for s in systems), sum((s.states for s in systems), ()))
+
+
+def _operand(given: Any) -> StateSpace | None:
+    """A system of this package or of python-control, a number or a matrix as a system; None for anything else."""
+    if isinstance(given, StateSpace):
+        return given
+    if isinstance(given, (int, float, np.number, np.ndarray)):
+        return gain(np.atleast_2d(np.asarray(given, float)))
+    if type(given).__module__.startswith("control."):
+        return StateSpace.from_control(given)
+    return None
 
 
 def _as_matrix(factor: np.ndarray | float, size: int) -> np.ndarray:

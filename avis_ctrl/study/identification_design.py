@@ -188,8 +188,11 @@ def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float]
     """
     shape = _AVIS if isinstance(rig, AvisTable) else _HALCYONICS
     uncertainty = shape["uncertainty"] | {"parameters_percent": dict(parameters_percent or {})}
+    # A quarter of the sample rate: what is faster, the hold distorts.
+    asked = [one | {"at_most": rig.sample_rate_Hz / 4} if one["quantity"] == "fastest_controller_pole_Hz" else one
+             for one in shape["requirement"]]
     return design_from_table(shape | {"title": title, "rig": RIG_FILE, "keep": default_keep(rig),
-                                      "uncertainty": uncertainty})
+                                      "uncertainty": uncertainty, "requirement": asked})
 
 
 def assumed_weights(rig: Rig) -> str:

@@ -32,6 +32,9 @@ def real(name: str, nominal: float, *, percent: float | tuple[float, float] | No
 
     Raises InputError for a range that does not contain the nominal value.
     """
+    size = percent if percent is not None else plus_minus
+    if isinstance(size, (int, float)) and size < 0:
+        raise InputError("expected half a range, not negative", field=name, value=size)
     if sum(one is not None for one in (percent, plus_minus, range)) != 1:
         raise InputError("expected exactly one of percent, plus_minus and range", field=name)
     try:

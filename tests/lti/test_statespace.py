@@ -112,3 +112,25 @@ def test_slow_states_are_not_lost_beside_fast_ones(rng):
     omega = np.concatenate([[0.0], np.geomspace(1e-14, 1e12, 60)])
     response = StateSpace(-G @ R @ G, B, C, np.zeros((2, 2))).frequency_response(omega)
     np.testing.assert_allclose(response[:3].real, np.broadcast_to(exact, (3, 2, 2)), rtol=1e-6, atol=1e-6)
+
+
+def test_arithmetic_with_numbers_matrices_and_python_control():
+    rng = np.random.default_rng(6)
+    made = [control.StateSpace(np.diag([-1.0, -3.0]), rng.standard_normal((2, 2)), rng.standard_normal((2, 2)),
+                               0.1 * rng.standard_normal((2, 2))) for _ in range(2)]
+    P, K = (StateSpace.from_control(one) for one in made)
+    M, s = rng.standard_normal((2, 2)), 0.7j
+    for found, true in ((P @ made[1], made[0] * made[1]), (P + made[1], made[0] + made[1]), (M @ P, M @ made[0](s)),
+                        (P @ M, made[0](s) @ M), (2 * P, 2 * made[0](s)), (P / 4, made[0](s) / 4),
+                        (M - P, M - made[0](s)), (P.feedback(made[1]), made[0].feedback(made[1])),
+                        (P.feedback(K, 1), made[0].feedback(made[1], 1)), (P.feedback(M), made[0].feedback(M))):
+        np.testing.assert_allclose(found(s), true(s) if callable(true) else true, rtol=1e-9)
+    one = tf([1.0], [1.0, 1.0])
+    assert (1 - one)(0)[0, 0] == pytest.approx(0.0) and one.feedback().dcgain()[0, 0] == pytest.approx(0.5)
+    with pytest.raises(TypeError):
+        P @ "K"
+    for wrong, words in (((np.ones((1, 2)),), "expected 2 inputs"), (("K",), "expected 2 inputs")):
+        with pytest.raises(InputError, match=words):
+            P.feedback(*wrong)
+    with pytest.raises(InputError, match="not well posed"):
+        gain([[1.0]]).feedback(-1.0)
