@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti.statespace import StateSpace, gain
+from avis_ctrl.lti.statespace import StateSpace, operand
 
 
 def as_system(given: Any, field: str = "system") -> StateSpace:
@@ -21,19 +21,16 @@ def as_system(given: Any, field: str = "system") -> StateSpace:
     ------
     InputError : anything else, an improper transfer function, a frequency response (which has no states).
     """
-    if isinstance(given, StateSpace):
-        return given
     if hasattr(given, "frdata"):
         raise InputError("expected a system with states; a frequency response has none", field=field)
     if hasattr(given, "system") and callable(given.system):
         return given.system()
     try:
-        if hasattr(given, "A") or hasattr(given, "num"):
-            return StateSpace.from_control(given)
-        if isinstance(given, (int, float, list, np.ndarray, np.number)):
-            return gain(np.atleast_2d(np.asarray(given, float)))
+        found = operand(np.asarray(given, float) if isinstance(given, list) else given)
     except (TypeError, ValueError) as error:
         raise InputError(f"expected a proper system: {' '.join(str(error).split())}", field=field) from None
+    if found is not None:
+        return found
     raise InputError("expected a StateSpace (avis_ctrl or python-control), a TransferFunction, a number or a matrix",
                      field=field, value=type(given).__name__)
 

@@ -19,6 +19,7 @@ import scipy.linalg as la
 from numpy.typing import ArrayLike
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.lti.interconnection import Quadruple, feedback, parallel, return_difference, series
 
 Names = tuple[str, ...]
 Selector = str | int | slice | Sequence[str] | Sequence[int] | np.ndarray
@@ -93,6 +94,11 @@ class StateSpace:
 
     # -- sizes and properties -------------------------------------------------------------
     @property
+    def matrices(self) -> Quadruple:
+        """(A, B, C, D)."""
+        return self.A, self.B, self.C, self.D
+
+    @property
     def nstates(self) -> int:
         return self.A.shape[0]
 
@@ -142,19 +148,16 @@ class StateSpace:
 
     def __matmul__(self, other: Any) -> StateSpace:
         """Series connection: `self @ other` feeds other's outputs into self's inputs, in order."""
-        other = _operand(other)
+        other = operand(other)
         if other is None:
             return NotImplemented
         if self.ninputs != other.noutputs:
             raise InputError(f"series connection of {other.noutputs} outputs into {self.ninputs} inputs")
-        dt = _common_dt(self, other)
-        A = np.block([[self.A, self.B @ other.C],
-                      [np.zeros((other.nstates, self.nstates)), other.A]])
-        return StateSpace(A, np.vstack([self.B @ other.D, other.B]), np.hstack([self.C, self.D @ other.C]),
-                          self.D @ other.D, dt, other.inputs, self.outputs, self.states + other.states)
+        return StateSpace(*series(self.matrices, other.matrices), _common_dt(self, other), other.inputs, self.outputs,
+                          self.states + other.states)
 
     def __rmatmul__(self, other: Any) -> StateSpace:
-        left = _operand(other)
+        left = operand(other)
         return NotImplemented if left is None else left @ self
 
     def __mul__(self, factor: Any) -> StateSpace:
@@ -168,14 +171,13 @@ class StateSpace:
 
     def __add__(self, other: Any) -> StateSpace:
         """Parallel connection of two systems with the same inputs and outputs; a number where there is one of each."""
-        other = _operand(other)
+        other = operand(other)
         if other is None:
             return NotImplemented
         if self.D.shape != other.D.shape:
             raise InputError(f"parallel connection of shapes {self.D.shape} and {other.D.shape}")
-        return StateSpace(la.block_diag(self.A, other.A), np.vstack([self.B, other.B]),
-                          np.hstack([self.C, other.C]), self.D + other.D, _common_dt(self, other),
-                          self.inputs, self.outputs, self.states + other.states)
+        return StateSpace(*parallel(self.matrices, other.matrices), _common_dt(self, other), self.inputs, self.outputs,
+                          self.states + other.states)
 
     def __neg__(self) -> StateSpace:
         return replace(self, C=-self.C, D=-self.D)
@@ -183,7 +185,7 @@ class StateSpace:
     __radd__ = __add__
 
     def __sub__(self, other: Any) -> StateSpace:
-        other = _operand(other)
+        other = operand(other)
         return NotImplemented if other is None else self + (-other)
 
     def __rsub__(self, other: Any) -> StateSpace:
@@ -191,20 +193,14 @@ class StateSpace:
 
     def feedback(self, other: Any = 1.0, sign: int = -1) -> StateSpace:
         """Closed loop from r to y of y = self u, u = r + sign other y. Raises InputError where it is not well posed."""
-        K = _operand(other)
+        K = operand(other)
         if K is None or K.D.shape != self.D.shape[::-1] or sign not in (-1, 1):
             raise InputError(f"expected {self.noutputs} inputs and {self.ninputs} outputs, and sign -1 or 1",
                              field="other, sign", value=(np.shape(K.D) if K else type(other).__name__, sign))
-        E = np.eye(self.ninputs) - sign * K.D @ self.D
-        if np.linalg.cond(E) > 1 / np.finfo(float).eps:
+        if np.linalg.cond(return_difference(self.matrices, K.matrices, sign)) > 1 / np.finfo(float).eps:
             raise InputError("the loop is not well posed: an algebraic loop without a solution", field="other")
-        u = np.linalg.solve(E, np.hstack([sign * K.D @ self.C, sign * K.C, np.eye(self.ninputs)]))
-        n = self.nstates + K.nstates
-        y = np.hstack([self.C, np.zeros((self.noutputs, u.shape[1] - self.nstates))]) + self.D @ u
-        motion = np.vstack([self.B @ u, K.B @ y])
-        motion[:, :n] += la.block_diag(self.A, K.A)
-        return StateSpace(motion[:, :n], motion[:, n:], y[:, :n], y[:, n:], _common_dt(self, K), self.inputs,
-                          self.outputs, self.states + K.states)
+        return StateSpace(*feedback(self.matrices, K.matrices, sign), _common_dt(self, K), self.inputs, self.outputs,
+                          self.states + K.states)
 
     def scaled(self, left: np.ndarray | float = 1.0, right: np.ndarray | float = 1.0) -> StateSpace:
         """`left @ self @ right` with vectors read as diagonals, scalars as multiples of identity.
@@ -231,8 +227,8 @@ class StateSpace:
 
     def select(self, outputs: Selector | None = None, inputs: Selector | None = None) -> StateSpace:
         """The subsystem from some inputs to some outputs, by name or position, in the order asked."""
-        rows = _positions(self.outputs, outputs, "output")
-        cols = _positions(self.inputs, inputs, "input")
+        rows = positions(self.outputs, outputs, "output")
+        cols = positions(self.inputs, inputs, "input")
         return StateSpace(self.A, self.B[:, cols], self.C[rows], self.D[np.ix_(rows, cols)], self.dt,
                           tuple(self.inputs[k] for k in cols), tuple(self.outputs[k] for k in rows), self.states)
 
@@ -319,13 +315,16 @@ def append(*systems: StateSpace) -> StateSpace:
                       joined(s.outputs for s in systems), sum((s.states for s in systems), ()))
 
 
-def _operand(given: Any) -> StateSpace | None:
-    """A system of this package or of python-control, a number or a matrix as a system; None for anything else."""
+def operand(given: Any) -> StateSpace | None:
+    """A system of this package or of python-control, a number or a matrix as a system; None for anything else.
+
+    python-control's StateSpace and TransferFunction are known by what they offer: importing it takes two seconds.
+    """
     if isinstance(given, StateSpace):
         return given
     if isinstance(given, (int, float, np.number, np.ndarray)):
         return gain(np.atleast_2d(np.asarray(given, float)))
-    if type(given).__module__.startswith("control."):
+    if hasattr(given, "A") or hasattr(given, "num"):
         return StateSpace.from_control(given)
     return None
 
@@ -343,21 +342,24 @@ def _common_dt(*systems: StateSpace) -> float:
     return clocks.pop()
 
 
-def _positions(names: Names, asked: Selector | None, what: str) -> list[int]:
+def positions(names: Names, asked: Selector | None, what: str) -> list[int]:
+    """Places of signals that are named or numbered, in the order asked; all for None."""
     if asked is None:
         return list(range(len(names)))
     if isinstance(asked, slice):
         return list(range(len(names)))[asked]
     wanted: list[Any] = [asked] if isinstance(asked, (str, int, np.integer)) else list(asked)
-    positions = []
+    found = []
     for one in wanted:
         if isinstance(one, str):
             if one not in names:
                 raise InputError(f"no {what} named {one!r}; there are {list(names)}")
-            positions.append(names.index(one))
+            found.append(names.index(one))
+        elif -len(names) <= int(one) < len(names):
+            found.append(int(one))
         else:
-            positions.append(int(one))
-    return positions
+            raise InputError(f"no {what} {one}; there are {len(names)}")
+    return found
 
 
 def _resolvent(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -19,7 +19,8 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.interchange import as_system, plot_frequencies
-from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.lti.interconnection import Quadruple, feedback, parallel, return_difference, series
+from avis_ctrl.lti.statespace import StateSpace, positions
 from avis_ctrl.summary import html_table
 from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.elements import ComplexDisk, Element, RealParameter
@@ -27,7 +28,6 @@ from avis_ctrl.uncertainty.lft_reduction import reduce_copies
 
 # The states among the elements: a block 1/s I (or z^-1 I). Equal to no uncertain element: these are of other classes.
 STATES = Element("states")
-Parts = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,11 @@ class UncertainSystem:
     def shape(self) -> tuple[int, int]:
         """(outputs, inputs)."""
         return self.d.shape
+
+    @property
+    def matrices(self) -> Quadruple:
+        """(a, b, c, d)."""
+        return self.a, self.b, self.c, self.d
 
     @property
     def nstates(self) -> int:
@@ -206,8 +211,7 @@ class UncertainSystem:
         X, Y = self, as_uncertain(other)
         if X.shape != Y.shape:
             raise InputError(f"sum of shapes {X.shape} and {Y.shape}")
-        parts = la.block_diag(X.a, Y.a), np.vstack([X.b, Y.b]), np.hstack([X.c, Y.c]), X.d + Y.d
-        return _of_both(parts, X, Y, X.inputs, X.outputs)
+        return _of_both(parallel(X.matrices, Y.matrices), X, Y, X.inputs, X.outputs)
 
     def __neg__(self) -> UncertainSystem:
         return replace(self, c=-self.c, d=-self.d)
@@ -229,9 +233,7 @@ class UncertainSystem:
             X, Y = sorted((X, Y), key=lambda one: (not np.any(one.a), sorted(one.uncertain)))
         if X.shape[1] != Y.shape[0]:
             raise InputError(f"product of shapes {X.shape} and {Y.shape}")
-        parts = (np.block([[X.a, X.b @ Y.c], [np.zeros((Y.a.shape[0], X.a.shape[1])), Y.a]]),
-                 np.vstack([X.b @ Y.d, Y.b]), np.hstack([X.c, X.d @ Y.c]), X.d @ Y.d)
-        return _of_both(parts, X, Y, inputs, outputs)
+        return _of_both(series(X.matrices, Y.matrices), X, Y, inputs, outputs)
 
     def __rmatmul__(self, other: Any) -> UncertainSystem:
         return as_uncertain(other) @ self
@@ -280,23 +282,15 @@ class UncertainSystem:
             Y = _repeated(Y, X.shape[0])
         if Y.shape != (X.shape[1], X.shape[0]):
             raise InputError(f"feedback of shape {Y.shape} around {X.shape}")
-        loop = np.eye(X.shape[0]) - sign * X.d @ Y.d
+        loop = return_difference(X.matrices, Y.matrices, sign)
         if np.linalg.cond(loop) > SETTINGS.singular:
             raise ComputationError("the nominal loop is not well posed", measured=f"I + X Y = {loop.tolist()} at "
                                    "infinite frequency", cause="an algebraic loop of unit gain")
-        R = np.linalg.inv(loop)
-        # y and u = r + sign Y y from the internal signals of X and Y, and from r
-        y = R @ np.hstack([X.c, sign * X.d @ Y.c, X.d])
-        u = sign * Y.d @ y
-        u[:, X.a.shape[1]:] += np.hstack([sign * Y.c, np.eye(X.shape[1])])
-        out = np.vstack([X.b @ u, Y.b @ y])
-        n = X.a.shape[1] + Y.a.shape[1]
-        out[:, :n] += la.block_diag(X.a, Y.a)
-        return _of_both((out[:, :n], out[:, n:], y[:, :n], y[:, n:]), X, Y, X.inputs, X.outputs)
+        return _of_both(feedback(X.matrices, Y.matrices, sign), X, Y, X.inputs, X.outputs)
 
     def select(self, outputs: Any = None, inputs: Any = None) -> UncertainSystem:
         """Some outputs and inputs, by name or position."""
-        rows, cols = _chosen(self.outputs, outputs), _chosen(self.inputs, inputs)
+        rows, cols = positions(self.outputs, outputs, "output"), positions(self.inputs, inputs, "input")
         return reduced(replace(self, b=self.b[:, cols], c=self.c[rows], d=self.d[np.ix_(rows, cols)],
                                 inputs=tuple(self.inputs[k] for k in cols),
                                 outputs=tuple(self.outputs[k] for k in rows)))
@@ -387,7 +381,7 @@ def _clock(*systems: UncertainSystem) -> float:
     return clocks.pop()
 
 
-def _of_both(parts: Parts, X: UncertainSystem, Y: UncertainSystem, inputs: Sequence[str],
+def _of_both(parts: Quadruple, X: UncertainSystem, Y: UncertainSystem, inputs: Sequence[str],
               outputs: Sequence[str]) -> UncertainSystem:
     return reduced(gathered(parts, _kinds(X, Y), _clock(X, Y), tuple(inputs), tuple(outputs)))
 
@@ -473,11 +467,11 @@ def _power_of_two(size: np.ndarray) -> np.ndarray:
     return np.exp2(np.round(np.log2(np.where(size > 0, size, 1.0))))
 
 
-def _same(M: Parts, sizes: Sequence[int], small: Parts, kept: Sequence[int]) -> bool:
+def _same(M: Quadruple, sizes: Sequence[int], small: Quadruple, kept: Sequence[int]) -> bool:
     """Whether two LFTs agree at random deltas to round-off; a rank decided wrongly would show here."""
     rng = np.random.default_rng(0)
 
-    def value(parts: Parts, counts: Sequence[int], delta: np.ndarray) -> np.ndarray:
+    def value(parts: Quadruple, counts: Sequence[int], delta: np.ndarray) -> np.ndarray:
         a, b, c, d = parts
         values = np.repeat(delta, counts)
         return d + c @ (values[:, None] * np.linalg.solve(np.eye(len(values)) - a * values, b))
@@ -490,23 +484,6 @@ def _same(M: Parts, sizes: Sequence[int], small: Parts, kept: Sequence[int]) -> 
         if np.any(np.abs(one - other) > SETTINGS.same * np.maximum(size, largest)):
             return False
     return True
-
-
-def _chosen(names: tuple[str, ...], given: Any) -> list[int]:
-    if given is None:
-        return list(range(len(names)))
-    if isinstance(given, slice):
-        return list(range(len(names)))[given]
-    wanted = [given] if isinstance(given, (str, int, np.integer)) else list(given)
-    places = []
-    for one in wanted:
-        if isinstance(one, str) and one not in names:
-            raise InputError(f"expected some of {', '.join(names)}", field="signal", value=one)
-        place = names.index(one) if isinstance(one, str) else int(one)
-        if not -len(names) <= place < len(names):
-            raise InputError(f"expected a number below {len(names)}", field="signal", value=place)
-        places.append(place)
-    return places
 
 
 def _random_dynamics(one: Element, rng: np.random.Generator, grid: np.ndarray, dt: float) -> StateSpace:

@@ -1,0 +1,38 @@
+"""Series, parallel and feedback connection of (A, B, C, D); integrators or uncertain elements close A."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg as la
+
+Quadruple = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def series(X: Quadruple, Y: Quadruple) -> Quadruple:
+    """X Y: Y's outputs into X's inputs; the internal signals of X first."""
+    (A, B, C, D), (a, b, c, d) = X, Y
+    return (np.block([[A, B @ c], [np.zeros((a.shape[0], A.shape[1])), a]]), np.vstack([B @ d, b]),
+            np.hstack([C, D @ c]), D @ d)
+
+
+def parallel(X: Quadruple, Y: Quadruple) -> Quadruple:
+    """X + Y."""
+    (A, B, C, D), (a, b, c, d) = X, Y
+    return la.block_diag(A, a), np.vstack([B, b]), np.hstack([C, c]), D + d
+
+
+def return_difference(X: Quadruple, Y: Quadruple, sign: int) -> np.ndarray:
+    """I - sign D_X D_Y (n_y, n_y), which `feedback` inverts."""
+    return np.eye(X[3].shape[0]) - sign * X[3] @ Y[3]
+
+
+def feedback(X: Quadruple, Y: Quadruple, sign: int) -> Quadruple:
+    """From r to y of y = X u, u = r + sign Y y."""
+    (A, B, C, D), (a, b, c, d) = X, Y
+    # y and u from the internal signals of X and Y, and from r.
+    y = np.linalg.inv(return_difference(X, Y, sign)) @ np.hstack([C, sign * D @ c, D])
+    u = sign * d @ y
+    u[:, A.shape[1]:] += np.hstack([sign * c, np.eye(D.shape[1])])
+    out, n = np.vstack([B @ u, b @ y]), A.shape[1] + a.shape[1]
+    out[:, :n] += la.block_diag(A, a)
+    return out[:, :n], out[:, n:], y[:, :n], y[:, n:]
