@@ -16,6 +16,7 @@ from avis_ctrl.export.rounding import rounding_noise
 from avis_ctrl.export.sampled_controller import SampledController
 from avis_ctrl.export.sampled_response import SampledAxes
 from avis_ctrl.export.worst_plant import WorstPlant, mu_lower, worst_transmissibility
+from avis_ctrl.lti.norms import decibels
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.simulation.discrete import spectral_radius
 from avis_ctrl.simulation.sampled_loop import SampledLoop
@@ -89,17 +90,15 @@ def certify(folder: DesignFolder, controller: SampledController, files: Mapping[
     if not found.gain_above < 1:
         unproved += (f"the loop gain from half the sample rate on is bounded by {found.gain_above:.3g} only",)
 
-    def dB(value: float) -> float:
-        return 20 * float(np.log10(value))
     content = {"format": "avis-certificate", "version": 1, "controller_sha256": controller.sha256,
                "mu_upper": found.mu.upper, "mu_lower": lower, "guaranteed": not unproved,
                "stable": not unstable and bool(np.isfinite(found.peak.upper)) and found.gain_above < 1,
-               "worst_case_peak_transmissibility_dB": dB(found.peak.upper),
-               "worst_case_band_transmissibility_dB": dB(found.band.upper),
+               "worst_case_peak_transmissibility_dB": decibels(found.peak.upper),
+               "worst_case_band_transmissibility_dB": decibels(found.band.upper),
                "rounding_noise_m_per_s": float(np.linalg.norm(noise)),
                "step_time_us": None if files is None else step_time_us(files, controller),
-               "between_samples": {"worst_case_gain_dB": dB(found.all_times),
-                                   "floor_above_half_rate_dB": dB(found.above)}}
+               "between_samples": {"worst_case_gain_dB": decibels(found.all_times),
+                                   "floor_above_half_rate_dB": decibels(found.above)}}
     return Certificate(content, loop, worst, (*unstable, *unproved))
 
 

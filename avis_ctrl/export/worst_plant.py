@@ -55,8 +55,6 @@ def _near(peak: MuPeak, half_rate: float, count: int = 12) -> np.ndarray:
 
 def _closed(plant: GeneralizedPlant, axes: SampledAxes, omega: np.ndarray) -> np.ndarray:
     """(n_omega, n_z + n_e, n_w + n_d) the loop with the emitted controller."""
-    P, n_y, n_u = plant.P.frequency_response(omega), plant.nmeas, plant.ncon
-    rows, cols = P.shape[1] - n_y, P.shape[2] - n_u
-    K = axes.response(omega)
-    return P[:, :rows, :cols] + P[:, :rows, cols:] @ K @ np.linalg.solve(
-        np.eye(n_y) - P[:, rows:, cols:] @ K, P[:, rows:, :cols])
+    # F_l(P, K) is F_u of P with its last inputs and outputs first.
+    P = plant.P.frequency_response(omega)
+    return perturbed(np.roll(P, (plant.nmeas, plant.ncon), axis=(1, 2)), axes.response(omega))

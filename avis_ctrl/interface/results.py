@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl import plot, report
+from avis_ctrl import plot, report, uncertain_value
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.lti.statespace import StateSpace
@@ -140,8 +140,8 @@ class IdentificationStudy:
                                                                        strict=True)}
 
     def _rows(self) -> list[tuple[str, str, str]]:
-        return [(name, f"{value:.6g} +- {sigma:.2g}" if np.isfinite(sigma) else f"{value:.6g}, only in combination",
-                 unit) for name, (value, sigma, unit) in self.values.items()]
+        return [(name, uncertain_value.text(value, sigma) if np.isfinite(sigma) else
+                 f"{value:.6g}, only in combination", unit) for name, (value, sigma, unit) in self.values.items()]
 
     def summary(self) -> str:
         """The identified values, the verdict on held-out records, what the data do not determine."""

@@ -22,6 +22,11 @@ NEAR_AXIS = 3e-2
 NEIGHBOURHOOD = np.geomspace(0.5, 2.0, 101)
 
 
+def decibels(gain: float) -> float:
+    """20 log10 of a gain; minus infinity for none."""
+    return float(20 * np.log10(gain)) if gain > 0 else -np.inf
+
+
 class PeakGain(NamedTuple):
     """H-infinity norm and the frequency [rad/s] where it is reached (inf for the direct term)."""
 

@@ -7,15 +7,25 @@ import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
 from avis_ctrl.errors import InputError
 
+Content = TypeVar("Content", bound=BaseModel)
 _UNITS = {"kg", "g", "t", "lb", "m", "mm", "cm", "um", "in", "N", "kN", "mN", "Nm", "Ns", "Nms", "kNs", "per", "rad",
           "deg", "V", "mV", "kV", "Hz", "kHz", "rtHz", "s", "ms", "us", "s2", "Vs", "Vs2", "kgm2", "gmm2", "kgmm2",
           "gcm2"}
+
+
+def validated(model: type[Content], content: object, file: object = None) -> Content:
+    """The content as a model of a file; the complaint names the file where there is one. Raises InputError."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        complaint = first_complaint(error, model)
+        raise (complaint.in_file(file) if file is not None else complaint) from None
 
 
 def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputError:

@@ -10,15 +10,15 @@ from __future__ import annotations
 import tomllib
 import warnings
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.avis import AvisTable, Isolator, LinearMotor
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
-from avis_ctrl.rigs.file_errors import first_complaint
+from avis_ctrl.rigs.file_errors import validated
 from avis_ctrl.rigs.halcyonics import Halcyonics, Load, ReactionMass
 from avis_ctrl.rigs.instruments import (
     AccelerometerAt,
@@ -44,8 +44,6 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 
 SHIPPED = {"avis": ("avis.toml", False), "halcyonics": ("halcyonics.toml", False),
            "halcyonics_loaded": ("halcyonics.toml", True)}
-
-File = TypeVar("File", bound=BaseModel)
 
 
 def load_rig(path_or_name: str | Path, loaded: bool = False, check: bool = True) -> AvisTable | Halcyonics:
@@ -90,9 +88,9 @@ def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcy
     if "isolator" in content:
         if loaded:
             raise InputError("a table on isolators has no [load] section", field="load")
-        rig = _avis(_checked(AvisFile, content))
+        rig = _avis(validated(AvisFile, content))
     elif "suspension" in content:
-        rig = _halcyonics(_checked(HalcyonicsFile, content), loaded)
+        rig = _halcyonics(validated(HalcyonicsFile, content), loaded)
     else:
         raise InputError("expected the sections of a rig: [[isolator]] (air mounts) or [suspension] (springs)",
                          field="top level", value=sorted(content))
@@ -118,13 +116,6 @@ def _check_support(rig: AvisTable | Halcyonics) -> None:
         most = COORDINATES[int(np.argmax(np.abs(motion)))]
         raise InputError(f"expected a positive definite stiffness; no spring resists motion mainly along {most}",
                          field="isolator" if isinstance(rig, AvisTable) else "suspension")
-
-
-def _checked(model: type[File], content: dict[str, Any]) -> File:
-    try:
-        return model.model_validate(content)
-    except ValidationError as error:
-        raise first_complaint(error, model) from None
 
 
 def _avis(file: AvisFile) -> AvisTable:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, connect, gain
+from avis_ctrl.lti.norms import decibels
 from avis_ctrl.rigs.logical_axes import ActuatorAxes, actuator_axes
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
@@ -165,8 +166,5 @@ def reduction_error(rig: Rig, keep: Sequence[str] = Z_PHIX, others: Others = "fr
     return ReductionError(
         keep, (*floors, *forces), dropped, omega, reduced, full, relative,
         response(full_rig.system, dropped, outside),
-        {name: _dB(np.max(e)) for name, e in channels}, {name: _dB(np.sqrt(np.mean(e**2))) for name, e in channels})
-
-
-def _dB(value: float) -> float:
-    return float(20 * np.log10(value)) if value > 0 else -np.inf
+        {name: decibels(np.max(e)) for name, e in channels},
+        {name: decibels(np.sqrt(np.mean(e**2))) for name, e in channels})

@@ -45,6 +45,7 @@ class FixedOrderSettings:
         nearer one makes the slope less smooth, a farther one less true.
     armijo, wolfe : fractions of the slope that a step must gain, and may leave (Lewis and Overton 2013).
     trials : most points of a line search.
+    same_pole : relative distance up to which two computations of a pole are one.
     """
 
     sharpness: tuple[float, ...] = (20.0, 80.0, 300.0, 1000.0)
@@ -57,11 +58,10 @@ class FixedOrderSettings:
     armijo: float = 1e-4
     wolfe: float = 0.5
     trials: int = 25
+    same_pole: float = 1e-9
 
 
 SETTINGS = FixedOrderSettings()
-# Relative distance up to which two computations of a pole are one.
-SAME_POLE = 1e-9
 
 
 def fixed_order(P: StateSpace, structure: BlockStructure, K: StateSpace, order: int, decentralised: bool = False,
@@ -156,7 +156,7 @@ def _without_one_mode(K: StateSpace) -> list[StateSpace]:
             continue
 
         def other(re: float, im: float, pole: complex = pole) -> bool:
-            return abs(complex(re, abs(im)) - pole) > SAME_POLE * abs(pole)
+            return abs(complex(re, abs(im)) - pole) > SETTINGS.same_pole * abs(pole)
         kept, gone = split(K, other)
         if gone.nstates:
             fewer.append(kept)

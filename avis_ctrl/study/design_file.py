@@ -16,14 +16,13 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    ValidationError,
     ValidationInfo,
     field_serializer,
     field_validator,
 )
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.file_errors import first_complaint, read_toml
+from avis_ctrl.rigs.file_errors import read_toml, validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import SHIPPED, load_rig
 from avis_ctrl.rigs.rig_sections import LIMIT, Band, Spectrum
@@ -248,13 +247,10 @@ def read_design(path: str | Path) -> Design:
 
 def design_from_table(table: dict, file: object = None) -> Design:
     """Check a design given as a table."""
+    design = validated(Design, table, file)
     try:
-        design = Design.model_validate(table)
         _require_band_below_crossovers(design)
         _require_rival(design)
-    except ValidationError as error:
-        complaint = first_complaint(error, Design)
-        raise (complaint.in_file(file) if file is not None else complaint) from None
     except InputError as complaint:
         raise (complaint.in_file(file) if file is not None else complaint) from None
     return design

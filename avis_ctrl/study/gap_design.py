@@ -21,7 +21,7 @@ from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.realisation import Realised, not_realised, realise
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.lti.norms import hinf_norm
+from avis_ctrl.lti.norms import decibels, hinf_norm
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
@@ -241,13 +241,9 @@ def figures(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace
     in_band = nominal.frequency_response(2 * np.pi * np.geomspace(low, high, 400))
     worst = worst_case_gain(motion, blocks, slack=SLACK)
     worst_band = worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high), slack=SLACK)
-    return LoopFigures(True, in_six, mu.upper, mu.lower, _dB(hinf_norm(nominal).gain),
-                       _dB(float(np.max(np.linalg.norm(in_band, ord=2, axis=(1, 2))))), _dB(worst.upper),
-                       _dB(worst_band.upper), fastest)
-
-
-def _dB(value: float) -> float:
-    return float(20 * np.log10(value)) if value > 0 else -float("inf")
+    return LoopFigures(True, in_six, mu.upper, mu.lower, decibels(hinf_norm(nominal).gain),
+                       decibels(float(np.max(np.linalg.norm(in_band, ord=2, axis=(1, 2))))), decibels(worst.upper),
+                       decibels(worst_band.upper), fastest)
 
 
 def start_files(design: Design, model: TableModel, when: float = 0.0

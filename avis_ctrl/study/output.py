@@ -11,6 +11,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
+from avis_ctrl.lti.norms import decibels
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.files import as_json
 from avis_ctrl.study.saved import STUDY, study_dict
@@ -61,13 +62,11 @@ def _worst_case(result: DesignResult, bound: Bound) -> dict[str, Any] | None:
 
 
 def _controller_row(c: ControllerResult) -> dict[str, Any]:
-    def dB(value: float) -> float:
-        return 20 * float(np.log10(value)) if value > 0 else -np.inf
     return {"name": c.name, "kind": c.kind, "file": f"controllers/{c.name}.json" if c.K is not None else None,
             "order": c.order, "gamma": c.gamma, "mu_upper": c.mu.upper, "mu_lower": c.mu.lower,
             "mu_peak_Hz": c.mu.omega / (2 * np.pi), "stable": c.stable,
-            "peak_transmissibility_dB": dB(c.peak_transmissibility),
-            "worst_case_peak_transmissibility_dB": dB(c.worst_peak.upper), "note": "; ".join(c.notes)}
+            "peak_transmissibility_dB": decibels(c.peak_transmissibility),
+            "worst_case_peak_transmissibility_dB": decibels(c.worst_peak.upper), "note": "; ".join(c.notes)}
 
 
 def _failed_row(c: FailedController) -> dict[str, Any]:

@@ -10,9 +10,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import ValidationError
-
-from avis_ctrl.rigs.file_errors import first_complaint, read_toml
+from avis_ctrl.rigs.file_errors import read_toml, validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
 
@@ -36,11 +34,7 @@ def read_plan(path: str | Path) -> CampaignPlan:
 
 def plan_from_table(table: dict, file: object = None) -> CampaignPlan:
     """Check a plan given as a table."""
-    try:
-        return CampaignPlan.model_validate(table)
-    except ValidationError as error:
-        complaint = first_complaint(error, CampaignPlan)
-        raise (complaint.in_file(file) if file is not None else complaint) from None
+    return validated(CampaignPlan, table, file)
 
 
 def default_plan(rig: Rig, scheme: Literal["zippered", "orthogonal"] = "zippered", *, perturbed: bool = False,

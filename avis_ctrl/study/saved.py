@@ -7,10 +7,8 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.file_errors import first_complaint
+from avis_ctrl.rigs.file_errors import validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -53,12 +51,10 @@ def read_saved(folder: Path) -> tuple[Design, Rig]:
         table = dict(content["design"])
         known = dict(table.get("uncertainty") or {})
         if isinstance(known.get("identified"), dict):
-            known["identified"] = UncertaintyFile.model_validate(known["identified"])
+            known["identified"] = validated(UncertaintyFile, known["identified"])
             table["uncertainty"] = known
         design = design_from_table({key: value for key, value in table.items() if value is not None})
         rig = rig_from(tomllib.loads(content["rig"]), bool(content.get("loaded")))
-    except ValidationError as error:
-        raise first_complaint(error, UncertaintyFile).in_file(path) from None
     except InputError as error:
         raise error.in_file(path) from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from avis_ctrl.errors import InputError
+from avis_ctrl.lti.norms import decibels
 from avis_ctrl.rigs.file_errors import read_toml
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -112,5 +111,5 @@ def figures_of(found: ControllerResult) -> dict[str, Any]:
     """What the table shows of a controller."""
     return {"mu_upper": found.mu.upper, "mu_lower": found.mu.lower,
             "guaranteed": found.mu.guaranteed and found.worst_peak.guaranteed and found.worst_band.guaranteed,
-            "worst_case_peak_transmissibility_dB": 20 * float(np.log10(found.worst_peak.upper)),
-            BAND: 20 * float(np.log10(found.worst_band.upper)), "order": found.order}
+            "worst_case_peak_transmissibility_dB": decibels(found.worst_peak.upper),
+            BAND: decibels(found.worst_band.upper), "order": found.order}

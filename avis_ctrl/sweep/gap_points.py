@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.formats import read_measurements
-from avis_ctrl.rigs.file_errors import first_complaint
+from avis_ctrl.rigs.file_errors import validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import SHIPPED, load_rig
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -74,10 +74,7 @@ class GapBase:
             raise InputError("expected the name of a file", field=wrong[0], value=names[wrong[0]])
         given = {key: value for key, value in point.items() if key not in names and
                  not key.startswith((VALUE, FACTOR))}
-        try:
-            options = Options.model_validate(given)
-        except ValidationError as error:
-            raise first_complaint(error, Options) from None
+        options = validated(Options, given)
         path = (self.folder / names["base"]).resolve()
         if path not in self.digests:
             self.digests[path] = digest(_campaign(path))

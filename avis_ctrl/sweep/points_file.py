@@ -6,9 +6,9 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from avis_ctrl.rigs.file_errors import first_complaint, read_toml
+from avis_ctrl.rigs.file_errors import read_toml, validated
 
 
 class _Section(BaseModel):
@@ -71,7 +71,4 @@ class PointsFile(_Section):
 
 def read_points_file(path: Path) -> PointsFile:
     """Read and check a file of points. Raises InputError: one line naming file, field, value and what was expected."""
-    try:
-        return PointsFile.model_validate(read_toml(path, "a file of points as in docs/sweep.md"))
-    except ValidationError as error:
-        raise first_complaint(error, PointsFile).in_file(path) from None
+    return validated(PointsFile, read_toml(path, "a file of points as in docs/sweep.md"), path)

@@ -20,8 +20,18 @@ from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.weight_base import Role, Weight, smallest_cover
 
 Kind = Literal["output", "input", "additive"]
-# Relative size below which what the nominal system cannot make of an error is round-off.
-ROUND_OFF = 1e-8
+
+
+@dataclass(frozen=True)
+class CoverSettings:
+    """round_off : relative size below which what the nominal system cannot make of an error is round-off.
+    followed : errors below this fraction of the largest are covered, not followed closely."""
+
+    round_off: float = 1e-8
+    followed: float = 1e-4
+
+
+SETTINGS = CoverSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -43,8 +53,7 @@ class UncertaintyWeight(Shown, Weight):
 
     @cached_property
     def shape(self) -> Rational:
-        # Errors far below the largest are covered, not followed.
-        floor = np.maximum(self.error, 1e-4 * np.max(self.error))
+        floor = np.maximum(self.error, SETTINGS.followed * np.max(self.error))
         return smallest_cover(self.omega, floor, floor, self.tolerance_dB, self.max_order, "the error")
 
     @property
@@ -101,7 +110,7 @@ def uncertainty_weight(nominal: Any, responses: Sequence[Any] | Any, *, kind: Ki
             inverse, whole = np.linalg.pinv(G), difference
             difference = whole @ inverse if kind == "output" else inverse @ whole
             rest = whole - (difference @ G if kind == "output" else G @ difference)
-            if np.linalg.norm(rest) > ROUND_OFF * np.linalg.norm(whole):
+            if np.linalg.norm(rest) > SETTINGS.round_off * np.linalg.norm(whole):
                 raise InputError(f"no error at the {kind} of the nominal system makes this response; expected kind "
                                  f"additive or {'input' if kind == 'output' else 'output'}", field=f"response {k}")
         error = np.maximum(error, np.linalg.norm(difference, ord=2, axis=(1, 2)))
