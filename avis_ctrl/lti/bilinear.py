@@ -9,7 +9,7 @@ far below the sample rate as they are, so that the image is as well scaled as th
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as la
@@ -17,8 +17,16 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti.statespace import StateSpace
 
-# Distance of a pole from the point that goes to infinity, relative to that point, up to which it counts as there.
-AT_INFINITY = 1e-9
+
+@dataclass(frozen=True)
+class BilinearSettings:
+    """at_infinity : distance of a pole from the point that goes to infinity, relative to that point, up to which it
+    counts as there; nearer ones lose more digits than a design can spare."""
+
+    at_infinity: float = 1e-9
+
+
+SETTINGS = BilinearSettings()
 
 
 def continuous_image(system: StateSpace) -> StateSpace:
@@ -74,7 +82,7 @@ def sampled_frequency(image: np.ndarray | float, dt: float) -> np.ndarray | floa
 def _inverse(matrix: np.ndarray, size: float, failed: str, cause: str) -> np.ndarray:
     # By the poles, not by a condition, in which the units of the states would count.
     nearest = float(np.min(np.abs(la.eigvals(matrix)))) / size
-    if nearest <= AT_INFINITY:
+    if nearest <= SETTINGS.at_infinity:
         raise ComputationError(failed, measured=f"relative distance {nearest:.1e}", cause=cause,
                                next_step="move the pole off this point, or take another discretisation")
     return np.linalg.inv(matrix)
