@@ -13,7 +13,16 @@ class AvisError(Exception):
 
 
 class InputError(AvisError, ValueError):
-    """The input is wrong (exit code 2): one line naming file, field, value and what was expected."""
+    """The input is wrong (exit code 2): one line naming file, field, value and what was expected.
+
+    Examples
+    --------
+    >>> try:
+    ...     ac.tf([1.0, 0.0], [1.0])
+    ... except ac.InputError as error:
+    ...     print(error)
+    improper: numerator of degree 1 over denominator of degree 0
+    """
 
     exit_code = 2
 
@@ -30,7 +39,16 @@ class InputError(AvisError, ValueError):
 
 
 class ComputationError(AvisError, ArithmeticError):
-    """A computation failed (exit code 3): what failed, the measured number, the likely cause, the next step."""
+    """A computation failed (exit code 3): what failed, the measured number, the likely cause, the next step.
+
+    Examples
+    --------
+    >>> try:
+    ...     ac.mu_peak(ac.tf([1.0], [1.0, -1.0]), [ac.ComplexScalar(1)])
+    ... except ac.ComputationError as error:
+    ...     print(error.measured, "-", error.cause)
+    pole 1+0j - the nominal closed loop is unstable or has a mode that the controller misses
+    """
 
     exit_code = 3
 

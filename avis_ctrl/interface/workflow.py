@@ -34,6 +34,12 @@ def rig(source: str | Path = "avis", loaded: bool = False) -> Rig:
     """A table: a shipped one ("avis", "halcyonics", "halcyonics_loaded") or that of a rig file (docs/rig_file.md).
 
     loaded : with the load of the file's [load] section. Raises InputError: one line that names file, field and value.
+
+    Examples
+    --------
+    >>> table = ac.rig("avis")
+    >>> table.parameters()["mass"].value
+    500.0
     """
     return load_rig(source, loaded)
 
@@ -46,7 +52,17 @@ def campaign(path: str | Path, columns: Mapping[str, Any] | None = None, **hints
     columns : which variable of the file is what, such as {"u": ["V1", "V2"], "y": "S1", "t": "time"}.
     hints : what the file does not state: period_s, excitation, sample_rate_Hz, y_unit.
 
-    Raises InputError: one line that names the file, the field, its value and what was expected.
+    Raises
+    ------
+    InputError : one line that names the file, the field, its value and what was expected.
+
+    Examples
+    --------
+    >>> volts = np.random.default_rng(1).normal(size=(1000, 3))
+    >>> np.savetxt("record.csv", volts, header="V1,V2,S1", delimiter=",", comments="")
+    >>> measured = ac.campaign("record.csv", {"u": ["V1", "V2"], "y": "S1"}, sample_rate_Hz=1000.0)
+    >>> measured.u_names, measured.records[0].header.samples
+    (('V1', 'V2'), 1000)
     """
     return read_measurements(path, columns, **hints)
 
@@ -57,6 +73,13 @@ def simulate_campaign(table: Rig | str, plan: Mapping[str, Any] | str | Path | N
 
     plan : file or keys of docs/campaign_plan.md; by default multisines at three levels, noise, rest, a shaken floor.
     Raises InputError for a plan that is wrong.
+
+    Examples
+    --------
+    >>> plan = {"duration_s": 2.0, "record": [{"excitation": "noise", "level_percent": 50.0, "records": 2}]}
+    >>> measured = ac.simulate_campaign("avis", plan, seed=3)
+    >>> len(measured.records), measured.y_names[:2]
+    (2, ('Sy1', 'Sz1'))
     """
     table = _rig(table)
     chosen = (default_plan(table) if plan is None else plan_from_table(dict(plan)) if isinstance(plan, Mapping)
@@ -79,6 +102,15 @@ def identify(measured: Campaign | FrequencyResponse | str | Path, table: Rig | s
     ------
     InputError : records that are not of this table, a gate that says stop, options that do not fit.
     ComputationError : a fit that does not come to an end.
+
+    Examples
+    --------
+    >>> plan = {"duration_s": 20.0, "truth": {"perturb_percent": 5.0}, "record": [
+    ...     {"excitation": "noise", "level_percent": 50.0, "records": 3, "band_Hz": [0.5, 60.0]}]}
+    >>> identified = ac.identify(ac.simulate_campaign("avis", plan, seed=3), "avis", starts=1)
+    >>> value, standard_deviation, unit = identified.values["mass"]
+    >>> abs(value - 500.0) < 50.0, standard_deviation < 25.0, unit
+    (True, True, 'kg')
     """
     found = identify_rig(_measured(measured), _rig(table), _options(IdentifyOptions, options), progress or _silent)
     return IdentificationStudy(found)
@@ -90,6 +122,13 @@ def gap(measured: Campaign | FrequencyResponse | str | Path, table: Rig | str, *
 
     options : band_Hz, seed, gates, despite_gates, amplifier_corner_Hz, design, design_file, own_effects; see
         `avis_ctrl.study.gap.GapOptions`. Raises as `identify`.
+
+    Examples
+    --------
+    >>> measured = ac.simulate_campaign("avis", "designs/plans/lagging_amplifiers.toml")
+    >>> found = ac.gap(measured, "avis")
+    >>> found.verdict, [effect.name for effect in found.effects]
+    ('explained', ['actuator_lag'])
     """
     return GapStudy(find_gap(_measured(measured), _rig(table), _options(GapOptions, options), progress or _silent))
 
@@ -108,6 +147,16 @@ def design(source: Design | IdentificationStudy | Rig | str | Path, *, progress:
     Raises
     ------
     InputError : a key, value or parameter that does not fit, in one line. ComputationError : no controller exists.
+
+    Examples
+    --------
+    >>> study = ac.design("designs/avis_z_phix.toml", keep=["z"], synthesis={"max_iterations": 2},
+    ...                   simulation={"duration_s": 15.0, "random_plants": 0})
+    >>> study.met
+    True
+    >>> files = study.save("reports/z")
+    >>> "report.html" in {path.name for path in files}
+    True
     """
     return DesignStudy(run_design(*study_inputs(source, **sections), progress or _silent))
 

@@ -54,6 +54,16 @@ class StateSpace:
     Raises
     ------
     InputError : shapes that do not fit, entries that are not finite, names that repeat.
+
+    Examples
+    --------
+    >>> G = ac.StateSpace([[0, 1], [-4, -0.4]], [[0], [1]], [[1, 0]], [[0]], inputs=["force"], outputs=["x"])
+    >>> G
+    StateSpace(2 states, continuous, ['force'] -> ['x'])
+    >>> (2 * G @ G).nstates, G.is_stable(), G.dcgain()      # @ is the series connection: the right one acts first
+    (4, True, array([[0.25]]))
+    >>> control.damp(G.to_control(), doprint=False)[1]
+    array([0.1, 0.1])
     """
 
     A: np.ndarray
@@ -277,6 +287,11 @@ def tf(numerator: Sequence[float], denominator: Sequence[float], inputs: Sequenc
     """A proper scalar transfer function, coefficients by descending power of s, in a balanced companion form.
 
     Raises InputError when it is improper (more zeros than poles).
+
+    Examples
+    --------
+    >>> ac.tf([25.0], [1.0, 10.0, 10.0, 10.0]).dcgain()
+    array([[2.5]])
     """
     num = np.trim_zeros(np.atleast_1d(np.asarray(numerator, float)), "f")
     den = np.trim_zeros(np.atleast_1d(np.asarray(denominator, float)), "f")

@@ -5,6 +5,12 @@ mu : both bounds over frequency, with the certified peak.
 transmissibility : floor to payload of the controllers of a design, with their certified worst cases.
 dk_history, order : the course of a mu synthesis; mu by the controller's order.
 vc_curves : generic vibration criteria, with third-octave spectra.
+
+Examples
+--------
+>>> magnitude, phase = ac.plot.bode(ac.tf([25.0], [1.0, 10.0, 10.0, 10.0]))
+>>> magnitude.get_ylabel()
+'magnitude [dB]'
 """
 
 from avis_ctrl.plot.results import dk_history, mu, order, transmissibility, vc_curves

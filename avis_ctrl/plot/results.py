@@ -47,7 +47,9 @@ def transmissibility(result: Any, ax: Any = None, *, controllers: Iterable[str] 
     result : a design's result (of `avis_ctrl.design` or `run_design`).
     controllers : names of those drawn; by default all. The certified worst-case peak of the last one is a dashed line.
 
-    Returns the axes. Raises InputError for a controller that the result does not have.
+    Raises
+    ------
+    InputError : a controller that the result does not have.
     """
     ax = axes_of(ax)
     result = getattr(result, "result", result)

@@ -18,6 +18,8 @@ SAMPLES, FAINT = 20, {"color": "#0072b2", "alpha": 0.3, "linewidth": 0.8}
 def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label: str | None = None, **line: Any) -> Any:
     """Magnitude [dB] and phase [degrees] over frequency [Hz], one curve for each input and output.
 
+    Returns the two axes.
+
     Parameters
     ----------
     system : StateSpace, or python-control's StateSpace, TransferFunction or FRD; of an UncertainSystem the nominal one
@@ -27,7 +29,9 @@ def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label:
     label : of the curves in the legend; by default "output / input" where there are several.
     line : options of matplotlib's `plot`.
 
-    Returns the two axes. Raises InputError for something that is no system.
+    Raises
+    ------
+    InputError : something that is no system.
     """
     top, bottom = axes = axes_of(ax, 2)
     if isinstance(system, UncertainSystem):

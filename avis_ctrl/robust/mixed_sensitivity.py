@@ -49,6 +49,15 @@ def mixed_sensitivity(G: Any, W_S: Any = None, W_KS: Any = None, W_T: Any = None
     Raises
     ------
     InputError : no weight, or one that does not fit. ComputationError : no stabilising controller.
+
+    Examples
+    --------
+    Skogestad and Postlethwaite, example 2.17, where gamma is 1.37:
+
+    >>> G = ac.tf([200.0], [0.025, 1.0025, 10.1, 1.0])
+    >>> made = ac.mixed_sensitivity(G, W_S=ac.tf([1 / 1.5, 10.0], [1.0, 1e-3]), W_KS=1.0, backoff=0.001)
+    >>> round(made.gamma, 2)
+    1.37
     """
     G = as_system(G, "G")
     n_y, n_u = G.noutputs, G.ninputs

@@ -108,6 +108,17 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     InputError : blocks that do not fit P, counts or options that are wrong, controllers that do not fit, a state of
         other controllers.
     ComputationError : no stabilising controller (the mode is named), or none found.
+
+    Examples
+    --------
+    x' = -x + w + k u with z = (x, u) and y = x + n, the actuator's gain k known to 50 %:
+
+    >>> k = ac.real("k", 1.0, percent=50)
+    >>> plant = ac.ss([[-1]], [[1, 0, k]], [[1], [0], [1]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]])
+    >>> P, blocks = plant.lft()
+    >>> made = ac.musyn(P, blocks, nmeas=1, ncon=1, max_iterations=3, polish=False)
+    >>> made.guaranteed, round(made.mu_upper, 2)
+    (True, 0.91)
     """
     P = as_plant(P, nmeas, ncon)
     if structure not in ("full", "decentralised"):

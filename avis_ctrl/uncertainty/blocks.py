@@ -46,7 +46,13 @@ class Block:
 
 
 class RealScalar(Block):
-    """delta I_n with delta real: a physical parameter."""
+    """delta I_n with delta real: a physical parameter.
+
+    Examples
+    --------
+    >>> ac.RealScalar(2, "k")
+    RealScalar(rows=2, cols=2, name='k')
+    """
 
     kind = "real"
 
@@ -55,7 +61,13 @@ class RealScalar(Block):
 
 
 class ComplexScalar(Block):
-    """delta I_n with delta complex: one neglected dynamic that acts n times."""
+    """delta I_n with delta complex: one neglected dynamic that acts n times.
+
+    Examples
+    --------
+    >>> ac.ComplexScalar(1, "loss").kind
+    'complex'
+    """
 
     kind = "complex"
 
@@ -64,7 +76,13 @@ class ComplexScalar(Block):
 
 
 class ComplexFull(Block):
-    """A full complex matrix of rows x cols: neglected dynamics, or a performance channel."""
+    """A full complex matrix of rows x cols: neglected dynamics, or a performance channel.
+
+    Examples
+    --------
+    >>> ac.ComplexFull(2, 3, "flexible modes").rows
+    2
+    """
 
     kind = "full"
 
@@ -74,7 +92,14 @@ class ComplexFull(Block):
 
 @dataclass(frozen=True)
 class BlockStructure:
-    """The blocks of Delta in order, with their places in z_delta and w_delta."""
+    """The blocks of Delta in order, with their places in z_delta and w_delta.
+
+    Examples
+    --------
+    >>> blocks = ac.BlockStructure.of([ac.RealScalar(2, "k"), ac.ComplexFull(1, 2, "flexible modes")])
+    >>> blocks.n_w, blocks.n_z
+    (3, 4)
+    """
 
     blocks: tuple[Block, ...]
 

@@ -72,22 +72,29 @@ class UncertaintyWeight(Shown, Weight):
 def uncertainty_weight(nominal: Any, responses: Sequence[Any] | Any, *, kind: Kind = "output",
                        omega: np.ndarray | None = None, tolerance_dB: float = 2.0, max_order: int = 8
                        ) -> UncertaintyWeight:
-    """The filter of lowest order that covers the error of every response about a nominal one.
+    """The filter of lowest order that covers the error of every response about a nominal one, at the frequencies given.
 
     Parameters
     ----------
     nominal, responses : systems, python-control FRDs, or an `UncertainSystem`'s `sample`; one response or a list.
     kind : "output" (G_k - G) G^+ , "input" G^+ (G_k - G), both largest singular values, "additive" G_k - G.
     omega : (n,) frequencies [rad/s]; by default those of the first FRD, or around the poles of the nominal system.
-    tolerance_dB : how far W may lie above the error. max_order : most states.
-
-    The cover is checked at these frequencies only.
+    tolerance_dB : how far W may lie above the error.
+    max_order : most states.
 
     Raises
     ------
     InputError : no responses, responses of another shape, a nominal response that is zero or not finite, an error that
         the nominal system cannot make from this side (fewer inputs than outputs, say).
     ComputationError : no filter of this order within the tolerance.
+
+    Examples
+    --------
+    >>> plant = ac.ss([[0, 1], [-ac.real("k", 2.0, percent=30), -1.0]], [[0], [1]], [[1, 0]])
+    >>> weight = ac.uncertainty_weight(plant.nominal, plant.sample(20, seed=1))
+    >>> weight.order, bool(np.all(weight.magnitude(weight.omega) >= weight.error))
+    (2, True)
+    >>> model = plant.nominal * (1 + ac.dynamics("spread", weight))
     """
     every = list(responses) if isinstance(responses, (list, tuple)) else [responses]
     if not every or kind not in ("output", "input", "additive"):

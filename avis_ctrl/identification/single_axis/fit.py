@@ -19,6 +19,7 @@ import numpy as np
 from avis_ctrl import uncertain_value
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
+from avis_ctrl.summary import Shown
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class ResidualStatistics:
     lags: int
 
 
-@dataclass(frozen=True, eq=False)
-class SingleAxisFit:
+@dataclass(frozen=True, eq=False, repr=False)
+class SingleAxisFit(Shown):
     """Parameters of a model of one axis.
 
     Attributes

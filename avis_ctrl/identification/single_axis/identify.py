@@ -62,6 +62,17 @@ def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str]
     Raises
     ------
     InputError : an unknown kind, role, option or column; a file that cannot be read. ComputationError : as the fits.
+
+    Examples
+    --------
+    A decay of 1 Hz and damping ratio 0.02:
+
+    >>> t = np.arange(0.0, 20.0, 0.01)
+    >>> y = np.exp(-0.02 * 2 * np.pi * t) * np.cos(2 * np.pi * np.sqrt(1 - 0.02**2) * t)
+    >>> y += 0.01 * np.random.default_rng(1).normal(size=t.size)
+    >>> np.savetxt("decay.csv", np.c_[t, y], header="t,y", delimiter=",", comments="")
+    >>> print(ac.single_axis("decay", "decay.csv", {"t": "t", "y": "y"}, corner_Hz=1.1, damping=0.05).lines()[0])
+    corner_Hz = 0.999986 +- 0.000031 Hz
     """
     if kind not in ROLES:
         raise InputError(f"expected one of {', '.join(ROLES)}", field="kind", value=kind)
