@@ -15,9 +15,11 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import inspect
 import io
 import json
 import os
+import pydoc
 import re
 import subprocess
 import sys
@@ -27,9 +29,12 @@ from typing import Any
 
 import numpy as np
 
+import avis_ctrl as ac
+
 ROOT = Path(__file__).resolve().parents[1]
 LEVELS = ("check", "quick", "full", "gallery")
 FENCE = re.compile(r"^```(python|console)((?: \w+)*)\n(.*?)^```\n", re.MULTILINE | re.DOTALL)
+REFERENCE = re.compile(r"^::: ([\w.]+)(?:: (.*))?$", re.MULTILINE)
 
 
 class Failed(Exception):
@@ -169,11 +174,54 @@ def notebook(text: str) -> str:
     return json.dumps({"nbformat": 4, "nbformat_minor": 5, "metadata": {"kernelspec": kernel}, "cells": cells}, indent=1)
 
 
+def reference(path: str, members: str = "") -> str:
+    """Heading, signature and docstring of a public name, and of some of its members, as Markdown."""
+    found = pydoc.locate(path)
+    if found is None:
+        raise Failed(f"{path}: no such object")
+    name = next((key for key in ac.__all__ if getattr(ac, key) is found), path.rpartition(".")[2])
+    parts = [_described(found, name, "##")]
+    for member in members.replace(",", " ").split():
+        parts.append(_described(inspect.getattr_static(found, member), f"{name}.{member}", "###"))
+    return "\n".join(parts)
+
+
+def _described(one: Any, name: str, heading: str) -> str:
+    one = one.fget if isinstance(one, property) else getattr(one, "__func__", one)
+    call = ""
+    if inspect.isfunction(one) or name == "StateSpace":
+        signature = inspect.signature(one)
+        plain = [each.replace(annotation=each.empty) for each in signature.parameters.values() if each.name != "self"]
+        call = f"```python\n{name}{signature.replace(parameters=plain, return_annotation=signature.empty)}\n```\n"
+    return f"{heading} {name}\n\n{call}\n{docstring(inspect.getdoc(one) or '')}\n"
+
+
+def docstring(text: str) -> str:
+    """The house style of docstrings as Markdown: headings, lists of `name : meaning`, examples."""
+    text = re.sub(r"^(\w+)\n-+$", r"**\1**\n", text, flags=re.MULTILINE)
+    # `name : meaning. other : meaning` are two items; a line that is indented goes on with the one above.
+    text = re.sub(r"(?<=[.;\w)]) ([a-zA-Z_]\w*(?:, \w+)*) : ", r"\n\1 : ", text) if " : " in text else text
+    lines, code = [], False
+    for line in text.splitlines():
+        if line.startswith(">>>") and not code:
+            lines.append("```pycon")
+            code = True
+        if code and not line.strip():
+            lines.append("```")
+            code = False
+        item = None if code else re.match(r"([a-zA-Z_]\w*(?:, \w+)*) : (.*)", line)
+        if item and lines and not lines[-1].startswith("- ") and lines[-1].strip():
+            lines.append("")
+        lines.append(f"- `{item[1]}`: {item[2]}" if item else line)
+    return "\n".join([*lines, *(["```"] if code else [])])
+
+
 def on_page_markdown(text: str, page: Any, config: Any, files: Any) -> str:
     """The hook of mkdocs."""
     from mkdocs.structure.files import File
 
     level, source = LEVELS.index(os.environ.get("AVIS_DOCS", "full")), page.file.src_uri
+    text = REFERENCE.sub(lambda match: reference(match[1], match[2] or ""), text)
     if not page.meta.get("run"):
         return text
     with folder_for_page() as folder:
