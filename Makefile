@@ -5,7 +5,7 @@ BIN = .venv/bin
 export OPENBLAS_NUM_THREADS = 1
 export OMP_NUM_THREADS = 1
 
-.PHONY: test test-slow demo lint bench clean
+.PHONY: test test-slow demo docs gallery lint bench clean
 
 $(BIN)/.installed: pyproject.toml constraints.txt
 	@echo "Installing into .venv: a minute or two"
@@ -29,6 +29,14 @@ demo: $(BIN)/.installed
 	$(BIN)/avis design designs/avis_z_phix.toml --out reports/avis_z_phix
 	$(BIN)/avis simulate-campaign --rig avis --plan designs/plans/lagging_amplifiers.toml --out reports/lagging_amplifiers.h5
 	$(BIN)/avis gap reports/lagging_amplifiers.h5 --rig avis --out reports/lagging_amplifiers
+
+# Every example is run, so that no figure is older than the code; AVIS_DOCS=check builds without running them.
+docs: $(BIN)/.installed
+	PATH=$(BIN):$$PATH PYTHONPATH=. NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+	@echo "Open build/site/index.html; the search needs a server: $(BIN)/python -m http.server -d build/site"
+
+gallery: export AVIS_DOCS = gallery
+gallery: docs
 
 # Minutes each; the campaigns of hours beside them (gates, random_plants, sound_campaigns, mutations, own_tables, blind)
 # are started by hand.

@@ -1,4 +1,4 @@
-"""Runs the examples on the pages of the site and puts their results below them; a hook of mkdocs, and used by the tests.
+"""Runs the examples on the pages of the site and shows their results below them; a hook of mkdocs, used by the tests.
 
 On a page with `run: true` in its head, Python blocks run in order, in one namespace and one folder. What they print,
 their last value and their figures are shown below them. `# -> value` beside an expression states its value, which is
@@ -37,7 +37,7 @@ FENCE = re.compile(r"^```(python|console)((?: \w+)*)\n(.*?)^```\n", re.MULTILINE
 REFERENCE = re.compile(r"^::: ([\w.]+)(?:: (.*))?$", re.MULTILINE)
 
 
-class Failed(Exception):
+class ExampleError(Exception):
     """An example that does not run, or does not give what the page says."""
 
 
@@ -69,10 +69,10 @@ class Runner:
         os.chdir(self.folder)
         try:
             made = self._console(code) if language == "console" else self._python(code)
-        except Failed:
+        except ExampleError:
             raise
         except Exception as error:
-            raise Failed(f"{self.name}: {error!r} in\n{code}") from error
+            raise ExampleError(f"{self.name}: {error!r} in\n{code}") from error
         finally:
             os.chdir(home)
         return "\n".join([shown, *made, *self._reports(before)]) + "\n"
@@ -100,7 +100,7 @@ class Runner:
         first = stated[0] if isinstance(stated, tuple) and stated else stated
         same = np.allclose(value, stated, rtol=5e-3) if isinstance(first, float) else value == stated
         if not same:
-            raise Failed(f"{self.name}: {line.strip()}: found {value!r}")
+            raise ExampleError(f"{self.name}: {line.strip()}: found {value!r}")
         self.compared += 1
 
     def _figures(self) -> list[str]:
@@ -123,7 +123,7 @@ class Runner:
                 done = subprocess.run(["bash", "-c", line[2:]], capture_output=True, text=True, check=False,
                                       env={**os.environ, "PATH": path, "COLUMNS": "100"})
                 if done.returncode:
-                    raise Failed(f"{self.name}: {line}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
+                    raise ExampleError(f"{self.name}: {line}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
                 printed.append(done.stdout.rstrip())
         text = "\n".join(part for part in printed if part)
         return [f"```text\n{text}\n```\n"] if text else []
@@ -142,7 +142,7 @@ def _value(value: Any) -> list[str]:
     if hasattr(value, "_repr_html_"):
         return [f'<div class="result">{value._repr_html_()}</div>\n']
     plain = isinstance(value, (bool, int, float, complex, str, tuple, list, dict, np.ndarray))
-    if not plain or getattr(value, "dtype", None) == object or "Path(" in repr(value):
+    if not plain or (isinstance(value, np.ndarray) and value.dtype.hasobject) or "Path(" in repr(value):
         return []
     return [f"```text\n{value if isinstance(value, str) else repr(value)}\n```\n"]
 
@@ -171,14 +171,14 @@ def notebook(text: str) -> str:
         place = match.end()
     add("markdown", text[place:])
     kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
-    return json.dumps({"nbformat": 4, "nbformat_minor": 5, "metadata": {"kernelspec": kernel}, "cells": cells}, indent=1)
+    return json.dumps({"nbformat": 4, "nbformat_minor": 5, "metadata": {"kernelspec": kernel}, "cells": cells})
 
 
 def reference(path: str, members: str = "") -> str:
     """Heading, signature and docstring of a public name, and of some of its members, as Markdown."""
     found = pydoc.locate(path)
     if found is None:
-        raise Failed(f"{path}: no such object")
+        raise ExampleError(f"{path}: no such object")
     name = next((key for key in ac.__all__ if getattr(ac, key) is found), path.rpartition(".")[2])
     parts = [_described(found, name, "##")]
     for member in members.replace(",", " ").split():
