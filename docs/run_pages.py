@@ -94,7 +94,7 @@ class Runner:
                     self._compare(value, ast.literal_eval(stated), lines[node.end_lineno - 1])
                     value = None
         text = printed.getvalue()
-        return [*([f"```text\n{text.rstrip()}\n```\n"] if text.strip() else []), *_value(value), *self._figures()]
+        return [*_text(text), *_value(value), *self._figures()]
 
     def _compare(self, value: Any, stated: Any, line: str) -> None:
         first = stated[0] if isinstance(stated, tuple) and stated else stated
@@ -125,8 +125,7 @@ class Runner:
                 if done.returncode:
                     raise ExampleError(f"{self.name}: {line}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
                 printed.append(done.stdout.rstrip())
-        text = "\n".join(part for part in printed if part)
-        return [f"```text\n{text}\n```\n"] if text else []
+        return _text("\n".join(part for part in printed if part))
 
     def _reports(self, before: set[Path]) -> list[str]:
         links = []
@@ -137,6 +136,15 @@ class Runner:
         return [f"Made by this run: {', '.join(links)}\n"] if links else []
 
 
+def _text(text: str) -> list[str]:
+    """Printed text; where it is long, folded."""
+    if not text.strip():
+        return []
+    block = f"```text\n{text.rstrip()}\n```\n"
+    fold = text.count("\n") > 24
+    return [f'<details markdown="1"><summary>What it prints</summary>\n\n{block}\n</details>\n' if fold else block]
+
+
 def _value(value: Any) -> list[str]:
     """The last value of a block, as a notebook shows it; axes, files and functions are not shown."""
     if hasattr(value, "_repr_html_"):
@@ -144,7 +152,7 @@ def _value(value: Any) -> list[str]:
     plain = isinstance(value, (bool, int, float, complex, str, tuple, list, dict, np.ndarray))
     if not plain or (isinstance(value, np.ndarray) and value.dtype.hasobject) or "Path(" in repr(value):
         return []
-    return [f"```text\n{value if isinstance(value, str) else repr(value)}\n```\n"]
+    return _text(value if isinstance(value, str) else repr(value))
 
 
 @contextlib.contextmanager

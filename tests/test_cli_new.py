@@ -33,6 +33,8 @@ def test_a_rig_from_mass_size_and_frequencies(tmp_path, mounts, drives):
     # sqrt(k/m) of the whole table is the frequency that was asked for.
     assert np.sqrt(sum(k) / 240) / (2 * np.pi) == pytest.approx(4.0, rel=1e-5)
     eom = rig.equations_of_motion()
+    # ... and so is that of its vertical mode, for three mounts, too: it does not tilt.
+    assert np.min(np.abs(eom.natural_frequencies().frequencies_Hz - 4.0)) < 1e-3
     assert len(eom.actuators) == drives
     # The drives move all six coordinates.
     assert np.linalg.matrix_rank(eom.T) == 6
@@ -85,6 +87,37 @@ def test_wrong_answers_are_one_line_and_write_nothing(tmp_path, arguments, said)
     done = avis("new", *(str(tmp_path / word) if word in ("OUT", "OLD") else word for word in arguments))
     assert done.returncode == 2 and said in done.stderr and done.stderr.count("\n") == 1
     assert (tmp_path / "OLD").read_text() == "kept" and not (tmp_path / "OUT").exists()
+
+
+def test_a_wrong_answer_is_asked_for_again_at_once(tmp_path):
+    path = tmp_path / "mine.toml"
+    done = avis("new", "rig", str(path), answers="mine\nheavy\n-240\n240\n1, 2\n1, 0.8, 0.3\n7\n3\n" + "\n" * 8)
+    assert done.returncode == 0, done.stderr
+    for asked in ("Mass of the payload [kg]", "Length, width, height of the payload [m]", "Number of mounts, 3 or 4"):
+        assert done.stdout.count(asked) >= 2
+    assert "expected a positive number" in done.stdout + done.stderr
+    assert load_rig(path).parameters()["mass"].value == 240
+    done = avis("new", "design", str(tmp_path / "design.toml"),
+                answers="none.toml\navis\n\nup\nz\n10, 1\n1, 10\n\n9\n-6" + "\n" * 5)
+    assert done.returncode == 0, done.stderr
+    design, _ = read_study(tmp_path / "design.toml")
+    assert design.keep == ["z"] and design.transmissibility.band_dB == -6.0
+
+
+def test_without_answers_the_options_are_named(tmp_path):
+    done = avis("new", "rig", str(tmp_path / "mine.toml"), answers="")
+    assert done.returncode == 2 and "give what is missing as options" in done.stderr
+    assert not (tmp_path / "mine.toml").exists()
+
+
+def test_the_help_has_units():
+    shown = avis("new", "rig", "--help").stdout + avis("new", "design", "--help").stdout
+    assert all(unit in shown for unit in ("[kg]", "[m]", "[Hz]", "[N/V]", "[V]", "[dB]", "[%]"))
+
+
+def test_values_that_no_table_has_write_nothing(tmp_path):
+    done = avis("new", "rig", str(tmp_path / "mine.toml"), "--vertical", "2e5")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and not (tmp_path / "mine.toml").exists()
 
 
 def test_the_shell_completes_commands_and_options():

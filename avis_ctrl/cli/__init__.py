@@ -21,7 +21,7 @@ from avis_ctrl.cli.identify import identify, predict, single_axis
 from avis_ctrl.cli.measure import convert, excite, simulate_campaign
 from avis_ctrl.cli.new import app as new
 from avis_ctrl.cli.sweep import sweep
-from avis_ctrl.errors import AvisError, ComputationError
+from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.measurement.layouts import FORMATS
 
 # A line a paragraph: the terminal breaks them.
@@ -120,7 +120,13 @@ def main() -> None:
         # Output that could not be written is not tried again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         sys.exit(ComputationError.exit_code)
-    except (KeyboardInterrupt, typer.Abort):
+    except typer.Abort as error:
+        if isinstance(error.__context__, EOFError):  # a question, and nobody there
+            print("\navis: no answer: the standard input has ended; give what is missing as options (see --help)",
+                  file=sys.stderr)
+            sys.exit(InputError.exit_code)
+        code = INTERRUPTED
+    except KeyboardInterrupt:
         code = INTERRUPTED
     except Exception as error:  # usage errors of the command line parser carry their own code
         if not (hasattr(error, "exit_code") and hasattr(error, "format_message")):

@@ -1,10 +1,12 @@
-"""`avis new`: asks a few questions and writes a commented rig file or design file."""
+"""`avis new`: asks a few questions and writes a commented rig file or design file. Each answer is checked at once."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,49 +23,115 @@ def _absent(out: Path) -> Path:
     return out
 
 
+def _asked(flag: str, question: str, check: Callable[[typer.Context, str, Any], None]) -> Any:
+    """An option that is asked for where it is not given; an answer that does not pass is asked for again."""
+    def checked(ctx: typer.Context, param: typer.CallbackParam, value: Any) -> Any:
+        try:
+            check(ctx, str(param.name), value)
+        except InputError as error:
+            if ctx.get_parameter_source(str(param.name)) is None:  # an answer: its source is noted after the question
+                raise typer.BadParameter(str(error)) from None
+            raise
+        return value
+    # In a help text [kg] would be markup.
+    return typer.Option(flag, prompt=question, help=question.replace("[", r"\["), callback=checked)
+
+
+def _check_rig(ctx: typer.Context, name: str, value: Any) -> None:
+    from avis_ctrl.study.new_files import NewRig, rig_text
+
+    rig_text(replace(NewRig(), **_rig_fields({name: value})))
+
+
+def _rig_fields(given: dict[str, Any]) -> dict[str, Any]:
+    """Answers as fields of NewRig."""
+    fields = dict(given)
+    if "size_m" in fields:
+        fields["size_m"] = _numbers(fields["size_m"], 3, "--size")
+    if "geophone" in fields:
+        fields["geophone"] = Path(fields["geophone"]) if fields["geophone"].strip() else None
+    return fields
+
+
 @app.command()
 def rig(
     out: Annotated[Path, typer.Argument(metavar="RIG.toml", help="file to write", callback=_absent)],
-    name: Annotated[str, typer.Option(prompt="Name of the table")] = "my_table",
-    mass_kg: Annotated[float, typer.Option("--mass", prompt="Mass of the payload [kg]")] = 500.0,
-    size_m: Annotated[str, typer.Option("--size", prompt="Length, width, height of the payload [m]")] = "1.2, 0.9, 0.4",
-    mounts: Annotated[int, typer.Option(prompt="Number of mounts, 3 or 4")] = 4,
-    vertical_Hz: Annotated[float, typer.Option("--vertical", prompt="Vertical natural frequency [Hz]")] = 3.0,
-    horizontal_Hz: Annotated[float, typer.Option("--horizontal", prompt="Horizontal natural frequency [Hz]")] = 2.0,
-    damping: Annotated[float, typer.Option(prompt="Damping ratio")] = 0.03,
-    constant_N_per_V: Annotated[float, typer.Option("--force-constant", prompt="Force of a drive [N/V]")] = 2.0,
-    limit_V: Annotated[float, typer.Option("--limit", prompt="Largest drive voltage [V]")] = 10.0,
-    geophone: Annotated[str, typer.Option(prompt="RESP file of the geophones (empty: a common one)")] = "",
-    sample_rate_Hz: Annotated[float, typer.Option("--sample-rate", prompt="Sample rate of the controller [Hz]")
+    name: Annotated[str, _asked("--name", "Name of the table", _check_rig)] = "my_table",
+    mass_kg: Annotated[float, _asked("--mass", "Mass of the payload [kg]", _check_rig)] = 500.0,
+    size_m: Annotated[str, _asked("--size", "Length, width, height of the payload [m]", _check_rig)] = "1.2, 0.9, 0.4",
+    mounts: Annotated[int, _asked("--mounts", "Number of mounts, 3 or 4", _check_rig)] = 4,
+    vertical_Hz: Annotated[float, _asked("--vertical", "Vertical natural frequency [Hz]", _check_rig)] = 3.0,
+    horizontal_Hz: Annotated[float, _asked("--horizontal", "Horizontal natural frequency, without rocking [Hz]",
+                                           _check_rig)] = 2.0,
+    damping: Annotated[float, _asked("--damping", "Damping ratio, 0.03 for 3 %", _check_rig)] = 0.03,
+    constant_N_per_V: Annotated[float, _asked("--force-constant", "Force of a drive [N/V]", _check_rig)] = 2.0,
+    limit_V: Annotated[float, _asked("--limit", "Largest drive voltage [V]", _check_rig)] = 10.0,
+    geophone: Annotated[str, _asked("--geophone", "RESP file of the geophones (empty: a common one)", _check_rig)] = "",
+    sample_rate_Hz: Annotated[float, _asked("--sample-rate", "Sample rate of the controller [Hz]", _check_rig)
                               ] = 1000.0,
 ) -> None:
     """A table from its mass, size and natural frequencies."""
     from avis_ctrl.files import write_whole
-    from avis_ctrl.rigs import load_rig
-    from avis_ctrl.study.new_files import NewRig, rig_text
+    from avis_ctrl.study.new_files import NewRig, rig_of, rig_text
 
-    text = rig_text(NewRig(name, mass_kg, _numbers(size_m, 3, "--size"), mounts, vertical_Hz,  # type: ignore[arg-type]
-                           horizontal_Hz, damping, constant_N_per_V, limit_V,
-                           Path(geophone) if geophone.strip() else None, sample_rate_Hz))
+    text = rig_text(NewRig(**_rig_fields({
+        "name": name, "mass_kg": mass_kg, "size_m": size_m, "mounts": mounts, "vertical_Hz": vertical_Hz,
+        "horizontal_Hz": horizontal_Hz, "damping": damping, "constant_N_per_V": constant_N_per_V, "limit_V": limit_V,
+        "geophone": geophone, "sample_rate_Hz": sample_rate_Hz})))
+    modes = rig_of(text).equations_of_motion().natural_frequencies().frequencies_Hz
     write_whole(out, text.encode())
-    modes = load_rig(out).equations_of_motion().natural_frequencies().frequencies_Hz
-    print(f"{out}: modes at {', '.join(f'{f:.3g}' for f in sorted(modes))} Hz; next: replace the lines marked "
-          f"\"assumed\", then avis new design DESIGN.toml --rig {out}")
+    print(f"{out}: modes at {', '.join(f'{f:.3g}' for f in sorted(modes))} Hz (horizontal ones rock: the mounts stand "
+          f"below the centre of mass); next: replace the lines marked \"assumed\", then avis new design DESIGN.toml "
+          f"--rig {out}")
+
+
+def _check_design(ctx: typer.Context, name: str, value: Any) -> None:
+    """With what is usual in place of the other answers, so that what is wrong is this one."""
+    from avis_ctrl.rigs import load_rig
+    from avis_ctrl.study.new_files import NewDesign, new_design
+
+    if name == "rig":
+        load_rig(value)
+        return
+    if "rig" not in ctx.params:  # still to be asked for; all is checked together in the end
+        return
+    fields = _design_fields({name: value})
+    if name == "peak_dB":  # asked for before the limit in the band, which must be lower
+        fields["band_dB"] = min(NewDesign.band_dB, value - 1.0)
+    elif name == "band_dB":
+        fields["peak_dB"] = ctx.params.get("peak_dB", NewDesign.peak_dB)
+    new_design(NewDesign(**fields), load_rig(ctx.params["rig"]), "rig.toml")
+
+
+DESIGN = ("title", "keep", "band_Hz", "band_dB", "peak_dB", "mass_percent", "stiffness_percent", "damping_percent")
+
+
+def _design_fields(given: dict[str, Any]) -> dict[str, Any]:
+    """Answers as fields of NewDesign."""
+    fields = {"title": "My design", **given}
+    if "keep" in fields:
+        fields["keep"] = tuple(fields["keep"].replace(",", " ").split())
+    if "band_Hz" in fields:
+        fields["band_Hz"] = _numbers(fields["band_Hz"], 2, "--band")
+    return fields
 
 
 @app.command()
 def design(
+    ctx: typer.Context,
     out: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="file to write", callback=_absent)],
-    rig: Annotated[str, typer.Option(prompt="Rig file, or avis, halcyonics, halcyonics_loaded")] = "avis",
-    title: Annotated[str, typer.Option(prompt="Title of the report")] = "My design",
-    keep: Annotated[str, typer.Option(prompt="Coordinates under one controller (empty: chosen for the rig)")] = "",
-    band_Hz: Annotated[str, typer.Option("--band", prompt="Band in which the table must isolate [Hz]")] = "1, 10",
-    band_dB: Annotated[float, typer.Option("--band-limit", prompt="Transmissibility in this band, at most [dB]")
+    rig: Annotated[str, _asked("--rig", "Rig file, or avis, halcyonics, halcyonics_loaded", _check_design)] = "avis",
+    title: Annotated[str, _asked("--title", "Title of the report", _check_design)] = "My design",
+    keep: Annotated[str, _asked("--keep", "Coordinates under one controller, such as z, phi_x (empty: chosen for the "
+                                          "rig)", _check_design)] = "",
+    band_Hz: Annotated[str, _asked("--band", "Band in which the table must isolate [Hz]", _check_design)] = "1, 10",
+    peak_dB: Annotated[float, _asked("--peak-limit", "Transmissibility at any frequency, at most [dB]", _check_design)
+                       ] = 3.5,
+    band_dB: Annotated[float, _asked("--band-limit", "Transmissibility in the band, at most [dB]", _check_design)
                        ] = -7.0,
-    peak_dB: Annotated[float, typer.Option("--peak-limit", prompt="Transmissibility elsewhere, at most [dB]")] = 3.5,
-    mass: Annotated[float, typer.Option(prompt="Mass known to within [%]")] = 10.0,
-    stiffness: Annotated[float, typer.Option(prompt="Stiffness known to within [%]")] = 15.0,
-    damping: Annotated[float, typer.Option(prompt="Damping known to within [%]")] = 30.0,
+    mass_percent: Annotated[float, _asked("--mass", "Mass known to within [%]", _check_design)] = 10.0,
+    stiffness_percent: Annotated[float, _asked("--stiffness", "Stiffness known to within [%]", _check_design)] = 15.0,
+    damping_percent: Annotated[float, _asked("--damping", "Damping known to within [%]", _check_design)] = 30.0,
 ) -> None:
     """A design for a rig from its bounds and uncertainty."""
     from avis_ctrl.files import write_whole
@@ -73,9 +141,7 @@ def design(
 
     # A design file names its rig relative to itself.
     named = os.path.relpath(rig, out.resolve().parent) if _is_file(rig) else rig
-    low, high = _numbers(band_Hz, 2, "--band")
-    made = new_design(NewDesign(title, tuple(keep.replace(",", " ").split()), (low, high), band_dB, peak_dB, mass,
-                                stiffness, damping), load_rig(rig), named)
+    made = new_design(NewDesign(**_design_fields({key: ctx.params[key] for key in DESIGN})), load_rig(rig), named)
     write_whole(out, design_text(made).encode())
     read_study(out)
     print(f"{out}: next: avis design {out} --out {out.with_suffix('')}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.geophone_catalogue import check_against_name, read_response
+from avis_ctrl.rigs.plausibility import plausible
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.study.design_file import Design, design_from_table
 from avis_ctrl.study.identification_design import default_design, design_toml
 
@@ -21,24 +24,25 @@ class NewRig:
     Attributes
     ----------
     name : of the rig. mass_kg : of the payload. size_m : length, width, height along x, y, z.
-    mounts : 3 (two at one end, one in the middle of the other) or 4.
-    vertical_Hz, horizontal_Hz : natural frequencies of the payload on its mounts, without rotation.
+    mounts : 3 (two near one side, one in the middle of the other) or 4, their centroid below the centre of mass.
+    vertical_Hz, horizontal_Hz : natural frequencies of the payload on its mounts, without rotation. The vertical mode
+        has none; horizontal modes rock, because the mounts stand below the centre of mass.
     damping : ratio, of all mounts. constant_N_per_V, limit_V : of a drive.
     geophone : RESP file of the sensor; None for a 4.5 Hz geophone of 28.8 V s/m.
     sample_rate_Hz : of the controller.
     """
 
-    name: str
-    mass_kg: float
-    size_m: tuple[float, float, float]
-    mounts: int
-    vertical_Hz: float
-    horizontal_Hz: float
-    damping: float
-    constant_N_per_V: float
-    limit_V: float
-    geophone: Path | None
-    sample_rate_Hz: float
+    name: str = "my_table"
+    mass_kg: float = 500.0
+    size_m: tuple[float, ...] = (1.2, 0.9, 0.4)
+    mounts: int = 4
+    vertical_Hz: float = 3.0
+    horizontal_Hz: float = 2.0
+    damping: float = 0.03
+    constant_N_per_V: float = 2.0
+    limit_V: float = 10.0
+    geophone: Path | None = None
+    sample_rate_Hz: float = 1000.0
 
 
 def rig_text(new: NewRig) -> str:
@@ -92,15 +96,23 @@ def rig_text(new: NewRig) -> str:
         "sensor_noise_rms_V = 0.001           # assumed\n")
 
 
+def rig_of(text: str) -> Rig:
+    """The table of a rig file's text. Raises InputError for values that no table has."""
+    content = tomllib.loads(text)
+    plausible(content, rig_from)
+    return rig_from(content)
+
+
 def _row(values: object) -> str:
     return f"[{', '.join(str(float(f'{value:.6g}')) for value in np.asarray(values, float))}]"
 
 
 def _places(new: NewRig) -> list[tuple[float, float, float]]:
-    """Mounts under the lower corners, a tenth of the length inside."""
+    """Mounts under the lower corners, a tenth of the length inside; of three, the pair is nearer to the middle, so that
+    a vertical motion does not tilt the payload."""
     x, y, z = 0.4 * new.size_m[0], 0.4 * new.size_m[1], -0.5 * new.size_m[2]
     if new.mounts == 3:
-        return [(-x, -y, z), (x, -y, z), (0.0, y, z)]
+        return [(-x, -y / 2, z), (x, -y / 2, z), (0.0, y, z)]
     return [(-x, -y, z), (x, -y, z), (x, y, z), (-x, y, z)]
 
 
@@ -131,7 +143,7 @@ class NewDesign:
 
     title: str
     keep: tuple[str, ...] = ()
-    band_Hz: tuple[float, float] = (1.0, 10.0)
+    band_Hz: tuple[float, ...] = (1.0, 10.0)
     band_dB: float = -7.0
     peak_dB: float = 3.5
     mass_percent: float = 10.0
