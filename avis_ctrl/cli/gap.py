@@ -48,10 +48,12 @@ def gap(
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.files import open_folder, output_folder
+    from avis_ctrl.study.gap import GapOptions, find_gap
     from avis_ctrl.study.gap_names import GAP_FILES
     from avis_ctrl.study.rig_channels import in_words_of
 
     console = Console(highlight=False)
+    GapOptions(seed, band_Hz, amplifier_corner_Hz=amplifier_Hz)  # what is wrong with them is said now
     own = None
     if effects is not None:
         from avis_ctrl.gap.effects.user_effects import load_effects
@@ -75,7 +77,6 @@ def gap(
         console.print(f"[dim]{note}[/]")
     with output_folder(out, GAP_FILES) as folder, Progress(console) as progress:
         from avis_ctrl.report import gap_html, gap_pdf
-        from avis_ctrl.study.gap import GapOptions, find_gap
         from avis_ctrl.study.gap_files import write_gap
 
         options = GapOptions(seed, band_Hz, True, despite_gates, amplifier_Hz, design or design_file is not None,

@@ -82,7 +82,8 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     mended = repair(campaign, rig, None, converter) if campaign.y_unit == "V" and rig.acquisition else None
     campaign = mended.campaign if mended else campaign
     halves = divide(campaign)
-    band = _band(halves, band_Hz, settings)
+    band = band_Hz or excited_band(halves.fitted)
+    check_band(halves.fitted, band, settings)
     if amplifier_corner_Hz is not None and not 0 < amplifier_corner_Hz < np.inf:
         raise InputError("expected a frequency above zero", field="amplifier corner", value=amplifier_corner_Hz)
     apart = rig.with_channels_apart() if hasattr(rig, "with_channels_apart") else rig
@@ -112,20 +113,17 @@ def mended_with(prepared: Prepared, model: TableModel, progress: Progress, each:
                   prepared.clipped, progress, each, settings)
 
 
-def _band(halves: Halves, band_Hz: tuple[float, float] | None, settings: GapSettings) -> tuple[float, float]:
-    low, high = excited_band(halves.fitted)
-    band = band_Hz or (low, high)
-    if not 0 <= band[0] < band[1]:
-        raise InputError("expected 0 <= LOW < HIGH", field="band_Hz", value=band)
+def check_band(campaign: Campaign, band: tuple[float, float], settings: GapSettings) -> None:
+    """Raises InputError for a band in which the records are not excited, or have too few lines."""
+    low, high = excited_band(campaign)
     if band[1] <= low or band[0] >= high:
         raise InputError(f"expected a band in which the records are excited, {low:.3g} to {high:.3g} Hz",
                          field="band_Hz", value=band)
-    for record in halves.fitted.records:
+    for record in campaign.records:
         lines = int((band[1] - band[0]) * record.header.duration_s)
         if lines < settings.fewest_lines:
             raise InputError(f"expected a wider band or longer records: {lines} lines of record {record.header.name} "
                              f"lie in it, and a fit needs {settings.fewest_lines}", field="band_Hz", value=band)
-    return band
 
 
 def _ready(campaign: Campaign, halves: Halves, nominal: TableModel, rough: TableModel, band: tuple[float, float],

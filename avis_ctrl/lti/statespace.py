@@ -282,41 +282,89 @@ def gain(matrix: ArrayLike, inputs: Sequence[str] = (), outputs: Sequence[str] =
                       tuple(inputs), tuple(outputs))
 
 
-def tf(numerator: Sequence[float], denominator: Sequence[float], inputs: Sequence[str] = (),
-       outputs: Sequence[str] = ()) -> StateSpace:
-    """A proper scalar transfer function, coefficients by descending power of s, in a balanced companion form.
+def tf(numerator: Any, denominator: Any, inputs: Sequence[str] = (), outputs: Sequence[str] = ()) -> StateSpace:
+    """A proper transfer function, coefficients by descending power of s, in a balanced companion form.
 
-    Raises InputError when it is improper (more zeros than poles).
+    Of several inputs and outputs, numerator[i][k] and denominator[i][k] are the coefficients from input k to output i,
+    as in python-control; one denominator for all may be given once. Entries of a column with one denominator share
+    their states.
+
+    Raises
+    ------
+    InputError : an entry that is improper (more zeros than poles), a denominator of zero, tables that do not fit.
 
     Examples
     --------
     >>> ac.tf([25.0], [1.0, 10.0, 10.0, 10.0]).dcgain()
     array([[2.5]])
+    >>> G = ac.tf([[[1.0], [2.0]], [[1.0, 0.0], [3.0]]], [1.0, 3.0, 2.0])        # 2 outputs, 2 inputs
+    >>> G.nstates, G.dcgain()
+    (4, array([[0.5, 1. ],
+           [0. , 1.5]]))
     """
-    num = np.trim_zeros(np.atleast_1d(np.asarray(numerator, float)), "f")
-    den = np.trim_zeros(np.atleast_1d(np.asarray(denominator, float)), "f")
+    nums = _table(numerator, "numerator")
+    dens = _table(denominator, "denominator")
+    if len(dens) == len(dens[0]) == 1:
+        dens = [dens[0] * len(nums[0]) for _ in nums]
+    shape = len(nums), len(nums[0])
+    if {len(row) for row in nums} != {shape[1]} or [len(row) for row in dens] != [shape[1]] * shape[0]:
+        raise InputError(f"expected tables of {shape[0]} rows and {shape[1]} columns", field="numerator, denominator")
+    A: list[np.ndarray] = []
+    B: list[np.ndarray] = []
+    C: list[np.ndarray] = []
+    D = np.zeros(shape)
+    for k in range(shape[1]):
+        rows = {i: _proper(nums[i][k], dens[i][k]) for i in range(shape[0])}
+        for den in dict.fromkeys(tuple(den) for _, den in rows.values()):
+            sharing = [i for i, (_, own) in rows.items() if tuple(own) == den]
+            a, b, c = _companion(np.array([rows[i][0] for i in sharing]), np.array(den))
+            D[sharing, k] = [rows[i][0][0] for i in sharing]
+            A.append(a)
+            B.append(b @ np.eye(shape[1])[[k]])
+            C.append(np.eye(shape[0])[:, sharing] @ c)
+    return StateSpace(la.block_diag(*A), np.vstack(B), np.hstack(C), D, 0.0, tuple(inputs), tuple(outputs))
+
+
+def _table(given: Any, field: str) -> list[list[np.ndarray]]:
+    """Coefficients by output and input, from those of one entry or a table."""
+    depth, first = 0, given
+    while isinstance(first, (list, tuple)) or np.ndim(first):
+        if not len(first):
+            raise InputError("expected coefficients", field=field)
+        depth, first = depth + 1, first[0]
+    if depth not in (0, 1, 3):
+        raise InputError("expected coefficients, or rows with coefficients for each input", field=field)
+    try:
+        rows = given if depth == 3 else [[given]]
+        return [[np.trim_zeros(np.atleast_1d(np.asarray(one, float)), "f") for one in row] for row in rows]
+    except (TypeError, ValueError):
+        raise InputError("expected coefficients, or rows with coefficients for each input", field=field) from None
+
+
+def _proper(num: np.ndarray, den: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both with a leading 1 in the denominator, of one length."""
     if den.size == 0:
         raise InputError("the denominator is zero")
     if num.size > den.size:
         raise InputError(f"improper: numerator of degree {num.size - 1} over denominator of degree {den.size - 1}")
-    num, den = num / den[0], den / den[0]
+    return np.concatenate([np.zeros(den.size - num.size), num / den[0]]), den / den[0]
+
+
+def _companion(nums: np.ndarray, den: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(A, B, C) from one input to the outputs nums (n_y, n + 1) over den (n + 1,) with a leading 1."""
     n = den.size - 1
-    num = np.concatenate([np.zeros(n + 1 - num.size), num])
-    d = num[0]
-    if n == 0:
-        return gain(d, inputs, outputs)
-    A = np.zeros((n, n))
+    A, B, C = np.zeros((n, n)), np.zeros((n, 1)), (nums[:, 1:] - nums[:, :1] * den[1:])[:, ::-1]
+    if not n:
+        return A, B, C
     A[:-1, 1:] = np.eye(n - 1)
-    A[-1] = -den[:0:-1]
-    B = np.zeros((n, 1))
-    B[-1] = 1.0
-    C = (num[1:] - d * den[1:])[::-1][None, :]
+    A[-1], B[-1] = -den[:0:-1], 1.0
     # Equal magnitudes along the chain: state k scaled by w0^k, w0 the geometric mean of the poles.
     w0 = abs(den[-1]) ** (1.0 / n) if den[-1] else max(np.max(np.abs(np.roots(den)), initial=0.0), 1.0)
-    T = np.diag(w0 ** np.arange(n))
-    system = StateSpace(A, B, C, np.array([[d]]), 0.0, tuple(inputs), tuple(outputs)).similar(T)
-    size = np.sqrt(np.linalg.norm(system.B) * np.linalg.norm(system.C)) or 1.0
-    return system.similar(np.eye(n) * (np.linalg.norm(system.B) / size if np.linalg.norm(system.C) else 1.0))
+    t = w0 ** np.arange(n)
+    A, B, C = A * t / t[:, None], B / t[:, None], C * t
+    sizes = np.linalg.norm(B), np.linalg.norm(C)
+    size = np.sqrt(sizes[0] / sizes[1]) if sizes[1] else 1.0
+    return A, B / size, C * size
 
 
 def append(*systems: StateSpace) -> StateSpace:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.errors import InputError
 from avis_ctrl.lti.interchange import is_response, plot_frequencies, response_of
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.plot.axes import HERTZ, axes_of, decibels, finish
@@ -15,7 +16,8 @@ from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 SAMPLES, FAINT = 20, {"color": "#0072b2", "alpha": 0.3, "linewidth": 0.8}
 
 
-def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label: str | None = None, **line: Any) -> Any:
+def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, frequency_Hz: np.ndarray | None = None,
+         label: str | None = None, **line: Any) -> Any:
     """Magnitude [dB] and phase [degrees] over frequency [Hz], one curve for each input and output.
 
     Returns the two axes.
@@ -24,19 +26,19 @@ def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label:
     ----------
     system : StateSpace, or python-control's StateSpace, TransferFunction or FRD; of an UncertainSystem the nominal one
         and 20 random ones.
-    omega : (n,) frequencies [rad/s]; by default around the poles, or those of the FRD.
+    omega, frequency_Hz : (n,) frequencies [rad/s], or in hertz; by default around the poles, or those of the FRD.
     ax : two axes, magnitude and phase; by default those of a new figure.
     label : of the curves in the legend; by default "output / input" where there are several.
     line : options of matplotlib's `plot`.
 
     Raises
     ------
-    InputError : something that is no system.
+    InputError : something that is no system; both omega and frequency_Hz.
     """
     top, bottom = axes = axes_of(ax, 2)
     if isinstance(system, UncertainSystem):
-        return _family(bode, system, omega, axes, label, line)
-    omega = plot_frequencies(system) if omega is None else np.asarray(omega, float)
+        return _family(bode, system, _rad_s(omega, frequency_Hz), axes, label, line)
+    omega = _rad_s(omega, frequency_Hz, system)
     H = response_of(system, omega)
     for i in range(H.shape[1]):
         for k in range(H.shape[2]):
@@ -52,19 +54,30 @@ def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label:
     return axes
 
 
-def sigma(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, label: str | None = None, **line: Any
-          ) -> Any:
+def sigma(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, frequency_Hz: np.ndarray | None = None,
+          label: str | None = None, **line: Any) -> Any:
     """Singular values [dB] over frequency [Hz], in one colour; arguments as for `bode`, one pair of axes."""
     ax = axes_of(ax)
     if isinstance(system, UncertainSystem):
-        return _family(sigma, system, omega, ax, label, line)
-    omega = plot_frequencies(system) if omega is None else np.asarray(omega, float)
+        return _family(sigma, system, _rad_s(omega, frequency_Hz), ax, label, line)
+    omega = _rad_s(omega, frequency_Hz, system)
     values = decibels(np.linalg.svd(response_of(system, omega), compute_uv=False))
     for k in range(values.shape[1]):
         if k:
             line["color"] = ax.lines[-1].get_color()
         ax.plot(omega / HERTZ, values[:, k], label=None if k else label, **line)
     return finish(ax, "frequency [Hz]", "singular values [dB]" if values.shape[1] > 1 else "magnitude [dB]")
+
+
+def _rad_s(omega: Any, frequency_Hz: Any, system: Any = None) -> Any:
+    """(n,) frequencies [rad/s]; those that show the system where none are given (None without a system)."""
+    if omega is not None and frequency_Hz is not None:
+        raise InputError("expected omega or frequency_Hz", field="omega, frequency_Hz")
+    if frequency_Hz is not None:
+        return HERTZ * np.asarray(frequency_Hz, float)
+    if omega is not None:
+        return np.asarray(omega, float)
+    return None if system is None else plot_frequencies(system)
 
 
 def _family(draw: Any, system: UncertainSystem, omega: np.ndarray | None, ax: Any, label: str | None,

@@ -102,6 +102,14 @@ def disk_margin(L: Any, K: Any = None, *, at: At = "outputs", skew: float = 0.0,
         loop, names = loop @ factor, names + own
     P, blocks = loop.feedback(np.eye(n_y) if controller is None else controller).lft()
     N = P.select(slice(blocks.n_z), slice(blocks.n_w))
+    if not N.is_stable():
+        poles = N.poles()
+        worst = poles[np.argmax(np.abs(poles) if N.dt else poles.real)]
+        raise ComputationError(
+            "the nominal loop is not stable, so it has no margin", measured=f"pole {worst:.4g}",
+            cause="the sign of K: the loop has negative feedback, u = -K y" if K is not None else
+            "the sign of the loop: it has negative feedback, 1 + L", next_step="for a K of hinfsyn or musyn, which has "
+            "u = K y, give -K" if K is not None else "give -L if its controller has u = K y")
     place = np.concatenate([np.arange(w.start, w.stop) for block, w, _ in blocks.slices() if block.name in names])
     if place.size == blocks.n_w:
         return _margin(mu_peak(N, blocks, slack=slack), skew)

@@ -16,7 +16,9 @@ from threadpoolctl import threadpool_limits
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.gap.analysis import analyse
 from avis_ctrl.gap.effects.user_effects import OwnEffects, try_out
+from avis_ctrl.gap.preparation import check_band
 from avis_ctrl.gap.result import Gap
+from avis_ctrl.gap.settings import SETTINGS
 from avis_ctrl.gap.signal_effects import predicted
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.gap.tuning_values import tuning_values
@@ -60,6 +62,14 @@ class GapOptions:
     design_file: Path | None = None
     own_effects: OwnEffects | None = None
 
+    def __post_init__(self) -> None:
+        """Raises InputError for a band that is none, or a corner that is not positive."""
+        if self.band_Hz is not None and not 0 <= self.band_Hz[0] < self.band_Hz[1] < np.inf:
+            raise InputError("expected 0 <= LOW < HIGH", field="band_Hz", value=self.band_Hz)
+        corner = self.amplifier_corner_Hz
+        if corner is not None and not 0 < corner < np.inf:
+            raise InputError("expected a positive frequency", field="amplifier_corner_Hz", value=corner)
+
 
 @dataclass(frozen=True, eq=False)
 class GapFinding:
@@ -97,6 +107,8 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
     assert isinstance(named, Campaign)  # as it was
     measured = named
     _require_records(measured, rig)
+    if options.band_Hz is not None:
+        check_band(measured, options.band_Hz, SETTINGS)
     if options.own_effects is not None:
         try_out(options.own_effects, TableModel(ResponseModel.of(rig, (), measured.y_unit, measured.y_names,
                                                                  measured.u_names)))

@@ -220,16 +220,23 @@ def test_hostile_input_is_one_line(case, gates):
 
 
 def test_a_band_without_excitation():
-    """There noise agrees with any model."""
-    case = draw_case(duration_s=6.0, seed=3, kind="none")
+    """There noise agrees with any model. It is refused before anything is computed."""
+    case, steps = draw_case(duration_s=6.0, seed=3, kind="none"), []
     with pytest.raises(InputError, match=r"band_Hz .*expected a band in which the records are excited"):
-        find_gap(simulate_case(case), rig(), GapOptions(gates=False, band_Hz=(200.0, 300.0)))
+        find_gap(simulate_case(case), rig(), GapOptions(band_Hz=(200.0, 300.0)), steps.append)
+    assert not steps
 
 
 @pytest.mark.parametrize("band", [(60.0, 1.0), (-1.0, 20.0), (3.0, 3.0), (600.0, 700.0), (np.nan, 3.0)])
 def test_bands_that_are_none(band):
     with pytest.raises(InputError, match="band_Hz"):
         find_gap(campaign(), RIG, GapOptions(gates=False, band_Hz=band))
+
+
+@pytest.mark.parametrize("corner", [0.0, -5.0, np.nan, np.inf])
+def test_corners_that_are_none(corner):
+    with pytest.raises(InputError, match="amplifier_corner_Hz"):
+        GapOptions(amplifier_corner_Hz=corner)
 
 
 def test_a_rig_of_other_channels():

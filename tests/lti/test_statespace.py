@@ -35,6 +35,31 @@ def test_tf_evaluates_as_the_ratio_of_its_polynomials(num, den, w):
     assert tf(num, den).frequency_response([w])[0, 0, 0] == pytest.approx(expected, rel=1e-8)
 
 
+def test_tf_of_several_channels_is_that_of_python_control(rng):
+    den = [[1.0, 3.0, 2.0], [1.0, 0.2], [4.0]]
+    columns = [0, 1, 0]                                     # denominators by input: two columns share theirs
+    nums = [[rng.standard_normal(rng.integers(1, len(den[k]) + 1)) for k in columns] for _ in range(2)]
+    dens = [[den[k] for k in columns] for _ in range(2)]
+    G = tf(nums, dens, ["a", "b", "c"], ["x", "y"])
+    assert G.nstates == 2 + 1 + 2 and G.inputs == ("a", "b", "c")
+    other = control.tf(nums, dens)
+    for s in (0.3j, 5.0j, 1.0 + 2.0j):
+        np.testing.assert_allclose(G(s), other(s), rtol=1e-10)
+    dens[1][0] = [1.0, 7.0, 1.0]                             # an entry with a denominator of its own
+    assert tf(nums, dens).nstates == 7
+    np.testing.assert_allclose(tf(nums, dens)(2j), control.tf(nums, dens)(2j), rtol=1e-10)
+    np.testing.assert_allclose(tf([[[1.0], [2.0, 1.0]]], [1.0, 3.0])(2j), [[1 / (3 + 2j), (4j + 1) / (3 + 2j)]])
+
+
+@pytest.mark.parametrize("num, den, message", [
+    ([[1.0, 2.0]], [1.0, 1.0], "expected coefficients"), ([[[1.0], [1.0]], [[1.0]]], [1.0, 1.0], "tables of 2 rows"),
+    ([[[1.0]], [[1.0, 0.0]]], [[[1.0]], [[1.0]]], "improper"), ([], [1.0], "expected coefficients"),
+    ([[[1.0]]], [[[0.0]]], "denominator is zero"), ("ab", [1.0], "expected coefficients")])
+def test_tables_that_are_no_transfer_function(num, den, message):
+    with pytest.raises(InputError, match=message):
+        tf(num, den)
+
+
 @given(st.integers(0, 2 ** 31), st.integers(0, 5))
 @settings(max_examples=30, deadline=None)
 def test_algebra_is_that_of_the_transfer_matrices(seed, n):

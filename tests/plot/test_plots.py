@@ -48,6 +48,16 @@ def test_bode_and_sigma_of_a_lag_in_closed_form(system):
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["lag"]
 
 
+def test_frequencies_may_be_in_hertz():
+    for draw in (plot.bode, plot.sigma):
+        ax = draw(LAG, frequency_Hz=[0.1, 1.0, 10.0])
+        np.testing.assert_allclose(curve(np.ravel(ax)[0])[0], [0.1, 1.0, 10.0], rtol=1e-12)
+        uncertain = draw(real("k", 1.0, percent=10) * LAG, frequency_Hz=[0.1, 1.0])
+        np.testing.assert_allclose(curve(np.ravel(uncertain)[0])[0], [0.1, 1.0], rtol=1e-12)
+        with pytest.raises(InputError, match="omega or frequency_Hz"):
+            draw(LAG, OMEGA, frequency_Hz=OMEGA)
+
+
 def test_axes_given_are_the_axes_returned():
     _, pair = plt.subplots(2)
     assert plot.bode(LAG, ax=pair) is pair

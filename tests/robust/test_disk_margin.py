@@ -70,6 +70,16 @@ def test_the_factor_returned_puts_a_pole_on_the_imaginary_axis():
         assert abs(1 + f * L(1j * found.omega)) < 1e-6 and abs(found.delta[0, 0]) == pytest.approx(found.upper)
 
 
+@pytest.mark.parametrize("plant, controller, pole, words", [
+    (control.tf([1.0], [1.0, -1.0]), tf([-3.0], [1.0]), "4", "give -K"),
+    (control.tf([-3.0], [1.0, 1.0]), None, "2", "give -L"),
+    (real("k", 1.0, percent=1) * tf([-3.0], [1.0, 1.0]), None, "2", "give -L")])
+def test_a_nominal_loop_that_is_not_stable_is_named_as_such(plant, controller, pole, words):
+    with pytest.raises(ComputationError, match="nominal loop is not stable") as error:
+        disk_margin(plant, controller)
+    assert f"pole {pole}" in str(error.value) and words in str(error.value)
+
+
 def test_gains_and_phases_inside_the_margin_are_stable():
     found = disk_margin(L)
     for gain in np.linspace(*found.gain, 30):
