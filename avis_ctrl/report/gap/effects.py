@@ -43,8 +43,8 @@ def _sizes(gap: Gap) -> Table:
             rows.append((one.name, one.location, name, value, f"± {sigma}" if known else "none",
                          "" if p.unit == "1" else words.unit(p.unit)))
     return table("Parameters of the named effects. Those of the table are fitted together with all parameters of the "
-                 "rig and all tolerances, with one standard deviation that counts noise and what has no name; those "
-                 "of hum, converters and floor are from the records themselves.",
+                 "rig and all tolerances. Their standard deviation includes the noise and what no effect explains. "
+                 "Those of hum, converters and floor are from the records themselves.",
                  ("effect", "place", "parameter", "value", "± 1 σ", "unit"), rows, "lllrrl")
 
 

@@ -37,8 +37,8 @@ def detectable(gap: Gap) -> Table:
         size = " to ".join(_seen(one) for one in ends)
         rows.append((wording.titled(name), where, spoken(parameter, unit), size))
     return table("The size at which an effect that is absent would differ from zero by five standard deviations of the "
-                 "fit, at the best and at the worst of its places; the search names about this size. Smaller effects "
-                 "may be present. \"At no size\": re-identified parameters of the rig would absorb the effect. Effects "
+                 "fit, at the best and at the worst of its places; the search finds effects of about this size. Smaller "
+                 "effects may be present. \"At no size\": re-identified parameters of the rig would absorb the effect. Effects "
                  "with a frequency or another shape of their own are not in this table.",
                  ("effect", "place", "parameter", "seen from about"), rows, "lllr")
 
@@ -72,8 +72,8 @@ def _nothing(found: Found) -> str:
     if gap.effects and any(one.indistinguishable_from for one in gap.effects):
         return "No experiment was found that would distinguish the inseparable effects."
     if gap.verdict in ("partly explained", "unexplained"):
-        return "No experiment was found that would tell more."
+        return "No further measurement was found that would show more."
     if gap.effects and found.design is None:
-        return ("Nothing is needed to decide what is missing. What it does to the controller avis gap shows with "
-                "--design; avis predict tries the updated model on a campaign that it was not found from.")
-    return "Nothing is needed to decide what is asked here."
+        return ("No further measurement is needed to decide what is missing. avis gap --design shows what it means for "
+                "the controller; avis predict tests the updated model on another campaign.")
+    return "No further measurement is needed for this question."

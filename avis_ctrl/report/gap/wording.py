@@ -16,14 +16,14 @@ CLAIMS = {
     "none": "Verdict: none. With its own parameters re-identified and every value of the rig file within its "
             "tolerance, the residual is noise, or less than 1 % of the response, and no effect is named. An effect "
             "that is too weak for this campaign, or that these records do not excite, would not be visible.",
-    "explained": "Verdict: explained. Tolerances and the effects named above account for at least 90 % of the power "
-                 "beyond noise of the re-identified model's residual on held-out records, or the rest is noise.",
-    "partly explained": "Verdict: partly explained. What is named above is certain, but it and the tolerances account "
-                        "for less than 90 % of the power beyond noise of the re-identified model's residual. What "
-                        "remains is described below. The updated model is better, not complete.",
-    "unexplained": "Verdict: unexplained. Model and held-out records disagree, tolerances do not account for it, and "
-                   "no effect of the library does with certainty, so none is named. The updated model has tolerances "
-                   "only.",
+    "explained": "Verdict: explained. On held-out records the re-identified model has a residual beyond noise. "
+                 "Tolerances and the effects named above remove at least 90 % of its power, or the rest is noise.",
+    "partly explained": "Verdict: partly explained. What is named above is certain. Together with the tolerances it "
+                        "removes less than 90 % of the power that the residual of the re-identified model has beyond "
+                        "noise. What remains is described below. The updated model is better, not complete.",
+    "unexplained": "Verdict: unexplained. Model and held-out records disagree. Neither the tolerances nor, with "
+                   "certainty, any effect of the library explains it, so none is named. The updated model has "
+                   "tolerances only.",
 }
 # What it claims where the noise of some sensors is all that has no name.
 RAISED = ("Verdict: {verdict}. The noise of {sensors} is above the rig file's ambient level, and the library has no "

@@ -30,8 +30,8 @@ def tolerances(found: Sequence[Tolerance], shown: Shown = Shown()) -> list[Piece
     rows = [_row(one) for one in found]
     first, rest = rows[:shown.rows], rows[shown.rows:]
     pieces: list[Piece] = [
-        Paragraph(f"{len(rows)} values of the rig file have a tolerance. The fit moved them by {rms} tolerances, "
-                  f"r.m.s., {far or 'none'} of them by more than {shown.far:g}."),
+        Paragraph(f"{len(rows)} values of the rig file have a tolerance. The fit moved them by {rms} tolerances "
+                  f"(r.m.s.), {far or 'none'} of them by more than {shown.far:g} tolerances."),
         table("The values of the rig file that moved most, in units of their tolerance.", _HEADER, first, "lrrlr")]
     if rest:
         pieces.append(Fold(f"{len(rest)} more tolerances", (table("The other values.", _HEADER, rest, "lrrlr"),)))
