@@ -207,6 +207,7 @@ def _described(one: Any, name: str, heading: str) -> str:
 def docstring(text: str) -> str:
     """The house style of docstrings as Markdown: headings, lists of `name : meaning`, examples."""
     text = re.sub(r"^(\w+)\n-+$", r"**\1**\n", text, flags=re.MULTILINE)
+    text = re.sub(r"\bdocs/(\w+)\.md", r"[\1](../\1.md)", text)
     # `name : meaning. other : meaning` are two items; a line that is indented goes on with the one above.
     text = re.sub(r"(?<=[.;\w)]) ([a-zA-Z_]\w*(?:, \w+)*) : ", r"\n\1 : ", text) if " : " in text else text
     lines, code = [], False

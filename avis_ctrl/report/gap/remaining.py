@@ -37,8 +37,8 @@ def detectable(gap: Gap) -> Table:
         size = " to ".join(_seen(one) for one in ends)
         rows.append((wording.titled(name), where, spoken(parameter, unit), size))
     return table("The size at which an effect that is absent would differ from zero by five standard deviations of the "
-                 "fit, at the best and at the worst of its places; the search finds effects of about this "
-                 "size. Smaller ones may be present. \"At no size\": re-identified parameters of the rig would absorb the "
+                 "fit, at the best and at the worst of its places; the search finds effects of about this size. "
+                 "Smaller ones may be present. \"At no size\": re-identified parameters of the rig would absorb the "
                  "effect. Effects with a frequency or another shape of their own are not in this table.",
                  ("effect", "place", "parameter", "seen from about"), rows, "lllr")
 
