@@ -309,19 +309,16 @@ def tf(numerator: Any, denominator: Any, inputs: Sequence[str] = (), outputs: Se
     shape = len(nums), len(nums[0])
     if {len(row) for row in nums} != {shape[1]} or [len(row) for row in dens] != [shape[1]] * shape[0]:
         raise InputError(f"expected tables of {shape[0]} rows and {shape[1]} columns", field="numerator, denominator")
-    A: list[np.ndarray] = []
-    B: list[np.ndarray] = []
-    C: list[np.ndarray] = []
-    D = np.zeros(shape)
+    A, B, C, D = list[np.ndarray](), list[np.ndarray](), list[np.ndarray](), np.zeros(shape)
     for k in range(shape[1]):
         rows = {i: _proper(nums[i][k], dens[i][k]) for i in range(shape[0])}
         for den in dict.fromkeys(tuple(den) for _, den in rows.values()):
             sharing = [i for i, (_, own) in rows.items() if tuple(own) == den]
-            a, b, c = _companion(np.array([rows[i][0] for i in sharing]), np.array(den))
-            D[sharing, k] = [rows[i][0][0] for i in sharing]
-            A.append(a)
-            B.append(b @ np.eye(shape[1])[[k]])
-            C.append(np.eye(shape[0])[:, sharing] @ c)
+            part = _companion(np.array([rows[i][0] for i in sharing]), np.array(den))
+            D[sharing, k] = part.D[:, 0]
+            A.append(part.A)
+            B.append(part.B @ np.eye(shape[1])[[k]])
+            C.append(np.eye(shape[0])[:, sharing] @ part.C)
     return StateSpace(la.block_diag(*A), np.vstack(B), np.hstack(C), D, 0.0, tuple(inputs), tuple(outputs))
 
 
@@ -350,21 +347,19 @@ def _proper(num: np.ndarray, den: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([np.zeros(den.size - num.size), num / den[0]]), den / den[0]
 
 
-def _companion(nums: np.ndarray, den: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(A, B, C) from one input to the outputs nums (n_y, n + 1) over den (n + 1,) with a leading 1."""
-    n = den.size - 1
-    A, B, C = np.zeros((n, n)), np.zeros((n, 1)), (nums[:, 1:] - nums[:, :1] * den[1:])[:, ::-1]
-    if not n:
-        return A, B, C
+def _companion(nums: np.ndarray, den: np.ndarray) -> StateSpace:
+    """From one input to the outputs nums (n_y, n + 1) over den (n + 1,) with a leading 1."""
+    n, D = den.size - 1, nums[:, :1]
+    if n == 0:
+        return gain(D)
+    A, B = np.zeros((n, n)), np.zeros((n, 1))
     A[:-1, 1:] = np.eye(n - 1)
     A[-1], B[-1] = -den[:0:-1], 1.0
     # Equal magnitudes along the chain: state k scaled by w0^k, w0 the geometric mean of the poles.
     w0 = abs(den[-1]) ** (1.0 / n) if den[-1] else max(np.max(np.abs(np.roots(den)), initial=0.0), 1.0)
-    t = w0 ** np.arange(n)
-    A, B, C = A * t / t[:, None], B / t[:, None], C * t
-    sizes = np.linalg.norm(B), np.linalg.norm(C)
-    size = np.sqrt(sizes[0] / sizes[1]) if sizes[1] else 1.0
-    return A, B / size, C * size
+    system = StateSpace(A, B, (nums[:, 1:] - D * den[1:])[:, ::-1], D).similar(np.diag(w0 ** np.arange(n)))
+    size = np.sqrt(np.linalg.norm(system.B) * np.linalg.norm(system.C)) or 1.0
+    return system.similar(np.eye(n) * (np.linalg.norm(system.B) / size if np.linalg.norm(system.C) else 1.0))
 
 
 def append(*systems: StateSpace) -> StateSpace:

@@ -26,7 +26,8 @@ def listed(text, kinds):
     found = {}
     for kind, section, rows in HEADING.findall(text):
         if kind in kinds:
-            found[section] = set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", rows, re.M))))
+            own = re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", rows, re.M)))
+            found.setdefault(section, set()).update(own)  # text after the tables has no section of its own
     return found
 
 
