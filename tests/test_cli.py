@@ -24,6 +24,13 @@ def avis(*arguments: str, timeout: float = 60.0) -> subprocess.CompletedProcess[
                           capture_output=True, text=True, timeout=timeout, env=ONE_THREAD, check=False)
 
 
+def of_compiled_code() -> SystemError:
+    """What numba makes of Ctrl-C while it loads compiled code."""
+    error, inner = SystemError("returned a result with an exception set"), SystemError("the same")
+    error.__cause__, inner.__cause__ = inner, KeyboardInterrupt()
+    return error
+
+
 def test_help_names_the_commands_and_loads_no_arrays():
     code = ("import sys\nsys.argv = ['avis', '--help']\nfrom avis_ctrl.cli import main\ntry:\n    main()\n"
             "except SystemExit as stop:\n    assert not stop.code, stop.code\n"
@@ -92,7 +99,8 @@ def test_a_folder_that_cannot_be_written_is_code_2(tmp_path):
      "avis: d.toml: mass = -1: expected a positive number\n"),
     (ComputationError("no controller found", measured="gamma 7", cause="too much asked", next_step="ask less"), 3,
      "avis: no controller found; measured: gamma 7; likely cause: too much asked; next: ask less\n"),
-    (KeyboardInterrupt(), 130, "avis: interrupted; no partial results were written\n")])
+    (KeyboardInterrupt(), 130, "avis: interrupted; no partial results were written\n"),
+    (of_compiled_code(), 130, "avis: interrupted; no partial results were written\n")])
 def test_errors_end_in_their_line_and_code(raised, code, words, monkeypatch, capsys):
     def stop(*args, **kwargs):
         raise raised

@@ -139,6 +139,13 @@ def main() -> None:
         code = INTERRUPTED
     except KeyboardInterrupt:
         code = INTERRUPTED
+    except SystemError as error:  # what numba makes of an interrupt while it loads compiled code
+        reason: BaseException | None = error
+        while reason is not None and not isinstance(reason, KeyboardInterrupt):
+            reason = reason.__cause__ or reason.__context__
+        if reason is None:
+            raise
+        code = INTERRUPTED
     except Exception as error:  # usage errors of the command line parser carry their own code
         if not (hasattr(error, "exit_code") and hasattr(error, "format_message")):
             raise
