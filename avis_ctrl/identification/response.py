@@ -27,9 +27,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
 from avis_ctrl.identification.sample_and_hold import Motion, aliases, hold
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace
-from avis_ctrl.rigs.geophone import second_order_roots
 from avis_ctrl.rigs.rig import Parameter, Rig
 
 FLOOR = ("vx", "vy", "vz")

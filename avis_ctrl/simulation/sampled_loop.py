@@ -104,20 +104,6 @@ def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
                       rig.converter, made[0] if len(set(filters)) == 1 else made)
 
 
-def geophone_bank(rig: Rig) -> SensorBank:
-    """The sensors of a rig without accelerometers. Raises InputError where it has some."""
-    if any(one.quantity == "acceleration" for one in rig.sensors()) or rig.converter is None:
-        raise InputError("the rig has no geophones with a converter", field="geophones")
-    return rig_bank(rig, 1.0)
-
-
-def accelerometer_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
-    """The sensors of a rig with accelerometers. Raises InputError where it has none."""
-    if all(one.quantity != "acceleration" for one in rig.sensors()):
-        raise InputError("the rig has no accelerometers", field="accelerometers")
-    return rig_bank(rig, integrator_corner_Hz)
-
-
 @dataclass(frozen=True, eq=False)
 class SampledLoop:
     """A table under digital control on a moving floor.
