@@ -90,28 +90,10 @@ def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequen
     """
     if apart and frequency_Hz is not None:
         raise InputError("expected frequencies, or windows that do not overlap, not both", field="apart", value=apart)
-    return _local_response(campaign, False, band_Hz, frequency_Hz, order, half_width, inputs, floor, longest_piece,
-                           apart, partial)
-
-
-def local_rational(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
-                   order: int = 2, half_width: int | None = None, inputs: Sequence[str] | None = None,
-                   floor: bool | None = None, longest_piece: int | None = None) -> FrequencyResponse:
-    """Local rational estimate with one denominator per output (McKelvey and Guerin 2012): for sharp resonances.
-
-    Parameters and errors as in `local_polynomial`. It is a linear least squares with noise among its regressors: meant
-    for signal-to-noise ratios above some 20 dB; below that the polynomial method is the better one.
-    """
-    return _local_response(campaign, True, band_Hz, frequency_Hz, order, half_width, inputs, floor, longest_piece)
-
-
-def _local_response(campaign: Campaign, rational: bool, band_Hz: Band | None, frequency_Hz: np.ndarray | None,
-                    order: int, half_width: int | None, inputs: Sequence[str] | None, floor: bool | None,
-                    longest: int | None, apart: bool = False, partial: bool = False) -> FrequencyResponse:
     records = taking_part(campaign, floor)
     used = channels(campaign, records, inputs, floor)
     band = checked_band(band_Hz, campaign.sample_rate_Hz)
-    plan = _Plan.of(campaign, records, longest)
+    plan = _Plan.of(campaign, records, longest_piece)
     moving, spacing, rank = _driven(records, used, band, plan)
     driven = list(range(len(used.inputs))) if inputs is not None else moving
     names = tuple(used.inputs[j] for j in driven)
@@ -120,17 +102,16 @@ def _local_response(campaign: Campaign, rational: bool, band_Hz: Band | None, fr
     n_y = len(used.outputs)
     width = half_width
     if width is None:
-        width = least_half_width(plan.count, min(rank, len(names)), n_y, order, rational, spacing)
+        width = least_half_width(plan.count, min(rank, len(names)), n_y, order, spacing)
     where = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
     if apart:
         where = _apart(where, width)
-    fit = LocalFit(where, len(names), n_y, order, width, width * campaign.sample_rate_Hz / plan.shortest, rational)
+    fit = LocalFit(where, len(names), n_y, order, width, width * campaign.sample_rate_Hz / plan.shortest)
     for part in _spectra(records, used, driven, band, width, plan):
         fit.add(*part)
     found = fit.estimate(names, partial)
-    kind = "rational" if rational else "polynomial"
     left_out = [name for name in used.inputs if name not in names] if inputs is None else []
-    method = (f"local {kind} method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces"
+    method = (f"local polynomial method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces"
               + (f"; not excited and left out: {', '.join(left_out)}" if left_out else ""))
     return FrequencyResponse(found.frequency_Hz, found.value, found.noise, found.gram, names, used.outputs,
                              used.input_unit, used.output_unit, float(found.dof), method=method,
