@@ -72,17 +72,8 @@ class DeadChannel(Gate):
         traces = {k: (t[(part := slice(max(0, at - n), at + 2 * n))], y[part, k]) for k, (n, at) in stuck.items()}
         codes = np.array([len(np.unique(y[: 1 << 14, k])) for k in range(y.shape[1])])
         spread = np.ptp(np.concatenate([p.u for p in seen.pieces]), axis=0)
-        return _Kept(
-            seen.header.name,
-            seen.driven,
-            np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0),
-            spread,
-            codes,
-            longest,
-            stuck,
-            _excess(seen),
-            traces,
-        )
+        return _Kept(seen.header.name, seen.driven, np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0), spread, codes,
+                     longest, stuck, _excess(seen), traces)
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         names = campaign.y_names
@@ -99,52 +90,30 @@ class DeadChannel(Gate):
             if dead:
                 constant.add(name)
                 found.append(
-                    Finding(
-                        self.name,
-                        "stop",
-                        f"Channel {name!r} is constant in {_records(dead, kept)}: the sensor is "
-                        "not connected or not recorded. Check its cable and input, or leave the channel out.",
-                        (name,),
-                        dead,
-                        0.0,
-                        0.0,
-                        picture,
-                    )
-                )
+                    Finding(self.name, "stop",
+                            f"Channel {name!r} is constant in {_records(dead, kept)}: the sensor is not connected or "
+                            "not recorded. Check its cable and input, or leave the channel out.", (name,), dead, 0.0,
+                            0.0, picture))
             for k in kept:
                 if j in k.stuck:
                     found.append(self._stuck(name, j, k, campaign))
             if name not in constant and excess is not None and excess[j] < 1 and np.median(excess) > RESPONDS:
                 found.append(
-                    Finding(
-                        self.name,
-                        "stop",
-                        f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} r.m.s."
-                        f" ({int(np.median([k.codes[j] for k in kept]))} different values) in every driven record while"
-                        f" the other channels respond (its ratio of response to noise is {excess[j]:.2g} times the"
-                        f" limit for noise alone; the median of all channels is {np.median(excess):.3g} times it): not"
-                        " connected, or recorded under another name. Check its cable, or leave it out.",
-                        (name,),
-                        tuple(k.record for k in kept if k.response is not None),
-                        float(excess[j]),
-                        1.0,
-                        picture,
-                    )
-                )
+                    Finding(self.name, "stop",
+                            f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} "
+                            f"r.m.s. ({int(np.median([k.codes[j] for k in kept]))} different values) in every driven "
+                            "record while the other channels respond (its ratio of response to noise is "
+                            f"{excess[j]:.2g} times the limit for noise alone; the median of all channels is "
+                            f"{np.median(excess):.3g} times it): not connected, or recorded under another name. Check "
+                            "its cable, or leave it out.", (name,),
+                            tuple(k.record for k in kept if k.response is not None), float(excess[j]), 1.0, picture))
         found += self._never_driven(kept, campaign, picture)
         if not found:
             found.append(
-                Finding(
-                    self.name,
-                    "ok",
-                    f"All {len(names)} channels move; the quietest is "
-                    f"{names[int(np.argmin(rms.max(axis=0)))]!r} with {rms.max(axis=0).min():.3g} "
-                    f"{campaign.y_unit} r.m.s. in its strongest record.",
-                    value=float(rms.max(axis=0).min()),
-                    limit=0.0,
-                    picture=picture,
-                )
-            )
+                Finding(self.name, "ok",
+                        f"All {len(names)} channels move; the quietest is {names[int(np.argmin(rms.max(axis=0)))]!r} "
+                        f"with {rms.max(axis=0).min():.3g} {campaign.y_unit} r.m.s. in its strongest record.",
+                        value=float(rms.max(axis=0).min()), limit=0.0, picture=picture))
         return found
 
     def _never_driven(self, kept: list[_Kept], campaign: Campaign, picture: Picture) -> list[Finding]:
@@ -155,50 +124,27 @@ class DeadChannel(Gate):
         if not idle:
             return []
         return [
-            Finding(
-                self.name,
-                "note",
-                f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. "
-                "Drive it in a further record, or leave it out.",
-                idle,
-                picture=picture,
-            )
-        ]
+            Finding(self.name, "note",
+                    f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. Drive "
+                    "it in a further record, or leave it out.", idle, picture=picture)]
 
     def _stuck(self, name: str, j: int, kept: _Kept, campaign: Campaign) -> Finding:
         n, at = kept.stuck[j]
         rate = campaign.sample_rate_Hz
         t, x = kept.traces[j]
         severity: Severity = "warning"
-        picture = Picture(
-            f"Record {kept.record}, {name}",
-            "time [s]",
-            f"{name} [{campaign.y_unit}]",
-            (Series(name, *thinned(t, x)),),
-            (Limit("stuck from", at / rate, "x"),),
-        )
-        return Finding(
-            self.name,
-            severity,
-            f"Channel {name!r} of record {kept.record} repeats one value for {n} samples "
-            f"({n / rate:.3g} s) from {at / rate:.4g} s on: the converter or the data link was stuck. "
-            "Leave that part out or repeat the record.",
-            (name,),
-            (kept.record,),
-            float(n),
-            float(STUCK_SAMPLES),
-            picture,
-        )
+        picture = Picture(f"Record {kept.record}, {name}", "time [s]", f"{name} [{campaign.y_unit}]",
+                          (Series(name, *thinned(t, x)),), (Limit("stuck from", at / rate, "x"),))
+        return Finding(self.name, severity,
+                       f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) "
+                       f"from {at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or "
+                       "repeat the record.", (name,), (kept.record,), float(n), float(STUCK_SAMPLES), picture)
 
     def _picture(self, kept: list[_Kept], rms: np.ndarray, campaign: Campaign) -> Picture:
         x = np.arange(len(kept))
-        return Picture(
-            "R.m.s. of each channel by record",
-            "record number",
-            f"r.m.s. [{campaign.y_unit}]",
-            tuple(Series(name, x, rms[:, j], "points") for j, name in enumerate(campaign.y_names)),
-            y_scale="log",
-        )
+        return Picture("R.m.s. of each channel by record", "record number", f"r.m.s. [{campaign.y_unit}]",
+                       tuple(Series(name, x, rms[:, j], "points") for j, name in enumerate(campaign.y_names)),
+                       y_scale="log")
 
 
 def _records(names: tuple[str, ...], kept: list[_Kept]) -> str:

@@ -105,15 +105,8 @@ class Hum(Gate):
             what = "No mains hum was found" if tested else "No line of the mains could be tested"
             last = kept[-1]
             found.append(
-                Finding(
-                    self.name,
-                    "ok",
-                    f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).",
-                    value=None,
-                    limit=FALSE_ALARM,
-                    picture=self._picture(last, 0, names[0], campaign.y_unit, []),
-                )
-            )
+                Finding(self.name, "ok", f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).", value=None,
+                        limit=FALSE_ALARM, picture=self._picture(last, 0, names[0], campaign.y_unit, [])))
         return found
 
     def _finding(self, name: str, mains: float, hits: list[tuple[_Kept, _Line]], unit: str) -> Finding:
@@ -124,30 +117,16 @@ class Hum(Gate):
         at = sorted({round(hit.at_Hz / mains) for _, hit in hits})
         harmonics = ", ".join(f"{k * mains:g}" for k in at)
         picture = self._picture(record, line.channel, name, unit, [k * mains for k in at])
-        return Finding(
-            self.name,
-            severity,
-            f"Channel {name!r} carries mains hum at {harmonics} Hz: at {line.at_Hz:.4g} Hz {line.rms:.3g} {unit}"
-            f" r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, {100 * part:.2g} % of the channel's"
-            f" r.m.s. (record {record.record}). Check grounding and shielding; keep these lines out of the fit.",
-            (name,),
-            records,
-            float(line.ratio),
-            3.0,
-            picture,
-        )
+        return Finding(self.name, severity,
+                       f"Channel {name!r} carries mains hum at {harmonics} Hz: at {line.at_Hz:.4g} Hz {line.rms:.3g} "
+                       f"{unit} r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, {100 * part:.2g} % "
+                       f"of the channel's r.m.s. (record {record.record}). Check grounding and shielding; keep these "
+                       "lines out of the fit.", (name,), records, float(line.ratio), 3.0, picture)
 
     def _picture(self, kept: _Kept, j: int, name: str, unit: str, at: list[float]) -> Picture:
         f, a = thinned(kept.f[1:], kept.asd[1:, j])
-        return Picture(
-            f"Record {kept.record}, {name}",
-            "frequency [Hz]",
-            f"amplitude density [{unit}/sqrt(Hz)]",
-            (Series(name, f, a),),
-            tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ),
-            "log",
-            "log",
-        )
+        return Picture(f"Record {kept.record}, {name}", "frequency [Hz]", f"amplitude density [{unit}/sqrt(Hz)]",
+                       (Series(name, f, a),), tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ), "log", "log")
 
 
 def _length(samples: int, rate: float) -> int:
@@ -177,10 +156,8 @@ def _tested(f: np.ndarray, P: np.ndarray, driven: np.ndarray, at: float, mains: 
         return None
     lines = []
     for j in range(P.shape[1]):
-        floor = max(
-            P[low - GUARD - REFERENCE : low - GUARD, j].mean(),
-            P[high + GUARD + 1 : high + GUARD + REFERENCE + 1, j].mean(),
-        )
+        floor = max(P[low - GUARD - REFERENCE : low - GUARD, j].mean(),
+                    P[high + GUARD + 1 : high + GUARD + REFERENCE + 1, j].mean())
         peak = low + int(np.argmax(P[low : high + 1, j]))
         if floor <= 0:
             continue

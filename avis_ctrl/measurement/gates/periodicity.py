@@ -74,14 +74,8 @@ class Periodicity(Gate):
         judged = [k for k in kept if k.T is not None]
         if not judged:
             why = "no record is periodic with four periods or more"
-            return [
-                Finding(
-                    self.name,
-                    "ok",
-                    f"Periodicity was not tested: {why}.",
-                    picture=Picture("Periods against the last ones", "period", "ratio to noise [-]", ()),
-                )
-            ]
+            return [Finding(self.name, "ok", f"Periodicity was not tested: {why}.",
+                            picture=Picture("Periods against the last ones", "period", "ratio to noise [-]", ()))]
         tests = sum(k.T.size for k in judged if k.T is not None)
         found, drops = [], {}
         for k in judged:
@@ -91,13 +85,9 @@ class Periodicity(Gate):
             P = len(k.T)
             reference = P - P // 2
             picture = Picture(
-                f"Record {k.record}: periods against the last {P // 2}",
-                "period",
-                "difference by noise, power [-]",
+                f"Record {k.record}: periods against the last {P // 2}", "period", "difference by noise, power [-]",
                 tuple(Series(n, np.arange(1, P + 1), k.T[:, j], "points") for j, n in enumerate(campaign.y_names)),
-                (Limit("1 % limit for noise", limit),),
-                y_scale="log",
-            )
+                (Limit("1 % limit for noise", limit),), y_scale="log")
             if (drifting := self._drifting(k, tests, campaign, picture)) is not None:
                 found.append(drifting)
                 continue
@@ -105,20 +95,12 @@ class Periodicity(Gate):
             if drop > reference:
                 bad = tuple(n for j, n in enumerate(campaign.y_names) if (k.T[reference - 1 :, j] > limit).any())
                 found.append(
-                    Finding(
-                        self.name,
-                        "warning",
-                        f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s:"
-                        f" {quoted(bad)} still differ by {times(float(np.sqrt(k.T[drop - 1].max())))} the noise,"
-                        f" {percent(k.relative[drop - 1].max())} of the signal. The rig drifts, or the transient is"
-                        " longer than the record. Wait longer before recording, or look for drift.",
-                        bad,
-                        (k.record,),
-                        float(k.T[drop - 1].max()),
-                        limit,
-                        picture,
-                    )
-                )
+                    Finding(self.name, "warning",
+                            f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s: "
+                            f"{quoted(bad)} still differ by {times(float(np.sqrt(k.T[drop - 1].max())))} the noise, "
+                            f"{percent(k.relative[drop - 1].max())} of the signal. The rig drifts, or the transient is "
+                            "longer than the record. Wait longer before recording, or look for drift.", bad,
+                            (k.record,), float(k.T[drop - 1].max()), limit, picture))
             else:
                 drops[k.record] = (drop, k, limit, picture)
         late = {r: d for r, d in drops.items() if d[0] > 0}
@@ -127,34 +109,18 @@ class Periodicity(Gate):
             periods = f"{most} period{'s' if most > 1 else ''}"
             assert k.relative is not None and k.T is not None
             found.append(
-                Finding(
-                    self.name,
-                    "note",
-                    f"The initial transient lasts {periods} of {k.period_s:g} s"
-                    f" (record {k.record}: the first differs from the last ones by {100 * k.relative[0].max():.2g} % of"
-                    f" the signal). A fit that includes the transient, as in avis identify, needs no change;"
-                    f" otherwise drop the first {periods} of each record.",
-                    (),
-                    tuple(late),
-                    float(most),
-                    0.0,
-                    picture,
-                )
-            )
+                Finding(self.name, "note",
+                        f"The initial transient lasts {periods} of {k.period_s:g} s (record {k.record}: the first "
+                        f"differs from the last ones by {100 * k.relative[0].max():.2g} % of the signal). A fit that "
+                        "includes the transient, as in avis identify, needs no change; otherwise drop the first "
+                        f"{periods} of each record.", (), tuple(late), float(most), 0.0, picture))
         elif drops and not found:
             _, k, limit, picture = next(iter(drops.values()))
             assert k.T is not None
             found.append(
-                Finding(
-                    self.name,
-                    "ok",
-                    f"All periods repeat within the noise (largest ratio {k.T.max():.2f}, limit for noise alone"
-                    f" {limit:.2f}).",
-                    value=float(k.T.max()),
-                    limit=limit,
-                    picture=picture,
-                )
-            )
+                Finding(self.name, "ok",
+                        f"All periods repeat within the noise (largest ratio {k.T.max():.2f}, limit for noise alone "
+                        f"{limit:.2f}).", value=float(k.T.max()), limit=limit, picture=picture))
         return found
 
     def _drifting(self, k: _Kept, tests: int, campaign: Campaign, picture: Picture) -> Finding | None:
@@ -166,19 +132,12 @@ class Periodicity(Gate):
         if not bad.any():
             return None
         names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-        return Finding(
-            self.name,
-            "warning",
-            f"Record {k.record} drifts: over its last {len(k.T) // 2} periods of {k.period_s:g} s {quoted(names)}"
-            f" change steadily by {percent(drift[bad].max())} of the signal ({times(float(T[bad].max()))} the noise"
-            f" power; limit for noise alone {limit:.2f}). The rig drifts, or the transient is longer than the record."
-            " Wait longer before recording, or find the cause of the drift.",
-            names,
-            (k.record,),
-            float(T[bad].max()),
-            limit,
-            picture,
-        )
+        return Finding(self.name, "warning",
+                       f"Record {k.record} drifts: over its last {len(k.T) // 2} periods of {k.period_s:g} s "
+                       f"{quoted(names)} change steadily by {percent(drift[bad].max())} of the signal "
+                       f"({times(float(T[bad].max()))} the noise power; limit for noise alone {limit:.2f}). The rig "
+                       "drifts, or the transient is longer than the record. Wait longer before recording, or find the "
+                       "cause of the drift.", names, (k.record,), float(T[bad].max()), limit, picture)
 
 
 def windowed(difference: np.ndarray) -> np.ndarray:

@@ -99,35 +99,22 @@ class _Records(Gate):
         return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, u, y, variance, P - 1, of)
 
     def _picture(self, d: Difference, names: tuple[str, ...]) -> Picture:
-        return Picture(
-            f"{d.a} against {d.b}",
-            "frequency [Hz]",
-            "relative difference [-]",
-            tuple(Series(n, d.f, d.by_line[:, j]) for j, n in enumerate(names)),
-            (Limit("large", SETTINGS.large),),
-            "log",
-            "log",
-        )
+        return Picture(f"{d.a} against {d.b}", "frequency [Hz]", "relative difference [-]",
+                       tuple(Series(n, d.f, d.by_line[:, j]) for j, n in enumerate(names)),
+                       (Limit("large", SETTINGS.large),), "log", "log")
 
     def _alike(self, differences: list[Difference], campaign: Campaign, what: str) -> Finding:
         """Nothing stands out; a note where that means little."""
         d = max(differences, key=lambda d: d.noise)
         severity: Severity = "note" if d.noise > SETTINGS.blind else "ok"
-        hint = (
-            " Smaller changes would not be detected; records with the same periodic voltage allow a more sensitive"
-            " comparison."
-            if severity == "note"
-            else ""
-        )
-        return Finding(
-            self.name,
-            severity,
-            f"{what} within their noise, which is up to {100 * d.noise:.2g} % of the response in an octave "
-            f"({d.a} against {d.b}), or within 1 %.{hint}",
-            value=float(d.T.max()),
-            limit=d.limit,
-            picture=self._picture(d, campaign.y_names),
-        )
+        hint = (" Smaller changes would not be detected; records with the same periodic voltage allow a more sensitive"
+                " comparison."
+                if severity == "note"
+                else "")
+        return Finding(self.name, severity,
+                       f"{what} within their noise, which is up to {100 * d.noise:.2g} % of the response in an octave "
+                       f"({d.a} against {d.b}), or within 1 %.{hint}", value=float(d.T.max()), limit=d.limit,
+                       picture=self._picture(d, campaign.y_names))
 
 
 class Repeatability(_Records):
@@ -152,14 +139,9 @@ class Repeatability(_Records):
         level = FALSE_ALARM / max(1, len(pairs) * len(campaign.y_names))
         differences = [d for a, b in pairs if (d := difference(a, b, level)) is not None]
         if not differences:
-            return [
-                Finding(
-                    self.name,
-                    "ok",
-                    "Repeatability was not tested: no two driven records of one level and enough length.",
-                    picture=Picture("Repeatability", "frequency [Hz]", "relative difference [-]", ()),
-                )
-            ]
+            return [Finding(self.name, "ok",
+                            "Repeatability was not tested: no two driven records of one level and enough length.",
+                            picture=Picture("Repeatability", "frequency [Hz]", "relative difference [-]", ()))]
         found = []
         for d in differences:
             bad = (d.limit < d.T) & (d.relative > SETTINGS.notable)
@@ -167,28 +149,15 @@ class Repeatability(_Records):
                 names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
                 severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
                 found.append(
-                    Finding(
-                        self.name,
-                        severity,
-                        f"{d.b.capitalize()} does not repeat {d.a}: {quoted(names)} differ by up to"
-                        f" {percent(d.relative[bad].max())} of the response, {beyond_chance(d.T[bad].max())}. The rig"
-                        " drifted or was changed in between; treat its"
-                        " parameters as uncertain by this amount, or use only one of the two.",
-                        names,
-                        (d.a, d.b),
-                        float(d.T[bad].max()),
-                        d.limit,
-                        self._picture(d, campaign.y_names),
-                    )
-                )
+                    Finding(self.name, severity,
+                            f"{d.b.capitalize()} does not repeat {d.a}: {quoted(names)} differ by up to "
+                            f"{percent(d.relative[bad].max())} of the response, {beyond_chance(d.T[bad].max())}. The "
+                            "rig drifted or was changed in between; treat its parameters as uncertain by this amount, "
+                            "or use only one of the two.", names, (d.a, d.b), float(d.T[bad].max()), d.limit,
+                            self._picture(d, campaign.y_names)))
         if not found:
-            found.append(
-                self._alike(
-                    differences,
-                    campaign,
-                    f"{len(differences)} pair{'s' if len(differences) > 1 else ''} of records agree",
-                )
-            )
+            found.append(self._alike(differences, campaign,
+                                     f"{len(differences)} pair{'s' if len(differences) > 1 else ''} of records agree"))
         return found
 
 
@@ -204,21 +173,15 @@ class LevelDependence(_Records):
 
     def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         groups = _by_kind_and_level(kept)
-        pairs = [
-            (a, b) for a, b in combinations(sorted(groups), 2) if a[0] == b[0] and b[1] >= SETTINGS.apart * a[1]
-        ]
+        pairs = [(a, b) for a, b in combinations(sorted(groups), 2) if a[0] == b[0] and b[1] >= SETTINGS.apart * a[1]]
         level = FALSE_ALARM / max(1, len(pairs) * len(campaign.y_names))
         differences = [d for a, b in pairs if (d := _of_levels(groups[a], groups[b], level)) is not None]
         if not differences:
             return [
-                Finding(
-                    self.name,
-                    "ok",
-                    "Dependence on the level was not tested: no driven records of one kind and enough length at"
-                    f" two levels, at least a factor {SETTINGS.apart:g} apart.",
-                    picture=Picture("Level dependence", "frequency [Hz]", "relative difference [-]", ()),
-                )
-            ]
+                Finding(self.name, "ok",
+                        "Dependence on the level was not tested: no driven records of one kind and enough length at "
+                        f"two levels, at least a factor {SETTINGS.apart:g} apart.",
+                        picture=Picture("Level dependence", "frequency [Hz]", "relative difference [-]", ()))]
         found = []
         for d in differences:
             bad = (d.limit < d.T) & (d.relative > SETTINGS.notable)
@@ -227,20 +190,12 @@ class LevelDependence(_Records):
                 severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
                 low, high = d.band_Hz[int(np.argmax(np.where(bad, d.relative, 0)))]
                 found.append(
-                    Finding(
-                        self.name,
-                        severity,
-                        f"The response depends on the level: from {d.a} to {d.b} {quoted(names)} change by up to"
-                        f" {percent(d.relative[bad].max())} (most from {low:.3g} to {high:.3g} Hz),"
-                        f" {beyond_chance(d.T[bad].max())}: nonlinearity. Identify at the level of use, and"
-                        " include the difference in the uncertainty.",
-                        names,
-                        (),
-                        float(d.T[bad].max()),
-                        d.limit,
-                        self._picture(d, campaign.y_names),
-                    )
-                )
+                    Finding(self.name, severity,
+                            f"The response depends on the level: from {d.a} to {d.b} {quoted(names)} change by up to "
+                            f"{percent(d.relative[bad].max())} (most from {low:.3g} to {high:.3g} Hz), "
+                            f"{beyond_chance(d.T[bad].max())}: nonlinearity. Identify at the level of use, and include "
+                            "the difference in the uncertainty.", names, (), float(d.T[bad].max()), d.limit,
+                            self._picture(d, campaign.y_names)))
         if not found:
             found.append(self._alike(differences, campaign, "The responses at all levels agree"))
         return found
@@ -282,15 +237,13 @@ def _of_levels(a: list[_Kept], b: list[_Kept], level: float) -> Difference | Non
 
 def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Difference | None:
     """Where u of b is u of a times a constant: y of b against y of a times it."""
-    if (
-        a.u is None
+    if (a.u is None
         or b.u is None
         or a.y is None
         or b.y is None
         or a.variance is None
         or b.variance is None
-        or a.u.shape != b.u.shape
-    ):
+        or a.u.shape != b.u.shape):
         return None
     power = float(np.sum(a.u * a.u))
     scale = float(np.sum(a.u * b.u)) / power if power else 0.0
@@ -305,9 +258,8 @@ def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Dif
     keep &= driven > SETTINGS.excited * np.median(driven[keep])
     power = np.abs(D) ** 2
     by_line = np.sqrt(power / np.maximum(size, 1e-300))
-    T, relative, band = _by_band(
-        f[keep], (power / variance)[keep], (power - variance)[keep], size[keep], 1, min(a.dof, b.dof), level
-    )
+    T, relative, band = _by_band(f[keep], (power / variance)[keep], (power - variance)[keep], size[keep], 1,
+                                 min(a.dof, b.dof), level)
     noise = _noise(f[keep], variance[keep], size[keep])
     return Difference(*names, T, 1.0, relative, band, f[keep], by_line[keep], noise)
 
@@ -315,13 +267,11 @@ def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Dif
 def _noise(f: np.ndarray, spread: np.ndarray, size: np.ndarray) -> float:
     """Noise of the difference by the response, r.m.s. in the octave where it is largest."""
     return max(
-        float(np.sqrt(np.max(spread[b].sum(axis=0) / np.maximum(size[b].sum(axis=0), 1e-300)))) for b in octaves(f)
-    )
+        float(np.sqrt(np.max(spread[b].sum(axis=0) / np.maximum(size[b].sum(axis=0), 1e-300)))) for b in octaves(f))
 
 
-def _by_band(
-    f: np.ndarray, ratio: np.ndarray, excess: np.ndarray, size: np.ndarray, n_u: int, dof: int, level: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _by_band(f: np.ndarray, ratio: np.ndarray, excess: np.ndarray, size: np.ndarray, n_u: int, dof: int,
+             level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(n_y,) of the octave that stands out most: mean ratio by the limit of F(n_u L, dof L), relative excess, and its
     ends (n_y, 2)."""
     bands = octaves(f)

@@ -66,70 +66,39 @@ class SignalToNoise(Gate):
         measured = [(k.f, k.snr, k.segment_s) for k in kept if k.snr is not None and len(k.f)]
         if not measured:
             picture = Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ())
-            return found or [
-                Finding(self.name, "ok", "No driven record is long enough to separate signal and noise.",
-                        picture=picture)
-            ]
+            return found or [Finding(self.name, "ok", "No driven record is long enough to separate signal and noise.",
+                                     picture=picture)]
         f, snr, segment_s = max(measured, key=lambda m: float(np.median(m[1])))
-        advice = (
-            f": noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. A periodic"
-            " excitation would distinguish them; a higher level helps only against noise."
-            if segment_s
-            else ". Such bands have little weight in a fit; excite them more if they are important."
-        )
+        advice = (f": noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. A periodic"
+                  " excitation would distinguish them; a higher level helps only against noise."
+                  if segment_s
+                  else ". Such bands have little weight in a fit; excite them more if they are important.")
         bands = octaves(f)
         dB = np.array([10 * np.log10(np.maximum(snr[band].mean(axis=0), 1e-6)) for band in bands])
         middle = np.array([np.sqrt(f[band][0] * f[band][-1]) for band in bands])
-        picture = Picture(
-            "Signal to noise of the best record",
-            "frequency [Hz]",
-            "ratio [dB]",
-            tuple(Series(n, middle, dB[:, j], "points") for j, n in enumerate(campaign.y_names)),
-            (Limit("low", LOW_DB),),
-            "log",
-        )
+        picture = Picture("Signal to noise of the best record", "frequency [Hz]", "ratio [dB]",
+                          tuple(Series(n, middle, dB[:, j], "points") for j, n in enumerate(campaign.y_names)),
+                          (Limit("low", LOW_DB),), "log")
         for j, name in enumerate(campaign.y_names):
             weakest = int(np.argmin(dB[:, j]))
             if dB[:, j].max() < POOR_DB:
                 found.append(
-                    Finding(
-                        self.name,
-                        "warning",
-                        f"Channel {name!r} has more noise than signal in every band (at best {dB[:, j].max():.1f} dB at"
-                        f" {middle[np.argmax(dB[:, j])]:.3g} Hz). Raise the level, or average longer.",
-                        (name,),
-                        value=float(dB[:, j].max()),
-                        limit=POOR_DB,
-                        picture=picture,
-                    )
-                )
+                    Finding(self.name, "warning",
+                            f"Channel {name!r} has more noise than signal in every band (at best {dB[:, j].max():.1f} "
+                            f"dB at {middle[np.argmax(dB[:, j])]:.3g} Hz). Raise the level, or average longer.",
+                            (name,), value=float(dB[:, j].max()), limit=POOR_DB, picture=picture))
             elif dB[weakest, j] < LOW_DB:
                 weak = np.flatnonzero(dB[:, j] < LOW_DB)
                 low = ", ".join(f"{middle[b]:.3g} Hz {round(float(dB[b, j]))} dB" for b in weak)
                 found.append(
-                    Finding(
-                        self.name,
-                        "note",
-                        f"Channel {name!r} has little signal around {low}{advice}",
-                        (name,),
-                        value=float(dB[weakest, j]),
-                        limit=LOW_DB,
-                        picture=picture,
-                    )
-                )
+                    Finding(self.name, "note", f"Channel {name!r} has little signal around {low}{advice}", (name,),
+                            value=float(dB[weakest, j]), limit=LOW_DB, picture=picture))
         if not found:
             b, j = divmod(int(np.argmin(dB)), dB.shape[1])
             found.append(
-                Finding(
-                    self.name,
-                    "ok",
-                    f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest {campaign.y_names[j]!r}"
-                    f" around {middle[b]:.3g} Hz).",
-                    value=float(dB[b, j]),
-                    limit=LOW_DB,
-                    picture=picture,
-                )
-            )
+                Finding(self.name, "ok",
+                        f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest {campaign.y_names[j]!r} "
+                        f"around {middle[b]:.3g} Hz).", value=float(dB[b, j]), limit=LOW_DB, picture=picture))
         return found
 
     def _noisy(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> list[Finding]:
@@ -139,26 +108,14 @@ class SignalToNoise(Gate):
             return []
         rms = np.median(levels, axis=0)
         x = np.arange(len(rms))
-        picture = Picture(
-            "Noise of each channel, from above half the Nyquist frequency",
-            "channel",
-            f"r.m.s. [{campaign.y_unit}]",
-            (Series("measured", x, rms, "bars"),),
-            (Limit("stated", stated),),
-            y_scale="log",
-            x_names=campaign.y_names,
-        )
+        picture = Picture("Noise of each channel, from above half the Nyquist frequency", "channel",
+                          f"r.m.s. [{campaign.y_unit}]", (Series("measured", x, rms, "bars"),),
+                          (Limit("stated", stated),), y_scale="log", x_names=campaign.y_names)
         return [
-            Finding(
-                self.name,
-                "warning",
-                f"Channel {name!r} has sensor noise of {rms[j]:.3g} {campaign.y_unit} r.m.s., {rms[j] / stated:.1f}"
-                " times what the rig file states. Check its preamplifier and cable, or correct the rig file.",
-                (name,),
-                value=float(rms[j]),
-                limit=NOISE_FACTOR * stated,
-                picture=picture,
-            )
+            Finding(self.name, "warning",
+                    f"Channel {name!r} has sensor noise of {rms[j]:.3g} {campaign.y_unit} r.m.s., {rms[j] / stated:.1f}"
+                    " times what the rig file states. Check its preamplifier and cable, or correct the rig file.",
+                    (name,), value=float(rms[j]), limit=NOISE_FACTOR * stated, picture=picture)
             for j, name in enumerate(campaign.y_names)
             if rms[j] > NOISE_FACTOR * stated
         ]
@@ -200,14 +157,8 @@ class Coherence(Gate):
         chosen = [k for k in driven if k.level * SAME_LEVEL >= top]
         best, seconds = _pooled(chosen)
         if best is None:
-            return [
-                Finding(
-                    self.name,
-                    "ok",
-                    "No driven record is long enough for a coherence of all inputs together.",
-                    picture=Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ()),
-                )
-            ]
+            return [Finding(self.name, "ok", "No driven record is long enough for a coherence of all inputs together.",
+                            picture=Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ()))]
         n_u = best.rank
         free = best.coherence - (1 - best.coherence) * n_u / best.dof
         bands = thirds(best.f)
@@ -217,53 +168,29 @@ class Coherence(Gate):
         z = stats.norm.isf(FALSE_ALARM / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
         surely = np.all(mean < LOW_COHERENCE - margin[:, None], axis=0)
-        picture = Picture(
-            f"Multiple coherence at {top:.3g} V, thirds of octaves",
-            "frequency [Hz]",
-            "coherence [-]",
-            tuple(Series(n, middle, mean[:, j]) for j, n in enumerate(campaign.y_names)),
-            (Limit("low", LOW_COHERENCE),),
-            "log",
-        )
+        picture = Picture(f"Multiple coherence at {top:.3g} V, thirds of octaves", "frequency [Hz]", "coherence [-]",
+                          tuple(Series(n, middle, mean[:, j]) for j, n in enumerate(campaign.y_names)),
+                          (Limit("low", LOW_COHERENCE),), "log")
         below, excited = "", _lowest_driven(chosen)
         if best.f[0] > 1.5 * excited:
-            below = (
-                f" Below {best.f[0]:.3g} Hz, down to {excited:.3g} Hz where the voltage begins, the records are too"
-                " short for a coherence of all inputs."
-            )
+            below = (f" Below {best.f[0]:.3g} Hz, down to {excited:.3g} Hz where the voltage begins, the records are "
+                     "too short for a coherence of all inputs.")
         low = np.any(mean < LOW_COHERENCE, axis=0)
         groups = [[int(j)] for j in np.flatnonzero(surely)] + [[int(j) for j in np.flatnonzero(low & ~surely)]]
-        found = [
-            self._low(campaign.y_names, group, middle, mean, bool(surely[group[0]]), seconds, below, picture)
-            for group in groups
-            if group
-        ]
+        found = [self._low(campaign.y_names, group, middle, mean, bool(surely[group[0]]), seconds, below, picture)
+                 for group in groups
+                 if group]
         if found:
             return found
         b, j = divmod(int(np.argmin(mean)), mean.shape[1])
         return [
-            Finding(
-                self.name,
-                "ok",
-                f"Multiple coherence is at least {mean[b, j]:.2f} in every third of an octave from {best.f[0]:.3g} to"
-                f" {best.f[-1]:.3g} Hz (lowest {quoted((campaign.y_names[j],))} around {middle[b]:.3g} Hz).{below}",
-                value=float(mean[b, j]),
-                limit=LOW_COHERENCE,
-                picture=picture,
-            )
-        ]
+            Finding(self.name, "ok",
+                    f"Multiple coherence is at least {mean[b, j]:.2f} in every third of an octave from {best.f[0]:.3g} "
+                    f"to {best.f[-1]:.3g} Hz (lowest {quoted((campaign.y_names[j],))} around {middle[b]:.3g} "
+                    f"Hz).{below}", value=float(mean[b, j]), limit=LOW_COHERENCE, picture=picture)]
 
-    def _low(
-        self,
-        names: tuple[str, ...],
-        group: list[int],
-        middle: np.ndarray,
-        mean: np.ndarray,
-        surely: bool,
-        seconds: float,
-        below: str,
-        picture: Picture,
-    ) -> Finding:
+    def _low(self, names: tuple[str, ...], group: list[int], middle: np.ndarray, mean: np.ndarray, surely: bool,
+             seconds: float, below: str, picture: Picture) -> Finding:
         """One channel that is low everywhere, or all those that are low somewhere."""
         severity: Severity = "warning" if surely else "note"
         ordered = sorted(group, key=lambda j: float(mean[:, j].min()))
@@ -273,19 +200,14 @@ class Coherence(Gate):
             count = int(np.count_nonzero(mean[:, j] < LOW_COHERENCE))
             said.append(f"{names[j]!r} {max(mean[b, j], 0):.2f} around {middle[b]:.3g} Hz (low in {count} bands)")
         more = f" and {len(group) - 4} more channels" if len(group) > 4 else ""
-        return Finding(
-            self.name,
-            severity,
-            f"Multiple coherence is below {LOW_COHERENCE:g} in {'all' if surely else 'some'} of the"
-            f" {len(middle)} thirds of octaves: {'; '.join(said)}{more}. Causes are noise, an input that is not"
-            f" recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that decays more slowly"
-            f" than the segments of {seconds:.3g} s. Longer records distinguish leakage from the other causes; a higher"
-            f" level reduces the influence of noise.{below}",
-            tuple(names[j] for j in ordered),
-            value=float(mean[:, group].min()),
-            limit=LOW_COHERENCE,
-            picture=picture,
-        )
+        return Finding(self.name, severity,
+                       f"Multiple coherence is below {LOW_COHERENCE:g} in {'all' if surely else 'some'} of the "
+                       f"{len(middle)} thirds of octaves: {'; '.join(said)}{more}. Causes are noise, an input that is "
+                       "not recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that decays "
+                       f"more slowly than the segments of {seconds:.3g} s. Longer records distinguish leakage from the "
+                       f"other causes; a higher level reduces the influence of noise.{below}",
+                       tuple(names[j] for j in ordered), value=float(mean[:, group].min()), limit=LOW_COHERENCE,
+                       picture=picture)
 
 
 def _pooled(chosen: list[_Coherence]) -> tuple[H1 | None, float]:
