@@ -23,6 +23,7 @@ from avis_ctrl.identification.predictor import model_inputs, predict
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.rigs.avis import AvisTable
+from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.study.files import as_json
@@ -135,15 +136,7 @@ def read_gap(folder: Path) -> dict[str, Any]:
     Raises InputError where the folder holds no result of avis gap, or half of one.
     """
     path = folder / GAP_FILE
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"expected the folder of avis gap ({error.strerror or error})", file=path) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"expected JSON; {error}", file=path) from None
-    if not isinstance(found, dict) or found.get("format") != "avis-gap":
-        raise InputError("expected the result of avis gap", file=path, field="format",
-                         value=found.get("format") if isinstance(found, dict) else type(found).__name__)
+    found = read_json(path, "avis-gap", "the folder of avis gap")
     for key in ("effects", "traces"):
         effects = found.setdefault(key, []) if key == "traces" else found.get(key)
         if not isinstance(effects, list) or not all(isinstance(one, dict) and isinstance(one.get("name"), str)
