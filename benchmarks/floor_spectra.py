@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.magnitude_fit import magnitude_fit
-from avis_ctrl.rigs.converter import require_positive
 from avis_ctrl.rigs.floor_motion import band_rms, check_spectrum
 from avis_ctrl.rigs.floor_spectrum import ONE_SIDED, SpectrumModel
 

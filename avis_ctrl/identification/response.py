@@ -23,6 +23,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
 from avis_ctrl.identification.sample_and_hold import Motion, aliases, hold
@@ -174,15 +175,14 @@ def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) 
     """
     known, _ = rig.sensor_rows()
     chosen = tuple(names) if names is not None else known
-    if missing := [name for name in chosen if name not in known]:
-        raise InputError(f"the sensors of the rig {rig.name} are {', '.join(known)}", field="y names", value=missing)
+    at = places(chosen, known, f"the sensors of the rig {rig.name} are", "y names")
     n = len(chosen)
     if unit in MOTION_OF_UNIT:
         return SensorModel(chosen, (MOTION_OF_UNIT[unit],) * n, (None,) * n, np.ones(n), unit,
                            (f"{unit} per {unit}",) * n, ((1.0,),) * n, np.zeros(n, bool))
     if unit != "V":
         raise InputError(f"expected V, {', '.join(MOTION_OF_UNIT)}", field="unit of y", value=unit)
-    sensors = [rig.sensors()[known.index(name)] for name in chosen]
+    sensors = [rig.sensors()[k] for k in at]
     # Alike sensors share one chain object, whose response is computed once.
     systems = {(one.zeros, one.poles, one.quantity): one.chain(1.0) for one in sensors}
     units = {"velocity": "V s/m", "acceleration": "V s^2/m", "displacement": "V/m"}
@@ -312,14 +312,9 @@ class ResponseModel:
     turning: Turning = AS_SIMULATED
 
     def __post_init__(self) -> None:
-        known = self._known
-        if unknown := [name for name in self.names if name not in known]:
-            raise InputError(f"the rig {self.rig.name} has no such parameter; it has {', '.join(known)}",
-                             field="parameters", value=unknown)
+        places(self.names, list(self._known), f"the rig {self.rig.name} has no such parameter; it has", "parameters")
         available = self.rig.equations_of_motion().actuators
-        if missing := [name for name in self.actuators if name not in available]:
-            raise InputError(f"the actuators of the rig {self.rig.name} are {', '.join(available)}", field="u names",
-                             value=missing)
+        places(self.actuators, available, f"the actuators of the rig {self.rig.name} are", "u names")
 
     @staticmethod
     def of(rig: Rig, names: Sequence[str], unit: str = "V", sensors: Sequence[str] | None = None,

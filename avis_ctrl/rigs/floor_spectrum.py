@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.rational import Rational, cascade
 from avis_ctrl.lti.statespace import StateSpace
-from avis_ctrl.rigs.converter import require_positive
 from avis_ctrl.rigs.floor_motion import DERIVATIVES, Quantity, band_rms
 
 ONE_SIDED = np.sqrt(2.0)

@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, gain
-from avis_ctrl.rigs.converter import Converter, require_positive
+from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel
 from avis_ctrl.rigs.instruments import ORDER
 from avis_ctrl.rigs.rig import Rig

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
 from avis_ctrl.gap import line_response
@@ -202,8 +203,7 @@ def _require_fit(model: TableModel, campaign: Campaign) -> None:
     if campaign.y_unit != model.sensors.unit:
         raise InputError(f"expected {model.sensors.unit}, as in the campaign that the model was found from",
                          field="unit of y", value=campaign.y_unit)
-    if missing := [name for name in campaign.y_names if name not in model.sensors.names]:
-        raise InputError(f"the model's sensors are {', '.join(model.sensors.names)}", field="y names", value=missing)
+    places(campaign.y_names, model.sensors.names, "the model's sensors are", "y names")
 
 
 def _not_predicted(effects: Sequence[Mapping[str, Any]], campaign: Campaign) -> list[str]:

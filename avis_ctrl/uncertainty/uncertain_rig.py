@@ -22,6 +22,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.uncertainty.blocks import BlockStructure, RealScalar
@@ -271,9 +272,8 @@ def _sensor_rows(rig: Rig, names: Sequence[str] | None, kept: list[int],
     if not names:
         return {}
     available, rows = rig.sensor_rows()
-    if missing := [name for name in names if name not in available]:
-        raise InputError(f"the rig's sensors are {list(available)}", field="sensors", value=missing)
-    return {name: rows[list(available).index(name)][kept] * scale for name in names}
+    at = places(names, available, "the rig's sensors are", "sensors")
+    return {name: rows[k][kept] * scale for name, k in zip(names, at, strict=True)}
 
 
 def _factor(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti.magnitude_fit import covering_fits
 from avis_ctrl.lti.rational import Rational
 from avis_ctrl.lti.statespace import StateSpace
@@ -64,11 +64,3 @@ def smallest_cover(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, tole
                            measured=f"{excess:.2f} dB above it, {tolerance_dB:g} dB allowed",
                            cause="a step too steep for the order", next_step="widen the transition, allow a higher "
                            "order or a larger tolerance")
-
-
-def require(value: float, field: str, low: float = 0.0, high: float = np.inf) -> None:
-    """Raise InputError naming the field unless low < value < high, a finite number."""
-    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not (number and np.isfinite(value) and low < value < high):
-        span = f"greater than {low:g}" if np.isinf(high) else f"between {low:g} and {high:g}"
-        raise InputError(f"a finite number {span}", field=field, value=value)

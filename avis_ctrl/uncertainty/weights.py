@@ -9,9 +9,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from avis_ctrl.checks import require
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.rational import Rational
-from avis_ctrl.uncertainty.weight_base import Role, Weight, require, smallest_cover
+from avis_ctrl.uncertainty.weight_base import Role, Weight, smallest_cover
 
 
 @dataclass(frozen=True)
