@@ -15,13 +15,13 @@ from avis_ctrl.measurement.gates.finding import Expectation, Finding
 from avis_ctrl.measurement.gates.hum import Hum
 from avis_ctrl.measurement.gates.missing_samples import MissingSamples
 from avis_ctrl.measurement.gates.periodicity import Periodicity
-from avis_ctrl.measurement.gates.repeatability import LevelDependence, Repeatability
+from avis_ctrl.measurement.gates.repeatability import Comparison
 from avis_ctrl.measurement.gates.signal_quality import Coherence, SignalToNoise
 from avis_ctrl.measurement.gates.spikes import Spikes
 from avis_ctrl.measurement.gates.stepped_sine import SteppedSine
 
 GATES: tuple[type[Gate], ...] = (Clipping, Spikes, DeadChannel, ChannelMap, SteppedSine, MissingSamples, Hum,
-                                 SignalToNoise, Coherence, Periodicity, Repeatability, LevelDependence)
+                                 SignalToNoise, Coherence, Periodicity, Comparison)
 # What rows that do not belong together spoil.
 CONSEQUENCES = ("signal to noise", "coherence", "periodicity", "repeatability", "level dependence", "spikes")
 # The same where no record is without them.

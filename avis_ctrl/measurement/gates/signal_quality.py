@@ -20,6 +20,7 @@ from avis_ctrl.measurement.gates.finding import (
     quoted,
 )
 from avis_ctrl.measurement.gates.h1 import H1, h1, octaves, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.periodicity import smoothed
 
 LOW_DB, POOR_DB = 10.0, 0.0
 LOW_COHERENCE = 0.5
@@ -255,8 +256,8 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
         P = len(Y)
         noise = np.sum(np.abs(Y - Y.mean(axis=0)) ** 2, axis=0)[keep] / (P - 1)
         # Neighbouring lines share their noise level: a mean over nine lines keeps the ratio from dividing by chance.
-        noise = _smooth(noise, 9)
-        signal = np.maximum(_smooth(np.abs(Y.mean(axis=0)[keep]) ** 2, 9) - noise / P, 0.0)
+        noise = smoothed(noise)
+        signal = np.maximum(smoothed(np.abs(Y.mean(axis=0)[keep]) ** 2) - noise / P, 0.0)
         f = np.fft.rfftfreq(periods.shape[1], 1 / rate)[keep]
         return f, signal / np.maximum(noise, 1e-300), 0.0
     u, y, wrap = usable(seen)
@@ -267,14 +268,6 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
         return np.zeros(0), None, 0.0
     free = np.maximum(estimate.coherence - (1 - estimate.coherence) * estimate.rank / estimate.dof, 0.0)
     return estimate.f, free / np.maximum(1 - free, 1e-12), length / rate
-
-
-def _smooth(a: np.ndarray, width: int) -> np.ndarray:
-    """Moving mean over lines, narrower at the ends."""
-    width = min(width, len(a))
-    kernel = np.ones(width)
-    count = np.convolve(np.ones(len(a)), kernel, "same")
-    return np.stack([np.convolve(a[:, j], kernel, "same") / count for j in range(a.shape[1])], axis=1)
 
 
 def _high_noise(seen: Excerpt) -> np.ndarray | None:
