@@ -76,7 +76,8 @@ class _Kept:
 @dataclass(frozen=True, eq=False)
 class Difference:
     """Of two records (or levels): T (n_y,) mean |difference|^2 by variance in the octave that stands out most, divided
-    by what noise alone exceeds with 1 % probability, relative (n_y,) difference there, free of noise, band_Hz (n_y, 2) where that is."""
+    by what noise alone exceeds with 1 % probability, relative (n_y,) difference there, free of noise, band_Hz (n_y, 2)
+    where that is."""
 
     a: str
     b: str
@@ -170,8 +171,8 @@ def _judged(gate: str, differences: list[Difference], campaign: Campaign,
     hint = (" Smaller changes would not be detected; records with the same periodic voltage allow a more sensitive "
             "comparison." if blind else "")
     return [Finding(gate, "note" if blind else "ok", f"{agreed} within their noise, which is up to {100 * d.noise:.2g} "
-                    f"% of the response in an octave ({d.a} against {d.b}), or within 1 %.{hint}", value=float(d.T.max()),
-                    limit=1.0, picture=_picture(d, campaign.y_names))]
+                    f"% of the response in an octave ({d.a} against {d.b}), or within 1 %.{hint}",
+                    value=float(d.T.max()), limit=1.0, picture=_picture(d, campaign.y_names))]
 
 
 def _picture(d: Difference, names: tuple[str, ...]) -> Picture:
