@@ -139,6 +139,6 @@ def _read(path: Path, parse: Callable[[str], Any], language: str, expected: str)
     except FileNotFoundError:
         raise InputError(f"no such file; expected {expected}", file=path) from None
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from None
+        raise InputError(f"cannot be read: {error.strerror or error}; expected {expected}", file=path) from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"expected a {language} file in UTF-8; {' '.join(str(error).split())}", file=path) from None
