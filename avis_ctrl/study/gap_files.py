@@ -44,7 +44,7 @@ UNPREDICTABLE = {"mains_hum": "the hum's phase in another campaign is not known"
                  "ground_motion": "floor motion that is not measured cannot be predicted"}
 
 
-def write_gap(folder: Path, gap: Gap, html: str | None = None, pdf: bytes | None = None,
+def write_gap(folder: Path, gap: Gap, html: bytes | None = None, pdf: bytes | None = None,
               told: Mapping[str, Any] | None = None) -> list[Path]:
     """All files or none; gap.json last, so that its presence says that the others are complete.
 
