@@ -277,8 +277,6 @@ def test_inputs_that_cannot_be_told_apart_are_named(rng):
     got = local_polynomial(campaign([(u, system.simulate(u))], RATE), band_Hz=(5, 80))
     assert got.inputs == ("u1", "u2") and "left out: u3" in got.method
     assert np.abs(got.value - system.response(got.frequency_Hz)[:, :, :2]).max() < 1e-3
-    with pytest.raises(ComputationError, match="u3"):
-        local_polynomial(campaign([(u, system.simulate(u))], RATE), inputs=("u1", "u3"))
 
 
 def test_inputs_that_depend_on_each_other_tell_what_they_span(rng):
@@ -350,7 +348,7 @@ def test_an_input_silent_in_part_of_the_band_is_named_with_the_frequencies(rng):
 @pytest.mark.parametrize(("change", "words"), [
     ({"band_Hz": (50.0, 20.0)}, "band_Hz"), ({"band_Hz": (5.0, 120.0)}, "100 Hz"), ({"order": 9}, "order"),
     ({"order": 2.5}, "whole order"),
-    ({"half_width": 1}, "half_width"), ({"inputs": ("u7",)}, "u7"), ({"band_Hz": (5.0, 5.5)}, "longer records"),
+    ({"half_width": 1}, "half_width"), ({"band_Hz": (5.0, 5.5)}, "longer records"),
     ({"half_width": 0}, "half_width"), ({"longest_piece": 0}, "longest_piece"),
     ({"frequency_Hz": np.array([5.0, 99.99])}, "frequency_Hz"), ({"half_width": 2, "order": 3}, "degrees of freedom")])
 def test_wrong_requests_are_answered(rng, change, words):
