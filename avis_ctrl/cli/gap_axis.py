@@ -46,7 +46,6 @@ def gap_axis(
 
     from avis_ctrl.cli.console import Progress
     from avis_ctrl.gap.axis import find_axis_gap_in
-    from avis_ctrl.gap.result import sized
     from avis_ctrl.report import rendered
     from avis_ctrl.report.gap.axis import document
     from avis_ctrl.study.files import output_folder
@@ -72,7 +71,7 @@ def gap_axis(
     for sentence in found.sentences:
         console.print(sentence, soft_wrap=True, markup=False)
     for name, one in (*found.parameters.items(), *found.ratios.items()):
-        console.print(f"{name} = {sized(one)}", markup=False)
+        console.print(f"{name} = {one}", markup=False)
     for stage in found.stages:
         noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
         console.print(f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True,
