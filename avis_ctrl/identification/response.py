@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, wraps
 from itertools import zip_longest
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -284,6 +284,34 @@ def _products(slopes: np.ndarray, x: np.ndarray) -> np.ndarray:
     return (x.swapaxes(1, 2).reshape(n * m, j) @ slopes.transpose(2, 1, 0).reshape(j, i * p)).reshape(n, m, i, p)
 
 
+class FrequencyModel(Protocol):
+    """What the fit of records uses of a model: `ResponseModel`, or one with effects (`gap.table_model`)."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def units(self) -> tuple[str, ...]: ...
+    @property
+    def values(self) -> np.ndarray: ...
+    @property
+    def actuators(self) -> tuple[str, ...]: ...
+    @property
+    def inputs(self) -> tuple[str, ...]: ...
+    @property
+    def matrices(self) -> Matrices: ...
+    @property
+    def derivative_matrices(self) -> Matrices: ...
+    def scales(self) -> np.ndarray: ...
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]: ...
+    def reach(self) -> tuple[np.ndarray, np.ndarray]: ...
+    def at(self, theta: Sequence[float] | np.ndarray) -> Self: ...
+    def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven: ...
+    def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True,
+               inner: np.ndarray | None = None) -> Driven: ...
+    def sensor_transients(self, omega: np.ndarray) -> np.ndarray: ...
+    def inner_transients(self, omega: np.ndarray) -> np.ndarray: ...
+
+
 @dataclass(frozen=True, eq=False)
 class ResponseModel:
     """y of a rig by frequency, as a function of its physical parameters.
@@ -377,7 +405,7 @@ class ResponseModel:
         """Actuators, then the floor's velocities."""
         return (*self.actuators, *FLOOR)
 
-    def at(self, theta: Sequence[float] | np.ndarray) -> ResponseModel:
+    def at(self, theta: Sequence[float] | np.ndarray) -> Self:
         """The model with its free parameters at theta (n_p,). Raises InputError where no rig has them."""
         values = dict(zip(self.names, np.asarray(theta, float).tolist(), strict=True))
         sensitivity = np.array([values.get(f"sensor.{name}", old) for name, old

@@ -9,7 +9,7 @@ import scipy.fft
 
 from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.response import FLOOR, N_Q, ResponseModel, kept_lines
+from avis_ctrl.identification.response import FLOOR, N_Q, FrequencyModel, ResponseModel, kept_lines
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -106,7 +106,7 @@ def _place(into: np.ndarray, names: Sequence[str], known: Sequence[str], values:
     into[:, [offset + k for k in places(names, known, "the model's inputs are", field)]] = values
 
 
-def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.ndarray, np.ndarray]:
+def transient_columns(block: SpectralBlock, model: FrequencyModel) -> tuple[np.ndarray, np.ndarray]:
     """(n, n_y, n_t) columns, for real coefficients, of what the ends of a record leave in its spectra; (n_t,) norms.
 
     Impulse and step on the body (12), the states of the sensors' chains (`ResponseModel.sensor_transients`), and last
@@ -117,7 +117,7 @@ def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.nd
 
 
 @kept_lines
-def _transient_columns(model: ResponseModel, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _transient_columns(model: FrequencyModel, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     n, n_in = len(omega), len(model.inputs)
     U = np.zeros((n, n_in + 2 * N_Q, 2 * N_Q), complex)
     U[:, n_in:] = np.eye(2 * N_Q)
@@ -127,7 +127,7 @@ def _transient_columns(model: ResponseModel, omega: np.ndarray) -> tuple[np.ndar
     return columns / norms, norms
 
 
-def transient_parts(x: np.ndarray, norms: np.ndarray, block: SpectralBlock, model: ResponseModel
+def transient_parts(x: np.ndarray, norms: np.ndarray, block: SpectralBlock, model: FrequencyModel
                     ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 12, 1) impulses and steps on the body, and (m,) what the states inside start with: the part of unknowns
     x (n_t,) of the columns of `transient_columns`, norms (n_t,), that changes with the model's parameters."""
