@@ -39,6 +39,7 @@ class CatalogueEntry:
     named_corner_Hz: float
     named_gain_Vs_per_m: float
 
+
 def check_against_name(entry: CatalogueEntry, tolerance: float = 0.02) -> list[str]:
     """What in the file contradicts its name or itself, in words with both numbers; empty when all agrees.
 

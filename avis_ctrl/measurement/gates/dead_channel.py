@@ -23,10 +23,19 @@ from avis_ctrl.measurement.gates.finding import (
 from avis_ctrl.measurement.gates.h1 import h1, segment_length, spectra, usable
 from avis_ctrl.measurement.gates.sine_fit import fit_sine
 
-# A stuck run is at least this long, and this many times as long as any other run of the channel.
-STUCK_SAMPLES, STUCK_FACTOR = 50, 5
-# A dead channel stays below this part of what chance may do, where the median channel exceeds it as often.
-RESPONDS = 10.0
+
+@dataclass(frozen=True)
+class DeadSettings:
+    """stuck_samples, stuck_factor : least length of a stuck run, in samples and over any other run of the channel [1].
+    responds : factor by which the median channel exceeds what chance may do where others count as dead [1].
+    """
+
+    stuck_samples: int = 50
+    stuck_factor: int = 5
+    responds: float = 10.0
+
+
+SETTINGS = DeadSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +55,11 @@ class DeadChannel(Gate):
     """Sensors that do not sense and drives that are never driven.
 
     Constant channels need no statistics. A stuck code is a run of equal samples, at least 50 and five times as long as
-    any
-    other such run of the channel. A channel is noise alone where its largest multiple coherence over the driven lines
-    is what
-    chance gives (beta distribution of n_u and K - n_u, 1 % shared over channels, records and lines) while half of the
-    channels exceed ten times as much in terms of coherence / (1 - coherence); that is judged over all driven records.
-    Of a
-    sine record the fitted sine's power is judged against the residual, by F(2, samples - 3).
-    On clean data the channel's signal-to-noise ratio would have to be at fault, so false alarms come from small signals
+    any other such run of the channel. A channel is noise alone where its largest multiple coherence over the driven
+    lines is what chance gives (beta distribution of n_u and K - n_u, 1 % shared over channels, records and lines) while
+    half of the channels exceed ten times as much in terms of coherence / (1 - coherence); that is judged over all
+    driven records. Of a sine record the fitted sine's power is judged against the residual, by F(2, samples - 3). On
+    clean data the channel's signal-to-noise ratio would have to be at fault, so false alarms come from small signals
     only.
     """
 
@@ -67,7 +73,7 @@ class DeadChannel(Gate):
             runs = equal_runs(y[:, k])
             longest[k] = runs[0][0]
             second = runs[1][0] if len(runs) > 1 else 1
-            if longest[k] < len(y) and longest[k] >= max(STUCK_SAMPLES, STUCK_FACTOR * second):
+            if longest[k] < len(y) and longest[k] >= max(SETTINGS.stuck_samples, SETTINGS.stuck_factor * second):
                 stuck[k] = runs[0]
         traces = {k: (t[(part := slice(max(0, at - n), at + 2 * n))], y[part, k]) for k, (n, at) in stuck.items()}
         codes = np.array([len(np.unique(y[: 1 << 14, k])) for k in range(y.shape[1])])
@@ -97,7 +103,7 @@ class DeadChannel(Gate):
             for k in kept:
                 if j in k.stuck:
                     found.append(self._stuck(name, j, k, campaign))
-            if name not in constant and excess is not None and excess[j] < 1 and np.median(excess) > RESPONDS:
+            if name not in constant and excess is not None and excess[j] < 1 and np.median(excess) > SETTINGS.responds:
                 found.append(
                     Finding(self.name, "stop",
                             f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} "
@@ -138,7 +144,7 @@ class DeadChannel(Gate):
         return Finding(self.name, severity,
                        f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) "
                        f"from {at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or "
-                       "repeat the record.", (name,), (kept.record,), float(n), float(STUCK_SAMPLES), picture)
+                       "repeat the record.", (name,), (kept.record,), float(n), float(SETTINGS.stuck_samples), picture)
 
     def _picture(self, kept: list[_Kept], rms: np.ndarray, campaign: Campaign) -> Picture:
         x = np.arange(len(kept))

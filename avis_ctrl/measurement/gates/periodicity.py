@@ -21,10 +21,18 @@ from avis_ctrl.measurement.gates.finding import (
     times,
 )
 
-# Lines over which the noise level is averaged, and lines looked at: those that carry most of the power.
-SMOOTH = 9
-# A steady drift over the last half of the record below this part of the signal is passed.
-DRIFT = 0.01
+
+@dataclass(frozen=True)
+class PeriodicitySettings:
+    """smooth : lines over which the noise level is averaged.
+    drift : part of the signal below which a steady drift over the last half of the record is passed [1].
+    """
+
+    smooth: int = 9
+    drift: float = 0.01
+
+
+SETTINGS = PeriodicitySettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +53,11 @@ class Periodicity(Gate):
     """Each period against the mean of the last half, line by line and channel by channel.
 
     Differences pass a Hann window, which keeps low frequencies from leaking into all lines. With noise variances from
-    the periods of the
-    reference, smoothed over 9 lines, T is F(L, L (R - 1)) distributed for L independent lines and R reference periods;
-    1 % is
-    shared over periods, channels and records. Periods up to the last one before the reference that fails are to be
-    dropped: a note, for a rig that starts at rest always has a transient. Where the reference's first period itself
-    fails against the
-    others, or where the reference's periods change steadily (slope against what it leaves, F(L, L (R - 2)), and more
-    than 1 % of the signal), the response drifts: a warning.
+    the periods of the reference, smoothed over 9 lines, T is F(L, L (R - 1)) distributed for L independent lines and R
+    reference periods; 1 % is shared over periods, channels and records. Periods up to the last one before the reference
+    that fails are to be dropped: a note, for a rig that starts at rest always has a transient. Where the reference's
+    first period itself fails against the others, or where the reference's periods change steadily (slope against what
+    it leaves, F(L, L (R - 2)), and more than 1 % of the signal), the response drifts: a warning.
     """
 
     name = "periodicity"
@@ -128,7 +133,7 @@ class Periodicity(Gate):
             return None
         T, drift = k.drift
         limit = float(stats.f.isf(FALSE_ALARM / tests, k.lines, k.lines * (k.dof - 1)))
-        bad = (limit < T) & (drift > DRIFT)
+        bad = (limit < T) & (drift > SETTINGS.drift)
         if not bad.any():
             return None
         names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
@@ -147,7 +152,7 @@ def windowed(difference: np.ndarray) -> np.ndarray:
     return np.fft.rfft(difference * window, axis=-2)[..., 2:-1:2, :]
 
 
-def smoothed(power: np.ndarray, width: int = SMOOTH) -> np.ndarray:
+def smoothed(power: np.ndarray, width: int = SETTINGS.smooth) -> np.ndarray:
     """(lines, n_y) moving mean over lines."""
     kernel = np.ones(min(width, len(power)))
     count = np.convolve(np.ones(len(power)), kernel, "same")
@@ -175,7 +180,7 @@ def compared(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
 
 def unbiased(dof: int) -> float:
     """Mean of a power by its smoothed variance is 1 / (1 - 1 / m), m = dof times lines smoothed over: F's mean."""
-    return 1 - 1 / (SMOOTH * dof)
+    return 1 - 1 / (SETTINGS.smooth * dof)
 
 
 def trend(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
