@@ -21,6 +21,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from avis_ctrl import uncertain_value
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
@@ -116,6 +117,9 @@ class Reported:
     value: float
     std: float
     unit: str
+
+    def __str__(self) -> str:
+        return uncertain_value.text(self.value, self.std, self.unit)
 
 
 class Added(NamedTuple):
