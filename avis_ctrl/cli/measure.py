@@ -22,7 +22,7 @@ def excite(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="signals.h5, .csv or .mat")],
     kind: Annotated[str, typer.Option("--kind", help="multisine or noise")] = "multisine",
     band_Hz: Annotated[tuple[float, float], typer.Option("--band", metavar="LOW HIGH", help="Hz")] = (0.5, 60.0),
-    period_s: Annotated[float, typer.Option("--period", help="period of a multisine, length of noise in seconds")] = 10.0,
+    period_s: Annotated[float, typer.Option("--period", help="period of a multisine, of noise its length, s")] = 10.0,
     periods: Annotated[int, typer.Option("--periods", help="number of periods of a multisine; the first one contains "
                                          "the transient")] = 6,
     rms_V: Annotated[float | None, typer.Option("--rms", help="r.m.s. voltage of each drive [V]; by default half of "
