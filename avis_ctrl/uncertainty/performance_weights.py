@@ -184,7 +184,8 @@ class ControlEffort(Weight):
     """Voltage of an actuator: at most its limit when the normalised disturbance has the level expected.
 
     W = (level / limit) ((s/wb + 1)/(s/(R wb) + 1))^order: up to wb the whole limit may be used, far above it only
-    a share 1/R^order, which rolls the controller off.
+    a share 1/R^order, which rolls the controller off. Below a corner w0 it is larger by the factor (s + k w0)/(s + w0),
+    k = sqrt(1 + offset^2), which rolls the controller off towards zero frequency.
 
     Parameters
     ----------
@@ -193,6 +194,8 @@ class ControlEffort(Weight):
     bandwidth_Hz : wb; None for a constant weight.
     reduction : R > 1, how much less is allowed per order far above wb.
     order : 1 or 2.
+    offset, offset_corner_Hz : at rest, of the same input, an offset that large over its unit; up to the corner it may
+        drift. 0 for none.
     """
 
     limit_V: float
@@ -200,6 +203,8 @@ class ControlEffort(Weight):
     bandwidth_Hz: float | None = None
     reduction: float = 10.0
     order: int = 1
+    offset: float = 0.0
+    offset_corner_Hz: float = 0.01
 
     role: ClassVar[Role] = "limit"
     unit: ClassVar[str] = "V per unit of disturbance"
@@ -210,21 +215,28 @@ class ControlEffort(Weight):
         require(self.reduction, "reduction", 1.0)
         if self.bandwidth_Hz is not None:
             require(self.bandwidth_Hz, "bandwidth_Hz")
+        require(self.offset_corner_Hz, "offset_corner_Hz")
+        if not 0 <= self.offset < np.inf:
+            raise InputError("a finite number, zero or positive", field="offset", value=self.offset)
         if self.order not in (1, 2):
             raise InputError("1 or 2", field="order", value=self.order)
 
     @cached_property
     def shape(self) -> Rational:
-        gain = self.disturbance_level / self.limit_V
+        gain, w0 = self.disturbance_level / self.limit_V, 2 * np.pi * self.offset_corner_Hz
+        zeros, poles = ((w0 * np.hypot(1, self.offset),), (w0,)) if self.offset else ((), ())
         if self.bandwidth_Hz is None:
-            return Rational(gain)
+            return Rational(gain, real_zeros=zeros, real_poles=poles)
         wb = 2 * np.pi * self.bandwidth_Hz
-        return Rational(gain * self.reduction ** self.order, real_zeros=(wb,) * self.order,
-                        real_poles=(self.reduction * wb,) * self.order)
+        return Rational(gain * self.reduction ** self.order, real_zeros=(*zeros, *(wb,) * self.order),
+                        real_poles=(*poles, *(self.reduction * wb,) * self.order))
 
     @property
     def meaning(self) -> str:
         text = f"at most {self.limit_V:g} V when the disturbance has the level {self.disturbance_level:.3g}"
+        if self.offset:
+            text += (f"; {np.hypot(1, self.offset):.3g} times stricter below {self.offset_corner_Hz:g} Hz, for the "
+                     "offset of the electronics")
         if self.bandwidth_Hz is None:
             return text
         return text + (f" up to {self.bandwidth_Hz:g} Hz, falling with order {self.order} to a fraction "

@@ -33,9 +33,52 @@ from avis_ctrl.uncertainty.weight_base import (
     smallest_cover,
 )
 
-__all__ = ["Band", "ComplianceBound", "ControlEffort", "FloorMotion", "NeglectedDynamics", "RationalWeight",
-           "SamplingCheck", "SensorNoise", "TransmissibilityBound", "VibrationCriterion", "Weight",
+__all__ = ["Band", "ComplianceBound", "ControlEffort", "FlickerNoise", "FloorMotion", "NeglectedDynamics",
+           "RationalWeight", "SamplingCheck", "SensorNoise", "TransmissibilityBound", "VibrationCriterion", "Weight",
            "sampling_feasibility"]
+
+
+@dataclass(frozen=True)
+class FlickerNoise(Weight):
+    """1/f noise of a sensor's electronics: sqrt(1 + flicker^2 / f) over its white noise.
+
+    Parameters
+    ----------
+    flicker : density of the 1/f noise at 1 Hz over that of the white noise; its square is the corner [Hz].
+    lowest_Hz : below it the weight is constant.
+    """
+
+    flicker: float
+    lowest_Hz: float
+    tolerance_dB: float = 1.0
+    max_order: int = 4
+
+    role: ClassVar[Role] = "level"
+    unit: ClassVar[str] = "white noise"
+
+    def __post_init__(self) -> None:
+        require(self.lowest_Hz, "lowest_Hz")
+        if not 0 <= self.flicker < np.inf:
+            raise InputError("a finite number, zero or positive", field="flicker", value=self.flicker)
+
+    def asked(self, omega: np.ndarray) -> np.ndarray:
+        """The density over that of the white noise, at omega > 0 [rad/s]."""
+        return np.sqrt(1 + self.flicker ** 2 / (np.asarray(omega, float) / (2 * np.pi)))
+
+    @cached_property
+    def shape(self) -> Rational:
+        if not self.flicker:
+            return Rational(1.0)
+        corner = self.flicker ** 2
+        # Far below and above, where the weight is constant, it must cover, too.
+        omega = 2 * np.pi * np.geomspace(self.lowest_Hz / 100, 1000 * max(corner, self.lowest_Hz), 120)
+        level = self.asked(np.maximum(omega, 2 * np.pi * self.lowest_Hz))
+        return smallest_cover(omega, level, level, self.tolerance_dB, self.max_order, "the 1/f noise")
+
+    @property
+    def meaning(self) -> str:
+        return (f"1/f noise of the sensors' electronics over their white noise, corner {self.flicker ** 2:.3g} Hz; "
+                f"constant below {self.lowest_Hz:g} Hz; realised with {self.shape.order} states")
 
 
 @dataclass(frozen=True, eq=False)
