@@ -13,13 +13,15 @@ Gaussian signal passes once in ten minutes (`study.analysis.PEAK_FACTOR` times t
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.export.sampled_controller import SampledController
 from avis_ctrl.rigs.rigid_body import COORDINATES
-from avis_ctrl.simulation.discrete import N_Q, disturbed_period_map
+from avis_ctrl.simulation.discrete import N_Q, disturbed_period_map, gain_at_rest
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
 from avis_ctrl.simulation.sampled_response import open_response
 from avis_ctrl.study.analysis import PEAK_FACTOR
@@ -83,5 +85,6 @@ def _levels(loop: SampledLoop, points: int) -> tuple[np.ndarray, np.ndarray]:
         return PEAK_FACTOR * np.sqrt(np.trapezoid(np.sum(np.abs(density) ** 2, axis=2), omega / (2 * np.pi), axis=0))
     # The offsets of the channels beside that, each of either sign; at rest nothing is fed back but by position sensors.
     offset = np.array([one.offset_V for one in loop.rig.sensors()])
-    held = np.abs(np.linalg.solve(np.eye(K.nstates) - K.A, K.B)) @ offset
+    to_states = replace(K, C=np.eye(K.nstates), D=np.zeros((K.nstates, K.ninputs)), outputs=(), states=())
+    held = np.abs(gain_at_rest(to_states)) @ offset
     return peak(y) + offset, peak(states) + held
