@@ -12,12 +12,12 @@ from avis_ctrl.export.sampled_controller import SampledController
 
 @dataclass(frozen=True)
 class SignalSettings:
-    """start : part of the rows that the start takes, from drives at zero to the full gain. low_Hz, high_Hz, tones : sines of the inputs, whole periods of
-    which fit between the start and the end. rest : amplitude of the tones beside the strongest one, relative to it.
-    overdrive : by which the largest demand exceeds its limit, unless the converter's range does not allow it.
-    range_fraction : of the converter that the inputs use at most. invalid : number of last samples with an input out of
-    range. margin : by which outputs may differ beyond what one precision's rounding makes: compilers add in another
-    order."""
+    """start : part of the rows that the start takes, from drives at zero to the full gain. low_Hz, high_Hz, tones :
+    sines of the inputs, whole periods of which fit between the start and the end. rest : amplitude of the tones beside
+    the strongest one, relative to it. overdrive : by which the largest demand exceeds its limit, unless the converter's
+    range does not allow it. range_fraction : of the converter that the inputs use at most. invalid : number of last
+    samples with an input out of range. margin : by which outputs may differ beyond what one precision's rounding makes:
+    compilers add in another order."""
 
     start: float = 0.75
     low_Hz: float = 4.0
@@ -62,10 +62,10 @@ def agreement_V(controller: SampledController, guard: Protection, y: np.ndarray,
 
     From the difference that the controller's precision makes to the next higher one, rounded up to one digit.
     """
-    other = np.longdouble if controller.arithmetic == "float64" else np.float32
-    differ = float(np.max(np.abs(_run(Processor(controller, guard, other), y) - u)))
-    size = 10 ** np.floor(np.log10(max(settings.margin * differ, np.finfo(controller.dtype).eps)))
-    return float(f"{np.ceil(settings.margin * differ / size) * size:.0e}")
+    other: type[np.floating] = np.longdouble if controller.arithmetic == "float64" else np.float32
+    differ = settings.margin * float(np.max(np.abs(_run(Processor(controller, guard, other), y) - u)))
+    digit = 10.0 ** int(np.floor(np.log10(max(differ, np.finfo(float).tiny))))
+    return float(f"{np.ceil(differ / digit) * digit:.0e}")
 
 
 def _run(processor: Processor, y: np.ndarray, unlimited: bool = False) -> np.ndarray:

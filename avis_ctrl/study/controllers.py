@@ -72,8 +72,8 @@ def _reduced(plant: DesignPlant, rig: Rig, made: MuSynthesis, cost: float, offse
     full, slow = peak_on_grid(made.K), residualise_fast(made.K, np.pi * rig.sample_rate_Hz)
     harmless = P.closed(slow).is_stable() and peak_on_grid(slow) <= (1 + cost) * full
     start = slow if harmless else made.K
-    # Far below the corner to which the offset may drift no weight changes.
-    lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 10)
+    # Below the corner to which the offset may drift no weight changes.
+    lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
     if P.closed(lasting).is_stable() and peak_on_grid(lasting) <= (1 + cost) * full:
         start = lasting
     reduced = reduce_controller(P.P, start, peak_on_grid, cost)

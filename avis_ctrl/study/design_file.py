@@ -141,7 +141,7 @@ class EffortSection(_Section):
     bandwidth_Hz: Positive
     reduction: Annotated[float, Field(gt=1, le=LIMIT)] = 30.0
     offset_percent: Percent = 10.0
-    offset_corner_Hz: Positive = 0.01
+    offset_corner_Hz: Positive = 0.003
 
 
 class ComplianceSection(_Section):

@@ -34,7 +34,8 @@ def examine() -> list[Check]:
     checks += [_attempt("processors and BLAS threads", _threads), _attempt("SLICOT H-infinity norm", _slicot),
                _attempt("clarabel solves an LMI", _clarabel), _attempt("mu bounds (compiled)", _mu),
                _attempt("nonlinear simulation (compiled)", _simulation),
-               _attempt("gcc, for avis export", _gcc), _attempt("typst compiles a PDF", _typst), _attempt("own H-infinity synthesis", _synthesis)]
+               _attempt("gcc, for avis export", _gcc), _attempt("typst compiles a PDF", _typst),
+               _attempt("own H-infinity synthesis", _synthesis)]
     return checks
 
 

@@ -204,7 +204,7 @@ class ControlEffort(Weight):
     reduction: float = 10.0
     order: int = 1
     offset: float = 0.0
-    offset_corner_Hz: float = 0.01
+    offset_corner_Hz: float = 0.003
 
     role: ClassVar[Role] = "limit"
     unit: ClassVar[str] = "V per unit of disturbance"

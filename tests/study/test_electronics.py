@@ -8,6 +8,7 @@ import pytest
 from scipy import signal
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.identification.response import sensor_model
 from avis_ctrl.lti.norms import hinf_norm
 from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.rigs.equipment import Electronics
@@ -43,7 +44,8 @@ def test_filter_is_scipys_butterworth_behind_every_sensor(name, order):
             one.as_velocity(OMEGA) * one.gain * butterworth(order, 200.0), rel=1e-9)
 
 
-@pytest.mark.parametrize("name", ["avis", "halcyonics", "designs/rigs/granite.toml", "designs/rigs/twelve_sensors.toml"])
+@pytest.mark.parametrize("name", ["avis", "halcyonics", *(f"designs/rigs/{one}.toml" for one in (
+    "granite", "twelve_sensors", "skewed"))])
 def test_controller_sees_the_filter_and_does_not_undo_it(name):
     bare = load_rig(name)
     seen, filtered = (sensing(rig, ["z"], 0.1) for rig in (bare, bare.with_electronics(FILTER)))
@@ -55,6 +57,15 @@ def test_controller_sees_the_filter_and_does_not_undo_it(name):
         assert (before is None) == (after is None)
         if before is not None:
             assert after.frequency_response(OMEGA) == pytest.approx(before.frequency_response(OMEGA), rel=1e-9)
+
+
+def test_identification_knows_the_filter():
+    """Volts over voltages of a simulated table, by the model that `avis identify` fits: scipy's filter is the ratio."""
+    bare = load_rig("avis")
+    omega = 2 * np.pi * np.geomspace(0.5, 100.0, 20)
+    responses = [sensor_model(rig).sense(omega) for rig in (bare, bare.with_electronics(FILTER))]
+    b, a = signal.butter(3, 2 * np.pi * 200.0, analog=True)
+    assert responses[1] == pytest.approx(responses[0] * signal.freqs(b, a, omega)[1][:, None], rel=1e-9)
 
 
 def test_default_offset_is_that_of_the_data_sheets():
