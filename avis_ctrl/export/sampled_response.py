@@ -46,12 +46,14 @@ class ResponseSettings:
     """images : pairs of images summed one by one; the rest is bounded by the decay of hold and table together, at least
     as k^-2. points, order : of the function that bounds the table's gain above half the sample rate, where it falls
     smoothly: the frequencies it is fitted to and its order. lowest : where it begins, as a fraction of half the rate:
-    the intervals of the grid reach a little beyond theirs."""
+    the intervals of the grid reach a little beyond theirs. rest : a frequency far below every pole, as a fraction of
+    half the rate, at which the gain at rest is taken: position sensors have none at zero itself."""
 
     images: int = 8
     points: int = 12
     order: int = 3
     lowest: float = 0.99
+    rest: float = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +136,10 @@ class SampledAxes:
     def response(self, omega: np.ndarray) -> np.ndarray:
         """(n_omega, n, n) R without the design model's delay: what stands in the place of its controller."""
         return (self.hold(omega) / self.pade(omega))[:, None, None] * (self.forces @ self.volts(omega))
+
+    def gain_at_rest(self) -> float:
+        """Largest gain from the seen velocities of the axes to their forces far below every pole [N s/m]."""
+        return float(np.linalg.norm(self.response(np.array([self.settings.rest * self.half_rate]))[0], 2))
 
     def controller_error(self, K: StateSpace, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
         """(n,) bound over |omega - centre| <= half of |R - K exp(-j omega tau)| and of what rounded decoding adds

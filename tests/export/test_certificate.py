@@ -155,6 +155,9 @@ def test_offset_at_the_inputs_costs_the_voltage_that_is_certified(shipped, packa
     assert u[drive] == pytest.approx(found["drive_V"], rel=1e-3)
     assert np.max(np.abs(u)) <= 1.001 * found["drive_V"]
     assert found["percent_of_limit"] == pytest.approx(100 * u[drive] / controller.limits_V[drive], rel=1e-3)
+    # At rest the response of the design's own controller is met exactly.
+    K0 = shipped.controller("mu")(0.0)
+    assert found["gain_Ns_per_m"] == pytest.approx(np.linalg.norm(K0, 2), rel=1e-3)
     assert found["percent_of_limit"] <= shipped.design.control_effort.offset_percent
 
 
