@@ -154,15 +154,15 @@ def test_interrupt_leaves_nothing_half_written(tmp_path):
 
 
 SWALLOWS = """
+import ctypes
 import time
 import avis_ctrl.cli as cli
 
 def app(**options):
     print("ready", flush=True)
-    try:
-        time.sleep(30)
-    except KeyboardInterrupt:  # as a callback of a compiled library does
-        time.sleep(30)
+    callback = ctypes.CFUNCTYPE(None)(lambda: time.sleep(30))
+    callback()  # an exception in a callback of a compiled library is lost, and Python prints its traceback
+    time.sleep(30)
 
 cli.app, cli.AGAIN_S = app, 0.5
 cli.main()

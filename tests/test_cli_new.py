@@ -72,7 +72,7 @@ def test_a_design_for_this_rig(tmp_path):
 
 @pytest.mark.parametrize(("arguments", "said"), [
     (("rig", "OUT", "--mounts", "5"), "mounts = 5: expected 3 or 4"),
-    (("rig", "OUT", "--mass", "-3"), "mass_kg = -3.0: expected a positive number"),
+    (("rig", "OUT", "--mass", "-3"), "mass_kg = -3.0: expected a finite number, greater than zero"),
     (("rig", "OUT", "--size", "1, 2"), "--size = '1, 2': expected 3 numbers"),
     (("rig", "OUT", "--name", 'a"b'), "expected a name without quotes"),
     (("rig", "OUT", "--geophone", "RESP.absent"), "RESP.absent"),

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "avis_ctrl"
-LEVEL = {"errors": -2, "summary": -2, "files": -1, "uncertain_value": -1, "lti": 0, "rigs": 1, "measurement": 1,
-         "identification": 2, "uncertainty": 2, "robust": 3, "classical": 3, "simulation": 4, "gap": 5, "study": 6,
-         "report": 7, "plot": 7, "export": 7, "sweep": 8, "interface": 9, "cli": 10}
+LEVEL = {"errors": -2, "summary": -2, "checks": -1, "files": -1, "uncertain_value": -1, "lti": 0, "rigs": 1,
+         "measurement": 1, "identification": 2, "uncertainty": 2, "robust": 3, "classical": 3, "simulation": 4,
+         "gap": 5, "study": 6, "report": 7, "plot": 7, "export": 7, "sweep": 8, "interface": 9, "cli": 10}
 PROJECT = ("avis_ctrl", "tests", "benchmarks", "designs")
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -82,6 +82,16 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+def _silence_lost_interrupts() -> None:
+    """Keep Python from printing the traceback of an interrupt lost in a callback: the alarm interrupts again."""
+    usual = sys.unraisablehook
+
+    def hook(ignored: Any) -> None:
+        if not issubclass(ignored.exc_type, KeyboardInterrupt):
+            usual(ignored)
+    sys.unraisablehook = hook
+
+
 def _refusal(error: OSError) -> str:
     """One line for an error of the operating system."""
     where = f"{error.filename}: " if error.filename else ""
@@ -104,6 +114,7 @@ def _say_unusual() -> None:
 def main() -> None:
     """Entry point: errors of ours end in one line and their exit code."""
     _say_unusual()
+    _silence_lost_interrupts()
     # Before numpy is loaded: several BLAS threads round differently from one, and are slower on small matrices.
     os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", MKL_NUM_THREADS="1")
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -30,13 +30,14 @@ def design(
     console = Console(highlight=False)
     design, rig = read_study(file)  # before anything is imported or written that takes time
     with output_folder(out, FILES, FOLDERS) as folder, Progress(console) as progress:
-        from avis_ctrl.report import render_html, render_pdf
+        from avis_ctrl.report import rendered
+        from avis_ctrl.report.content import document
         from avis_ctrl.study.runner import run_design
         from avis_ctrl.study.verdict import refuse_unstable
 
         result = run_design(design, rig, progress, source=file)
         progress("report")
-        files = write_study(result, folder, render_html(result), render_pdf(result))
+        files = write_study(result, folder, *rendered(document(result)))
     _verdict(console, result)
     console.print(f"{len(files)} files in {folder}; open {folder / 'report.html'} or {folder / 'report.pdf'}")
     refuse_unstable(result)

@@ -74,7 +74,8 @@ def gap(
     for note in in_short(measured.notes):
         console.print(f"[dim]{note}[/]")
     with output_folder(out, GAP_FILES) as folder, Progress(console) as progress:
-        from avis_ctrl.report import gap_html, gap_pdf
+        from avis_ctrl.report import rendered
+        from avis_ctrl.report.gap.content import document
         from avis_ctrl.study.gap import GapOptions, find_gap
         from avis_ctrl.study.gap_files import write_gap
 
@@ -85,7 +86,7 @@ def gap(
         except InputError as error:
             raise error if error.file else error.in_file(campaign) from None
         progress("report")
-        files = write_gap(folder, found.gap, gap_html(found), gap_pdf(found), found.to_json())
+        files = write_gap(folder, found.gap, *rendered(document(found)), found.to_json())
         if found.design is not None and found.design.files:
             onward = open_folder(folder / "design", tuple(found.design.files))
             write_together(onward, {name: text.encode() for name, text in found.design.files.items()})

@@ -46,8 +46,8 @@ def gap_axis(
 
     from avis_ctrl.cli.console import Progress
     from avis_ctrl.gap.axis import find_axis_gap_in
-    from avis_ctrl.gap.result import sized
-    from avis_ctrl.report import axis_gap_reports
+    from avis_ctrl.report import rendered
+    from avis_ctrl.report.gap.axis import document
     from avis_ctrl.study.files import output_folder
     from avis_ctrl.study.gap_axis import MODEL_FILE, write_axis_gap
 
@@ -65,12 +65,13 @@ def gap_axis(
                                      sample_rate_Hz=sample_rate_Hz, progress=progress, **reading, **options)
         if folder:
             given = {"kind": kind, "columns": roles, "scale": factors, "sample_rate_Hz": sample_rate_Hz}
-            files = write_axis_gap(folder, found, path.name, {**given, **reading, **options}, axis_gap_reports)
+            files = write_axis_gap(folder, found, path.name, {**given, **reading, **options},
+                                   lambda *told: rendered(document(*told)))
     console.print(f"verdict: {found.verdict}")
     for sentence in found.sentences:
         console.print(sentence, soft_wrap=True, markup=False)
     for name, one in (*found.parameters.items(), *found.ratios.items()):
-        console.print(f"{name} = {sized(one)}", markup=False)
+        console.print(f"{name} = {one}", markup=False)
     for stage in found.stages:
         noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
         console.print(f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True,

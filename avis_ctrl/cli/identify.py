@@ -72,7 +72,8 @@ def identify(
     for note in in_short(measured.notes) if isinstance(measured, Campaign) else ():
         console.print(f"[dim]{note}[/]")
     with output_folder(out, FILES) as folder, Progress(console) as progress:
-        from avis_ctrl.report import identification_html, identification_pdf
+        from avis_ctrl.report import rendered
+        from avis_ctrl.report.identification.content import document
         from avis_ctrl.study.identification import IdentifyOptions, identify
         from avis_ctrl.study.identification_design import design_start
         from avis_ctrl.study.identification_output import require_readable, write_identification
@@ -90,8 +91,7 @@ def identify(
             # The identification is valid without them.
             more, made, then = {}, None, f"; no uncertainty.json and design.toml: {error}"
         progress("report")
-        files = write_identification(found, folder, identification_html(found, made), identification_pdf(found, made),
-                                     more)
+        files = write_identification(found, folder, *rendered(document(found, made)), more)
     _summary(console, found)
     console.print(f"{len(files)} files in {folder}; open {folder / 'report.html'} or {folder / 'report.pdf'}{then}")
 

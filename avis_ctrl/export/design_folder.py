@@ -12,13 +12,14 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.export.realisation import processor_form
 from avis_ctrl.export.sampled_controller import Arithmetic, SampledController
 from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.discrete import digital_controller
 from avis_ctrl.simulation.sampled_loop import SampledLoop
 from avis_ctrl.study.companions import Companion
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.plant import DesignPlant, build_plant
-from avis_ctrl.study.saved import read_json, read_saved
+from avis_ctrl.study.saved import read_saved
 from avis_ctrl.study.simulation import bare_loop
 
 

@@ -22,8 +22,8 @@ from avis_ctrl.export.protection import protection
 from avis_ctrl.export.replay import Replay, replay_worst_plant
 from avis_ctrl.export.sampled_controller import Arithmetic, SampledController, parse_controller, read_controller
 from avis_ctrl.export.vectors import agreement_V, as_csv, vectors
+from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.study.files import as_json
-from avis_ctrl.study.saved import read_json
 
 CONTROLLER, CERTIFICATE, MAT, VECTORS = "controller.json", "certificate.json", "controller.mat", "test_vectors.csv"
 FILES = (CONTROLLER, HEADER, SOURCE, MAT, VECTORS, CERTIFICATE)

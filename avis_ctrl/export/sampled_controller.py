@@ -12,8 +12,8 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.study.files import as_json
-from avis_ctrl.study.saved import read_json
 
 Arithmetic = Literal["float32", "float64"]
 FORMAT = "avis-sampled-controller"

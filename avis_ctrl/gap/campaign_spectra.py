@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 
@@ -21,7 +20,6 @@ from avis_ctrl.identification.campaign_fit import (
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.prediction_error import prediction_error
-from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import record_block
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
@@ -115,8 +113,7 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campai
     for block in blocks:
         key = (block.kind, block.omega.tobytes())
         if key not in known:
-            shape = cast(ResponseModel, model)
-            known[key] = (noise_from_residuals(quiet, [block], model=shape)[0] if block.kind in kinds
+            known[key] = (noise_from_residuals(quiet, [block], model=model)[0] if block.kind in kinds
                           else _local(left, block, band_Hz))
         like = known[key]
         assert like.noise is not None
@@ -174,7 +171,7 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
     lines = np.maximum(np.bincount(octave), 1)
     for _ in range(SETTINGS.weightings):
         weights = power[:, :, None] * np.eye(power.shape[1])
-        left = prediction_error(cast(ResponseModel, model), block.with_noise(weights.astype(complex)), derivative=False)
+        left = prediction_error(model, block.with_noise(weights.astype(complex)), derivative=False)
         found = np.mean(np.abs(left.error) ** 2, axis=2)
         power = np.stack([(np.bincount(octave, one) / lines)[octave] for one in found.T], axis=1)
     return Residual(block, left.error, left.white, np.zeros_like(left.error))

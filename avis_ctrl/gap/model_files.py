@@ -6,7 +6,6 @@ these. The clock of the campaign is kept, for effects that depend on time.
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -24,6 +23,7 @@ from avis_ctrl.gap.effects.mounts import campaign_clock
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.response import ResponseModel, sensor_model
 from avis_ctrl.rigs.avis import INERTIA
+from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -124,12 +124,7 @@ def read_model(path: str | Path) -> tuple[TableModel, tuple[float, float]]:
 
     Raises InputError naming file and field.
     """
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"expected the model of avis gap ({error.strerror or error})", file=path) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"expected JSON; {error}", file=path) from None
+    content = read_json(Path(path), FORMAT, "the model of avis gap")
     try:
         return model_from_dict(content)
     except InputError as error:

@@ -21,10 +21,9 @@ from avis_ctrl.gap.state_space import SETTINGS, ReducedTable, addition, chassis,
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.sample_and_hold import hold
 from avis_ctrl.lti.connect import connect
-from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.actuator import pade_delay, zero_order_hold
-from avis_ctrl.rigs.geophone import second_order_roots
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.uncertainty.uncertain_rig import edge_name, uncertain_rig
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import cast
 
 import numpy as np
 from scipy import stats
@@ -16,7 +15,6 @@ from avis_ctrl.gap.preparation import Prepared
 from avis_ctrl.gap.result import HeatMap, PowerShares, RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.prediction_error import PredictionError, prediction_error
-from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
@@ -51,7 +49,7 @@ class ModelResidual:
 
     @staticmethod
     def of(model: TableModel, blocks: Sequence[SpectralBlock]) -> ModelResidual:
-        errors = (prediction_error(cast(ResponseModel, model), block, derivative=False) for block in blocks)
+        errors = (prediction_error(model, block, derivative=False) for block in blocks)
         return ModelResidual(tuple(errors), model.sensors.names, model.inputs)
 
     @property

@@ -22,17 +22,6 @@ def spoken(name: str, unit: str) -> str:
     return (name.removesuffix(f"_{tail}") if tail else name).replace("_", " ")
 
 
-def sized(p: Reported) -> str:
-    """value +- standard deviation unit, both to the second digit of the latter."""
-    unit = "" if p.unit == "1" else f" {p.unit}"
-    if not (np.isfinite(p.std) and p.std > 0 and np.isfinite(p.value)):
-        return f"{p.value:.5g}{unit}"
-    places = 1 - int(np.floor(np.log10(float(f"{p.std:.1e}"))))
-    power = int(np.floor(np.log10(max(abs(p.value), p.std)))) if not -4 <= places <= 6 else 0
-    value, std = (f"{v / 10.0 ** power:.{max(places + power, 0)}f}" for v in (p.value, p.std))
-    return f"({value} +- {std})e{power}{unit}" if power else f"{value} +- {std}{unit}"
-
-
 @dataclass(frozen=True, eq=False)
 class NamedEffect:
     """An effect that the data call for.
@@ -67,7 +56,7 @@ class NamedEffect:
     def in_words(self) -> str:
         """With its place, first parameters and probability; how single mounts differ stands in the table alone."""
         first = [(name, p) for name, p in self.parameters.items() if not name.startswith("uneven_")][:3]
-        sizes = ", ".join(f"{spoken(name, p.unit)} {sized(p)}" for name, p in first)
+        sizes = ", ".join(f"{spoken(name, p.unit)} {p}" for name, p in first)
         ties = (f", or {' or '.join(self.indistinguishable_from)}, which this data cannot tell from it"
                 if self.indistinguishable_from else "")
         return f"{self.title} ({self.name}, {self.location}: {sizes}; probability {self.probability:.2f}{ties})"

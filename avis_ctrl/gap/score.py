@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import cast
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from avis_ctrl.identification.fit_settings import FitSettings
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitened_real, whitener
 from avis_ctrl.identification.parameter_sets import default_parameters
-from avis_ctrl.identification.response import N_Q, ResponseModel
+from avis_ctrl.identification.response import N_Q
 from avis_ctrl.identification.spectra import span, transient_columns, transient_parts
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.weights import with_distortion
@@ -106,12 +105,11 @@ class Part:
         self.inner: np.ndarray | None = None
         self.response = TableResponse(self.made, self._acting(model))
         if block.transient:
-            columns, norms = transient_columns(block, cast(ResponseModel, model))
+            columns, norms = transient_columns(block, model)
             T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
             self.transient, X = span(T.T)
             left = as_real(whitened(self.L, block.Y - self.response.Y)[None])[0]
-            self.body, self.inner = transient_parts(X @ (self.transient.T @ left), norms, block,
-                                                    cast(ResponseModel, model))
+            self.body, self.inner = transient_parts(X @ (self.transient.T @ left), norms, block, model)
             self.response = TableResponse(self.made, self._acting(model))
 
     def _acting(self, model: TableModel) -> Acting:

@@ -275,6 +275,8 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
         return one.at(own.values(z).tolist()), gain
 
     def begun(one: Candidate) -> tuple[ActiveEffect, float] | None:
+        if at_full_strength(one.effect):
+            return one.effect, 0.0
         starts = [one.effect, *one.others]
         if len(starts) > 1:
             ends = [end for start in starts if (end := fitted(start, settings.first_iterations)) is not None]
@@ -287,14 +289,18 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     if not made:
         return {}
     most = max(gain for _, gain in made)
-    # What acts at full strength or not at all takes more than a first-order move of the rig's parameters: of its gain
-    # only the sign is known before these are fitted with it.
-    near = [one for one, gain in made if gain >= settings.not_far_behind * most
-            or (gain > 0 and not any(parameter.linear for parameter in one.parameters))]
+    near = [one for one, gain in made if gain >= settings.not_far_behind * most or at_full_strength(one)]
     further = [_whole(one, now) for one in each(ended, near) if one is not None]
     stated = tolerances_of(now.model.rig)
     return {one.labels[-1]: one for one in further if not implausible(one)
             and not within_tolerance(one.model.effects[-1], stated, settings)}
+
+
+def at_full_strength(one: ActiveEffect) -> bool:
+    """Whether an effect adds a resonance that has no strength that may be small. Mass and stiffness that the fit
+    without it has found must move by more than to first order, so that nothing is known before they are fitted
+    together."""
+    return one.effect.resonant and not any(parameter.linear for parameter in one.parameters)
 
 
 def _small(found: Fitted | None) -> Fitted | None:

@@ -31,7 +31,9 @@ class StartSettings:
     most_peaks : peaks that are searched, the highest first.
     attached_Hz : lowest and highest frequency of a sprung mass [Hz], and number of those searched: from the lowest
         resonance of a suspension to the end of the band of most records.
-    dampings : damping ratios at which a sprung mass is searched [1]: one narrow, one broad resonance.
+    dampings : damping ratios at which a sprung mass, or one inside the mounts, is searched [1]: one narrow, one broad
+        resonance.
+    peak_dampings : the same at the peaks of the residual [1], whose frequency is known better.
     followed_places : places at which three frequencies are searched on a finer grid, the best first.
     narrowest : least damping ratio for which the frequency grid of a sprung mass is made [1]; a smaller one would need
         more frequencies than a search can afford.
@@ -54,6 +56,7 @@ class StartSettings:
     most_peaks: int = 5
     attached_Hz: tuple[float, float, int] = (1.2, 90.0, 28)
     dampings: tuple[float, ...] = (0.03, 0.15)
+    peak_dampings: tuple[float, ...] = (0.01, 0.05)
     followed_places: int = 6
     narrowest: float = 0.02
     stiff_Hz: float = 150.0

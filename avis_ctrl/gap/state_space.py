@@ -74,7 +74,6 @@ class ReducedTable:
         return np.atleast_2d(of_q)[:, [COORDINATES.index(name) for name in self.keep]] * scale
 
 
-
 Addition = Callable[[ReducedTable, str, Values], StateSpace]
 
 

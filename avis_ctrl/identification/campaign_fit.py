@@ -295,8 +295,8 @@ class CampaignFit:
     the parameters of `fit`, and `first` is the fit that takes them for exact. Empty where they were not free.
     """
 
-    fit: LikelihoodFit
-    first: LikelihoodFit
+    fit: LikelihoodFit[ResponseModel]
+    first: LikelihoodFit[ResponseModel]
     band_Hz: tuple[float, float]
     notes: tuple[str, ...]
     start: ResponseModel

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.ekf_kernel import ModelArrays
 from avis_ctrl.rigs.rig import Rig
@@ -131,8 +132,8 @@ def linear_model(rig: Rig, names: Sequence[str], measurements: Sequence[str] | N
     _check_names(rig, names)
     eom = rig.equations_of_motion()
     sensors, rows = rig.sensor_rows()
-    picked = _rows(sensors, sensors if measurements is None else measurements, "y names")
-    driven = _rows(eom.actuators, eom.actuators if actuators is None else actuators, "u names")
+    picked = places(sensors if measurements is None else measurements, sensors, "the rig has", "y names")
+    driven = places(eom.actuators if actuators is None else actuators, eom.actuators, "the rig has", "u names")
     values = np.array([rig.parameters()[name].value for name in names], float)
     slopes = np.zeros((3, 6, 6, len(names)))
     for j, name in enumerate(names):
@@ -181,9 +182,3 @@ def _slope(rig: Rig, name: str, value: float) -> np.ndarray:
             raise InputError("M, C and K must be linear in the parameters of this filter; in this one they are not",
                              field="names", value=name)
     return (seen[0] + seen[1]) / 2
-
-
-def _rows(known: Sequence[str], asked: Sequence[str], field: str) -> list[int]:
-    if unknown := [name for name in asked if name not in known]:
-        raise InputError(f"the rig has {', '.join(known)}", field=field, value=unknown)
-    return [list(known).index(name) for name in asked]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
 
-from avis_ctrl.errors import InputError
 from avis_ctrl.identification.ekf_settings import EkfSettings
 
 LAGS = 50
@@ -158,7 +156,7 @@ class EkfResult:
 
 @dataclass(frozen=True, eq=False)
 class ParameterCurves:
-    """One figure in the manner of figs. 3.1-3.3: estimates (m, n), band (m, n) each, true values (n,) or None."""
+    """One figure in the manner of figs. 3.1-3.3: estimates (m, n), band (m, n) each."""
 
     title: str
     names: tuple[str, ...]
@@ -168,26 +166,15 @@ class ParameterCurves:
     lower: np.ndarray
     upper: np.ndarray
     boundaries_s: np.ndarray
-    true: np.ndarray | None
 
 
-def parameter_curves(result: EkfResult, true: Mapping[str, float] | None = None) -> tuple[ParameterCurves, ...]:
-    """The arrays of figs. 3.1-3.3: masses and inertias, damping, stiffness, and the rest where there is any.
-
-    true : values by name, of all parameters of the result, where they are known.
-
-    Raises
-    ------
-    InputError : `true` lacks a parameter.
-    """
-    if true is not None and (missing := [name for name in result.names if name not in true]):
-        raise InputError("expected the true value of every estimated parameter", field="true", value=missing)
+def parameter_curves(result: EkfResult) -> tuple[ParameterCurves, ...]:
+    """The arrays of figs. 3.1-3.3: masses and inertias, damping, stiffness, and the rest where there is any."""
     groups: dict[str, list[int]] = {"Mass and inertia": [], "Damping": [], "Stiffness": [], "Other parameters": []}
     for j, unit in enumerate(result.units):
         groups[{"kg": "Mass and inertia", "kg m^2": "Mass and inertia", "N s/m": "Damping", "N/m": "Stiffness",
                 "N m s/rad": "Damping", "N m/rad": "Stiffness"}.get(unit, "Other parameters")].append(j)
     h = result.history
     return tuple(ParameterCurves(title, tuple(result.names[j] for j in index), tuple(result.units[j] for j in index),
-                                 h.time_s, h.theta[:, index], h.lower[:, index], h.upper[:, index], h.boundaries_s,
-                                 None if true is None else np.array([true[result.names[j]] for j in index]))
+                                 h.time_s, h.theta[:, index], h.lower[:, index], h.upper[:, index], h.boundaries_s)
                  for title, index in groups.items() if index)

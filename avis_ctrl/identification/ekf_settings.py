@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.rig import Rig
@@ -56,9 +57,7 @@ class EkfSettings:
 
     def __post_init__(self) -> None:
         for field in ("q_sigma", "v_sigma", "highpass_Hz", "prior_share", "history_s"):
-            value = getattr(self, field)
-            if not (isinstance(value, (int, float, np.floating)) and np.isfinite(value) and value > 0):
-                raise InputError("expected a finite positive number", field=field, value=value)
+            require_positive(getattr(self, field), field)
         if self.parametrisation not in ("linear", "log"):
             raise InputError("expected linear or log", field="parametrisation", value=self.parametrisation)
         if not (isinstance(self.warm_up, int) and self.warm_up >= 0):

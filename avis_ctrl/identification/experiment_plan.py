@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.linalg
 
-from avis_ctrl.errors import InputError
 from avis_ctrl.identification.experiments import (
     AddedActuator,
     AddedSensor,
@@ -198,23 +197,13 @@ def _independent(rows: np.ndarray) -> list[int]:
     return sorted(scipy.linalg.qr(scaled, mode="r", pivoting=True)[1][:len(rows)].tolist())
 
 
-def compare(information: Information, model: ResponseModel, experiments: Sequence[Experiment], noise: Noise
-            ) -> tuple[Outcome, ...]:
-    """What each experiment would add by itself, the best first: most combinations, then the smallest errors.
-
-    Raises InputError where the model's free parameters are not those of the information.
-    """
-    if model.names != information.names:
-        raise InputError(f"expected a model with the free parameters {', '.join(information.names)}", field="model",
-                         value=model.names)
-    return _compared(information, _added(model, experiments, noise))
-
-
-def _added(model: ResponseModel, experiments: Sequence[Experiment], noise: Noise) -> Added:
+def predicted(model: ResponseModel, experiments: Sequence[Experiment], noise: Noise) -> Added:
+    """Each experiment with what it would add."""
     return [(one, one.information(model, noise)) for one in experiments]
 
 
-def _compared(information: Information, added: Added) -> tuple[Outcome, ...]:
+def compared(information: Information, added: Added) -> tuple[Outcome, ...]:
+    """What each experiment would add by itself, the best first: most combinations, then the smallest errors."""
     found = [_outcome(information, one, extra) for one, extra in added]
     return tuple(sorted(found, key=lambda one: (-one.gained, -len(one.alone), _worst(one), -one.tighter)))
 
@@ -236,13 +225,8 @@ def _outcome(before: Information, experiment: Experiment, added: Information) ->
     return Outcome(experiment, after, after.rank, after.rank - before.rank, alone, tighter)
 
 
-def plan(information: Information, model: ResponseModel, experiments: Sequence[Experiment], noise: Noise
-         ) -> tuple[Outcome, ...]:
+def planned(information: Information, added: Added) -> tuple[Outcome, ...]:
     """Experiments one after the other, each the one that adds most to those before; ends when nothing is gained."""
-    return _planned(information, _added(model, experiments, noise))
-
-
-def _planned(information: Information, added: Added) -> tuple[Outcome, ...]:
     chosen: list[Outcome] = []
     now = information
     while now.rank < len(now.names):
@@ -264,13 +248,13 @@ def needed_experiment(information: Information, model: ResponseModel, drive: Dri
     if not missing:
         return ("Every combination is determined; further records only make it more precise.",)
     chosen = candidates(model, drive) if experiments is None else experiments
-    added = _added(model, chosen, noise)
-    outcomes = _compared(information, added)
+    added = predicted(model, chosen, noise)
+    outcomes = compared(information, added)
     said = [one.words for one in outcomes if one.gained]
     useless = [_kind(one.experiment.words) for one in outcomes if not one.gained]
     if useless:
         said.append(f"These determine no further combination: {'; '.join(dict.fromkeys(useless))}.")
-    steps = _planned(information, added)
+    steps = planned(information, added)
     if steps:
         after = steps[-1].information
         order = " Then: ".join(one.experiment.words + "." for one in steps)

@@ -24,17 +24,19 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Generic, TypeVar
 
 import numpy as np
 from scipy.linalg import null_space
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.response import ResponseModel, moment_rows, positive
+from avis_ctrl.identification.response import FrequencyModel, moment_rows, positive
 from avis_ctrl.identification.spectra import span, transient_columns, transient_parts
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
 Prior = tuple[float, float]
+Fitted = TypeVar("Fitted", bound=FrequencyModel)
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class Residual:
 
 
 @dataclass(frozen=True, eq=False)
-class LikelihoodFit:
+class LikelihoodFit(Generic[Fitted]):
     """The most likely parameters.
 
     Attributes
@@ -81,7 +83,7 @@ class LikelihoodFit:
         a normal distribution that is truncated there.
     """
 
-    model: ResponseModel
+    model: Fitted
     information: Information
     chi2: float
     dof: int
@@ -113,9 +115,9 @@ class _Quadratic:
     residuals: tuple[Residual, ...] = ()
 
 
-def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior] | None = None,
+def fit(model: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior] | None = None,
         starts: int = 1, spread: float = 0.1, seed: int = 1, max_iterations: int = 60,
-        progress: Callable[[str], None] | None = None, about: ResponseModel | None = None) -> LikelihoodFit:
+        progress: Callable[[str], None] | None = None, about: Fitted | None = None) -> LikelihoodFit[Fitted]:
     """The most likely parameters of `model.names`, from its present values.
 
     Parameters
@@ -135,7 +137,7 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
     _check(model, blocks, priors, starts)
     rng = np.random.default_rng(seed)
     whiteners = [whitener(block) for block in blocks]
-    reached: list[tuple[float, _Descent | None]] = []
+    reached: list[tuple[float, _Descent[Fitted] | None]] = []
     for k in range(starts):
         begin = model if k == 0 else _moved(model, spread, rng)
         if begin is not None:
@@ -164,7 +166,7 @@ def fit(model: ResponseModel, blocks: Sequence[SpectralBlock], priors: Mapping[s
                          + best.largest_moments())
 
 
-def _thinned_descent(begin: ResponseModel, blocks, priors, first: ResponseModel, max_iterations: int) -> ResponseModel:
+def _thinned_descent(begin: Fitted, blocks, priors, first: Fitted, max_iterations: int) -> Fitted:
     """A first descent on some of the lines, drawn at random: from afar it leads to the same place, in less time."""
     rng = np.random.default_rng(0)
     few = [block.lines(np.sort(rng.choice(len(block.omega), max(min(len(block.omega), 200), len(block.omega) // 8),
@@ -174,10 +176,10 @@ def _thinned_descent(begin: ResponseModel, blocks, priors, first: ResponseModel,
     return descent.model
 
 
-class _Descent:
+class _Descent(Generic[Fitted]):
     """One Levenberg-Marquardt run."""
 
-    def __init__(self, model: ResponseModel, blocks, whiteners, priors, first: ResponseModel):
+    def __init__(self, model: Fitted, blocks, whiteners, priors, first: Fitted):
         self.model, self.blocks, self.whiteners, self.priors = model, blocks, whiteners, priors
         self.scale, (self.lowest, self.highest) = first.scales(), first.bounds()
         self.rows = _held_rows(first)
@@ -185,7 +187,7 @@ class _Descent:
         self.history = [self.now.chi2]
         self.iterations, self.converged = 0, False
 
-    def evaluate(self, model: ResponseModel, derivative: bool = True, residuals: bool = False) -> _Quadratic:
+    def evaluate(self, model: Fitted, derivative: bool = True, residuals: bool = False) -> _Quadratic:
         """chi2 at a model, with its expansion if asked for."""
         n_p = len(model.names)
         chi2, g, H, F, kept = 0.0, np.zeros(n_p), np.zeros((n_p, n_p)), np.zeros((n_p, n_p)), []
@@ -298,7 +300,7 @@ class _Descent:
         slack = 1e-9 * np.abs(self.highest, where=np.isfinite(self.highest), out=np.zeros(len(self.highest)))
         return self.model.values >= self.highest - slack
 
-    def _try(self, step: np.ndarray) -> tuple[ResponseModel, float] | None:
+    def _try(self, step: np.ndarray) -> tuple[Fitted, float] | None:
         values = np.clip(self.model.values + step * self.scale, self.lowest, self.highest)
         if len(self.rows):
             # Shorten the step to end where a moment reaches the sum of the other two, less the distance `edge`.
@@ -318,12 +320,12 @@ class _Descent:
         return (model, chi2) if np.isfinite(chi2) else None
 
 
-def _physical(model: ResponseModel) -> bool:
+def _physical(model: FrequencyModel) -> bool:
     """Stiffness, damping and sensitivities keep the sign that they have on a rig."""
     return all(value > 0 for name, value in zip(model.names, model.values, strict=True) if positive(name))
 
 
-def block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
+def block_residual(model: FrequencyModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
                     ) -> tuple[np.ndarray, np.ndarray, Residual]:
     """Real residual e (N,) of unit variance, its negative Jacobian J (n_p, N), both free of the transient."""
     if not block.transient:
@@ -349,7 +351,7 @@ def block_residual(model: ResponseModel, block: SpectralBlock, L: np.ndarray, *,
     return e, J, Residual(block, plain - transient, white / np.sqrt(2), transient)
 
 
-def added_terms(model: ResponseModel, blocks: Sequence[SpectralBlock], columns: Sequence[np.ndarray]
+def added_terms(model: FrequencyModel, blocks: Sequence[SpectralBlock], columns: Sequence[np.ndarray]
                 ) -> tuple[np.ndarray, np.ndarray]:
     """H (k, k) and g (k,) with chi2 = chi2_0 + s^T H s - 2 g^T s for outputs that hold s times k known terms beside the
     model's, the parameters moved along to where chi2 is least (to first order) and the transients taken out.
@@ -431,12 +433,12 @@ def as_real(white: np.ndarray) -> np.ndarray:
     return np.concatenate([flat.real, flat.imag], axis=1)
 
 
-def transient_unknowns(block: SpectralBlock, model: ResponseModel) -> int:
+def transient_unknowns(block: SpectralBlock, model: FrequencyModel) -> int:
     """How many unknowns the transient of a block has."""
     return len(transient_columns(block.lines(np.arange(1)), model)[1]) if block.transient else 0
 
 
-def _moved(model: ResponseModel, spread: float, rng: np.random.Generator) -> ResponseModel | None:
+def _moved(model: Fitted, spread: float, rng: np.random.Generator) -> Fitted | None:
     """Another start: each parameter a random factor away; None where no rig has the draw."""
     for _ in range(20):
         try:
@@ -448,14 +450,14 @@ def _moved(model: ResponseModel, spread: float, rng: np.random.Generator) -> Res
     return None
 
 
-def _held_rows(first: ResponseModel) -> np.ndarray:
+def _held_rows(first: FrequencyModel) -> np.ndarray:
     """`moment_rows` without those that the starting values violate by more than `edge`: a thin plate starts at the sum
     itself."""
     rows = moment_rows(first.names)
     return rows[rows @ first.values >= -SETTINGS.edge * np.abs(rows) @ np.abs(first.values)]
 
 
-def _check(model: ResponseModel, blocks, priors, starts: int) -> None:
+def _check(model: FrequencyModel, blocks, priors, starts: int) -> None:
     if not model.names:
         raise InputError("expected at least one free parameter", field="parameters")
     if not blocks:

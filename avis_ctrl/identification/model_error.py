@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.excited_space import excited_space
 from avis_ctrl.identification.predictor import Predictor, model_inputs
@@ -34,8 +35,7 @@ class Unexplained(RecordSource):
     def __init__(self, record: RecordSource, model: ResponseModel):
         self.record, self.model, self.header = record, model, record.header
         h = record.header
-        if missing := [name for name in model.sensors.names if name not in h.y_names]:
-            raise InputError(f"the record has {', '.join(h.y_names)}", field=f"record {h.name}: y names", value=missing)
+        self.columns = places(model.sensors.names, h.y_names, "the record has", f"record {h.name}: y names")
         if abs(h.sample_rate_Hz * model.period_s - 1) > 1e-6:
             raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
                              field=f"record {h.name}: sample_rate_Hz")
@@ -55,7 +55,7 @@ class Unexplained(RecordSource):
         read = self.predictor.read(*model_inputs(self.model, piece))
         keep, self.at = slice(start - self.at, None), stop
         y = piece.y.copy()
-        y[:, [self.header.y_names.index(name) for name in self.model.sensors.names]] -= read
+        y[:, self.columns] -= read
         header = replace(piece.header, samples=stop - start,
                          start_s=self.header.start_s + start / self.header.sample_rate_Hz)
         return Record(header, piece.u[keep], y[keep], None if piece.floor is None else piece.floor[keep])

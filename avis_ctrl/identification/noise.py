@@ -21,7 +21,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.maximum_likelihood import Residual
-from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.response import FrequencyModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
 # Half the band [Hz] over which S and d count as constant, lines in it at least, and rounds of their fit.
@@ -46,7 +46,7 @@ def relative_noise(blocks: Sequence[SpectralBlock], fraction: float = 0.1) -> li
 
 
 def residual_noise(residuals: Sequence[Residual], half_width_Hz: float = 0.15, least_dof: int | None = None,
-                   model: ResponseModel | None = None) -> list[SpectralBlock]:
+                   model: FrequencyModel | None = None) -> list[SpectralBlock]:
     """The blocks with the covariance of their residuals, averaged over +- half_width_Hz and records of a kind.
 
     The window grows until the covariance has least_dof degrees of freedom and three for each output. With a model the
@@ -57,7 +57,7 @@ def residual_noise(residuals: Sequence[Residual], half_width_Hz: float = 0.15, l
 
 
 def noise_from_residuals(residuals: Sequence[Residual], blocks: Sequence[SpectralBlock], half_width_Hz: float = 0.15,
-                         least_dof: int | None = None, model: ResponseModel | None = None) -> list[SpectralBlock]:
+                         least_dof: int | None = None, model: FrequencyModel | None = None) -> list[SpectralBlock]:
     """Blocks, which may be other ones, with the covariance that residuals of their kind have near their lines.
 
     Raises
@@ -100,7 +100,7 @@ class _Shape(NamedTuple):
         S = (1 - share)[:, None, None] * self.S[right - 1] + share[:, None, None] * self.S[right]
         return S, (1 - share)[:, None] * self.d[right - 1] + share[:, None] * self.d[right]
 
-    def factor(self, omega: np.ndarray, model: ResponseModel | None) -> np.ndarray:
+    def factor(self, omega: np.ndarray, model: FrequencyModel | None) -> np.ndarray:
         """(n, n_y, n_y) Cholesky factor of C_0."""
         assert model is not None
         S, d = self.at(omega)
@@ -108,7 +108,7 @@ class _Shape(NamedTuple):
         return np.linalg.cholesky(_lifted(G @ S @ _adjoint(G) + d[:, :, None] * np.eye(d.shape[1])))
 
 
-def _shape(pool: Sequence[Residual], model: ResponseModel) -> _Shape:
+def _shape(pool: Sequence[Residual], model: FrequencyModel) -> _Shape:
     """S and d of residuals, windows on a grid of half their width."""
     half = max(2 * np.pi * SHAPE_HALF_Hz, SHAPE_LINES / _density(pool) / 2)
     low, high = min(one.block.omega[0] for one in pool), max(one.block.omega[-1] for one in pool)
@@ -141,7 +141,7 @@ def _expected(G: np.ndarray, R: np.ndarray, m: int, S: np.ndarray, d: np.ndarray
     return vv, np.real(left)
 
 
-def _floor_response(model: ResponseModel, omega: np.ndarray) -> np.ndarray:
+def _floor_response(model: FrequencyModel, omega: np.ndarray) -> np.ndarray:
     """(n, n_y, 3)"""
     n_u = len(model.actuators)
     U = np.broadcast_to(np.eye(len(model.inputs), dtype=complex)[:, n_u:], (len(omega), len(model.inputs), 3))

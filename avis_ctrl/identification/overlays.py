@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification import model_error
 from avis_ctrl.identification.campaign_fit import SETTINGS
@@ -76,16 +77,12 @@ def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseMo
     ------
     InputError : inputs or outputs that the model does not have; no coordinate along which the response is known.
     """
-    if missing := [name for name in measured.inputs if name not in model.inputs]:
-        raise InputError(f"the model's inputs are {', '.join(model.inputs)}", field="inputs", value=missing)
-    V = np.eye(len(model.inputs))[:, [model.inputs.index(name) for name in measured.inputs]]
+    V = np.eye(len(model.inputs))[:, places(measured.inputs, model.inputs, "the model's inputs are", "inputs")]
     if not np.any(np.all(measured.spanned(np.eye(len(measured.inputs))), axis=1)):
         measured, V = _along_coordinates(measured, model)
     else:
         measured = measured.at(np.all(measured.spanned(np.eye(len(measured.inputs))), axis=1))
-    if missing := [name for name in model.sensors.names if name not in measured.outputs]:
-        raise InputError(f"the response has {', '.join(measured.outputs)}", field="outputs", value=missing)
-    rows = [measured.outputs.index(name) for name in model.sensors.names]
+    rows = places(model.sensors.names, measured.outputs, "the response has", "outputs")
     U = np.broadcast_to(V.astype(complex), (len(measured.omega), *V.shape))
     found = model.driven(measured.omega, U)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import stats
 
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
-from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.response import FrequencyModel
 from avis_ctrl.identification.spectra import span, transient_columns
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
@@ -71,7 +71,7 @@ class PredictionError:
         return self.dof + float(np.real(np.einsum("ik,ij,jk->", J.conj(), covariance, J, optimize=True)))
 
 
-def prediction_error(model: ResponseModel, block: SpectralBlock, derivative: bool = True) -> PredictionError:
+def prediction_error(model: FrequencyModel, block: SpectralBlock, derivative: bool = True) -> PredictionError:
     """The error of a model on a block whose noise is known.
 
     Raises

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.large_motion import March, arrays_of, march, march_linear, sensors_of
 from avis_ctrl.identification.response import FLOOR, ResponseModel, SensorModel
@@ -203,17 +204,9 @@ def model_inputs(model: ResponseModel, record: Record) -> tuple[np.ndarray, np.n
     """u (n, n_u) and floor (n, 3) of a record in the model's order; inputs that it does not name are zero."""
     h = record.header
     u = np.zeros((h.samples, len(model.actuators)))
-    for names, known, values, into in ((h.u_names, model.actuators, record.u, u),):
-        if unknown := [name for name in names if name not in known]:
-            raise InputError(f"the model's actuators are {', '.join(known)}", field=f"record {h.name}: u names",
-                             value=unknown)
-        for k, name in enumerate(names):
-            into[:, known.index(name)] = values[:, k]
+    u[:, places(h.u_names, model.actuators, "the model's actuators are", f"record {h.name}: u names")] = record.u
     if record.floor is None:
         return u, None
-    if unknown := [name for name in h.floor_names if name not in FLOOR]:
-        raise InputError(f"expected {', '.join(FLOOR)}", field=f"record {h.name}: floor names", value=unknown)
     floor = np.zeros((h.samples, len(FLOOR)))
-    for k, name in enumerate(h.floor_names):
-        floor[:, FLOOR.index(name)] = record.floor[:, k]
+    floor[:, places(h.floor_names, FLOOR, "expected", f"record {h.name}: floor names")] = record.floor
     return u, floor

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.signal as signal
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.rigs.rig import Rig
@@ -55,8 +56,7 @@ def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str, undo_chain: bo
     InputError : a unit that is none of V, m, m/s, m/s^2; volts of a rig without sensors; unknown channels.
     """
     names, _ = rig.sensor_rows()
-    if unknown := [name for name in y_names if name not in names]:
-        raise InputError(f"the sensors of the rig {rig.name} are {', '.join(names)}", field="y names", value=unknown)
+    places(y_names, names, f"the sensors of the rig {rig.name} are", "y names")
     none, one = np.zeros(0, complex), np.ones(len(y_names))
     plain = {"m": ("displacement", none), "m/s": ("velocity", none), "m/s^2": ("velocity", np.zeros(1, complex))}
     if unit in plain:

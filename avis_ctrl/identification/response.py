@@ -19,17 +19,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, wraps
 from itertools import zip_longest
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.large_motion import AS_SIMULATED, Turning
 from avis_ctrl.identification.sample_and_hold import Motion, aliases, hold
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace
-from avis_ctrl.rigs.geophone import second_order_roots
 from avis_ctrl.rigs.rig import Parameter, Rig
 
 FLOOR = ("vx", "vy", "vz")
@@ -175,15 +175,14 @@ def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) 
     """
     known, _ = rig.sensor_rows()
     chosen = tuple(names) if names is not None else known
-    if missing := [name for name in chosen if name not in known]:
-        raise InputError(f"the sensors of the rig {rig.name} are {', '.join(known)}", field="y names", value=missing)
+    at = places(chosen, known, f"the sensors of the rig {rig.name} are", "y names")
     n = len(chosen)
     if unit in MOTION_OF_UNIT:
         return SensorModel(chosen, (MOTION_OF_UNIT[unit],) * n, (None,) * n, np.ones(n), unit,
                            (f"{unit} per {unit}",) * n, ((1.0,),) * n, np.zeros(n, bool))
     if unit != "V":
         raise InputError(f"expected V, {', '.join(MOTION_OF_UNIT)}", field="unit of y", value=unit)
-    sensors = [rig.sensors()[known.index(name)] for name in chosen]
+    sensors = [rig.sensors()[k] for k in at]
     # Alike sensors share one chain object, whose response is computed once.
     systems = {(one.zeros, one.poles, one.quantity): one.chain(1.0) for one in sensors}
     units = {"velocity": "V s/m", "acceleration": "V s^2/m", "displacement": "V/m"}
@@ -285,6 +284,34 @@ def _products(slopes: np.ndarray, x: np.ndarray) -> np.ndarray:
     return (x.swapaxes(1, 2).reshape(n * m, j) @ slopes.transpose(2, 1, 0).reshape(j, i * p)).reshape(n, m, i, p)
 
 
+class FrequencyModel(Protocol):
+    """What the fit of records uses of a model: `ResponseModel`, or one with effects (`gap.table_model`)."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def units(self) -> tuple[str, ...]: ...
+    @property
+    def values(self) -> np.ndarray: ...
+    @property
+    def actuators(self) -> tuple[str, ...]: ...
+    @property
+    def inputs(self) -> tuple[str, ...]: ...
+    @property
+    def matrices(self) -> Matrices: ...
+    @property
+    def derivative_matrices(self) -> Matrices: ...
+    def scales(self) -> np.ndarray: ...
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]: ...
+    def reach(self) -> tuple[np.ndarray, np.ndarray]: ...
+    def at(self, theta: Sequence[float] | np.ndarray) -> Self: ...
+    def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven: ...
+    def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True,
+               inner: np.ndarray | None = None) -> Driven: ...
+    def sensor_transients(self, omega: np.ndarray) -> np.ndarray: ...
+    def inner_transients(self, omega: np.ndarray) -> np.ndarray: ...
+
+
 @dataclass(frozen=True, eq=False)
 class ResponseModel:
     """y of a rig by frequency, as a function of its physical parameters.
@@ -313,14 +340,9 @@ class ResponseModel:
     turning: Turning = AS_SIMULATED
 
     def __post_init__(self) -> None:
-        known = self._known
-        if unknown := [name for name in self.names if name not in known]:
-            raise InputError(f"the rig {self.rig.name} has no such parameter; it has {', '.join(known)}",
-                             field="parameters", value=unknown)
+        places(self.names, list(self._known), f"the rig {self.rig.name} has no such parameter; it has", "parameters")
         available = self.rig.equations_of_motion().actuators
-        if missing := [name for name in self.actuators if name not in available]:
-            raise InputError(f"the actuators of the rig {self.rig.name} are {', '.join(available)}", field="u names",
-                             value=missing)
+        places(self.actuators, available, f"the actuators of the rig {self.rig.name} are", "u names")
 
     @staticmethod
     def of(rig: Rig, names: Sequence[str], unit: str = "V", sensors: Sequence[str] | None = None,
@@ -383,7 +405,7 @@ class ResponseModel:
         """Actuators, then the floor's velocities."""
         return (*self.actuators, *FLOOR)
 
-    def at(self, theta: Sequence[float] | np.ndarray) -> ResponseModel:
+    def at(self, theta: Sequence[float] | np.ndarray) -> Self:
         """The model with its free parameters at theta (n_p,). Raises InputError where no rig has them."""
         values = dict(zip(self.names, np.asarray(theta, float).tolist(), strict=True))
         sensitivity = np.array([values.get(f"sensor.{name}", old) for name, old

@@ -111,11 +111,6 @@ def whole_numbers(row: np.ndarray, largest: int = 12, tolerance: float = 1e-4) -
     return found * np.sign(found[inside[0]])
 
 
-def complement(rows: np.ndarray) -> np.ndarray:
-    """(n, n - d) orthonormal columns orthogonal to rows (d, n) of full rank."""
-    return np.linalg.svd(rows)[2][len(rows):].T
-
-
 def _cleaned(rows: np.ndarray, tolerance: float) -> np.ndarray:
     if not rows.size:
         return rows

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.fft
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.response import FLOOR, N_Q, ResponseModel, kept_lines
+from avis_ctrl.identification.response import FLOOR, N_Q, FrequencyModel, ResponseModel, kept_lines
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -44,9 +45,7 @@ def record_block(record: Record, model: ResponseModel, band_Hz: tuple[float, flo
     _place(U, h.u_names, model.actuators, spectrum(record.u), f"record {h.name}: u names")
     if record.floor is not None:
         _place(U, h.floor_names, FLOOR, spectrum(record.floor), f"record {h.name}: floor names", len(model.actuators))
-    if missing := [name for name in model.sensors.names if name not in h.y_names]:
-        raise InputError(f"the record has {', '.join(h.y_names)}", field=f"record {h.name}: y names", value=missing)
-    Y = spectrum(record.y)[:, [h.y_names.index(name) for name in model.sensors.names]]
+    Y = spectrum(record.y)[:, places(model.sensors.names, h.y_names, "the record has", f"record {h.name}: y names")]
     kind = "floor measured" if record.floor is not None else "floor not measured"
     return SpectralBlock(h.name, 2 * np.pi * frequency[keep], U[:, :, None], Y[:, :, None], transient=True, kind=kind,
                          start_s=h.start_s, samples=h.samples)
@@ -67,9 +66,7 @@ def response_block(measured: FrequencyResponse, model: ResponseModel, name: str 
         raise InputError(f"expected {model.sensors.unit}", field="unit of the response's outputs",
                          value=measured.output_unit)
     n, n_in = len(measured.frequency_Hz), len(measured.inputs)
-    if missing := [one for one in model.sensors.names if one not in measured.outputs]:
-        raise InputError(f"the response has {', '.join(measured.outputs)}", field="outputs", value=missing)
-    rows = [measured.outputs.index(one) for one in model.sensors.names]
+    rows = places(model.sensors.names, measured.outputs, "the response has", "outputs")
     if measured.entry_variance is None:
         assert measured.gram is not None and measured.noise is not None
         W = _root(measured.gram)
@@ -106,13 +103,10 @@ def _root(gram: np.ndarray) -> np.ndarray:
 def _place(into: np.ndarray, names: Sequence[str], known: Sequence[str], values: np.ndarray, field: str,
            offset: int = 0) -> None:
     """Rows of the inputs by name."""
-    if unknown := [name for name in names if name not in known]:
-        raise InputError(f"the model's inputs are {', '.join(known)}", field=field, value=unknown)
-    for k, name in enumerate(names):
-        into[:, offset + list(known).index(name)] = values[:, k]
+    into[:, [offset + k for k in places(names, known, "the model's inputs are", field)]] = values
 
 
-def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.ndarray, np.ndarray]:
+def transient_columns(block: SpectralBlock, model: FrequencyModel) -> tuple[np.ndarray, np.ndarray]:
     """(n, n_y, n_t) columns, for real coefficients, of what the ends of a record leave in its spectra; (n_t,) norms.
 
     Impulse and step on the body (12), the states of the sensors' chains (`ResponseModel.sensor_transients`), and last
@@ -123,7 +117,7 @@ def transient_columns(block: SpectralBlock, model: ResponseModel) -> tuple[np.nd
 
 
 @kept_lines
-def _transient_columns(model: ResponseModel, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _transient_columns(model: FrequencyModel, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     n, n_in = len(omega), len(model.inputs)
     U = np.zeros((n, n_in + 2 * N_Q, 2 * N_Q), complex)
     U[:, n_in:] = np.eye(2 * N_Q)
@@ -133,7 +127,7 @@ def _transient_columns(model: ResponseModel, omega: np.ndarray) -> tuple[np.ndar
     return columns / norms, norms
 
 
-def transient_parts(x: np.ndarray, norms: np.ndarray, block: SpectralBlock, model: ResponseModel
+def transient_parts(x: np.ndarray, norms: np.ndarray, block: SpectralBlock, model: FrequencyModel
                     ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 12, 1) impulses and steps on the body, and (m,) what the states inside start with: the part of unknowns
     x (n_t,) of the columns of `transient_columns`, norms (n_t,), that changes with the model's parameters."""

@@ -68,8 +68,8 @@ def end(begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[st
     return begun._replace(fitted=found)
 
 
-def as_likelihood_fit(found: ToleranceFit, blocks: Sequence[SpectralBlock], first: LikelihoodFit,
-                      settings: FitSettings = SETTINGS) -> LikelihoodFit:
+def as_likelihood_fit(found: ToleranceFit, blocks: Sequence[SpectralBlock], first: LikelihoodFit[ResponseModel],
+                      settings: FitSettings = SETTINGS) -> LikelihoodFit[ResponseModel]:
     """In the form of a fit by noise alone, tolerances among the parameters; residuals on all lines of the blocks."""
     one, model = found.fitted, found.fitted.model
     H, g, cost = one.weights.normal_equations(one.white.J, one.white.e)

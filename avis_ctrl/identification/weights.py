@@ -113,8 +113,8 @@ def path_contributions(model: Any, block: SpectralBlock) -> np.ndarray:
 def with_distortion(block: SpectralBlock, level: float, variances: Variances, settings: FitSettings) -> SpectralBlock:
     """The block with noise and distortion as its covariance."""
     assert block.noise is not None
-    own = bands(block.omega, settings.bands_per_octave)
-    s = np.array([variances.of_distortion(level, int(band)) for band in own])
+    own, of_line = np.unique(bands(block.omega, settings.bands_per_octave), return_inverse=True)
+    s = np.array([variances.of_distortion(level, int(band)) for band in own])[of_line]
     return block.with_noise(block.noise[:, 0] + s[:, :, None] * np.eye(s.shape[1]))
 
 

@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl import plot, report, uncertain_value
+from avis_ctrl import plot, uncertain_value
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.plot.axes import axes_of, finish
+from avis_ctrl.report import content, rendered
+from avis_ctrl.report.gap import content as gap_content
+from avis_ctrl.report.identification import content as identification
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.design_file import Design, design_from_table
 from avis_ctrl.study.design_result import DesignResult, Requirement
@@ -109,7 +112,7 @@ class DesignStudy:
         Raises InputError for a folder that cannot be written, ComputationError for a full disk.
         """
         out = open_folder(folder, FILES, FOLDERS)
-        return write_study(self.result, out, report.render_html(self.result), report.render_pdf(self.result))
+        return write_study(self.result, out, *rendered(content.document(self.result)))
 
     def __repr__(self) -> str:
         met = sum(one.met for one in self.requirements)
@@ -196,8 +199,7 @@ class IdentificationStudy:
             # As in the command: the identification is valid without the files for design.
             if sections:
                 raise
-        return write_identification(self.found, out, report.identification_html(self.found, made),
-                                    report.identification_pdf(self.found, made), more)
+        return write_identification(self.found, out, *rendered(identification.document(self.found, made)), more)
 
     def __repr__(self) -> str:
         information = self.found.information
@@ -251,7 +253,7 @@ class GapStudy:
     def save(self, folder: str | Path) -> list[Path]:
         """The files of `avis gap`, all or none. Raises InputError for a folder that cannot be written."""
         out = open_folder(folder, GAP_FILES)
-        return write_gap(out, self.gap, report.gap_html(self.found), report.gap_pdf(self.found), self.found.to_json())
+        return write_gap(out, self.gap, *rendered(gap_content.document(self.found)), self.found.to_json())
 
     def __repr__(self) -> str:
         named = ", ".join(one.name for one in self.effects) or "no effect named"

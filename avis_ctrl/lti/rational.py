@@ -86,30 +86,6 @@ class Rational:
         """1/H; raises InputError unless H is biproper."""
         return Rational(1.0 / self.gain, self.pole_pairs, self.zero_pairs, self.real_poles, self.real_zeros)
 
-    @staticmethod
-    def from_roots(zeros: Sequence[complex] | np.ndarray, poles: Sequence[complex] | np.ndarray,
-                   leading: float) -> Rational:
-        """leading * prod(s - z) / prod(s - p).
-
-        Raises InputError for a root on or right of the imaginary axis, a complex root without its conjugate, a
-        leading coefficient that is not positive, or more zeros than poles.
-        """
-        pairs: dict[str, tuple[Section, ...]] = {}
-        singles: dict[str, tuple[float, ...]] = {}
-        for field, roots in (("zeros", zeros), ("poles", poles)):
-            roots = np.atleast_1d(np.asarray(roots, complex))
-            if not np.all(np.isfinite(roots)):
-                raise InputError("finite roots", field=field, value=roots.tolist())
-            if np.any(roots.real >= 0):
-                worst = complex(roots[np.argmax(roots.real)])
-                raise InputError("every root left of the imaginary axis (stable, minimum phase)", field=field,
-                                 value=worst.real if worst.imag == 0 else worst)
-            sections = _real_sections(roots, field)
-            complex_ones = [section for section in sections if section[0].imag]
-            pairs[field] = tuple((float(abs(z[0])), float(-z[0].real / abs(z[0]))) for z in complex_ones)
-            singles[field] = tuple(float(-r.real) for z in sections if not z[0].imag for r in z)
-        return Rational(leading, pairs["zeros"], pairs["poles"], singles["zeros"], singles["poles"])
-
     def zeros(self) -> np.ndarray:
         """Finite zeros [rad/s], complex."""
         return _roots(self.zero_pairs, self.real_zeros)
@@ -126,6 +102,11 @@ class Rational:
 def _roots(pairs: Sequence[Section], real: Sequence[float]) -> np.ndarray:
     found = [np.roots([1.0, 2 * zeta * w, w * w]) for w, zeta in pairs]
     return np.concatenate([*found, -np.asarray(real, float)]).astype(complex)
+
+
+def second_order_roots(corner_Hz: float, damping: float) -> np.ndarray:
+    """Roots of s^2 + 2 zeta w s + w^2 [rad/s]."""
+    return _roots([(2 * np.pi * corner_Hz, damping)], [])
 
 
 def cascade(zeros: Sequence[complex] | np.ndarray, poles: Sequence[complex] | np.ndarray, leading: float,

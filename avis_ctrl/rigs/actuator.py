@@ -11,9 +11,9 @@ from math import comb, factorial
 import numpy as np
 import scipy.linalg as la
 
+from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.statespace import StateSpace, gain, tf
-from avis_ctrl.rigs.converter import require_positive
 
 
 def pade_coefficients(order: int) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 
 
@@ -84,11 +85,3 @@ class Converter:
 def white_density(rms: float, sample_rate_Hz: float) -> float:
     """One-sided density [unit/sqrt(Hz)] of noise of that r.m.s., white from 0 to half the sample rate."""
     return float(rms * np.sqrt(2.0 / sample_rate_Hz))
-
-
-def require_positive(value: float, field: str, *, zero_allowed: bool = False) -> None:
-    """Raise InputError naming the field unless the value is a finite positive number (or zero where allowed)."""
-    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not (number and np.isfinite(value) and (value > 0 or (zero_allowed and value == 0))):
-        raise InputError("a finite number, " + ("zero or positive" if zero_allowed else "greater than zero"),
-                         field=field, value=value)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import json
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from avis_ctrl.errors import InputError
 
@@ -17,6 +18,12 @@ Content = TypeVar("Content", bound=BaseModel)
 _UNITS = {"kg", "g", "t", "lb", "m", "mm", "cm", "um", "in", "N", "kN", "mN", "Nm", "Ns", "Nms", "kNs", "per", "rad",
           "deg", "V", "mV", "kV", "Hz", "kHz", "rtHz", "s", "ms", "us", "s2", "Vs", "Vs2", "kgm2", "gmm2", "kgmm2",
           "gcm2"}
+
+
+class Section(BaseModel):
+    """A section of a file: its keys and no others, each of the type that it says."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
 def validated(model: type[Content], content: object, file: object = None) -> Content:
@@ -113,12 +120,25 @@ def read_toml(path: Path, expected: str) -> dict[str, Any]:
     ------
     InputError : one line naming the file: it is not there, cannot be read, is not TOML in UTF-8.
     """
+    return _read(path, tomllib.loads, "TOML", expected)
+
+
+def read_json(path: Path, form: str, expected: str = "a file of avis design") -> dict[str, Any]:
+    """The content of a JSON file whose key `format` is `form`; otherwise as `read_toml`."""
+    content = _read(path, json.loads, "JSON", expected)
+    found = content.get("format") if isinstance(content, dict) else None
+    if found != form:
+        raise InputError(f"expected {form!r}", file=path, field="format", value=found)
+    return content
+
+
+def _read(path: Path, parse: Callable[[str], Any], language: str, expected: str) -> Any:
     try:
         # Editors on Windows begin a file with a byte-order mark.
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return parse(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"no such file; expected {expected}", file=path) from None
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from None
+        raise InputError(f"cannot be read: {error.strerror or error}; expected {expected}", file=path) from None
     except (ValueError, RecursionError) as error:
-        raise InputError(f"expected a TOML file in UTF-8; {' '.join(str(error).split())}", file=path) from None
+        raise InputError(f"expected a {language} file in UTF-8; {' '.join(str(error).split())}", file=path) from None

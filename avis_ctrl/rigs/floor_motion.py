@@ -7,7 +7,6 @@ double-logarithmic axes) and integrated exactly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -16,42 +15,6 @@ from avis_ctrl.errors import InputError
 
 Quantity = Literal["displacement", "velocity", "acceleration"]
 DERIVATIVES: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
-
-
-@dataclass(frozen=True)
-class MeasuredSpectrum:
-    """A measured displacement ASD.
-
-    Parameters
-    ----------
-    name : what was measured, usually the file's name.
-    frequency_Hz : (n,) increasing, positive.
-    displacement_asd : (n,) [m/sqrt(Hz)], positive.
-
-    Raises
-    ------
-    InputError : values that are not finite and positive, or frequencies that do not increase.
-    """
-
-    name: str
-    frequency_Hz: np.ndarray
-    displacement_asd: np.ndarray
-
-    def __post_init__(self) -> None:
-        check_spectrum(self.frequency_Hz, self.displacement_asd, "displacement_asd")
-
-    def asd(self, quantity: Quantity = "displacement") -> np.ndarray:
-        """The ASD of that quantity, (n,)."""
-        return convert_asd(self.frequency_Hz, self.displacement_asd, "displacement", quantity)
-
-    def rms(self, low_Hz: float, high_Hz: float, quantity: Quantity = "velocity") -> float:
-        """R.m.s. in a band [m, m/s or m/s^2]."""
-        return band_rms(self.frequency_Hz, self.asd(quantity), low_Hz, high_Hz)
-
-    def between(self, low_Hz: float, high_Hz: float) -> MeasuredSpectrum:
-        """The points of a band."""
-        kept = (self.frequency_Hz >= low_Hz) & (self.frequency_Hz <= high_Hz)
-        return MeasuredSpectrum(self.name, self.frequency_Hz[kept], self.displacement_asd[kept])
 
 
 def check_spectrum(frequency_Hz: np.ndarray, asd: np.ndarray, field: str = "asd") -> None:
@@ -64,18 +27,6 @@ def check_spectrum(frequency_Hz: np.ndarray, asd: np.ndarray, field: str = "asd"
         raise InputError("finite, positive, increasing frequencies", field="frequency_Hz")
     if not (np.all(np.isfinite(asd)) and np.all(np.asarray(asd) > 0)):
         raise InputError("finite, positive densities", field=field)
-
-
-def convert_asd(frequency_Hz: np.ndarray, asd: np.ndarray, given: Quantity, wanted: Quantity) -> np.ndarray:
-    """ASD of another derivative of the same motion: each derivative multiplies by 2 pi f.
-
-    Raises InputError for a quantity other than displacement, velocity and acceleration.
-    """
-    for what in (given, wanted):
-        if what not in DERIVATIVES:
-            raise InputError(f"one of {list(DERIVATIVES)}", field="quantity", value=what)
-    steps = DERIVATIVES[wanted] - DERIVATIVES[given]
-    return np.asarray(asd, float) * (2 * np.pi * np.asarray(frequency_Hz, float)) ** steps
 
 
 def band_rms(frequency_Hz: np.ndarray, asd: np.ndarray, low_Hz: float, high_Hz: float) -> float:

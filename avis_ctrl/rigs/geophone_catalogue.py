@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.geophone import Geophone
 
 VELOCITY_UNIT, VOLT_UNIT = "M/S", "V"
 
@@ -39,10 +38,6 @@ class CatalogueEntry:
     shunt_ohm: float | None
     named_corner_Hz: float
     named_gain_Vs_per_m: float
-
-    def geophone(self) -> Geophone:
-        """The geophone that the file's lines describe."""
-        return Geophone(self.corner_Hz, self.damping, self.gain_Vs_per_m, self.coil_ohm, self.shunt_ohm)
 
 
 def check_against_name(entry: CatalogueEntry, tolerance: float = 0.02) -> list[str]:

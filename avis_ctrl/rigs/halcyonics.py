@@ -6,20 +6,17 @@ second derivatives in eq. 4, K(4,4) = (k_a + k_s) L_2^2 + 2 k_a L_6^2, E(3,1..4)
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti import StateSpace
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
 from avis_ctrl.rigs.instruments import Sensor, Tolerances, Triple, white_rms
 from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
 from avis_ctrl.rigs.rig import Parameter, Place, Rig
-from avis_ctrl.rigs.rigid_body import EquationsOfMotion, cross_matrix, point_map
+from avis_ctrl.rigs.rigid_body import EquationsOfMotion, cross_matrix
 
 _ROOT_HALF = np.sqrt(0.5)
 # Signs of (x, y) of the corners that actuator A_i and spring i stand at, and of the force of A5..A8.
@@ -160,9 +157,6 @@ class Halcyonics(Rig):
     def loop_delay_s(self) -> float:
         return self.accelerometers.loop_delay_s
 
-    def unloaded(self) -> Halcyonics:
-        return replace(self, load=None)
-
     def mass_matrix(self) -> np.ndarray:
         """M of eq. 16."""
         M = np.diag([self.mass] * 3 + [self.Ixx, self.Iyy, self.Izz])
@@ -247,48 +241,6 @@ class Halcyonics(Rig):
         inertia = (plate - self.mass * to_plate @ to_plate
                    + self.load.inertia() - self.load.mass * to_load @ to_load)
         return total, inertia, centre
-
-    def free_actuator(self) -> StateSpace:
-        """An actuator with its reaction mass free, eq. 1: "voltage" [V] to "displacement" [m] and "velocity"."""
-        m_a, d_a, e = self.reaction.mass, self.reaction.damping, self.reaction.constant_N_per_V
-        A = np.array([[0.0, 1.0], [-self.k_a / m_a, -d_a / m_a]])
-        motion = ("displacement", "velocity")
-        B = np.array([[0.0], [e / m_a]])
-        return StateSpace(A, B, np.eye(2), np.zeros((2, 1)), 0.0, ("voltage",), motion, motion)
-
-    def transfer(self, point: str | ArrayLike, direction: str | ArrayLike,
-                 drive: Mapping[str, float] | Sequence[float], omega: ArrayLike,
-                 reference: str | None = None) -> np.ndarray:
-        """X_ps / F_r of eq. 32, (n_omega,) complex [m/N].
-
-        Parameters
-        ----------
-        point : name of `points()` (such as "M3"), or position (3,) [m] from the plate's centre of mass.
-        direction : "x", "y", "z", or a vector (3,) of any length.
-        drive : voltage pattern A, by actuator name or as 8 numbers.
-        omega : rad/s.
-        reference : actuator r whose force is divided by; the first one driven by default.
-        """
-        pattern = self._pattern(drive)
-        if reference is None:
-            reference = self.actuator_names[int(np.flatnonzero(pattern)[0])]
-        e_r = self.e[self.actuator_names.index(reference)]
-        place = self.points()[point].position if isinstance(point, str) else np.asarray(point, float)
-        s = np.eye(3)["xyz".index(direction)] if isinstance(direction, str) else np.asarray(direction, float)
-        eom = self.equations_of_motion()
-        w = np.atleast_1d(np.asarray(omega, float))[:, None, None]
-        W = np.linalg.solve(-w**2 * eom.M + 1j * w * eom.C + eom.K, (eom.T @ pattern)[:, None])[:, :, 0]
-        return W @ point_map(place).T @ s / (np.linalg.norm(s) * e_r)
-
-    def _pattern(self, drive: Mapping[str, float] | Sequence[float]) -> np.ndarray:
-        if isinstance(drive, Mapping):
-            if unknown := [name for name in drive if name not in self.actuator_names]:
-                raise InputError(f"expected actuators out of {self.actuator_names}", field="drive", value=unknown)
-            drive = [float(drive.get(name, 0.0)) for name in self.actuator_names]
-        pattern = np.asarray(drive, float)
-        if pattern.shape != (8,) or not np.any(pattern) or not np.all(np.isfinite(pattern)):
-            raise InputError("expected 8 finite voltages, not all zero", field="drive", value=pattern.tolist())
-        return pattern
 
     def points(self) -> dict[str, Place]:
         found = {m.name: Place(m.position, "isolator") for m in self.mounted_body().mounts[:4]}

@@ -14,11 +14,10 @@ from typing import Literal
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.converter import Converter, white_density
 from avis_ctrl.rigs.equipment import Acquisition, Ambient, Electronics
-from avis_ctrl.rigs.geophone import second_order_roots
 
 Quantity = Literal["velocity", "acceleration", "displacement"]
 Triple = tuple[float, float, float]

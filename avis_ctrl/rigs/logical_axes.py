@@ -21,9 +21,6 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
-# A logical axis counts as reached when the weakest combination has this share of the strongest.
-RANK_TOLERANCE = 1e-9
-
 
 @dataclass(frozen=True)
 class Reach:
@@ -47,16 +44,15 @@ class ActuatorAxes:
 
     matrix : (6, n_u) T, N/V and N m/V, all six coordinates.
     allocation : (n_u, n_axes) V per N or N m: the voltages of least Euclidean norm that make the
-        force asked on `axes` and as little as possible on `quiet`.
+        force asked on `axes` and as little as possible on the others.
     condition : condition number of the rows inverted, each scaled to unit length, so that it does
         not depend on units.
-    leftover : (n_quiet, n_axes) force on `quiet` per force on `axes`, moments as forces at the edge; zero where the
-        actuators span all six coordinates.
+    leftover : (n_others, n_axes) force on the other coordinates per force on `axes`, moments as forces at the edge;
+        zero where the actuators span all six coordinates.
     """
 
     actuators: tuple[str, ...]
     axes: tuple[str, ...]
-    quiet: tuple[str, ...]
     matrix: np.ndarray
     allocation: np.ndarray
     condition: float
@@ -69,16 +65,15 @@ class SensorAxes:
 
     matrix : (n_s, 6) from q to the sensors.
     decoding : (n_axes, n_s) least-squares inverse, weighted with the sensors' noise: logical coordinates `axes` from
-        the sensors, with the least possible sensitivity to `resolved` coordinates that are not requested.
+        the sensors, with the least possible sensitivity to the others.
     condition : condition number of the columns inverted, each scaled to unit length.
-    leftover : (n_axes, n_resolved) what is read of `resolved`, rotations at the edge.
+    leftover : (n_axes, n_others) what is read of the other coordinates, rotations at the edge.
     relative : those of `axes` that are measured relative to the chassis.
     inertial : (n_s,) which sensors measure motion in space.
     """
 
     sensors: tuple[str, ...]
     axes: tuple[str, ...]
-    resolved: tuple[str, ...]
     matrix: np.ndarray
     decoding: np.ndarray
     condition: float
@@ -87,11 +82,9 @@ class SensorAxes:
     inertial: np.ndarray
 
 
-def actuator_axes(rig: Rig, axes: Sequence[str] = COORDINATES, actuators: Sequence[str] | None = None,
-                  quiet: Sequence[str] | None = None) -> ActuatorAxes:
+def actuator_axes(rig: Rig, axes: Sequence[str] = COORDINATES,
+                  actuators: Sequence[str] | None = None) -> ActuatorAxes:
     """Allocation of forces on `axes` to the actuators (all of them by default).
-
-    quiet : coordinates that must not be pushed; by default all the others, as far as the actuators can help it.
 
     Raises
     ------
@@ -102,21 +95,16 @@ def actuator_axes(rig: Rig, axes: Sequence[str] = COORDINATES, actuators: Sequen
     names = eom.actuators if actuators is None else tuple(actuators)
     T = eom.T[:, _positions(eom.actuators, names, "actuators")]
     wanted = _positions(COORDINATES, axes, "axes")
-    still = [name for name in COORDINATES if name not in axes] if quiet is None else list(quiet)
-    others = _positions(COORDINATES, still, "quiet")
-    inverse, condition = _blind_inverse(T.T, wanted, others, rig.edge_m, quiet is not None,
+    others = [k for k in range(6) if k not in wanted]
+    inverse, condition = _blind_inverse(T.T, wanted, others, rig.edge_m,
                                         f"cannot be pushed independently by the actuators {list(names)}")
     arms = _arms(rig)
     leftover = (T[others] @ inverse.T) * arms[wanted] / arms[others][:, None]
-    return ActuatorAxes(names, tuple(axes), tuple(still), T, inverse.T, condition, leftover)
+    return ActuatorAxes(names, tuple(axes), T, inverse.T, condition, leftover)
 
 
-def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[str] | None = None,
-                resolved: Sequence[str] | None = None) -> SensorAxes:
+def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[str] | None = None) -> SensorAxes:
     """Logical coordinates `axes` from the sensors (all of them by default).
-
-    resolved : coordinates besides `axes` that the sensors also have to tell apart; by default all
-        the others, as far as these sensors can.
 
     Raises
     ------
@@ -127,17 +115,15 @@ def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[s
     chosen = _positions(all_names, names, "sensors")
     H, channels = matrix[chosen], [rig.sensors()[k] for k in chosen]
     wanted = _positions(COORDINATES, axes, "axes")
-    others = [name for name in COORDINATES if name not in axes] if resolved is None else list(resolved)
-    columns = _positions(COORDINATES, others, "resolved")
+    others = [k for k in range(6) if k not in wanted]
     inertial, noise = np.array([one.inertial for one in channels]), _noise(rig, chosen)
     complaint = f"cannot be distinguished by the sensors {list(names)}"
-    exact = resolved is not None
     alone = bool(np.all(inertial))
     absolute = wanted if alone else _absolute(H[inertial], wanted, rig.edge_m, noise[inertial])
     relative = [k for k in wanted if k not in absolute]
     decoding, condition = np.zeros((len(wanted), len(names))), 1.0
     if absolute and alone:
-        decoding, condition = _blind_inverse(H, wanted, columns, rig.edge_m, exact, complaint, noise)
+        decoding, condition = _blind_inverse(H, wanted, others, rig.edge_m, complaint, noise)
     elif absolute:
         # Position sensors see the absolute axes minus the floor's motion: unknowns of their own.
         own = [H[:, k] * inertial for k in absolute]
@@ -147,16 +133,16 @@ def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[s
         rows = [wanted.index(k) for k in absolute]
         decoding[rows], condition = _blind_inverse(
             np.array([*own, *both, *against]).T, list(range(len(own))), list(range(len(own), len(order))), rig.edge_m,
-            False, complaint, noise, order)
+            complaint, noise, order)
     if relative:
         rows, least = [wanted.index(k) for k in relative], ~inertial
-        part, worse = _blind_inverse(H[least], relative, [k for k in range(6) if k not in relative], rig.edge_m, False,
+        part, worse = _blind_inverse(H[least], relative, [k for k in range(6) if k not in relative], rig.edge_m,
                                      complaint, noise[least])
         decoding[np.array(rows)[:, None], np.flatnonzero(least)] = part
         condition = max(condition, worse)
     arms = _arms(rig)
-    leftover = (decoding @ H[:, columns]) * arms[wanted][:, None] / arms[columns]
-    return SensorAxes(names, tuple(axes), tuple(others), H, decoding, condition, leftover,
+    leftover = (decoding @ H[:, others]) * arms[wanted][:, None] / arms[others]
+    return SensorAxes(names, tuple(axes), H, decoding, condition, leftover,
                       tuple(COORDINATES[k] for k in relative), inertial)
 
 
@@ -186,7 +172,7 @@ def _absolute(H: np.ndarray, wanted: list[int], edge_m: float, noise: np.ndarray
         asked = [*found, k]
         others = [j for j in range(6) if j not in asked]
         try:
-            decoding, _ = _blind_inverse(H, asked, others, edge_m, False, "", noise)
+            decoding, _ = _blind_inverse(H, asked, others, edge_m, "", noise)
         except InputError:
             continue
         leftover = (decoding @ H[:, others]) / scale[asked][:, None] * scale[others]
@@ -215,11 +201,11 @@ def _arms(rig: Rig) -> np.ndarray:
     return 1 / _edge_scale(rig.edge_m)
 
 
-def _blind_inverse(H: np.ndarray, wanted: list[int], others: list[int], edge_m: float, exact: bool, complaint: str,
+def _blind_inverse(H: np.ndarray, wanted: list[int], others: list[int], edge_m: float, complaint: str,
                    noise: np.ndarray | None = None, order: list[int] | None = None) -> tuple[np.ndarray, float]:
     """D (n_wanted, n) with D H = I on `wanted` and as little as possible on `others`, then of least noise.
 
-    H : (n, m) by coordinates `order` (m,), by default the six. exact : refuse where `others` are not told apart, too.
+    H : (n, m) by coordinates `order` (m,), by default the six.
     Also returns the condition number of the columns inverted, each scaled to unit length.
     """
     order = list(range(6)) if order is None else order
@@ -228,10 +214,8 @@ def _blind_inverse(H: np.ndarray, wanted: list[int], others: list[int], edge_m: 
     if len(H) >= len(columns):
         lengths = np.linalg.norm(H[:, columns] * scale[columns], axis=0)
         sizes = np.linalg.svd(H[:, columns] * scale[columns], compute_uv=False)
-        if exact or (np.all(lengths > 0) and sizes[-1] > REACH.weakest * sizes[0]):
-            return _weighted(H[:, columns], [order[k] for k in columns], complaint, len(wanted), noise)
-    elif exact:
-        return _weighted(H[:, columns], [order[k] for k in columns], complaint, len(wanted), noise)
+        if np.all(lengths > 0) and sizes[-1] > REACH.weakest * sizes[0]:
+            return _weighted(H[:, columns], len(wanted), noise)
     _require_reach(H * scale, wanted, [order[k] for k in wanted], complaint)
     # Of the others, what these channels tell from the wanted ones; it is made zero, the rest is left over.
     own, rest = H[:, wanted] * scale[wanted], H[:, others] * scale[others]
@@ -239,7 +223,7 @@ def _blind_inverse(H: np.ndarray, wanted: list[int], others: list[int], edge_m: 
     _, sizes, V = np.linalg.svd(rest - basis @ (basis.T @ rest), full_matrices=False)
     kept = V[sizes > REACH.weakest * np.linalg.svd(H * scale, compute_uv=False)[0]]
     told = np.hstack([H[:, wanted], rest @ kept.T])
-    return _weighted(told, [order[k] for k in wanted], complaint, len(wanted), noise)
+    return _weighted(told, len(wanted), noise)
 
 
 def _require_reach(H: np.ndarray, wanted: list[int], coordinates: list[int], complaint: str) -> None:
@@ -252,31 +236,14 @@ def _require_reach(H: np.ndarray, wanted: list[int], coordinates: list[int], com
         raise InputError(f"{' and '.join(weak)} {complaint}", field="axes", value=[COORDINATES[k] for k in coordinates])
 
 
-def _weighted(columns: np.ndarray, coordinates: list[int], complaint: str, n_wanted: int, noise: np.ndarray | None
-              ) -> tuple[np.ndarray, float]:
+def _weighted(columns: np.ndarray, n_wanted: int, noise: np.ndarray | None) -> tuple[np.ndarray, float]:
     """First rows of the left inverse of `columns` (n, m) that is least in the noise (n,), and the condition number."""
-    plain = noise is None or bool(np.all(noise == 1))
-    inverse, condition = _inverse(columns.T, coordinates, complaint)
-    if not plain:
-        assert noise is not None
-        inverse = (np.linalg.pinv(columns / noise[:, None]) / noise).T
-    return inverse.T[:n_wanted], condition
-
-
-def _inverse(rows: np.ndarray, coordinates: list[int], complaint: str) -> tuple[np.ndarray, float]:
-    """Right inverse of least norm of `rows` (n, m), and the condition number of its unit-length rows.
-
-    coordinates : of the first rows, the ones that a complaint names.
-    """
-    asked = [COORDINATES[k] for k in coordinates]
-    lengths = np.linalg.norm(rows, axis=1)
-    if np.any(lengths == 0):
-        raise InputError(f"{asked[int(np.argmin(lengths))]} {complaint}", field="axes", value=asked)
-    left, sizes, _ = np.linalg.svd(rows / lengths[:, None], full_matrices=True)
-    if len(sizes) < len(rows) or sizes[-1] < RANK_TOLERANCE * sizes[0]:
-        weak = [name for name, share in zip(asked, np.abs(left[:, -1]), strict=False) if share > 0.1]
-        raise InputError(f"{' and '.join(weak)} {complaint}", field="axes", value=asked)
-    return np.linalg.pinv(rows), float(sizes[0] / sizes[-1])
+    sizes = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), compute_uv=False)
+    if noise is None or np.all(noise == 1):
+        inverse = np.linalg.pinv(columns.T).T
+    else:
+        inverse = np.linalg.pinv(columns / noise[:, None]) / noise
+    return inverse[:n_wanted], float(sizes[0] / sizes[-1])
 
 
 def _positions(names: Sequence[str], asked: Sequence[str], field: str) -> list[int]:

@@ -4,8 +4,7 @@ Large 3-2-1 rotations of payload and chassis; springs, dampers and actuators act
 body-fixed points; full inertia and an offset centre of mass. Gravity is not in the source: the
 levelled payload rests at q = 0 without force in its mounts, and its weight makes no moment.
 
-`payload_acceleration` works on plain arrays so that a compiled closed loop can call it at each step;
-`NonlinearRig` is the same model for Python callers.
+`payload_acceleration` works on plain arrays so that a compiled closed loop can call it at each step.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import numpy as np
 from numba import njit
 
 from avis_ctrl.rigs.mounted_body import MountedBody
-from avis_ctrl.rigs.rigid_body import body_rate_map, cross_matrix, rotation_matrix
 
 
 class RigArrays(NamedTuple):
@@ -215,40 +213,3 @@ def payload_acceleration(q, q_dot, u, q_ch, q_ch_dot, arrays):
             force[i] = arrays.actuator_force[k, i] * u[k]
         _add_force(wrench, arrays.actuator_position[k], R, force)
     return _accelerations(wrench, R, omega, q, q_dot, arrays)
-
-
-class NonlinearRig:
-    """The nonlinear model for Python callers; state = (q, q') of length 12."""
-
-    def __init__(self, body: MountedBody):
-        self.body = body
-        self.arrays = rig_arrays(body)
-
-    def derivative(self, state: np.ndarray, u: np.ndarray | None = None, q_ch: np.ndarray | None = None,
-                   q_ch_dot: np.ndarray | None = None) -> np.ndarray:
-        """d/dt (q, q') for voltages u (n_u,) and chassis motion (6,); each absent input is zero.
-
-        Complex arguments are taken as they are, for complex-step differentiation.
-        """
-        given = (state, u, q_ch, q_ch_dot)
-        kind = complex if any(np.iscomplexobj(part) for part in given if part is not None) else float
-        sizes = (12, len(self.body.actuators), 6, 6)
-        # Copies: a read-only array is another type to numba, and would be compiled for anew.
-        state, u, q_ch, q_ch_dot = (np.zeros(n, kind) if part is None else np.array(part, dtype=kind)
-                                    for part, n in zip(given, sizes, strict=True))
-        q, q_dot = state[:6], state[6:]
-        return np.concatenate([q_dot, payload_acceleration(q, q_dot, u, q_ch, q_ch_dot, self.arrays)])
-
-    def energy(self, state: np.ndarray, q_ch: np.ndarray | None = None) -> float:
-        """Kinetic plus elastic energy [J]; conserved without damping, voltage and chassis motion."""
-        q, q_dot = np.asarray(state[:6], float), np.asarray(state[6:], float)
-        q_ch = np.zeros(6) if q_ch is None else np.asarray(q_ch, float)
-        R, R_ch = rotation_matrix(q[3:]), rotation_matrix(q_ch[3:])
-        omega = body_rate_map(q[3:]) @ q_dot[3:]
-        speed = q_dot[:3] + R @ cross_matrix(omega) @ self.body.centre_of_mass
-        total = self.body.mass * speed @ speed + omega @ self.body.inertia @ omega
-        for mount in self.body.mounts:
-            stretch = (q[:3] + (R - np.eye(3)) @ mount.position
-                       - q_ch[:3] - (R_ch - np.eye(3)) @ mount.chassis_point)
-            total += stretch @ mount.stiffness @ stretch
-        return 0.5 * float(total + (q - q_ch) @ self.body.stiffness @ (q - q_ch))

@@ -7,7 +7,6 @@ Whatever is wrong is one `InputError` line that names file, field, value and wha
 
 from __future__ import annotations
 
-import tomllib
 import warnings
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from pydantic import BaseModel
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.avis import AvisTable, Isolator, LinearMotor
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
-from avis_ctrl.rigs.file_errors import validated
+from avis_ctrl.rigs.file_errors import read_toml, validated
 from avis_ctrl.rigs.halcyonics import Halcyonics, Load, ReactionMass
 from avis_ctrl.rigs.instruments import (
     AccelerometerAt,
@@ -63,23 +62,13 @@ def load_rig(path_or_name: str | Path, loaded: bool = False, check: bool = True)
         loaded, check = loaded or with_load, False
     else:
         path = Path(path_or_name)
-    content = _read_toml(path)
+    content = read_toml(path, f"a rig file or one of {', '.join(sorted(SHIPPED))}")
     try:
         if check and (unusual := plausible(content, lambda one: rig_from(one, loaded))):
             warnings.warn(UnusualRig(f"{path}: {unusual}"), stacklevel=2)
         return rig_from(content, loaded)
     except InputError as error:
         raise error.in_file(path) from None
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"expected a rig file or one of {sorted(SHIPPED)}; {error.strerror or error}",
-                         file=path) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"expected a TOML file in UTF-8; {' '.join(str(error).split())}", file=path) from None
 
 
 def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcyonics:

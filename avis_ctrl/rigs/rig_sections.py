@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator
 
 from avis_ctrl.rigs.converter import bits_of
 from avis_ctrl.rigs.equipment import Electronics
+from avis_ctrl.rigs.file_errors import Section
 from avis_ctrl.rigs.floor_spectrum import shipped_spectra
 from avis_ctrl.rigs.instruments import Tolerances
 
@@ -55,25 +56,21 @@ Band = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidat
 Spectrum = Annotated[str, AfterValidator(_shipped)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
-
-
-class AvisPayload(_Section):
+class AvisPayload(Section):
     mass_kg: Positive
     inertia_kgm2: PositiveVector
     inertia_offdiagonal_kgm2: Vector = [0.0, 0.0, 0.0]
     centre_of_mass_m: Point
 
 
-class IsolatorSection(_Section):
+class IsolatorSection(Section):
     position_m: Point
     stiffness_N_per_m: PositiveVector
     damping_Ns_per_m: DampingVector
     chassis_point_m: Point | None = None
 
 
-class MotorSection(_Section):
+class MotorSection(Section):
     """Motors in the isolators, along their axes; without any, only the limit of [[drive]] tables."""
 
     names: list[str] = []
@@ -83,7 +80,7 @@ class MotorSection(_Section):
     limit_V: Positive
 
 
-class DriveSection(_Section):
+class DriveSection(Section):
     name: Name
     position_m: Point
     direction: Direction
@@ -91,7 +88,7 @@ class DriveSection(_Section):
     limit_V: Positive | None = None
 
 
-class GeophoneSection(_Section):
+class GeophoneSection(Section):
     names: list[str]
     isolator: list[int]
     axis: list[Axis]
@@ -103,7 +100,7 @@ class GeophoneSection(_Section):
     preamplifier_gain: Positive
 
 
-class GeophoneAtSection(_Section):
+class GeophoneAtSection(Section):
     name: Name
     position_m: Point
     direction: Direction
@@ -116,7 +113,7 @@ class GeophoneAtSection(_Section):
     noise_rms_V: NotNegative | None = None
 
 
-class AccelerometerAtSection(_Section):
+class AccelerometerAtSection(Section):
     name: Name
     position_m: Point
     direction: Direction
@@ -127,7 +124,7 @@ class AccelerometerAtSection(_Section):
     noise_rms_V: NotNegative | None = None
 
 
-class PositionSensorSection(_Section):
+class PositionSensorSection(Section):
     name: Name
     position_m: Point
     direction: Direction
@@ -138,13 +135,13 @@ class PositionSensorSection(_Section):
     noise_rms_V: NotNegative | None = None
 
 
-class FloorSensorSection(_Section):
+class FloorSensorSection(Section):
     name: Name
     axis: Axis
     noise_rms_m_per_s: NotNegative
 
 
-class TolerancesSection(_Section):
+class TolerancesSection(Section):
     """One standard deviation each; what is left out takes the default."""
 
     place_m: NotNegative = Tolerances.place_m
@@ -157,7 +154,7 @@ class TolerancesSection(_Section):
     product_of_inertia_kgm2: NotNegative = Tolerances.product_of_inertia_kgm2
 
 
-class ElectronicsSection(_Section):
+class ElectronicsSection(Section):
     """Offset, 1/f noise and anti-alias filter of the channels; what is left out takes the default."""
 
     sensor_offset_V: NotNegative | None = None
@@ -175,19 +172,19 @@ class ElectronicsSection(_Section):
         return corner
 
 
-class AcquisitionSection(_Section):
+class AcquisitionSection(Section):
     sample_rate_Hz: Positive
     adc_bits: Annotated[int, BeforeValidator(bits_of)]
     adc_range_V: Positive
     loop_delay_s: NotNegative
 
 
-class AmbientSection(_Section):
+class AmbientSection(Section):
     floor_velocity_rms_m_per_s: NotNegative
     sensor_noise_rms_V: NotNegative
 
 
-class AvisFile(_Section):
+class AvisFile(Section):
     name: str
     payload: AvisPayload
     isolator: Annotated[list[IsolatorSection], Field(min_length=3)]
@@ -204,7 +201,7 @@ class AvisFile(_Section):
     electronics: ElectronicsSection = ElectronicsSection()
 
 
-class PlateSection(_Section):
+class PlateSection(Section):
     mass_kg: Positive
     inertia_kgm2: PositiveVector
     L1_m: PositiveLength
@@ -216,7 +213,7 @@ class PlateSection(_Section):
     M3_arm_m: Length = 0.15
 
 
-class SuspensionSection(_Section):
+class SuspensionSection(Section):
     """k_s_each_N_per_m : the springs at the corners of A1..A4, where they differ; k_s_N_per_m is then their mean."""
 
     k_s_N_per_m: Positive
@@ -231,7 +228,7 @@ class SuspensionSection(_Section):
     d6_Nms_per_rad: NotNegative
 
 
-class VoiceCoilSection(_Section):
+class VoiceCoilSection(Section):
     names: Annotated[list[str], Field(min_length=8, max_length=8)]
     constant_N_per_V: Annotated[list[Positive], Field(min_length=8, max_length=8)]
     reaction_mass_kg: Positive
@@ -239,7 +236,7 @@ class VoiceCoilSection(_Section):
     free_constant_N_per_V: Positive
 
 
-class AccelerometerSection(_Section):
+class AccelerometerSection(Section):
     at: Annotated[list[str], Field(min_length=1)]
     sensitivity_Vs2_per_m: Positive
     low_corner_Hz: Positive
@@ -249,7 +246,7 @@ class AccelerometerSection(_Section):
     drive_limit_V: Positive
 
 
-class LoadSection(_Section):
+class LoadSection(Section):
     mass_kg: Positive
     L7_m: Length
     L8_m: Length
@@ -262,7 +259,7 @@ class LoadSection(_Section):
     Iyz_load_kgm2: Number = 0.0
 
 
-class HalcyonicsFile(_Section):
+class HalcyonicsFile(Section):
     name: str
     payload: PlateSection
     suspension: SuspensionSection

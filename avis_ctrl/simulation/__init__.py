@@ -6,11 +6,11 @@ from avis_ctrl.simulation.design_check import PlantCheck, SimulationCheck, check
 from avis_ctrl.simulation.discrete import spectral_radius
 from avis_ctrl.simulation.loop import SimulationRecord, simulate
 from avis_ctrl.simulation.rehearsal import Rehearsal, perturbed_truth, rehearse
-from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, accelerometer_bank, geophone_bank
+from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, rig_bank
 from avis_ctrl.simulation.sampled_response import predict_transmissibility_6dof, sampled_response
 from avis_ctrl.simulation.spectrum_check import SpectrumAgreement, check_spectrum_agreement
 
 __all__ = ["CampaignPlan", "PlantCheck", "Rehearsal", "SampledLoop", "SensorBank", "SimulationCheck",
-           "SimulationRecord", "SpectrumAgreement", "accelerometer_bank", "check_designs", "check_spectrum_agreement",
-           "geophone_bank", "judge", "perturbed_truth", "predict_transmissibility_6dof", "rehearse",
+           "SimulationRecord", "SpectrumAgreement", "check_designs", "check_spectrum_agreement",
+           "judge", "perturbed_truth", "predict_transmissibility_6dof", "rehearse", "rig_bank",
            "sampled_response", "simulate", "simulate_campaign", "spectral_radius"]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
+from avis_ctrl.rigs.file_errors import Section
 from avis_ctrl.rigs.rig_sections import Band, NotNegative, Positive, Spectrum
 
 Duration = Annotated[float, Field(gt=0, le=36000)]
@@ -13,11 +14,7 @@ Percent = Annotated[float, Field(gt=0, le=100)]
 Spread = Annotated[float, Field(ge=0, lt=100)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
-
-
-class RecordPlan(_Section):
+class RecordPlan(Section):
     """One record, or a set of them at one level.
 
     level_V : r.m.s. of every drive. level_percent : instead, a share of the largest level at which neither drives nor
@@ -55,7 +52,7 @@ class RecordPlan(_Section):
         return rms
 
 
-class MultisinePlan(_Section):
+class MultisinePlan(Section):
     """As `avis_ctrl.measurement.excitation.MultisineSettings`."""
 
     period_s: Duration = 10.0
@@ -67,7 +64,7 @@ class MultisinePlan(_Section):
     low_crest: bool = True
 
 
-class AmbientPlan(_Section):
+class AmbientPlan(Section):
     """Floor motion that is always there, along x, y and z, independent: a measured shape at the level of the site.
 
     velocity_rms_m_per_s : in band_Hz; what the rig's file says where absent, 0 for a floor at rest.
@@ -78,21 +75,21 @@ class AmbientPlan(_Section):
     band_Hz: Band = [0.5, 60.0]
 
 
-class FloorSensorPlan(_Section):
+class FloorSensorPlan(Section):
     """Whether the floor's velocity is recorded, and the white noise of one sample of that measurement."""
 
     recorded: bool = True
     noise_rms_m_per_s: NotNegative = 0.0
 
 
-class SensorPlan(_Section):
+class SensorPlan(Section):
     """Switches for what the rig's file says of noise and quantiser."""
 
     noise: bool = True
     quantiser: bool = True
 
 
-class TruthPlan(_Section):
+class TruthPlan(Section):
     """How far the table that moves differs from the rig's file: each parameter by a uniform draw within these percent.
 
     perturb_percent : stiffness, mass and inertia. perturb_damping_percent : damping.
@@ -104,7 +101,7 @@ class TruthPlan(_Section):
     nonlinear: bool = True
 
 
-class CampaignPlan(_Section):
+class CampaignPlan(Section):
     """A whole campaign.
 
     settle_s : time with the drives at zero before each record, on the ambient floor.

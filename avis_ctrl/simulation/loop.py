@@ -8,8 +8,8 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.converter import require_positive
 from avis_ctrl.rigs.floor_spectrum import realise
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation import kernel

@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, gain
-from avis_ctrl.rigs.converter import Converter, require_positive
+from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel
 from avis_ctrl.rigs.instruments import ORDER
 from avis_ctrl.rigs.rig import Rig
@@ -115,20 +116,6 @@ def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
                       np.array([one.gain for one in sensors]), np.array([one.noise_rms_V for one in sensors]),
                       rig.converter, made[0] if len(set(filters)) == 1 else made,
                       np.array([one.flicker_rms_V for one in sensors]))
-
-
-def geophone_bank(rig: Rig) -> SensorBank:
-    """The sensors of a rig without accelerometers. Raises InputError where it has some."""
-    if any(one.quantity == "acceleration" for one in rig.sensors()) or rig.converter is None:
-        raise InputError("the rig has no geophones with a converter", field="geophones")
-    return rig_bank(rig, 1.0)
-
-
-def accelerometer_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
-    """The sensors of a rig with accelerometers. Raises InputError where it has none."""
-    if all(one.quantity != "acceleration" for one in rig.sensors()):
-        raise InputError("the rig has no accelerometers", field="accelerometers")
-    return rig_bank(rig, integrator_corner_Hz)
 
 
 @dataclass(frozen=True, eq=False)

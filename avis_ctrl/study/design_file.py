@@ -14,8 +14,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
-    ConfigDict,
     Field,
     ValidationInfo,
     field_serializer,
@@ -23,7 +21,7 @@ from pydantic import (
 )
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.file_errors import read_toml, validated
+from avis_ctrl.rigs.file_errors import Section, read_toml, validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import SHIPPED, load_rig
 from avis_ctrl.rigs.rig_sections import LIMIT, Band, ElectronicsSection, Spectrum
@@ -45,11 +43,7 @@ Axis = Literal["x", "y", "z", "phi_x", "phi_y", "phi_z"]
 Rival = Literal["hinf", "skyhook_classical", "skyhook"]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
-
-
-class LoopSection(_Section):
+class LoopSection(Section):
     """What lies between the controller and the rig, beyond what the rig file says."""
 
     amplifier_corner_Hz: Positive = 300.0
@@ -57,7 +51,7 @@ class LoopSection(_Section):
     pade_order: Annotated[int, Field(ge=1, le=6)] = 2
 
 
-class ChainUncertainty(_Section):
+class ChainUncertainty(Section):
     """Relative uncertainty of a chain: low at low frequency, 100 % at the crossover, high above."""
 
     low_percent: Percent
@@ -65,7 +59,7 @@ class ChainUncertainty(_Section):
     high_percent: Annotated[float, Field(gt=100, le=LIMIT)]
 
 
-class UncertaintySection(_Section):
+class UncertaintySection(Section):
     parameters_percent: dict[str, Percent] = {}
     parameters_absolute: dict[str, Positive] = {}
     actuator_chains: ChainUncertainty | None = None
@@ -113,7 +107,7 @@ class UncertaintySection(_Section):
         return list(found.values())
 
 
-class TransmissibilitySection(_Section):
+class TransmissibilitySection(Section):
     """The bound that synthesis is asked for: peak_dB everywhere, band_dB inside band_Hz."""
 
     peak_dB: Decibel
@@ -130,7 +124,7 @@ class TransmissibilitySection(_Section):
         return band_dB
 
 
-class EffortSection(_Section):
+class EffortSection(Section):
     """The floor velocity that may use the whole drive up to the bandwidth; above it the drive is rolled off.
 
     offset_percent : of the drive's range that the offset of the electronics may use. offset_corner_Hz : up to here the
@@ -144,13 +138,13 @@ class EffortSection(_Section):
     offset_corner_Hz: Positive = 0.003
 
 
-class ComplianceSection(_Section):
+class ComplianceSection(Section):
     """Largest displacement per force on the payload."""
 
     limit_m_per_N: Positive
 
 
-class FloorSection(_Section):
+class FloorSection(Section):
     """Floor motion of the site: a measured shape, scaled to a velocity r.m.s. in a band."""
 
     spectrum: Spectrum = "kamioka_quiet"
@@ -158,7 +152,7 @@ class FloorSection(_Section):
     band_Hz: Band = [0.5, 60.0]
 
 
-class SynthesisSection(_Section):
+class SynthesisSection(Section):
     """D-K iteration and its limits: only counts, so that the same file gives the same controller on any machine.
 
     max_iterations : most K-steps. target_mu : end once mu is proved below it; without it, go on while mu falls.
@@ -174,7 +168,7 @@ class SynthesisSection(_Section):
     polish: bool | None = None
 
 
-class SkyhookSection(_Section):
+class SkyhookSection(Section):
     tilt_corner_Hz: Band = [0.005, 1.0]
     roll_off_Hz: Annotated[Band, Field(validate_default=True)] = [5.0, 400.0]
 
@@ -187,7 +181,7 @@ class SkyhookSection(_Section):
         return roll_off
 
 
-class SimulationSection(_Section):
+class SimulationSection(Section):
     duration_s: Annotated[float, Field(ge=15, le=3600)] = 60.0
     random_plants: Annotated[int, Field(ge=0, le=500)] = 20
     seed: Annotated[int, Field(ge=0)] = 1
@@ -199,7 +193,7 @@ Quantity = Literal["mu_upper", "mu_gap_percent", "worst_case_peak_transmissibili
 UNITS: dict[str, str] = {"mu_upper": "", "mu_gap_percent": "%", "fastest_controller_pole_Hz": "Hz"}
 
 
-class RequirementSection(_Section):
+class RequirementSection(Section):
     """A line of the verdict table: a quantity of the mu controller and its limit."""
 
     quantity: Quantity
@@ -218,7 +212,7 @@ class RequirementSection(_Section):
         return UNITS.get(self.quantity, "dB")
 
 
-class Design(_Section):
+class Design(Section):
     """A whole design file. loaded : with the load of the rig file's [load] section on the table. electronics : keys
     in place of those of the rig file.
 

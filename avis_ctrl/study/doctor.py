@@ -95,10 +95,10 @@ def _simulation() -> str:
     """A table at rest on a still floor stays there; compiles the kernel."""
     from avis_ctrl.rigs.rig_file import load_rig
     from avis_ctrl.simulation.loop import simulate
-    from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, geophone_bank
+    from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, rig_bank
 
     rig = load_rig("avis")
-    bank = geophone_bank(rig)
+    bank = rig_bank(rig, 1.0)
     silent = SensorBank("velocity", bank.chains, bank.gain_V, np.zeros(len(bank.chains)), bank.converter)
     record = simulate(SampledLoop(rig, gain(np.zeros((1, 1))), ("z",), {}, silent, {}), 0.1, settle_s=0.0)
     if np.any(record.q):

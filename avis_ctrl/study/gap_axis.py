@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,14 +25,15 @@ MODEL_FILE = "axis_model.json"
 
 
 def write_axis_gap(folder: Path, gap: AxisGap, source: str, options: dict[str, Any],
-                   reports: Callable[[AxisGap, str, dict[str, Any]], Mapping[str, bytes]]) -> list[str]:
-    """gap.json, what `reports` makes of gap, source and provenance (`avis_ctrl.report.axis_gap_reports`: gap.html,
-    gap.pdf) and, of a drive or an oscillator, axis_model.json; their names."""
+                   reports: Callable[[AxisGap, str, dict[str, Any]], Sequence[bytes]]) -> list[str]:
+    """gap.json, gap.html and gap.pdf, which `reports` makes of gap, source and provenance, and, of a drive or an
+    oscillator, axis_model.json; their names."""
     made = {"avis_ctrl": avis_ctrl.__version__, "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "measurement": source, "inputs_sha256": hashlib.sha256(json.dumps(options, sort_keys=True, default=str
                                                                               ).encode()).hexdigest(),
             "options": options, "settings": asdict(SETTINGS)}
-    files = {"gap.json": _json({**gap.to_json(), "provenance": made}), **reports(gap, source, made)}
+    files = {"gap.json": _json({**gap.to_json(), "provenance": made}),
+             **dict(zip(("gap.html", "gap.pdf"), reports(gap, source, made), strict=True))}
     if "reading" in gap.model:
         files[MODEL_FILE] = _json({"format": "avis-axis-model", "version": 1, **gap.model})
     write_together(folder, files)

@@ -97,18 +97,6 @@ class DesignEffect:
     not_checked: dict[str, str] = field(default_factory=dict)
     uncertainty: FitUncertainty | None = None
 
-    @property
-    def mu_before(self) -> float:
-        return self.before.mu_upper
-
-    @property
-    def mu_after(self) -> float | None:
-        return self.after.mu_upper if self.after else None
-
-    @property
-    def mu_new(self) -> float | None:
-        return self.new.mu_upper if self.new else None
-
     def to_json(self) -> dict[str, Any]:
         """Figures of the three loops, infinite where a loop is unstable, and what is said of them."""
         loops = {"before": self.before, "after": self.after, "new": self.new}

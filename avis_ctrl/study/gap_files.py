@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
 from avis_ctrl.gap import line_response
@@ -23,6 +24,7 @@ from avis_ctrl.identification.predictor import model_inputs, predict
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.rigs.avis import AvisTable
+from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.study.files import as_json
@@ -42,7 +44,7 @@ UNPREDICTABLE = {"mains_hum": "the hum's phase in another campaign is not known"
                  "ground_motion": "floor motion that is not measured cannot be predicted"}
 
 
-def write_gap(folder: Path, gap: Gap, html: str | None = None, pdf: bytes | None = None,
+def write_gap(folder: Path, gap: Gap, html: bytes | None = None, pdf: bytes | None = None,
               told: Mapping[str, Any] | None = None) -> list[Path]:
     """All files or none; gap.json last, so that its presence says that the others are complete.
 
@@ -135,15 +137,7 @@ def read_gap(folder: Path) -> dict[str, Any]:
     Raises InputError where the folder holds no result of avis gap, or half of one.
     """
     path = folder / GAP_FILE
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"expected the folder of avis gap ({error.strerror or error})", file=path) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"expected JSON; {error}", file=path) from None
-    if not isinstance(found, dict) or found.get("format") != "avis-gap":
-        raise InputError("expected the result of avis gap", file=path, field="format",
-                         value=found.get("format") if isinstance(found, dict) else type(found).__name__)
+    found = read_json(path, "avis-gap", "the folder of avis gap")
     for key in ("effects", "traces"):
         effects = found.setdefault(key, []) if key == "traces" else found.get(key)
         if not isinstance(effects, list) or not all(isinstance(one, dict) and isinstance(one.get("name"), str)
@@ -209,8 +203,7 @@ def _require_fit(model: TableModel, campaign: Campaign) -> None:
     if campaign.y_unit != model.sensors.unit:
         raise InputError(f"expected {model.sensors.unit}, as in the campaign that the model was found from",
                          field="unit of y", value=campaign.y_unit)
-    if missing := [name for name in campaign.y_names if name not in model.sensors.names]:
-        raise InputError(f"the model's sensors are {', '.join(model.sensors.names)}", field="y names", value=missing)
+    places(campaign.y_names, model.sensors.names, "the model's sensors are", "y names")
 
 
 def _not_predicted(effects: Sequence[Mapping[str, Any]], campaign: Campaign) -> list[str]:

@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from avis_ctrl.checks import places
 from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.motion_estimate import clock_of
@@ -81,8 +82,7 @@ def _overlay(records: Campaign, baseline: TableModel, updated: TableModel, clock
     if measured is None:
         assert beside is not None
         measured = _regressed_on_grid(beside)
-    if missing := [name for name in measured.inputs if name not in baseline.inputs]:
-        raise InputError(f"the model's inputs are {', '.join(baseline.inputs)}", field="inputs", value=missing)
+    places(measured.inputs, baseline.inputs, "the model's inputs are", "inputs")
     rows = [measured.outputs.index(name) for name in baseline.sensors.names]
     before, after = (_response(model, measured) for model in (baseline, linear))
     value = measured.value[:, rows] + (after if measured.method.startswith(BESIDE) else 0.0)
@@ -145,14 +145,10 @@ def _simulated(records: Campaign, model: TableModel, clock: tuple[float, float])
     made = []
     for record in cast(tuple[Record, ...], records.records):
         h = record.header
-        for field, wanted, there in (("y", model.sensors.names, h.y_names), ("u", model.actuators, h.u_names)):
-            if missing := [name for name in wanted if name not in there]:
-                raise InputError(f"the record has {', '.join(there)}", field=f"record {h.name}: {field} names",
-                                 value=missing)
+        outputs = places(model.sensors.names, h.y_names, "the record has", f"record {h.name}: y names")
+        u = record.u[:, places(model.actuators, h.u_names, "the record has", f"record {h.name}: u names")]
         y = np.zeros_like(record.y)
-        u = record.u[:, [h.u_names.index(name) for name in model.actuators]]
-        y[:, [h.y_names.index(name) for name in model.sensors.names]] = simulate(
-            model, u, record.floor, h.sample_rate_Hz, start_s=h.start_s, campaign_s=clock).y
+        y[:, outputs] = simulate(model, u, record.floor, h.sample_rate_Hz, start_s=h.start_s, campaign_s=clock).y
         made.append(replace(record, y=y))
     return replace(records, records=tuple(made))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +18,7 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, ranges
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.rigs.avis import AvisTable
+from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig, rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -140,18 +140,7 @@ def _suspended(model: ResponseModel, folder: Path) -> ResponseModel:
 
 
 def _result(folder: Path) -> dict[str, Any]:
-    path = folder / RESULT_FILE
-    try:
-        result = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"expected the folder of avis identify or avis gap ({error.strerror or error})",
-                         file=path) from None
-    except ValueError as error:
-        raise InputError(f"expected JSON; {error}", file=path) from None
-    if not isinstance(result, dict) or result.get("format") != "avis-identification":
-        raise InputError("expected the result of avis identify", file=path, field="format",
-                         value=result.get("format") if isinstance(result, dict) else type(result).__name__)
-    return result
+    return read_json(folder / RESULT_FILE, "avis-identification", "the folder of avis identify or avis gap")
 
 
 def write_predictions(folder: Path, campaign: Campaign, out: Path,

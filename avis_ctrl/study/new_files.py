@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.geophone_catalogue import check_against_name, read_response
 from avis_ctrl.rigs.rig import Rig
@@ -53,8 +54,7 @@ def rig_text(new: NewRig) -> str:
         raise InputError("expected 3 or 4; write more into the file afterwards", field="mounts", value=new.mounts)
     for field in ("mass_kg", "vertical_Hz", "horizontal_Hz", "damping", "constant_N_per_V", "limit_V",
                   "sample_rate_Hz"):
-        if not (np.isfinite(value := getattr(new, field)) and value > 0):
-            raise InputError("expected a positive number", field=field, value=value)
+        require_positive(getattr(new, field), field)
     if len(new.size_m) != 3 or not all(np.isfinite(side) and side > 0 for side in new.size_m):
         raise InputError("expected three positive lengths", field="size_m", value=new.size_m)
     if not new.name.strip() or not new.name.isprintable() or set(new.name) & set('"\\'):

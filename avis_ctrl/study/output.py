@@ -21,14 +21,14 @@ FILES = STUDY, "plant.json", "sampled_controller.json", "report.html", "report.p
 FOLDERS = ("controllers",)
 
 
-def controller_dict(result: ControllerResult, units_in: str = "m/s", units_out: str = "N") -> dict[str, Any]:
+def controller_dict(result: ControllerResult) -> dict[str, Any]:
     """The contract's avis-controller form."""
     K = result.K
     if K is None:
         raise InputError("a passive rig has no controller", field="controller", value=result.name)
     return {"format": "avis-controller", "version": 1, "name": result.name, "A": K.A, "B": K.B, "C": K.C, "D": K.D,
-            "dt": K.dt, "inputs": K.inputs, "outputs": K.outputs, "input_units": [units_in] * K.ninputs,
-            "output_units": [units_out] * K.noutputs}
+            "dt": K.dt, "inputs": K.inputs, "outputs": K.outputs, "input_units": ["m/s"] * K.ninputs,
+            "output_units": ["N"] * K.noutputs}
 
 
 def result_dict(result: DesignResult) -> dict[str, Any]:

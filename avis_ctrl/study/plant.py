@@ -28,10 +28,16 @@ from avis_ctrl.study.design_file import ChainUncertainty, Design, EffortSection
 from avis_ctrl.study.identified_uncertainty import RESPONSE, InDesign, in_design
 from avis_ctrl.uncertainty.blocks import ComplexFull
 from avis_ctrl.uncertainty.generalized_plant import Diagram, GeneralizedPlant
-from avis_ctrl.uncertainty.performance_weights import Band, ComplianceBound, ControlEffort, TransmissibilityBound
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain, UncertainRig, uncertain_rig
 from avis_ctrl.uncertainty.weight_base import Weight
-from avis_ctrl.uncertainty.weights import FlickerNoise, NeglectedDynamics
+from avis_ctrl.uncertainty.weights import (
+    Band,
+    ComplianceBound,
+    ControlEffort,
+    FlickerNoise,
+    NeglectedDynamics,
+    TransmissibilityBound,
+)
 
 # Of the weight on the drives in `DesignPlant.weights`; followed by the axis where the drives' limits differ.
 EFFORT = "control effort"

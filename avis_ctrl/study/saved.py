@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.file_errors import validated
+from avis_ctrl.rigs.file_errors import read_json, validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -22,25 +21,6 @@ def study_dict(design: Design, rig: Rig) -> dict[str, Any]:
     """The inputs of a study; the rig as the text of a rig file. Raises InputError for a rig that has no file form."""
     return {"format": "avis-study", "version": 1, "design": design.model_dump(), "rig": rig_toml(rig),
             "loaded": getattr(rig, "load", None) is not None}
-
-
-def read_json(path: Path, form: str) -> dict[str, Any]:
-    """The content of a JSON file of that format.
-
-    Raises
-    ------
-    InputError : no such file, no JSON, another format.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"expected a file of avis design ({error.strerror or error})", file=path) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"expected JSON; {' '.join(str(error).split())}", file=path) from None
-    found = content.get("format") if isinstance(content, dict) else None
-    if found != form:
-        raise InputError(f"expected {form!r}", file=path, field="format", value=found)
-    return content
 
 
 def read_saved(folder: Path) -> tuple[Design, Rig]:

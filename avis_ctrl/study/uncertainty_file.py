@@ -7,16 +7,15 @@ follows from the design's coordinates, its confidence and what it declares itsel
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.spread import FrfSpread
-from avis_ctrl.rigs.file_errors import first_complaint
+from avis_ctrl.rigs.file_errors import Section, read_json, validated
 from avis_ctrl.rigs.rig import Rig
 
 # An isolation table has a few dozen parameters; more in a file is no uncertainty of a rig.
@@ -30,11 +29,7 @@ Share = Annotated[float, Field(gt=0, lt=1)]
 Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
-
-
-class ParameterSection(_Section):
+class ParameterSection(Section):
     """An identified parameter; scale is what one relative unit of it is."""
 
     name: str
@@ -43,14 +38,14 @@ class ParameterSection(_Section):
     scale: Positive
 
 
-class DirectionSection(_Section):
+class DirectionSection(Section):
     """A determined combination: relative standard deviation and its unit vector in relative parameters."""
 
     standard_deviation: NotNegative
     vector: list[Finite]
 
 
-class WeightSection(_Section):
+class WeightSection(Section):
     """The filter of lowest order that covers the spread alone, for a reader of the file; roots in rad/s.
 
     Of lines that noise drowns it covers the 100 % that designs assume there.
@@ -63,7 +58,7 @@ class WeightSection(_Section):
     slack_dB: NotNegative
 
 
-class SpreadSection(_Section):
+class SpreadSection(Section):
     """Largest singular value of the relative error in the kept coordinates: as measured, and quantiles of its noise."""
 
     keep: Annotated[list[str], Field(min_length=1)]
@@ -88,7 +83,7 @@ class SpreadSection(_Section):
                          tuple(self.confidence))
 
 
-class UncertaintyFile(_Section):
+class UncertaintyFile(Section):
     """The content of uncertainty.json."""
 
     format: Literal["avis-uncertainty"]
@@ -157,20 +152,10 @@ def read_uncertainty(path: str | Path) -> UncertaintyFile:
     InputError : one line naming file, field, value and what was expected.
     """
     path = Path(path)
+    content = read_json(path, "avis-uncertainty", "the uncertainty.json of an identification")
     try:
-        table = json.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError("no such file; expected the uncertainty.json of an identification", file=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"expected a JSON file in UTF-8; {' '.join(str(error).split())}", file=path) from None
-    if not isinstance(table, dict):
-        raise InputError("expected a JSON file with the keys of an uncertainty", file=path)
-    try:
-        return UncertaintyFile.model_validate(table)
-    except ValidationError as error:
-        found = first_complaint(error, UncertaintyFile)
+        return validated(UncertaintyFile, content, path)
+    except InputError as error:
         # What contradicts itself is a whole section, too long for a line.
-        value = None if isinstance(found.value, (dict, list)) else found.value
-        raise InputError(found.expected, file=path, field=found.field or None, value=value) from None
+        value = None if isinstance(error.value, (dict, list)) else error.value
+        raise InputError(error.expected, file=path, field=error.field or None, value=value) from None

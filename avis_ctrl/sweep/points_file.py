@@ -6,16 +6,12 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from avis_ctrl.rigs.file_errors import read_toml, validated
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+from avis_ctrl.rigs.file_errors import Section, read_toml, validated
 
 
-class RandomSection(_Section):
+class RandomSection(Section):
     """Values drawn between two ends, evenly ("linear") or evenly in their logarithm ("log")."""
 
     count: Annotated[int, Field(ge=1)]
@@ -39,7 +35,7 @@ class RandomSection(_Section):
         return math.exp(math.log(self.low) + fraction * (math.log(self.high) - math.log(self.low)))
 
 
-class VarySection(_Section):
+class VarySection(Section):
     """A key and its values: a list, or random ones."""
 
     key: Annotated[str, Field(min_length=1)]
@@ -53,7 +49,7 @@ class VarySection(_Section):
         return self
 
 
-class PointsFile(_Section):
+class PointsFile(Section):
     """A whole file of points.
 
     base : a design file; of kind "gap" a campaign; of kind "function" FILE.py:NAME. rig : of kind "gap" only.

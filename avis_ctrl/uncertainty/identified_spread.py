@@ -8,9 +8,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from avis_ctrl.checks import require
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.rational import Rational
-from avis_ctrl.uncertainty.weight_base import Role, Weight, require, smallest_cover
+from avis_ctrl.uncertainty.weight_base import Role, Weight, smallest_cover
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
 POINTS_PER_OCTAVE = 8

@@ -37,7 +37,6 @@ class Rig(Protocol):
     def parameters(self) -> dict[str, Any]: ...
     def with_parameters(self, values: dict[str, float]) -> Any: ...
     def equations_of_motion(self) -> Any: ...
-    def sensor_rows(self) -> tuple[Any, np.ndarray]: ...
 
 
 @dataclass(frozen=True)
@@ -187,15 +186,13 @@ def edge_name(coordinate: str) -> str:
     return f"{coordinate}_edge" if coordinate.startswith("phi") else coordinate
 
 
-def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str] = ("z", "phi_x"),
-                  sensor_names: Sequence[str] | None = None) -> UncertainRig:
+def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str] = ("z", "phi_x")) -> UncertainRig:
     """Pull uncertain parameters out of a rig; coordinates not kept are locked at rest.
 
     Parameters
     ----------
     parameters : uncertain ones and directions, by the rig's own names (`rig.parameters()`); a parameter may be both.
     keep : coordinates that move.
-    sensor_names : sensors along which velocity and acceleration are brought out.
 
     Raises
     ------
@@ -236,10 +233,9 @@ def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str]
     coefficients = {exponents: matrix / np.prod(stretch ** np.array(exponents, float))
                     for exponents, matrix in polynomial_coefficients(N, len(parameters), cubic=any(
                         isinstance(p, UncertainDirection) for p in parameters)).items()}
-    seen = _sensor_rows(rig, sensor_names, kept, scale)
     names = tuple(edge_name(name) for name in keep)
     lft = _pull_out(coefficients, len(parameters))
-    system = _realise(lft, names, equations.actuators, seen, [p.name for p in parameters])
+    system = _realise(lft, names, equations.actuators, [p.name for p in parameters])
     # A parameter of coordinates that are locked has no copy left.
     felt = [(p, copies) for p, copies in zip(parameters, lft.copies, strict=True) if copies]
     blocks = BlockStructure(tuple(RealScalar(copies, p.name) for p, copies in felt))
@@ -264,16 +260,6 @@ def _stacked(equations: Any, kept: list[int], scale: np.ndarray) -> np.ndarray:
     S = np.diag(scale)
     squares = [S @ X[np.ix_(kept, kept)] @ S for X in (equations.M, equations.C, equations.K)]
     return np.hstack([*squares, -S @ equations.T[kept]])
-
-
-def _sensor_rows(rig: Rig, names: Sequence[str] | None, kept: list[int],
-                 scale: np.ndarray) -> dict[str, np.ndarray]:
-    if not names:
-        return {}
-    available, rows = rig.sensor_rows()
-    if missing := [name for name in names if name not in available]:
-        raise InputError(f"the rig's sensors are {list(available)}", field="sensors", value=missing)
-    return {name: rows[list(available).index(name)][kept] * scale for name in names}
 
 
 def _factor(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -328,7 +314,7 @@ def _pull_out(coefficients: dict[Exponents, np.ndarray], n_parameters: int) -> _
     return _StaticLft(M[total:, total:], M[total:, :total], M[:total, total:], M[:total, :total], copies)
 
 
-def _realise(lft: _StaticLft, coordinates: tuple[str, ...], actuators: Sequence[str], rows: dict[str, np.ndarray],
+def _realise(lft: _StaticLft, coordinates: tuple[str, ...], actuators: Sequence[str],
              parameters: list[str]) -> StateSpace:
     """State space of the LFT with x = (r, v) and inputs e = (w_delta, u, v_f, f)."""
     n, m, total = len(coordinates), len(actuators), sum(lft.copies)
@@ -346,12 +332,11 @@ def _realise(lft: _StaticLft, coordinates: tuple[str, ...], actuators: Sequence[
     # v = (v - v_f) + v_f
     velocity_x, velocity_e = S_x[n:2 * n], S_e[n:2 * n].copy()
     velocity_e[:, v_f] += np.eye(n)
-    sense = np.array(list(rows.values())).reshape(len(rows), n)
     z_e = lft.R @ S_e
     z_e[:, w] += lft.W
     A, B = np.vstack([S_x[n:2 * n], S_x[:n]]), np.vstack([S_e[n:2 * n], S_e[:n]])
-    C = np.vstack([lft.R @ S_x, S_x[2 * n:3 * n], velocity_x, S_x[:n], sense @ velocity_x, sense @ S_x[:n]])
-    D = np.vstack([z_e, S_e[2 * n:3 * n], velocity_e, S_e[:n], sense @ velocity_e, sense @ S_e[:n]])
+    C = np.vstack([lft.R @ S_x, S_x[2 * n:3 * n], velocity_x, S_x[:n]])
+    D = np.vstack([z_e, S_e[2 * n:3 * n], velocity_e, S_e[:n]])
 
     # python-control forbids dots in signal names.
     tags = [name.replace(".", "_") + (f"[{c}]" if copies > 1 else "")
@@ -359,7 +344,6 @@ def _realise(lft: _StaticLft, coordinates: tuple[str, ...], actuators: Sequence[
     inputs = [*(f"w:{tag}" for tag in tags), *actuators, *(f"floor_{name}_dot" for name in coordinates),
               *(f"force_{name}" for name in coordinates)]
     outputs = [*(f"z:{tag}" for tag in tags), *(f"{name}_rel" for name in coordinates),
-               *(f"{name}_dot" for name in coordinates), *(f"{name}_ddot" for name in coordinates),
-               *(f"{name}_dot" for name in rows), *(f"{name}_ddot" for name in rows)]
+               *(f"{name}_dot" for name in coordinates), *(f"{name}_ddot" for name in coordinates)]
     states = [*(f"{name}_rel" for name in coordinates), *(f"{name}_dot" for name in coordinates)]
     return StateSpace(A, B, C, D, 0.0, tuple(inputs), tuple(outputs), tuple(states))

@@ -1,41 +1,240 @@
-"""Weighting filters with a physical meaning: how large what comes in can be, and a user's own filter.
-
-The weights on what is to stay small are written in `performance_weights`; all are reachable from here.
-"""
+"""Weighting filters with a physical meaning: transmissibility, compliance, control effort, neglected dynamics, 1/f
+noise."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
 
+from avis_ctrl.checks import require, require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.rational import Rational
-from avis_ctrl.rigs.floor_motion import Quantity
-from avis_ctrl.rigs.floor_spectrum import ONE_SIDED, SpectrumModel
-from avis_ctrl.rigs.geophone import SensorChain
-from avis_ctrl.uncertainty.performance_weights import (
-    Band,
-    ComplianceBound,
-    ControlEffort,
-    TransmissibilityBound,
-    VibrationCriterion,
-)
-from avis_ctrl.uncertainty.weight_base import (
-    Role,
-    SamplingCheck,
-    Weight,
-    require,
-    sampling_feasibility,
-    smallest_cover,
-)
+from avis_ctrl.uncertainty.weight_base import Role, Weight, smallest_cover
 
-__all__ = ["Band", "ComplianceBound", "ControlEffort", "FlickerNoise", "FloorMotion", "NeglectedDynamics",
-           "RationalWeight", "SamplingCheck", "SensorNoise", "TransmissibilityBound", "VibrationCriterion", "Weight",
-           "sampling_feasibility"]
+
+@dataclass(frozen=True)
+class Band:
+    """A limit [dB] from low_Hz to high_Hz, in place of the overall one."""
+
+    low_Hz: float
+    high_Hz: float
+    limit_dB: float
+
+    def __post_init__(self) -> None:
+        require(self.low_Hz, "low_Hz")
+        require(self.high_Hz, "high_Hz", self.low_Hz)
+        require(self.limit_dB, "limit_dB", -200.0, 200.0)
+
+
+@dataclass(frozen=True)
+class TransmissibilityBound(Weight):
+    """Payload motion over floor motion: at most `overall_dB`, and in each band at most that band's limit.
+
+    A rational filter cannot step. It is never laxer than what is asked anywhere on the grid; within
+    `transition_octaves` outside a stricter band it may be stricter than asked, elsewhere by at most
+    `tolerance_dB`. The order is the smallest that does this.
+
+    Parameters
+    ----------
+    overall_dB : limit outside the bands.
+    bands : they must not overlap.
+    relaxed_below_Hz, relaxed_above_Hz : nothing is asked beyond (None: asked from a hundredth of the lowest to a
+        hundred times the highest frequency named, and the filter is flat outside).
+    """
+
+    overall_dB: float = 4.0
+    bands: tuple[Band, ...] = ()
+    transition_octaves: float = 0.5
+    tolerance_dB: float = 0.5
+    relaxed_below_Hz: float | None = None
+    relaxed_above_Hz: float | None = None
+    max_order: int = 8
+
+    role: ClassVar[Role] = "limit"
+    unit: ClassVar[str] = "m/m"
+
+    def __post_init__(self) -> None:
+        require(self.overall_dB, "overall_dB", -200.0, 200.0)
+        require(self.transition_octaves, "transition_octaves")
+        require(self.tolerance_dB, "tolerance_dB")
+        ordered = sorted(self.bands, key=lambda band: band.low_Hz)
+        for first, second in pairwise(ordered):
+            if second.low_Hz < first.high_Hz:
+                raise InputError(f"bands that do not overlap; {first.low_Hz:g} to {first.high_Hz:g} Hz and "
+                                 f"{second.low_Hz:g} to {second.high_Hz:g} Hz do", field="bands")
+        for field in ("relaxed_below_Hz", "relaxed_above_Hz"):
+            if getattr(self, field) is not None:
+                require(getattr(self, field), field)
+
+    def asked(self, omega: np.ndarray) -> np.ndarray:
+        """The limit as specified, with its steps; inf where nothing is asked."""
+        # A band owns its edges in spite of the rounding of 2 pi f.
+        f, slack = np.asarray(omega, float) / (2 * np.pi), 1e-12
+        limit = np.full(f.shape, 10 ** (self.overall_dB / 20))
+        for band in self.bands:
+            inside = (f >= band.low_Hz * (1 - slack)) & (f <= band.high_Hz * (1 + slack))
+            limit = np.where(inside, 10 ** (band.limit_dB / 20), limit)
+        low, high = self.relaxed_below_Hz or 0.0, self.relaxed_above_Hz or np.inf
+        return np.where((f < low) | (f > high), np.inf, limit)
+
+    @cached_property
+    def shape(self) -> Rational:
+        if not self.bands and self.relaxed_below_Hz is None and self.relaxed_above_Hz is None:
+            return Rational(10 ** (-self.overall_dB / 20))
+        omega = 2 * np.pi * self._grid(120, 15)
+        lower = 1.0 / self.asked(omega)
+        window = 2.0 ** self.transition_octaves
+        first = np.searchsorted(omega, omega / window * (1 - 1e-9))
+        last = np.searchsorted(omega, omega * window * (1 + 1e-9))
+        upper = np.array([np.max(lower[i:j]) for i, j in zip(first, last, strict=True)])
+        # Where nothing is asked the filter may fall as it likes, but not rise.
+        usual = 10 ** (-self.overall_dB / 20)
+        upper = np.where(upper > 0, upper, usual)
+        level = np.log(np.where(lower > 0, lower, usual))
+        # The search starts from straight flanks, in double-logarithmic axes, across the transitions.
+        slope = np.ptp(level) / np.log(window)
+        distance = np.abs(np.log(omega[:, None] / omega))
+        target = np.exp(np.max(level - slope * distance, axis=1))
+        lower = np.where(lower > 0, lower, 1e-4 * usual)
+        shape = smallest_cover(omega, lower, upper, self.tolerance_dB, self.max_order, "the transmissibility bound",
+                               target)
+        dense = 2 * np.pi * self._grid(4000, 400)
+        # 1e-4 covers what may hide between the dense points.
+        return shape.scaled(max(1.0, float(np.max(1.0 / (self.asked(dense) * shape.magnitude(dense)))) * (1 + 1e-4)))
+
+    def _grid(self, points: int, fine_points: int) -> np.ndarray:
+        """Frequencies [Hz], evenly spaced in logarithm, dense about every step and on both sides of it."""
+        steps = [edge for band in self.bands for edge in (band.low_Hz, band.high_Hz)]
+        steps += [f for f in (self.relaxed_below_Hz, self.relaxed_above_Hz) if f is not None]
+        window = 2.0 ** self.transition_octaves
+        fine = [np.geomspace(f / window, f * window, fine_points) for f in steps]
+        sides = [f * (1 + side) for f in steps for side in (-1e-6, 0.0, 1e-6)]
+        grid = np.sort(np.concatenate([np.geomspace(min(steps) / 100, max(steps) * 100, points), *fine, sides]))
+        return grid[np.concatenate([[True], np.diff(grid) > 1e-9 * grid[1:]])]
+
+    @property
+    def meaning(self) -> str:
+        parts = [f"at most {band.limit_dB:+g} dB from {band.low_Hz:g} to {band.high_Hz:g} Hz" for band in self.bands]
+        return (f"transmissibility at most {self.overall_dB:+g} dB" + "".join(f", {part}" for part in parts)
+                + f"; realised with {self.shape.order} states, stricter than this bound by up to "
+                  f"{self.tolerance_dB:g} dB, and by more within {self.transition_octaves:g} octave of a stricter band")
+
+
+@dataclass(frozen=True)
+class ComplianceBound(Weight):
+    """Payload displacement per force on the payload: at most limit_m_per_N.
+
+    Parameters
+    ----------
+    limit_m_per_N : limit in the middle band.
+    static_limit_m_per_N, corner_Hz : below the corner the limit rises to this (a velocity sensor cannot stiffen the rig
+        at rest); both or neither.
+    relaxed_above_Hz : above it the limit rises as frequency (the payload's mass takes over).
+    """
+
+    limit_m_per_N: float
+    static_limit_m_per_N: float | None = None
+    corner_Hz: float | None = None
+    relaxed_above_Hz: float | None = None
+
+    role: ClassVar[Role] = "limit"
+    unit: ClassVar[str] = "m/N"
+
+    def __post_init__(self) -> None:
+        require(self.limit_m_per_N, "limit_m_per_N")
+        if (self.static_limit_m_per_N is None) != (self.corner_Hz is None):
+            raise InputError("static_limit_m_per_N and corner_Hz belong together: give both or neither",
+                             field="corner_Hz", value=self.corner_Hz)
+        if self.static_limit_m_per_N is not None and self.corner_Hz is not None:
+            require(self.static_limit_m_per_N, "static_limit_m_per_N", self.limit_m_per_N)
+            require(self.corner_Hz, "corner_Hz")
+        if self.relaxed_above_Hz is not None:
+            require(self.relaxed_above_Hz, "relaxed_above_Hz")
+
+    @cached_property
+    def shape(self) -> Rational:
+        gain, zeros, poles = 1.0 / self.limit_m_per_N, [], []
+        if self.static_limit_m_per_N is not None and self.corner_Hz is not None:
+            poles.append(2 * np.pi * self.corner_Hz)
+            zeros.append(poles[0] * self.limit_m_per_N / self.static_limit_m_per_N)
+        if self.relaxed_above_Hz is not None:
+            poles.append(2 * np.pi * self.relaxed_above_Hz)
+            gain *= poles[-1]
+        return Rational(gain, real_zeros=tuple(zeros), real_poles=tuple(poles))
+
+    @property
+    def meaning(self) -> str:
+        text = f"compliance at most {self.limit_m_per_N:.3g} m/N"
+        if self.static_limit_m_per_N is not None:
+            text += f", rising below {self.corner_Hz:g} Hz to {self.static_limit_m_per_N:.3g} m/N at rest"
+        return text + (f", rising above {self.relaxed_above_Hz:g} Hz" if self.relaxed_above_Hz else "")
+
+
+@dataclass(frozen=True)
+class ControlEffort(Weight):
+    """Voltage of an actuator: at most its limit when the normalised disturbance has the level expected.
+
+    W = (level / limit) ((s/wb + 1)/(s/(R wb) + 1))^order: up to wb the whole limit may be used, far above it only
+    a share 1/R^order, which rolls the controller off. Below a corner w0 it is larger by the factor (s + k w0)/(s + w0),
+    k = sqrt(1 + offset^2), which rolls the controller off towards zero frequency.
+
+    Parameters
+    ----------
+    limit_V : actuator limit.
+    disturbance_level : size of the disturbance, in the unit of the plant's disturbance input, that may use it all.
+    bandwidth_Hz : wb; None for a constant weight.
+    reduction : R > 1, how much less is allowed per order far above wb.
+    order : 1 or 2.
+    offset, offset_corner_Hz : at rest, of the same input, an offset that large over its unit; up to the corner it may
+        drift. 0 for none.
+    """
+
+    limit_V: float
+    disturbance_level: float = 1.0
+    bandwidth_Hz: float | None = None
+    reduction: float = 10.0
+    order: int = 1
+    offset: float = 0.0
+    offset_corner_Hz: float = 0.003
+
+    role: ClassVar[Role] = "limit"
+    unit: ClassVar[str] = "V per unit of disturbance"
+
+    def __post_init__(self) -> None:
+        require(self.limit_V, "limit_V")
+        require(self.disturbance_level, "disturbance_level")
+        require(self.reduction, "reduction", 1.0)
+        if self.bandwidth_Hz is not None:
+            require(self.bandwidth_Hz, "bandwidth_Hz")
+        require(self.offset_corner_Hz, "offset_corner_Hz")
+        require_positive(self.offset, "offset", zero_allowed=True)
+        if self.order not in (1, 2):
+            raise InputError("1 or 2", field="order", value=self.order)
+
+    @cached_property
+    def shape(self) -> Rational:
+        gain, w0 = self.disturbance_level / self.limit_V, 2 * np.pi * self.offset_corner_Hz
+        zeros, poles = ((w0 * np.hypot(1, self.offset),), (w0,)) if self.offset else ((), ())
+        if self.bandwidth_Hz is None:
+            return Rational(gain, real_zeros=zeros, real_poles=poles)
+        wb = 2 * np.pi * self.bandwidth_Hz
+        return Rational(gain * self.reduction ** self.order, real_zeros=(*zeros, *(wb,) * self.order),
+                        real_poles=(*poles, *(self.reduction * wb,) * self.order))
+
+    @property
+    def meaning(self) -> str:
+        text = f"at most {self.limit_V:g} V when the disturbance has the level {self.disturbance_level:.3g}"
+        if self.offset:
+            text += (f"; {np.hypot(1, self.offset):.3g} times stricter below {self.offset_corner_Hz:g} Hz, for the "
+                     "offset of the electronics")
+        if self.bandwidth_Hz is None:
+            return text
+        return text + (f" up to {self.bandwidth_Hz:g} Hz, falling with order {self.order} to a fraction "
+                       f"{self.reduction ** -self.order:.2g} of it")
 
 
 @dataclass(frozen=True)
@@ -58,8 +257,7 @@ class FlickerNoise(Weight):
 
     def __post_init__(self) -> None:
         require(self.lowest_Hz, "lowest_Hz")
-        if not 0 <= self.flicker < np.inf:
-            raise InputError("a finite number, zero or positive", field="flicker", value=self.flicker)
+        require_positive(self.flicker, "flicker", zero_allowed=True)
 
     def asked(self, omega: np.ndarray) -> np.ndarray:
         """The density over that of the white noise, at omega > 0 [rad/s]."""
@@ -79,80 +277,6 @@ class FlickerNoise(Weight):
     def meaning(self) -> str:
         return (f"1/f noise of the sensors' electronics over their white noise, corner {self.flicker ** 2:.3g} Hz; "
                 f"constant below {self.lowest_Hz:g} Hz; realised with {self.shape.order} states")
-
-
-@dataclass(frozen=True, eq=False)
-class SensorNoise(Weight):
-    """Noise of a sensor chain: the filter covers its one-sided density with the smallest order.
-
-    Parameters
-    ----------
-    omega : (n,) frequencies [rad/s].
-    density : (n,) one-sided density [unit/sqrt(Hz)].
-    of_what : words for the report.
-    """
-
-    omega: np.ndarray
-    density: np.ndarray
-    of_what: str = "sensor noise"
-    tolerance_dB: float = 0.5
-    max_order: int = 6
-
-    role: ClassVar[Role] = "level"
-    unit: ClassVar[str] = "unit of the signal/sqrt(Hz)"
-
-    @staticmethod
-    def from_chain(chain: SensorChain, low_Hz: float = 0.1, as_velocity: bool = False) -> SensorNoise:
-        """The chain's noise from low_Hz to half its sample rate: in volts at the converter, or as case velocity."""
-        high = chain.converter.sample_rate_Hz / 2
-        require(low_Hz, "low_Hz", 0.0, high)
-        omega = 2 * np.pi * np.geomspace(low_Hz, high, 120)
-        density = chain.velocity_noise_density(omega) if as_velocity else chain.noise_density(omega)
-        return SensorNoise(omega, density, "equivalent velocity noise, m/s/sqrt(Hz)" if as_velocity
-                           else "voltage noise at the converter, V/sqrt(Hz)")
-
-    @cached_property
-    def shape(self) -> Rational:
-        return smallest_cover(self.omega, self.density, self.density, self.tolerance_dB, self.max_order,
-                              "the noise density")
-
-    @property
-    def meaning(self) -> str:
-        return (f"{self.of_what}: {np.min(self.density):.3g} to {np.max(self.density):.3g} from "
-                f"{self.omega[0] / (2 * np.pi):.3g} to {self.omega[-1] / (2 * np.pi):.3g} Hz")
-
-
-@dataclass(frozen=True)
-class FloorMotion(Weight):
-    """Floor motion: the magnitude is the one-sided density of a spectrum model, per sqrt(Hz).
-
-    As a velocity the model's displacement is multiplied by s + w instead of s, w a tenth of the lowest modelled
-    frequency, so that the filter keeps a stable inverse; inside the modelled band that adds at most 0.5 %.
-    """
-
-    spectrum: SpectrumModel
-    quantity: Quantity = "velocity"
-
-    role: ClassVar[Role] = "level"
-    unit: ClassVar[str] = "m or m/s per sqrt(Hz)"
-
-    def __post_init__(self) -> None:
-        if self.quantity not in ("displacement", "velocity"):
-            raise InputError("displacement or velocity", field="quantity", value=self.quantity)
-
-    @cached_property
-    def shape(self) -> Rational:
-        shape = self.spectrum.shape.scaled(ONE_SIDED)
-        if self.quantity == "displacement":
-            return shape
-        slow = 2 * np.pi * self.spectrum.low_Hz / 10
-        return Rational(shape.gain, shape.zero_pairs, shape.pole_pairs, (*shape.real_zeros, slow), shape.real_poles)
-
-    @property
-    def meaning(self) -> str:
-        model = self.spectrum
-        return (f"floor {self.quantity} of {model.name}, {model.low_Hz:.3g} to {model.high_Hz:.3g} Hz, fitted within "
-                f"{model.error_rms_dB:.2g} dB r.m.s. ({model.source})")
 
 
 @dataclass(frozen=True)
@@ -193,70 +317,3 @@ class NeglectedDynamics(Weight):
     def meaning(self) -> str:
         return (f"relative uncertainty {100 * self.low:g} % at low frequency, 100 % at {self.crossover_Hz:g} Hz, "
                 f"{100 * self.high:g} % at high frequency, order {self.order}")
-
-
-@dataclass(frozen=True)
-class RationalWeight(Weight):
-    """A user's own filter: leading * prod(s - zeros) / prod(s - poles), roots in rad/s.
-
-    Parameters
-    ----------
-    of_what : words for the report.
-    bounded : "limit" (an output is to stay below 1/|W|) or "level" (an input is as large as |W|).
-    unit_name : unit of the bound.
-
-    Raises
-    ------
-    InputError : improper, a pole or zero on or right of the imaginary axis, a root that is not finite or lacks its
-        conjugate, a leading coefficient that is not positive.
-    """
-
-    zeros: tuple[complex, ...]
-    poles: tuple[complex, ...]
-    leading: float
-    of_what: str = "user's weight"
-    bounded: Role = "limit"
-    unit_name: str = ""
-
-    def __post_init__(self) -> None:
-        if self.bounded not in ("limit", "level"):
-            raise InputError("limit or level", field="bounded", value=self.bounded)
-        require(self.leading, "leading")
-        if len(self.zeros) > len(self.poles):
-            raise InputError(f"improper: {len(self.zeros)} zeros over {len(self.poles)} poles; at least as many poles "
-                             "as zeros", field="zeros")
-        _ = self.shape
-
-    @staticmethod
-    def from_polynomials(numerator: Sequence[float], denominator: Sequence[float], of_what: str = "user's weight",
-                         bounded: Role = "limit", unit_name: str = "") -> RationalWeight:
-        """From coefficients by descending power of s; an overall sign is dropped (it changes no bound)."""
-        coefficients = {}
-        for field, given in (("numerator", numerator), ("denominator", denominator)):
-            try:
-                c = np.trim_zeros(np.atleast_1d(np.asarray(given, float)), "f")
-            except (TypeError, ValueError):
-                c = np.zeros(0)
-            if not c.size or c.ndim != 1 or not np.all(np.isfinite(c)):
-                raise InputError("finite coefficients, not all zero", field=field, value=given)
-            coefficients[field] = c
-        num, den = coefficients["numerator"], coefficients["denominator"]
-        return RationalWeight(tuple(np.roots(num).astype(complex)), tuple(np.roots(den).astype(complex)),
-                              float(abs(num[0] / den[0])), of_what, bounded, unit_name)
-
-    @property
-    def role(self) -> Role:  # type: ignore[override]
-        return self.bounded
-
-    @property
-    def unit(self) -> str:  # type: ignore[override]
-        return self.unit_name
-
-    @cached_property
-    def shape(self) -> Rational:
-        return Rational.from_roots(self.zeros, self.poles, self.leading)
-
-    @property
-    def meaning(self) -> str:
-        verb = "to stay below 1/|W|" if self.bounded == "limit" else "as large as |W|"
-        return f"{self.of_what}, {verb}, {self.shape.order} states" + (f" [{self.unit_name}]" if self.unit_name else "")

@@ -402,8 +402,8 @@ def values_at(name, place):
     values, parameters = VALUES[name], OWN[name].parameters(MOVING, place)
     if name == "cable_stiffness" and place.endswith("oblique"):
         values = [20.0, -15.0, 10.0, *values[3:]]
-    if name == "attached_oscillator" and place.endswith("axes"):
-        values = [10.0, 12.0, 9.0, 15.0, *values[4:]]
+    if name == "attached_oscillator" and place.endswith(("axes", "turned")):
+        values = [10.0, 12.0, 9.0, 15.0, *values[4:], 0.2, -0.1, 0.3]
     if name == "cubic_stiffness" and place.endswith("polynomial"):
         values = [values[0], 1e8, 1e22, *values[1:]]
     return values[:len(parameters)]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from assembled_table import Assembly, mount_map
 from noise_fit import fitted, reported
+from scipy.linalg import expm
 
 from avis_ctrl.gap.effects.impedance import peaks
 from avis_ctrl.gap.effects.library import library
@@ -57,9 +58,13 @@ def sprung_table(directions, frequencies):
 
 ONE = ([ALONG], [14.0], "payload/oblique", [*(np.sqrt(MASS) * ALONG), 14.0, ZETA, *PLACE])
 THREE = (list(np.eye(3)), [14.0, 9.0, 21.0], "payload/axes", [MASS, 14.0, 9.0, 21.0, ZETA, *PLACE])
+TURN = [0.4, -0.3, 0.5]
+TURNED = (list(expm(np.cross(np.eye(3), TURN)).T), [14.0, 9.0, 21.0], "payload/turned",
+          [MASS, 14.0, 9.0, 21.0, ZETA, *PLACE, *TURN])
+SPRUNG = [ONE, THREE, TURNED]
 
 
-@pytest.mark.parametrize(("directions", "frequencies", "place", "values"), [ONE, THREE], ids=["one", "three"])
+@pytest.mark.parametrize(("directions", "frequencies", "place", "values"), SPRUNG, ids=["one", "three", "turned"])
 def test_sprung_mass_is_masses_on_springs(directions, frequencies, place, values):
     model, table = with_effect("attached_oscillator", place, values), sprung_table(directions, frequencies)
     true = table.response(F)
@@ -67,7 +72,7 @@ def test_sprung_mass_is_masses_on_springs(directions, frequencies, place, values
     assert differ(BARE.response(2 * np.pi * F), true) > 1e-2
 
 
-@pytest.mark.parametrize(("directions", "frequencies", "place", "values"), [ONE, THREE], ids=["one", "three"])
+@pytest.mark.parametrize(("directions", "frequencies", "place", "values"), SPRUNG, ids=["one", "three", "turned"])
 def test_transients_hold_whatever_the_mass_starts_with(directions, frequencies, place, values):
     """R inv(s^2 M + s C + K) ((s M + C) z0 + M v0) with the masses displaced and moving, in real coefficients."""
     model, table = with_effect("attached_oscillator", place, values), sprung_table(directions, frequencies)

@@ -52,7 +52,7 @@ def gates(found):
 
 def test_every_gate_speaks_and_has_a_picture(clean):
     findings = examine(clean, known())
-    assert len({f.gate for f in findings}) == len(GATES) + 1  # the channel map speaks of order and of polarity
+    assert len({f.gate for f in findings}) == len(GATES) + 2  # of order and polarity, of repeatability and level
     for f in findings:
         assert f.sentence.endswith(".") and f.picture is not None
         assert all(len(s.x) == len(s.y) for s in f.picture.series)

@@ -57,7 +57,7 @@ def test_the_command_prints_both(folders):
 
 
 @pytest.mark.parametrize("spoil, words", [
-    (lambda path: None, "study.json"), (lambda path: (path / "study.json").write_text("{"), "expected JSON"),
+    (lambda path: None, "study.json"), (lambda path: (path / "study.json").write_text("{"), "expected a JSON file"),
     (lambda path: (path / "study.json").write_text('{"format": "avis-study"}'), "expected a design"),
 ])
 def test_a_folder_that_is_no_design_is_one_line(folders, tmp_path, spoil, words):

@@ -17,7 +17,8 @@ from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.result import VERDICTS, Detectable, HeatMap, Stage, Where, spoken
 from avis_ctrl.gap.table_model import active
 from avis_ctrl.measurement.gates.finding import Finding
-from avis_ctrl.report import gap_html, gap_pdf
+from avis_ctrl.report import html as page_of
+from avis_ctrl.report import pdf as paper_of
 from avis_ctrl.report.figures import Figure, Heat, Panel
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import edges_of, spectrum, worst_pairs
@@ -35,6 +36,14 @@ NAMED = {"gap_spectrum", "ladder", "gap_responses", "heat_map", "gap_records", "
 @pytest.fixture(scope="module")
 def found() -> Finds:
     return stand_in.finding(stand_in.records())
+
+
+def gap_html(found: Finds) -> str:
+    return page_of.render(document(found)).decode()
+
+
+def gap_pdf(found: Finds) -> bytes:
+    return paper_of.render(document(found))
 
 
 @pytest.fixture(scope="module")

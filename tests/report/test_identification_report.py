@@ -16,7 +16,9 @@ from avis_ctrl.identification.ekf_settings import HONEST_SETTINGS
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series
-from avis_ctrl.report import identification_html, identification_pdf, words
+from avis_ctrl.report import html as page_of
+from avis_ctrl.report import pdf as paper_of
+from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style
 from avis_ctrl.report.identification.content import document
 from avis_ctrl.report.identification.gate_figures import figure_of
@@ -45,12 +47,12 @@ def found() -> Identification:
 
 @pytest.fixture(scope="module")
 def html(found: Identification) -> bytes:
-    return identification_html(found)
+    return page_of.render(document(found))
 
 
 @pytest.fixture(scope="module")
 def pdf(found: Identification) -> bytes:
-    return identification_pdf(found)
+    return paper_of.render(document(found))
 
 
 def section(found: Identification, anchor: str) -> Section:
@@ -208,12 +210,12 @@ def test_a_filter_that_did_not_run_is_said_to_have_not(found):
 def test_text_from_files_is_never_markup(found, html, tmp_path):
     bad = replace(found, measured=replace(found.measured, notes=(HOSTILE,), source=HOSTILE),
                   findings=(Finding(HOSTILE, "warning", HOSTILE),), advice=(HOSTILE,), kalman_note=HOSTILE)
-    page, plain = Reader(identification_html(bad)), Reader(html)
+    page, plain = Reader(page_of.render(document(bad))), Reader(html)
     assert [tag for tag, _ in page.elements].count("script") == [tag for tag, _ in plain.elements].count("script")
     assert page.text.count(HOSTILE) >= 5
     # The PDF without the figures of responses, which take most of its time.
     bad = replace(bad, validation=replace(bad.validation, overlay=None))
-    text = " ".join(pdf_text(identification_pdf(bad), tmp_path).split())
+    text = " ".join(pdf_text(paper_of.render(document(bad)), tmp_path).split())
     assert '#panic("y") $ *z* {{ 7*7 }}' in text and "<b>x</b>" in text
 
 
@@ -226,7 +228,7 @@ def test_html_fetches_nothing_and_stays_small(html):
 
 @pytest.mark.slow
 def test_same_input_same_bytes(found, html, pdf):
-    assert identification_html(found) == html and identification_pdf(found) == pdf
+    assert page_of.render(document(found)) == html and paper_of.render(document(found)) == pdf
 
 
 def test_no_cell_shows_a_programmer_s_nothing(found):
@@ -245,7 +247,7 @@ def test_frequency_responses_alone(found):
     content = document(alone)
     text = " ".join(p.text for s in content.sections for p in s.flat() if isinstance(p, Paragraph))
     assert "there were none" in text and "Every fourth group of neighbouring lines" in text
-    assert identification_pdf(alone).startswith(b"%PDF-")
+    assert paper_of.render(document(alone)).startswith(b"%PDF-")
 
 
 def test_little_was_found(found):
@@ -253,7 +255,7 @@ def test_little_was_found(found):
     v = found.validation
     poor = replace(found, advice=(), validation=replace(v, overlay=None, modes=(), held_out=tuple(
         replace(h, whiteness=None, nrms_time=None, nrms_time_start=None, nrms_time_whole=None) for h in v.held_out)))
-    text = " ".join(Reader(identification_html(poor)).text.split())
+    text = " ".join(Reader(page_of.render(document(poor))).text.split())
     assert "No measured frequency response can be shown" in text and "not tested" in text
 
 

@@ -12,13 +12,22 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from avis_ctrl.report import render_html, render_pdf
+from avis_ctrl.report import html as page_of
+from avis_ctrl.report import pdf as paper_of
 from avis_ctrl.report.content import document
 from avis_ctrl.report.figures import Figure
 from avis_ctrl.report.pieces import Mark, Table
 from avis_ctrl.study.design_result import Bound, DesignResult
 
 HOSTILE = '</script><script>alert(1)</script> <b>x</b> #panic("y") $ *z* {{ 7*7 }} \\ & "'
+
+
+def render_html(result: DesignResult) -> bytes:
+    return page_of.render(document(result))
+
+
+def render_pdf(result: DesignResult) -> bytes:
+    return paper_of.render(document(result))
 
 
 class Reader(HTMLParser):

@@ -2,11 +2,48 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from avis_ctrl.rigs.floor_motion import MeasuredSpectrum
+from avis_ctrl.rigs.floor_motion import DERIVATIVES, Quantity, band_rms, check_spectrum
+
+
+@dataclass(frozen=True)
+class MeasuredSpectrum:
+    """A measured displacement ASD.
+
+    Parameters
+    ----------
+    name : what was measured, usually the file's name.
+    frequency_Hz : (n,) increasing, positive.
+    displacement_asd : (n,) [m/sqrt(Hz)], positive.
+
+    Raises
+    ------
+    InputError : values that are not finite and positive, or frequencies that do not increase.
+    """
+
+    name: str
+    frequency_Hz: np.ndarray
+    displacement_asd: np.ndarray
+
+    def __post_init__(self) -> None:
+        check_spectrum(self.frequency_Hz, self.displacement_asd, "displacement_asd")
+
+    def asd(self, quantity: Quantity = "displacement") -> np.ndarray:
+        """The ASD of that quantity, (n,)."""
+        return self.displacement_asd * (2 * np.pi * self.frequency_Hz) ** DERIVATIVES[quantity]
+
+    def rms(self, low_Hz: float, high_Hz: float, quantity: Quantity = "velocity") -> float:
+        """R.m.s. in a band [m, m/s or m/s^2]."""
+        return band_rms(self.frequency_Hz, self.asd(quantity), low_Hz, high_Hz)
+
+    def between(self, low_Hz: float, high_Hz: float) -> MeasuredSpectrum:
+        """The points of a band."""
+        kept = (self.frequency_Hz >= low_Hz) & (self.frequency_Hz <= high_Hz)
+        return MeasuredSpectrum(self.name, self.frequency_Hz[kept], self.displacement_asd[kept])
 
 
 def read_floor_motion(path: Path) -> MeasuredSpectrum:

@@ -77,13 +77,6 @@ def test_shunt_damping_of_the_gs11d_is_inverse_to_the_circuit_resistance(catalog
     assert c[0] == pytest.approx(c[1], rel=0.005)
 
 
-def test_an_entry_becomes_a_geophone_with_its_measured_numbers(catalogue):
-    geophone = next(e for e in catalogue if "NS388" in e.file).geophone()
-    assert geophone.corner_Hz == pytest.approx(4.5, rel=1e-5)
-    high = abs(geophone.system().frequency_response(np.array([2 * np.pi * 100.0]))[0, 0, 0])
-    assert high == pytest.approx(26.2, rel=2e-3)
-
-
 def test_a_well_formed_file_reads_and_agrees(write):
     entry = read_response(write(GOOD))
     assert not check_against_name(entry)

@@ -3,8 +3,11 @@
 Forces and moments are recomputed here from positions by force and lever arm, without the package's matrices.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from halcyonics_transfer import transfer
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import load_rig
@@ -147,8 +150,6 @@ def test_section_2_2_actuator_damping_times_velocity_is_a_force(rig):
     force, velocity = dimension("N"), dimension("m/s")
     assert np.array_equal(dimension("N s/m") + velocity, force)
     assert not np.array_equal(dimension("N m/s") + velocity, force)
-    # and d_a = 7.1 N s/m is what the model of eq. 1 has: the poles' sum is -d_a/m_a.
-    assert -rig.free_actuator().poles().sum().real == pytest.approx(7.1 / 0.05)
 
 
 def test_table_1_test_10_is_the_horizontal_damping(rig):
@@ -201,15 +202,6 @@ def test_natural_frequencies_by_hand(rig):
     assert np.allclose(found, np.sort(expected) / (2 * np.pi), rtol=1e-12)
 
 
-def test_free_actuator(rig):
-    actuator = rig.free_actuator()
-    assert np.abs(actuator.poles()[0]) == pytest.approx(np.sqrt(7300 / 0.05), rel=1e-12)
-    assert actuator.dcgain()[0, 0] == pytest.approx(0.39 / 7300)
-    w = 2 * np.pi * 200.0
-    expected = 0.39 / (-0.05 * w**2 + 7.1j * w + 7300)
-    assert np.allclose(actuator.frequency_response(np.array([w]))[0][:, 0], [expected, 1j * w * expected])
-
-
 def test_drive_patterns_of_tables_1_and_2_excite_what_the_source_says(rig):
     """With equal forces: test 5 turns about x, test 12 about z, test 8 of Table 2 pushes along x and tilts about y."""
     def wrench(pattern):
@@ -229,22 +221,15 @@ def test_transfer_of_eq_32_by_newton(rig, loaded):
         response = table.equations_of_motion().state_space().frequency_response(omega)[:, :6, 0]
         moved = response[:, :3] + np.cross(response[:, 3:], [0.0, 0.15, 0.0])
         expected = moved @ s / np.linalg.norm(s) / 6.59
-        assert np.allclose(table.transfer("M3", s, {"A1": 1.0}, omega), expected, rtol=1e-9)
-        assert np.allclose(table.transfer([0, 0.15, 0], s, [1, 0, 0, 0, 0, 0, 0, 0], omega), expected, rtol=1e-9)
+        for point in ("M3", [0, 0.15, 0]):
+            assert np.allclose(transfer(table, point, s, np.eye(8)[0], omega, 0), expected, rtol=1e-9)
 
 
 def test_transfer_limits(rig):
     """Z_1/F_1 under A1: 1/k below, the mass line above the resonance at 9.9 Hz."""
-    low, high = rig.transfer("M1", "z", {"A1": 1.0}, 2 * np.pi * np.array([1e-8, 1e4]))
+    low, high = transfer(rig, "M1", "z", np.eye(8)[0], 2 * np.pi * np.array([1e-8, 1e4]), 0)
     assert low == pytest.approx(1 / (4 * (K_A + K_S)), rel=1e-6)
     assert high * (2 * np.pi * 1e4) ** 2 == pytest.approx(-1 / 19.3, rel=1e-3)
-
-
-@pytest.mark.parametrize(("drive", "message"),
-                         [({"A9": 1.0}, "out of"), ([1.0, 0.0], "8 finite"), ([0.0] * 8, "8 finite")])
-def test_a_drive_that_makes_no_sense_is_refused(rig, drive, message):
-    with pytest.raises(InputError, match=message):
-        rig.transfer("M1", "z", drive, [1.0])
 
 
 def test_sensors_sit_at_the_actuators_and_see_along_their_axes(rig):
@@ -257,7 +242,7 @@ def test_parameters_are_those_of_table_1_and_can_be_changed(rig, loaded):
     values = {name: p.value for name, p in loaded.parameters().items()}
     assert values["mass"] == 19.3 and values["k_s"] == values["k_s3"] == 11300.0 and values["e4"] == 8.10
     assert loaded.with_parameters(values) == loaded
-    assert loaded.unloaded() == rig
+    assert replace(loaded, load=None) == rig
     changed = loaded.with_parameters({"k_s": 12000.0, "k_s2": 9000.0, "load.L8": 0.05, "e8": 6.0})
     assert changed.k_s == (12000.0, 9000.0, 12000.0, 12000.0)
     assert changed.load.L8 == 0.05 and changed.e[7] == 6.0 and loaded.load.L8 == 0.075

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import factorial
 
 import numba
@@ -16,52 +15,12 @@ from avis_ctrl.lti import hinf_norm
 from avis_ctrl.lti.realisation import hankel_singular_values
 from avis_ctrl.rigs.actuator import pade_delay, zero_order_hold
 from avis_ctrl.rigs.converter import Converter, quantise
-from avis_ctrl.rigs.geophone import CompensationFilter, Geophone, SensorChain
 
 AVIS_CONVERTER = Converter(14, 10.0, 1000.0)
 
 
 def response(system, frequency_Hz):
     return system.frequency_response(2 * np.pi * np.atleast_1d(frequency_Hz))[:, 0, 0]
-
-
-def avis_chain(corner_Hz=4.5, damping=0.56, **more):
-    return SensorChain(Geophone(corner_Hz, damping, 31.25, **more), CompensationFilter(4.5, 0.56, 0.5, 0.7), 100.0,
-                       AVIS_CONVERTER, 1e-3)
-
-
-def test_a_geophone_senses_velocity_above_its_corner_and_jerk_below():
-    geophone = Geophone(4.5, 0.56, 31.25)
-    high, low = 4.5e4, 4.5e-4
-    assert response(geophone.system(), high)[0] == pytest.approx(31.25, rel=2e-4)
-    jerk_over_velocity = (2j * np.pi * low) ** 2
-    assert response(geophone.system(), low)[0] / jerk_over_velocity == pytest.approx(
-        31.25 / (2 * np.pi * 4.5) ** 2, rel=2e-4)
-    slope = np.diff(np.log10(np.abs(response(geophone.system(), [low, 10 * low]))))
-    assert slope[0] == pytest.approx(2.0, abs=1e-6)
-
-
-def test_at_its_corner_a_geophone_turns_by_90_degrees_and_is_damped():
-    at_corner = response(Geophone(4.5, 0.56, 31.25).system(), 4.5)[0]
-    assert at_corner == pytest.approx(31.25 * 1j / (2 * 0.56), rel=1e-12)
-
-
-def test_exact_compensation_leaves_two_states_with_the_corner_wanted():
-    chain = avis_chain()
-    assert chain.system().nstates == 2
-    product = (response(chain.compensation.system(), [0.1, 0.5, 4.5, 100])
-               * response(chain.geophone.system(), [0.1, 0.5, 4.5, 100]) * 100.0)
-    np.testing.assert_allclose(response(chain.system(), [0.1, 0.5, 4.5, 100]), product, rtol=1e-12)
-
-
-def test_a_mismatched_geophone_keeps_its_full_order_and_its_error():
-    chain = avis_chain(corner_Hz=4.6)
-    assert chain.system().nstates == 4
-    singular_values = hankel_singular_values(chain.system())
-    assert singular_values[-1] > 1e-3 * singular_values[0]
-    # Far below both corners the gain is off by the square of the ratio of the corners.
-    ratio = response(chain.system(), 1e-3)[0] / response(avis_chain().system(), 1e-3)[0]
-    assert ratio == pytest.approx((4.5 / 4.6) ** 2, rel=1e-5)
 
 
 def test_rounding_noise_of_a_random_signal_is_lsb_squared_over_12(rng):
@@ -96,35 +55,6 @@ def test_compiled_sample_quantiser_equals_the_array_one(rng):
     voltage = np.concatenate([rng.uniform(-12, 12, 2000), [np.inf, -np.inf]])
     one_by_one = [compiled(v, AVIS_CONVERTER.lsb_V, *AVIS_CONVERTER.limits_V) for v in voltage]
     np.testing.assert_array_equal(one_by_one, AVIS_CONVERTER.convert(voltage))
-
-
-def test_chain_noise_adds_in_power_and_integrates_to_its_variance():
-    chain = avis_chain()
-    density = chain.noise_density(2 * np.pi * np.linspace(0, 500, 11))
-    np.testing.assert_allclose(density ** 2 * 500.0, 1e-6 + (20 / 2 ** 14) ** 2 / 12, rtol=1e-12)
-
-
-def test_johnson_noise_of_a_kilohm_is_four_nanovolt():
-    # Textbook value: 4.07 nV/sqrt(Hz) for 1 kohm at 300 K (Horowitz and Hill, The Art of Electronics, 3rd ed., 8.1.1).
-    assert Geophone(4.5, 0.5, 30.0, coil_ohm=1000.0).johnson_density_V_rtHz(300.0) == pytest.approx(4.07e-9, rel=2e-3)
-    shunted = Geophone(4.5, 0.5, 30.0, coil_ohm=2000.0, shunt_ohm=2000.0)
-    assert shunted.johnson_density_V_rtHz(300.0) == pytest.approx(4.07e-9, rel=2e-3)
-
-
-def test_thermal_noise_is_amplified_below_the_corner_that_was_moved():
-    silent = Converter(32, 1e-6, 1000.0)
-    chain = replace(avis_chain(coil_ohm=380.0), converter=silent, noise_rms_V=0.0)
-    density = chain.noise_density(2 * np.pi * np.array([1e-3, 400.0]))
-    assert density[0] / density[1] == pytest.approx(81.0, rel=1e-2)
-
-
-def test_equivalent_velocity_noise():
-    chain = avis_chain()
-    f = np.array([0.1, 1.0, 100.0])
-    # Compensated corner of 0.5 Hz, damping 0.7, written out.
-    sensed = 3125.0 * f ** 2 / np.hypot(0.25 - f ** 2, 2 * 0.7 * 0.5 * f)
-    density = np.sqrt((1e-6 + (20 / 2 ** 14) ** 2 / 12) / 500.0)
-    np.testing.assert_allclose(chain.velocity_noise_density(2 * np.pi * f), density / sensed, rtol=1e-12)
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 6])
@@ -166,11 +96,9 @@ def test_zero_order_hold_model_follows_the_sinc():
 
 
 @pytest.mark.parametrize(("make", "field"), [
-    (lambda: Geophone(-4.5, 0.5, 30.0), "corner_Hz"), (lambda: Geophone(4.5, np.nan, 30.0), "damping"),
-    (lambda: Geophone(4.5, 0.5, 0.0), "sensitivity"), (lambda: Geophone(4.5, 0.5, 30.0, coil_ohm=-1.0), "coil_ohm"),
     (lambda: Converter(0, 10.0, 1000.0), "bits"), (lambda: Converter(14.5, 10.0, 1000.0), "bits"),
     (lambda: Converter(33, 10.0, 1000.0), "bits = 33: expected a whole number of bits from 1 to 32"),
-    (lambda: Converter(14, np.inf, 1000.0), "range_V"), (lambda: CompensationFilter(4.5, 0.5, 0.0, 0.7), "to_Hz"),
+    (lambda: Converter(14, np.inf, 1000.0), "range_V"),
     (lambda: pade_delay(1e-3, 0), "order"), (lambda: pade_delay(1e-3, 40), "order"),
     (lambda: zero_order_hold(0.0), "sample_time")])
 def test_wrong_numbers_are_refused_by_name(make, field):

@@ -74,8 +74,6 @@ def slow_case(*values):
     # A hundred thousand: rather much for um/s^2 and for ug.
     ("halcyonics", "accelerometers.noise_m_per_s2_rtHz", 1e10, "accelerometers.noise_m_per_s2_rtHz",
      "0.00098067 (given in ng)"),
-    slow_case("halcyonics", "accelerometers.sensitivity_Vs2_per_m", 1e3, "accelerometers.sensitivity_Vs2_per_m",
-              "1 (given in"),
 ])
 def test_a_slip_is_named_in_one_line(rig, place, factor, field, meant):
     with pytest.raises(InputError) as refused:
@@ -163,6 +161,9 @@ def test_what_is_unusual_is_told_and_goes_on(tmp_path):
     path.write_text(text.replace("k_r_Nm_per_rad = 1590.0", "k_r_Nm_per_rad = 1.59e6"), encoding="utf-8")
     with pytest.warns(UnusualRig, match=r"284 Hz.*k_r_Nm_per_rad: did you mean 1590 \(given in N mm/rad\)"):
         assert load_rig(path).k_r == 1.59e6
+    path.write_text(text.replace("sensitivity_Vs2_per_m = 1.0", "sensitivity_Vs2_per_m = 1000.0"), encoding="utf-8")
+    with pytest.warns(UnusualRig, match=r"1000 V s\^2/m.*sensitivity_Vs2_per_m: did you mean 1 \(given in mV s"):
+        load_rig(path)
 
 
 def test_a_file_is_named_and_what_an_identification_wrote_is_not_held_against_it(tmp_path):

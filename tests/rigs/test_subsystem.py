@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti import tf
 from avis_ctrl.rigs import COORDINATES, load_rig
 from avis_ctrl.rigs.subsystem import critical_gains, reduce_rig, reduction_error
 
@@ -12,13 +11,12 @@ KEEP = [2, 3]
 OMEGA = 2 * np.pi * np.array([0.2, 1.7, 3.1, 4.9, 8.3, 30.0])
 
 
-def six_dof(rig, loops=None):
-    """(n_omega, 2, 14) response of z and phi_x to voltages and floor, the loops as impedances on the diagonal."""
+def six_dof(rig):
+    """(n_omega, 2, 14) response of z and phi_x to voltages and floor."""
     eom = rig.equations_of_motion()
     responses = []
     for w in OMEGA:
-        impedance = np.diag([(loops or {}).get(name, lambda s: 0.0)(1j * w) for name in COORDINATES])
-        dynamic = -w**2 * eom.M + 1j * w * (eom.C + impedance) + eom.K
+        dynamic = -w**2 * eom.M + 1j * w * eom.C + eom.K
         pushed = np.hstack([eom.T, 1j * w * eom.C_floor + eom.K_floor])
         responses.append(np.linalg.solve(dynamic, pushed)[KEEP])
     return np.array(responses)
@@ -47,31 +45,6 @@ def test_locked_is_two_equations():
         assert np.allclose(G[:2], np.linalg.solve(dynamic, pushed), rtol=1e-9, atol=1e-15)
 
 
-def test_loops_are_impedances_on_the_other_axes():
-    rig = load_rig("halcyonics_loaded")
-    lag = tf([900.0], [1.0, 30.0])
-    loops = {"x": 400.0, "y": lag, "phi_z": 5.0}
-    reduced = reduce_rig(rig, others="loops", loops=loops)
-    expected = six_dof(rig, {"x": lambda s: 400.0, "y": lambda s: 900.0 / (s + 30.0), "phi_z": lambda s: 5.0})
-    found = reduced.system.select(["z", "phi_x"]).frequency_response(OMEGA)
-    assert error(found, expected) < 1e-10
-    assert set(reduced.loops) == {"x", "y", "phi_z"} and reduced.loops["y"](0.0)[0, 0] == pytest.approx(30.0)
-
-
-def test_stiff_loops_lock_what_they_hold():
-    """The locked model is the limit of high velocity gain on the others, reached as one over the gain."""
-    rig, inputs = load_rig("avis"), ["Ay1", "Az1", "floor_z", "floor_phi_x"]
-    locked = reduce_rig(rig).system.select(None, inputs).frequency_response(OMEGA)
-
-    def distance(gain):
-        loops = {name: gain for name in COORDINATES if name not in ("z", "phi_x")}
-        held = reduce_rig(rig, others="loops", loops=loops).system.select(None, inputs)
-        return error(held.frequency_response(OMEGA), locked)
-
-    near, far = distance(1e9), distance(1e8)
-    assert near < 1e-5 and far / near == pytest.approx(10.0, rel=1e-3)
-
-
 def test_logical_inputs_are_pure_forces():
     rig = load_rig("avis")
     logical = reduce_rig(rig, others="free").logical()
@@ -96,12 +69,10 @@ def test_reduction_is_exact_where_nothing_couples():
     assert np.max(reduction.relative) < 1e-12 and np.max(np.abs(reduction.left_out)) < 1e-12
 
 
-@pytest.mark.parametrize("others", ["free", "loops"])
-def test_reduction_error_is_the_difference_of_the_responses(others):
+def test_reduction_error_is_the_difference_of_the_responses():
     rig = load_rig("avis")
-    reduction = reduction_error(rig, others=others, omega=OMEGA)
-    loops = {c: (lambda s, g=g: g) for c, g in critical_gains(rig, ("z", "phi_x")).items()} if others == "loops" else {}
-    full = six_dof(rig, loops)[:, :, [10, 11]]  # floor_z and floor_phi_x
+    reduction = reduction_error(rig, omega=OMEGA)
+    full = six_dof(rig)[:, :, [10, 11]]  # floor_z and floor_phi_x
     locked = reduce_rig(rig).system.select(["z", "phi_x"], ["floor_z", "floor_phi_x"]).frequency_response(OMEGA)
     edge = np.array([1.0, 0.375])
     difference = np.abs(edge[:, None] * (locked - full) / edge)
@@ -121,10 +92,7 @@ def test_the_floor_motion_that_the_reduction_drops_is_shown():
 
 
 @pytest.mark.parametrize(("arguments", "expected"), [
-    ({"others": "glued"}, "locked, free or loops"), ({"keep": ("z", "phi")}, "out of"),
-    ({"others": "free", "loops": {"x": 1.0}}, "others = 'loops' only"),
-    ({"others": "loops", "loops": {"z": 1.0}}, "coordinates other than"),
-    ({"others": "loops", "loops": {"x": np.eye(2)}}, "one input and one output")])
+    ({"others": "glued"}, "locked or free"), ({"keep": ("z", "phi")}, "out of")])
 def test_choices_that_make_no_sense_are_refused(arguments, expected):
     with pytest.raises(InputError, match=expected):
         reduce_rig(load_rig("avis"), **arguments)

@@ -9,7 +9,7 @@ from avis_ctrl.lti import StateSpace, append, tf
 from avis_ctrl.rigs import COORDINATES, load_rig
 from avis_ctrl.rigs.floor_spectrum import shipped_spectrum
 from avis_ctrl.rigs.subsystem import critical_gains
-from avis_ctrl.simulation import SampledLoop, accelerometer_bank, geophone_bank
+from avis_ctrl.simulation import SampledLoop, rig_bank
 
 CONTROLLED = ("z", "phi_x")
 
@@ -28,7 +28,7 @@ def make_loop():
         K = append(*(velocity_feedback(rig, axis, factor) for axis in CONTROLLED))
         loops = {axis: velocity_feedback(rig, axis, factor) for axis in COORDINATES if axis not in CONTROLLED}
         floor = shipped_spectrum("kamioka_quiet").scaled_to_rms(2e-6, 0.5, 60.0)
-        sensors = geophone_bank(rig) if rig.geophones else accelerometer_bank(rig, 0.1)
+        sensors = rig_bank(rig, 0.1)
         given = {"sensors": sensors, "floor": dict.fromkeys(("x", "y", "z"), floor), "amplifier_corner_Hz": 300.0}
         return SampledLoop(rig, K, CONTROLLED, loops, **(given | changes))
     return make

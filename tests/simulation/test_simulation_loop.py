@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg as la
+from nonlinear_rig import NonlinearRig
 from scipy.integrate import solve_ivp
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import discretise, gain
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.converter import Converter
-from avis_ctrl.rigs.nonlinear import NonlinearRig
 from avis_ctrl.simulation import SampledLoop, simulate, spectral_radius
 from avis_ctrl.simulation.culprit import find_culprit
 from avis_ctrl.simulation.sampled_loop import SensorBank

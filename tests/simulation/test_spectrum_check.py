@@ -95,11 +95,9 @@ def test_campaign_judges_each_plant_and_says_so_in_json(make_loop):
     runaway = replace(make_loop("avis", -20.0), name="runaway", limit_V=1e6)
     cycling = replace(make_loop("avis", -3.0), name="held by its limits")
     weak = replace(loop, name="weak drives", limit_V=0.01)
-    seen = []
-    check = check_designs([loop, heavy, runaway, weak, cycling], 40.0, progress=lambda *state: seen.append(state))
-    assert seen == [(k, 5, name) for k, name in enumerate(
-        ("nominal", "heavy", "runaway", "weak drives", "held by its limits"), 1)]
+    check = check_designs([loop, heavy, runaway, weak, cycling], 40.0)
     nominal, mass, unstable, clipped, cycle = check.plants
+    assert [plant.name for plant in check.plants[1:]] == ["heavy", "runaway", "weak drives", "held by its limits"]
     assert nominal.passed and mass.passed and not check.passed
     assert not unstable.stable and unstable.diverged and unstable.spectrum is None and not unstable.passed
     assert clipped.stable and not clipped.within_limits and clipped.clipped_dac > 0 and not clipped.passed

@@ -316,9 +316,10 @@ def test_whole_study_of_a_shipped_design(name, tmp_path):
         "simulation": design.simulation.model_copy(update={"duration_s": 20.0, "random_plants": 2})})
     said: list[str] = []
     result = run_design(short, rig, said.append)
-    from avis_ctrl.report import render_html, render_pdf
+    from avis_ctrl.report import rendered
+    from avis_ctrl.report.content import document
 
-    files = write_study(result, tmp_path, render_html(result), render_pdf(result))
+    files = write_study(result, tmp_path, *rendered(document(result)))
     stored = check_folder(tmp_path)
     assert {row["name"] for row in stored["controllers"]} >= {"passive", "skyhook", "hinf", "mu"}
     assert len(stored["dk_history"]) >= 1

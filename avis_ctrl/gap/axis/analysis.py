@@ -28,7 +28,7 @@ from avis_ctrl.gap.axis.search import (
 )
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.gap.effects.base import Reported
-from avis_ctrl.gap.result import NamedEffect, sized
+from avis_ctrl.gap.result import NamedEffect
 from avis_ctrl.gap.validation import Half, halves
 from avis_ctrl.identification.likelihood import Fitted
 from avis_ctrl.measurement.gates.finding import Picture, Series
@@ -338,7 +338,7 @@ def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], trac
                 f"falls from {first} to {last}{', and more is missing' * (verdict != 'explained')}."]
     if traces:
         said.append("Traces, below 1 % of the gap: " + "; ".join(
-            f"{one.name} ({', '.join(f'{key} {sized(p)}' for key, p in one.parameters.items())})"
+            f"{one.name} ({', '.join(f'{key} {p}' for key, p in one.parameters.items())})"
             for one in traces) + ".")
     for one in names:
         delay = one.effect.name == "delay" and next(p for e in (*told, *traces) if e.label == one.effect.label

@@ -110,6 +110,11 @@ def slopes(curve: Curve, s: np.ndarray, p: np.ndarray) -> list[np.ndarray]:
     return found
 
 
+def summed(parts: np.ndarray) -> np.ndarray:
+    """(n,) of the three summands of a line (n, 3): many times as fast as `np.sum` along so short an axis."""
+    return parts[:, 0] + parts[:, 1] + parts[:, 2]
+
+
 @dataclass(frozen=True, eq=False)
 class AxisModel:
     """base : names and units of the base model's parameters, the first one positive."""
@@ -184,28 +189,28 @@ class MassModel(AxisModel):
         regressors, several = (A, V, Q)[:n], split(self.values, self.effects, n)
         Z = sum(x * s ** (2 - k) for k, x in enumerate(self.values[:n]))
         R = sum(x * one for x, one in zip(self.values, regressors, strict=False))
-        P = np.ones(around.shape, complex)
+        P, forces = np.ones(around.shape, complex), {}
         for one, p in zip(self.effects, several, strict=True):
             if one.shapes:
-                own, linear = self._force(one, p, block)
+                own, linear = forces[one.label] = self._force(one, p, block)
                 R, Z = R + np.tensordot(p[:len(own)], own, 1), Z + p[:len(own)] @ linear
             if one.dynamics:
                 Z, R = Z + one.dynamics(s, p), R + one.dynamics(around, p) * Q
             if one.path:
                 P = P * one.path(around, p)
-        drive, f = self.lines.solves_for == "force", np.sum(P * F - R, axis=1)
+        drive, f = self.lines.solves_for == "force", summed(P * F - R)
         D = -P[:, 1] if drive else Z
-        Y = (F if drive else Q).sum(axis=1) + f / D
+        Y = summed(F if drive else Q) + f / D
         if not derivative:
             return Answer(Y[:, None, None], np.empty((0, len(s), 1, 1)))
 
         def force(column: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
-            return -column.sum(axis=1) / D - (0.0 if drive else f / D ** 2 * z)
+            return -summed(column) / D - (0.0 if drive else f / D ** 2 * z)
         dY = [force(one, s ** (2 - k)) for k, one in enumerate(regressors)]
         for one, p in zip(self.effects, several, strict=True):
             c = p[:len(one.shapes)]
             if one.shapes:
-                dY += [force(*both) for both in zip(*self._force(one, p, block), strict=True)]
+                dY += [force(*both) for both in zip(*forces[one.label], strict=True)]
             for h in np.diag(p * [q.step for q in one.parameters])[len(c):] if one.shapes else ():
                 up, down = (self._force(one, p + step, block) for step in (h, -h))
                 dY.append(force(*(np.tensordot(c, a - b, 1) / (2 * h.sum()) for a, b in zip(up, down, strict=True))))
@@ -214,7 +219,7 @@ class MassModel(AxisModel):
                                                               slopes(one.dynamics, s, p), strict=True)]
             if one.path:
                 dP = [P / one.path(around, p) * slope for slope in slopes(one.path, around, p)]
-                dY += [np.sum(slope * F, axis=1) / D + (f / D ** 2 * slope[:, 1] if drive else 0.0) for slope in dP]
+                dY += [summed(slope * F) / D + (f / D ** 2 * slope[:, 1] if drive else 0.0) for slope in dP]
         return Answer(Y[:, None, None], np.array(dY)[:, :, None, None])
 
 

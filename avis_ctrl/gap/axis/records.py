@@ -147,6 +147,7 @@ class Lines:
         self.motion = [self._motion(one) for one in self.records]
         self.kept: dict[tuple, tuple[Shape, list[np.ndarray]]] = {}
         self.linear: dict[tuple, tuple[Shape, tuple[float, float]]] = {}
+        self.picked: dict[tuple, tuple[Sequence[np.ndarray], np.ndarray]] = {}
         self.F = [self.transform(one.force, i) for i, one in enumerate(self.records)]
         self.Q, self.V, self.A = ([self.transform(one.position, i, order) for i, one in enumerate(self.records)]
                                   for order in range(3))
@@ -226,9 +227,12 @@ class Lines:
         return np.repeat(record * many + segment, len(self.k)), np.repeat(when, len(self.k))
 
     def pick(self, columns: Sequence[np.ndarray], name: str) -> np.ndarray:
-        """(n,) or (n, 3) of a block."""
-        record, segment = self.rows[name]
-        return np.concatenate([columns[i][j] for i, j in zip(record, segment, strict=True)])
+        """(n,) or (n, 3) of a block; picked once."""
+        key = id(columns), name
+        if key not in self.picked:
+            record, segment = self.rows[name]
+            self.picked[key] = columns, np.concatenate([columns[i][j] for i, j in zip(record, segment, strict=True)])
+        return self.picked[key][1]
 
     def _data(self, held: bool) -> Data:
         """A block for each octave of loudness, which share a discrepancy."""

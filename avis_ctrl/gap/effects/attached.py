@@ -7,18 +7,21 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
 from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, Values, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import about, at_points, peaks, positions, project, unit_matrices
 from avis_ctrl.gap.effects.line_of_action import best_direction, foot, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
-from avis_ctrl.gap.effects.sensors import second_order
+from avis_ctrl.gap.effects.sensors import second_order, sprung
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.rigs.rigid_body import point_map
+
+THREE_AXES = ("axes", "turned")
 
 
 @register
@@ -26,13 +29,14 @@ class AttachedOscillator(AtPoint):
     """A mass m on a spring and damper at a point: m s^2 (2 z w s + w^2)/(s^2 + 2 z w s + w^2) along its directions.
 
     oblique : one direction d; the parameters are d sqrt(m), of either sign. axes : the same mass along x, y and z, each
-    with its own frequency. "z", "xy" .. : the same mass and frequency along these axes, for values given by hand.
+    with its own frequency. turned : the same along three axes at right angles that are turned against x, y and z. "z",
+    "xy" .. : the same mass and frequency along these axes, for values given by hand.
     """
 
     name = "attached_oscillator"
     title = "a sprung mass on the payload"
     looks_like = "a pair of peak and dip at its own frequency, in every channel that moves its place"
-    at = ("payload/oblique", "payload/axes")
+    at = ("payload/oblique", "payload/axes", "payload/turned")
     holds_states = True
     resonant = True
 
@@ -49,10 +53,13 @@ class AttachedOscillator(AtPoint):
                                      -most, most, 0.1 * most) for axis in "xyz"]
             # Along the line of action a place makes no difference and may end anywhere.
             return (*along, frequency, damping, *(replace(one, optional=True) for one in self.position()))
-        if variant == "axes":
+        if variant in THREE_AXES:
             each = [replace(frequency, name=f"frequency_{axis}_Hz", description=f"of the mass along {axis}")
                     for axis in "xyz"]
-            return (own, *each, damping, *self.position())
+            turns = [EffectParameter(f"turn_{axis}", "rad", f"{axis} component of the rotation vector of its axes", 0.0,
+                                     -LIBRARY.most_turned, LIBRARY.most_turned, 0.3, False, (0.0,), True)
+                     for axis in "xyz" if variant == "turned"]
+            return (own, *each, damping, *self.position(), *turns)
         across = [one for one in self.position() if len(variant) > 1 or one.name != f"{variant}_m"]
         return (own, frequency, damping, *across)
 
@@ -64,14 +71,19 @@ class AttachedOscillator(AtPoint):
             ops.inner.append(row[:, None] / second_order(ops.s, frequency, values["damping"])[:, None, None])
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Over frequencies, damping ratios, places and directions; the mass follows from the score test."""
+        """Over frequencies, damping ratios, places and directions; the mass follows from the score test. Turned axes
+        begin at those along x, y and z (`richer`)."""
+        if place.endswith("turned"):
+            return []
         parameters = self.parameters(score.model, place)
         found = _along_three_axes(score, parameters) if place.endswith("axes") else _along_one(score, parameters)
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
         """Along three axes, from a fit along one direction: the nearest axis keeps its frequency, and along the others
-        a resonance is searched at each frequency, anywhere on the line of action."""
+        a resonance is searched at each frequency, anywhere on the line of action. Along turned ones, from these."""
+        if one.place.endswith("axes"):
+            return [("payload/turned", (*one.values, 0.0, 0.0, 0.0))]
         if not one.place.endswith("oblique"):
             return []
         values = one.by_name
@@ -117,15 +129,11 @@ def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]
         a = np.array([values[f"along_{axis}"] for axis in "xyz"])
         mass = float(a @ a)
         return [(a / np.sqrt(mass) @ rows, mass, values["frequency_Hz"])] if mass > 0 else []
-    axes = "xyz" if variant == "axes" else variant
+    if variant == "turned":
+        rows = Rotation.from_rotvec([values[f"turn_{axis}"] for axis in "xyz"]).as_matrix().T @ rows
+    axes = "xyz" if variant in THREE_AXES else variant
     return [(rows["xyz".index(axis)], values["mass_kg"],
-             values[f"frequency_{axis}_Hz" if variant == "axes" else "frequency_Hz"]) for axis in axes]
-
-
-def sprung(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
-    """Dynamic stiffness of a sprung mass of 1 kg, (n,)."""
-    w = 2 * np.pi * frequency_Hz
-    return s ** 2 * ((2 * damping * w * s + w ** 2) / second_order(s, frequency_Hz, damping))
+             values[f"frequency_{axis}_Hz" if variant in THREE_AXES else "frequency_Hz"]) for axis in axes]
 
 
 def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:
@@ -141,7 +149,7 @@ def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed
 
     grid = parameters[3].grid
     found = [seed for f in grid for zeta in SETTINGS.dampings if (seed := at(f, zeta))]
-    found += [seed for f in peaks(score) for zeta in (0.01, 0.05) if (seed := at(f, zeta))]
+    found += [seed for f in peaks(score) for zeta in SETTINGS.peak_dampings if (seed := at(f, zeta))]
     if not found:
         return []
     best, step, step_m = max(found, key=lambda seed: seed.chi2), np.sqrt(grid[1] / grid[0]), 0.5

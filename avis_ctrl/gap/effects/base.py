@@ -21,6 +21,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from avis_ctrl import uncertain_value
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
@@ -36,6 +37,8 @@ class LibrarySettings:
     tried_Hz : frequencies at which an effect of the user's own is tried out [Hz]: below, at and above the suspension.
     reach_m : largest distance along each axis from the geometric centre at which something can be fixed to a payload
         [m].
+    most_turned : largest angle about each axis by which the axes of a sprung mass may be turned against x, y, z [rad]:
+        every three axes at right angles are at most 1.1 rad from some order of these.
     loss_Hz : frequency at which the stiffness of a mount with structural damping equals that of the rig file [Hz]: near
         the suspension's own resonances.
     leveled : mounts with a leveling valve, the first ones; three points determine a plane.
@@ -46,6 +49,7 @@ class LibrarySettings:
     tilted_rad: float = 0.3
     tried_Hz: tuple[float, ...] = (0.3, 3.0, 30.0)
     reach_m: float = 2.0
+    most_turned: float = 1.2
     loss_Hz: float = 3.0
     leveled: int = 3
     valve_Hz: tuple[float, float] = (0.01, 100.0)
@@ -113,6 +117,9 @@ class Reported:
     value: float
     std: float
     unit: str
+
+    def __str__(self) -> str:
+        return uncertain_value.text(self.value, self.std, self.unit)
 
 
 class Added(NamedTuple):

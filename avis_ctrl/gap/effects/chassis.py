@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from operator import attrgetter
-from typing import cast
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from avis_ctrl.gap.starting_values import Seed
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, fit
 from avis_ctrl.identification.noise import relative_noise
-from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rigid_body import point_map
@@ -157,7 +155,7 @@ class BaseCompliance(OfMounts):
             return own
         if wide and reached.chi2 - reached.dof < SETTINGS.followed * (few - reached.dof):
             more = [thinned(part.block, SETTINGS.more_lines, seed=2) for part in score.parts]
-            made = _short_fit(cast(TableModel, reached.model), more, SETTINGS.later_iterations)
+            made = _short_fit(reached.model, more, SETTINGS.later_iterations)
             if made is not None:
                 few = Score(score.model, more).chi2
                 near = made.chi2 - made.dof < SETTINGS.followed * (few - made.dof)
@@ -168,7 +166,7 @@ class BaseCompliance(OfMounts):
         return [found] if found.chi2 > 0 else own
 
     def _followed(self, model: TableModel, place: str, starts: Sequence[tuple[float, ...]],
-                  weights: Sequence[Sequence[SpectralBlock]], wide: bool) -> LikelihoodFit | None:
+                  weights: Sequence[Sequence[SpectralBlock]], wide: bool) -> LikelihoodFit[TableModel] | None:
         """The best fit from these starts by the first weights, continued with the later ones; None where all fail.
         wide : starts with one frequency for all coordinates too, and refinement one coordinate after the other."""
         first, *later = weights
@@ -179,18 +177,18 @@ class BaseCompliance(OfMounts):
         alike = [values for left, values in (self._alike(model, place, first) if wide else [])
                  if left - noise < SETTINGS.promising * gap or not later]
         trials = [self._standing(model, place, values) for values in [*starts, *alike]]
-        made: list[LikelihoodFit] = []
+        made: list[LikelihoodFit[TableModel]] = []
         for most, iterations in SETTINGS.tried_by_fractions if later else SETTINGS.tried:
             fits = [_short_fit(one, first, iterations) for one in trials[:most]]
             made = sorted((one for one in fits if one is not None), key=attrgetter("chi2"))
-            trials = [cast(TableModel, one.model) for one in made]
+            trials = [one.model for one in made]
         enough = SETTINGS.negligible * gap if later else SETTINGS.explained * noise
         for one in made[:SETTINGS.followed_fits] if wide else []:
             if one.chi2 - noise < SETTINGS.followed * gap and made[0].chi2 > enough:
                 made = sorted([*made, self._one_by_one(one, place, first, noise, enough)], key=attrgetter("chi2"))
         reached = made[0] if made else None
         for then in later:
-            reached = reached and _short_fit(cast(TableModel, reached.model), then, SETTINGS.later_iterations)
+            reached = reached and _short_fit(reached.model, then, SETTINGS.later_iterations)
         return reached
 
     def _alike(self, model: TableModel, place: str, blocks: Sequence[SpectralBlock]
@@ -203,8 +201,8 @@ class BaseCompliance(OfMounts):
         expected = [(self._expected(model, place, values, blocks), values) for values in starts]
         return sorted(one for one in expected if one[0] < np.inf)
 
-    def _one_by_one(self, reached: LikelihoodFit, place: str, blocks: Sequence[SpectralBlock],
-                    noise: float, enough: float) -> LikelihoodFit:
+    def _one_by_one(self, reached: LikelihoodFit[TableModel], place: str, blocks: Sequence[SpectralBlock],
+                    noise: float, enough: float) -> LikelihoodFit[TableModel]:
         """A fit refined with other frequencies of coupled coordinates, while chi-square comes nearer to `noise`, that
         of an exact model, and until it is below `enough`. The parameters of the other coordinates can compensate for a
         wrong frequency: a local minimum, out of which no descent leads."""
@@ -212,7 +210,7 @@ class BaseCompliance(OfMounts):
             if reached.chi2 < enough:
                 return reached
             now = _effect(reached)
-            rest = cast(TableModel, reached.model).without(now.label)
+            rest = reached.model.without(now.label)
             left, values = min((self._expected(rest, place, moved, blocks), moved) for moved in _elsewhere(now))
             if left - noise > SETTINGS.promising * (reached.chi2 - noise):
                 return reached
@@ -330,13 +328,13 @@ def _elsewhere(one: ActiveEffect) -> Iterator[tuple[float, ...]]:
                 yield tuple(moved)
 
 
-def _effect(found: LikelihoodFit) -> ActiveEffect:
-    return cast(TableModel, found.model).effects[-1]
+def _effect(found: LikelihoodFit[TableModel]) -> ActiveEffect:
+    return found.model.effects[-1]
 
 
-def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock], iterations: int) -> LikelihoodFit | None:
+def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock], iterations: int) -> LikelihoodFit[TableModel] | None:
     try:
-        return fit(cast(ResponseModel, model), blocks, model.priors, max_iterations=iterations)
+        return fit(model, blocks, model.priors, max_iterations=iterations)
     except (AvisError, np.linalg.LinAlgError, FloatingPointError):
         return None
 

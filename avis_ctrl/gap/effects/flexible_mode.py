@@ -18,6 +18,7 @@ from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 # Variants by number of modes.
 COUNTS = {"": 1, "two": 2, "three": 3}
 
+
 @register
 class PayloadFlexibleMode(Effect):
     """Modes of the payload beside its rigid motion, mass-normalised shapes over the mounts' points.

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from itertools import product
+
 import numpy as np
 from numba import njit
 
@@ -18,11 +21,12 @@ from avis_ctrl.gap.effects.base import (
     shares,
     uneven,
 )
+from avis_ctrl.gap.effects.impedance import peaks, project
+from avis_ctrl.gap.effects.sensors import sprung
 from avis_ctrl.gap.operators import Operators, mount_geometry
 from avis_ctrl.gap.record_motion import RecordMotion
-from avis_ctrl.gap.score import Score
+from avis_ctrl.gap.score import Score, reduction, symmetric_coordinates
 from avis_ctrl.gap.starting_values import SETTINGS, Seed
-from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.rigs.rig import Rig
 
 
@@ -118,18 +122,19 @@ class MountSurge(OfMounts):
                 *uneven(range(1, count), "frequency of mount {} over the mean, less one", 0.2))
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Over frequency and damping, by what the change of the response takes of the residual when it may be of any
-        positive size: where the rig's parameters have given way, its size at full strength is wrong, not its shape."""
-        parameters, found = self.parameters(score.model, place), []
-        starts = self.starts(score.model, place)
-        for point in starts:
-            values = tuple(float(v) for v in point)
-            took = score.reduction(score.of_effect(ActiveEffect(self, place, parameters, values)))
-            if took.coefficients[0] > 0:
-                # From a narrow resonance at the wrong frequency no fit finds the right one.
-                begin = [max(value, SETTINGS.least_surge_damping) if one.name == "damping_ratio" else value
-                         for one, value in zip(parameters, values, strict=True)]
-                found.append(Seed(tuple(begin), took.chi2, len(parameters), len(starts)))
+        """Over frequency and damping: to first order the mass inside a mount is a sprung mass on the payload there."""
+        rig = score.model.rig
+        rows = mount_geometry(rig).payload[vertical(rig)]
+        units = symmetric_coordinates(rows[:, :, None] * rows[:, None, :])
+        tried = [*product(np.geomspace(*SETTINGS.surge_Hz).tolist(), SETTINGS.dampings),
+                 *product(peaks(score), SETTINGS.peak_dampings)]
+        found = []
+        for f, zeta in tried:
+            G, b = project(score, partial(sprung, frequency_Hz=f, damping=zeta), ("sprung", f, zeta))
+            took = reduction(units @ G @ units.T, units @ b)
+            if np.sum(took.coefficients) > 0:
+                values = (f, 0.5, max(zeta, SETTINGS.least_surge_damping), *np.zeros(len(units) - 1))
+                found.append(Seed(tuple(map(float, values)), took.chi2, len(units), len(tried)))
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def implausible(self, values: Values, std: Values) -> str:

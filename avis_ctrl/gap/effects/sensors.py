@@ -22,6 +22,12 @@ def receptance(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray
     return 1 / second_order(s, frequency_Hz, damping)
 
 
+def sprung(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
+    """Dynamic stiffness of a sprung mass of 1 kg, (n,)."""
+    w = 2 * np.pi * frequency_Hz
+    return s ** 2 * ((2 * damping * w * s + w ** 2) / second_order(s, frequency_Hz, damping))
+
+
 def suspensions(rig: Rig) -> dict[str, tuple[float, float]]:
     """Corner [Hz] and damping ratio of each geophone's suspension, by name."""
     return {one.name: one.suspension for one in rig.sensors() if one.suspension is not None}

@@ -7,12 +7,10 @@ section 6.3.2; band-limited signals)
 
 whose coefficients are projected out. The noise is what the fit leaves, smoothed over neighbouring lines, so that its
 colour weighs the lines. A cubic spring k3 y^3 is not a parameter here: under a Gaussian output of variance sigma^2 the
-best linear spring is k + 3 k3 sigma^2 (equivalent linearisation, Caughey 1963), and `by_level` shows this line.
+best linear spring is k + 3 k3 sigma^2 (equivalent linearisation, Caughey 1963).
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -25,16 +23,6 @@ TRANSIENT = 4  # coefficients of T
 SMOOTHED = 8  # lines on either side whose residual gives the noise
 CORRELATED_LINES = 4
 NAMES, UNITS = ("m", "d", "k"), ("u s^2 a unit of y", "u s a unit of y", "u a unit of y")
-
-
-def resonance_Hz(fit: SingleAxisFit) -> tuple[float, float]:
-    """sqrt(k/m)/2 pi and its standard deviation."""
-    return fit.derived(lambda theta: float(np.sqrt(theta[2] / theta[0]) / (2 * np.pi)))
-
-
-def damping_ratio(fit: SingleAxisFit) -> tuple[float, float]:
-    """d/(2 sqrt(k m)) and its standard deviation."""
-    return fit.derived(lambda theta: float(theta[1] / (2 * np.sqrt(theta[2] * theta[0]))))
 
 
 def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz: tuple[float, float]) -> SingleAxisFit:
@@ -136,50 +124,3 @@ def _smoothed(power: np.ndarray) -> np.ndarray:
     width = 2 * SMOOTHED + 1
     mean = np.convolve(np.pad(power, SMOOTHED, mode="edge"), np.ones(width) / width, mode="valid")
     return np.maximum(mean, 1e-12 * power.mean() + np.finfo(float).tiny)
-
-
-@dataclass(frozen=True, eq=False)
-class LevelDependence:
-    """Linear oscillators of stretches of a record, in the order of their level.
-
-    level : (k,) r.m.s. of y in each stretch. resonance_Hz, deviation_Hz, damping, share : (k,) of each; share is the
-    part of y that the linear oscillator does not explain. at_rest_Hz : resonance at zero level from the straight line
-    of the squared resonance over level^2, and cubic: its slope over three resonances squared at rest, k3/k (1/y^2),
-    each with a standard deviation from the scatter about the line.
-    """
-
-    level: np.ndarray
-    resonance_Hz: np.ndarray
-    deviation_Hz: np.ndarray
-    damping: np.ndarray
-    share: np.ndarray
-    at_rest_Hz: tuple[float, float]
-    cubic: tuple[float, float]
-
-
-def by_level(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz: tuple[float, float], stretch: int
-             ) -> LevelDependence:
-    """Fit each whole stretch of `stretch` samples by itself, sorted by the r.m.s. of y.
-
-    Raises
-    ------
-    InputError : fewer than four stretches, and as fit_oscillator.
-    """
-    count = len(y) // stretch if stretch > 0 else 0
-    if count < 4:
-        raise InputError("expected at least four stretches in the record", field="stretch", value=stretch)
-    rows = []
-    for k in range(count):
-        part = slice(k * stretch, (k + 1) * stretch)
-        fit = fit_oscillator(u[part], y[part], sample_rate_Hz, band_Hz)
-        rows.append((float(np.std(y[part])), *resonance_Hz(fit), damping_ratio(fit)[0], fit.residual.share))
-    level, found, deviation, damping, share = np.array(sorted(rows)).T
-    X = np.column_stack([np.ones(count), level ** 2])
-    line, *_ = np.linalg.lstsq(X, found ** 2, rcond=None)
-    e = found ** 2 - X @ line
-    C = np.linalg.inv(X.T @ X) * float(e @ e) / (count - 2)
-    rest = float(np.sqrt(max(line[0], 0.0)))
-    cubic = line[1] / line[0] / 3
-    gradient = np.array([-line[1] / line[0] ** 2, 1 / line[0]]) / 3
-    return LevelDependence(level, found, deviation, damping, share, (rest, float(np.sqrt(C[0, 0]) / (2 * rest))),
-                           (float(cubic), float(np.sqrt(gradient @ C @ gradient))))

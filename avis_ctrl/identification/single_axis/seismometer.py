@@ -73,30 +73,6 @@ def response(frequency_Hz: np.ndarray, names: tuple[str, ...], values: np.ndarra
     return {"coil": p["gain"] * s / D * late} if "gain" in p else {"ground": p["sensitivity"] * s ** 2 / D * late}
 
 
-
-def band(fit: SingleAxisFit, kind: str, frequency_Hz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The fitted response (n,) complex, and one standard deviation of its magnitude (relative) and phase (rad).
-
-    It holds the uncertainty of the parameters, not the misfit of single frequencies.
-
-    Raises
-    ------
-    InputError : a kind that the fit does not hold.
-    """
-    known = response(frequency_Hz, fit.names, fit.values)
-    if kind not in known:
-        raise InputError(f"expected one of {', '.join(known)}", field="kind", value=kind)
-    slopes = []
-    for j, scale in enumerate(fit.information.scale):
-        step = np.zeros(len(fit.values))
-        step[j] = 1e-5 * scale
-        ahead, behind = (response(frequency_Hz, fit.names, fit.values + sign * step)[kind] for sign in (1, -1))
-        slopes.append((np.log(ahead / known[kind]) - np.log(behind / known[kind])) / (2 * step[j]))
-    d = np.array(slopes).T
-    deviation = [np.sqrt(np.maximum(np.einsum("nj,jk,nk->n", part, fit.covariance, part), 0.0))
-                 for part in (d.real, d.imag)]
-    return known[kind], deviation[0], deviation[1]
-
 def fit_seismometer(data: Responses, delay: bool = True) -> SingleAxisFit:
     """Corner, damping and gains.
 

@@ -28,6 +28,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.linalg import dft, hadamard
 
+from avis_ctrl.checks import require_positive, require_whole
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.excitation.crest_factor import crest_factor, low_crest_phases, synthesise
 
@@ -88,7 +89,7 @@ class ExcitationSignals:
         ------
         InputError : a level that needs more than limit_V; it names the largest possible.
         """
-        _positive(rms_V, "rms_V")
+        require_positive(rms_V, "rms_V")
         largest = largest_rms(self.crest, self.limit_V)
         if rms_V > largest * (1 + 1e-12):
             raise InputError(f"expected at most {largest:.6g} V r.m.s.: with a crest factor of "
@@ -162,9 +163,9 @@ class MultisineSettings:
     def __post_init__(self) -> None:
         _check_inputs(self.inputs)
         for name in ("sample_rate_Hz", "period_s", "limit_V"):
-            _positive(getattr(self, name), name)
+            require_positive(getattr(self, name), name)
         if self.rms_V is not None:
-            _positive(self.rms_V, "rms_V")
+            require_positive(self.rms_V, "rms_V")
         samples = self.period_s * self.sample_rate_Hz
         if abs(samples - round(samples)) > 1e-6 * samples or round(samples) < 4:
             raise InputError(f"expected a whole number of samples, at least 4; at {self.sample_rate_Hz:g} Hz it is "
@@ -174,7 +175,7 @@ class MultisineSettings:
             if getattr(self, name) not in known:
                 raise InputError(f"expected one of {', '.join(known)}", field=name, value=getattr(self, name))
         for name, least in (("spacing", 1), ("group", 2), ("realisations", 1), ("dealt", 0), ("seed", 0)):
-            _whole(getattr(self, name), name, least)
+            require_whole(getattr(self, name), name, least)
         experiments = len(self.inputs) if self.scheme == "orthogonal" else 1
         _check_size(self.realisations * experiments * len(self.inputs) * self.samples, "period_s, realisations")
 
@@ -282,12 +283,12 @@ class NoiseSettings:
     def __post_init__(self) -> None:
         _check_inputs(self.inputs)
         for name in ("sample_rate_Hz", "duration_s", "limit_V"):
-            _positive(getattr(self, name), name)
+            require_positive(getattr(self, name), name)
         if self.rms_V is not None:
-            _positive(self.rms_V, "rms_V")
+            require_positive(self.rms_V, "rms_V")
         _check_band(self.band_Hz, self.sample_rate_Hz)
-        _whole(self.records, "records", 1)
-        _whole(self.seed, "seed", 0)
+        require_whole(self.records, "records", 1)
+        require_whole(self.seed, "seed", 0)
         _check_size(self.records * len(self.inputs) * self.duration_s * self.sample_rate_Hz, "duration_s, records")
 
 
@@ -351,14 +352,3 @@ def _check_size(voltages: float, field: str) -> None:
     if voltages > MOST_VOLTAGES:
         raise InputError(f"expected at most {MOST_VOLTAGES} voltages in all records and drives, which fit into memory; "
                          f"these are {voltages:.3g}", field=field)
-
-
-def _positive(value: float, name: str) -> None:
-    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not (number and np.isfinite(value) and value > 0):
-        raise InputError("expected a finite number greater than zero", field=name, value=value)
-
-
-def _whole(value: int, name: str, least: int) -> None:
-    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
-        raise InputError(f"expected a whole number, {least} or more", field=name, value=value)

@@ -18,11 +18,9 @@ UNITS: dict[str, tuple[str, float]] = {
     "V": ("V", 1.0), "Volt": ("V", 1.0), "Volts": ("V", 1.0), "mV": ("V", 1e-3), "uV": ("V", 1e-6), "kV": ("V", 1e3),
     "m": ("m", 1.0), "cm": ("m", 1e-2), "mm": ("m", 1e-3), "um": ("m", 1e-6), "nm": ("m", 1e-9), "in": ("m", 0.0254),
     "m/s": ("m/s", 1.0), "cm/s": ("m/s", 1e-2), "mm/s": ("m/s", 1e-3), "um/s": ("m/s", 1e-6), "nm/s": ("m/s", 1e-9),
-    "in/s": ("m/s", 0.0254),
-    "m/s^2": ("m/s^2", 1.0), "cm/s^2": ("m/s^2", 1e-2), "mm/s^2": ("m/s^2", 1e-3), "um/s^2": ("m/s^2", 1e-6),
-    "g": ("m/s^2", STANDARD_GRAVITY), "gn": ("m/s^2", STANDARD_GRAVITY), "in/s^2": ("m/s^2", 0.0254),
-    "N": ("N", 1.0), "mN": ("N", 1e-3), "kN": ("N", 1e3), "lbf": ("N", 4.4482216152605),
-}
+    "in/s": ("m/s", 0.0254), "m/s^2": ("m/s^2", 1.0), "cm/s^2": ("m/s^2", 1e-2), "mm/s^2": ("m/s^2", 1e-3),
+    "um/s^2": ("m/s^2", 1e-6), "g": ("m/s^2", STANDARD_GRAVITY), "gn": ("m/s^2", STANDARD_GRAVITY),
+    "in/s^2": ("m/s^2", 0.0254), "N": ("N", 1.0), "mN": ("N", 1e-3), "kN": ("N", 1e3), "lbf": ("N", 4.4482216152605)}
 INPUT_UNITS, OUTPUT_UNITS, FLOOR_UNITS = ("V", "N"), ("V", "m/s", "m/s^2", "m"), ("m/s",)
 ALLOWED = {"u": INPUT_UNITS, "y": OUTPUT_UNITS, "floor": FLOOR_UNITS}
 

@@ -13,15 +13,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordSource, ranges
 from avis_ctrl.measurement.formats.common import as_names, as_number, as_text, require_finite, units_of
-from avis_ctrl.measurement.formats.flat import (
-    UNNAMED,
-    Hints,
-    Mapped,
-    flat_header,
-    mapped,
-    one_clock,
-    root_mean_square,
-)
+from avis_ctrl.measurement.formats.flat import UNNAMED, Hints, Mapped, flat_header, mapped, one_clock, root_mean_square
 from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION
 from avis_ctrl.measurement.formats.matlab_shapes import (
     PERIODS,

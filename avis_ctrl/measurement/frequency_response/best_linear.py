@@ -56,21 +56,19 @@ class _Experiments:
 
 
 def best_linear_approximation(campaign: Campaign, *, band_Hz: Band | None = None, level_V: float | None = None,
-                              inputs: Sequence[str] | None = None, transient: Transient = "auto",
-                              drop: int | None = None, smooth_lines: int | None = None) -> FrequencyResponse:
-    """G on the excited lines, with total, noise and distortion covariances.
+                              transient: Transient = "auto", smooth_lines: int | None = None) -> FrequencyResponse:
+    """G from the drives on the excited lines, with total, noise and distortion covariances.
+
+    The floor's motion is not periodic and counts as noise.
 
     Parameters
     ----------
     band_Hz : all lines by default.
     level_V : r.m.s. level of the records to use, where the campaign has several.
-    inputs : names of actuators; by default those that some record drives. The floor's motion is not periodic and
-        counts as noise.
     transient : "drop" the periods that still settle (all but two at most); "remove" the transient by local polynomials
         or rational functions through the lines between harmonics; "none"; "auto": drop where that leaves half of the
         periods and these are settled, otherwise remove. Where a mode is narrower than some two lines of the record,
         part of its transient stays and counts in C.
-    drop : periods to drop, instead of the number found.
     smooth_lines : C is averaged over 2 smooth_lines + 1 excited lines; by default as few as leave 2 n_y + 4 degrees
         of freedom.
 
@@ -80,8 +78,8 @@ def best_linear_approximation(campaign: Campaign, *, band_Hz: Band | None = None
         `best_linear_approximations`), neither repeated periods nor realisations.
     ComputationError : experiments that cannot tell the inputs apart.
     """
-    found = best_linear_approximations(campaign, band_Hz=band_Hz, level_V=level_V, inputs=inputs, transient=transient,
-                                       drop=drop, smooth_lines=smooth_lines)
+    found = best_linear_approximations(campaign, band_Hz=band_Hz, level_V=level_V, transient=transient,
+                                       smooth_lines=smooth_lines)
     if len(found) > 1:
         sets = "; ".join(f"{', '.join(r.inputs)} on {r.frequency_Hz.size} lines" for r in found)
         raise InputError(f"different lines excite different inputs ({sets}): use best_linear_approximations, which "
@@ -90,20 +88,19 @@ def best_linear_approximation(campaign: Campaign, *, band_Hz: Band | None = None
 
 
 def best_linear_approximations(campaign: Campaign, *, band_Hz: Band | None = None, level_V: float | None = None,
-                               inputs: Sequence[str] | None = None, transient: Transient = "auto",
-                               drop: int | None = None,
+                               transient: Transient = "auto",
                                smooth_lines: int | None = None) -> tuple[FrequencyResponse, ...]:
     """One response for each set of inputs that are excited on the same lines (several for zippered multisines).
 
     Parameters and errors as in `best_linear_approximation`.
     """
     records = periodic_records(campaign, level_V)
-    used = channels(campaign, records, inputs, False)
+    used = channels(campaign, records, False)
     n, rate = records[0].header.period_samples or 0, campaign.sample_rate_Hz
     keep = lines(n, rate, checked_band(band_Hz, rate))
     if keep.stop <= keep.start:
         raise InputError(f"expected a band with harmonics of {rate / n:g} Hz", field="band_Hz", value=band_Hz)
-    dropped, remove = chosen_treatment(records, used, keep, transient, drop)
+    dropped, remove = chosen_treatment(records, used, keep, transient)
     means = [average(record, used, keep, dropped, remove) for record in records]
     data = _experiments(means, len(used.inputs))
     frequency = np.arange(keep.start, keep.stop) * rate / n
@@ -113,17 +110,15 @@ def best_linear_approximations(campaign: Campaign, *, band_Hz: Band | None = Non
                  for active, line in _excited_sets(data, used))
 
 
-def chosen_treatment(records: Sequence[RecordSource], used: Channels, keep: slice, transient: Transient,
-                     drop: int | None) -> tuple[int, bool]:
+def chosen_treatment(records: Sequence[RecordSource], used: Channels, keep: slice,
+                     transient: Transient) -> tuple[int, bool]:
     """How many periods to drop, and whether to remove a transient from the rest."""
     if transient not in ("auto", "drop", "remove", "none"):
         raise InputError("expected auto, drop, remove or none", field="transient", value=transient)
-    if drop is not None and drop < 0:
-        raise InputError("expected 0 or more periods", field="drop", value=drop)
     count = min(record.header.periods for record in records)
     found, settled = settled_after(records, used, keep) if transient in ("auto", "drop") else (0, False)
-    if drop is not None or transient != "auto":
-        return found if drop is None else drop, transient == "remove"
+    if transient != "auto":
+        return found, transient == "remove"
     # Dropping for a slow transient would cost most of the data. Removal then works on all periods: what is left of a
     # transient after some are dropped hides in the noise of a single record, but not in the mean of many.
     if settled and found <= count // 2:

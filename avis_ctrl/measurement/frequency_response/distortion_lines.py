@@ -7,7 +7,6 @@ odd harmonics, of which those left out are the detection lines (Pintelon and Sch
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,7 +16,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response.best_linear import Transient, chosen_treatment
 from avis_ctrl.measurement.frequency_response.periodic import SETTINGS, average
-from avis_ctrl.measurement.frequency_response.spectra import Band, channels, checked_band, lines
+from avis_ctrl.measurement.frequency_response.spectra import channels, checked_band, lines
 
 Kind = Literal["excited", "odd", "even"]
 
@@ -52,8 +51,7 @@ class DistortionLevels:
         return 10 * np.log10(np.sum(self.power[here], axis=0) / np.sum(self.noise[here], axis=0))
 
 
-def distortion_levels(campaign: Campaign, record: str, *, band_Hz: Band | None = None,
-                      inputs: Sequence[str] | None = None, transient: Transient = "auto") -> DistortionLevels:
+def distortion_levels(campaign: Campaign, record: str, *, transient: Transient = "auto") -> DistortionLevels:
     """Even and odd distortion of one record of an odd multisine with detection lines.
 
     Only harmonics from the lowest to the highest excited one are judged. What the generator itself puts on these lines
@@ -70,9 +68,9 @@ def distortion_levels(campaign: Campaign, record: str, *, band_Hz: Band | None =
         raise InputError("expected a periodic record of at least two periods", field=f"{field}: period_s",
                          value=header.period_s)
     n, rate = header.period_samples, header.sample_rate_Hz
-    used = channels(campaign, (source,), inputs, False)
-    keep = lines(n, rate, checked_band(band_Hz, rate))
-    drop, remove = chosen_treatment((source,), used, keep, transient, None)
+    used = channels(campaign, (source,), False)
+    keep = lines(n, rate, checked_band(None, rate))
+    drop, remove = chosen_treatment((source,), used, keep, transient)
     mean = average(source, used, keep, drop, remove)
     n_u, harmonic = len(used.inputs), np.arange(keep.start, keep.stop)
     size = np.abs(mean.Z[:, :n_u])

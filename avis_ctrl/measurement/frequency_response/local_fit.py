@@ -1,13 +1,12 @@
-"""Local models of a frequency response: polynomials or rational functions of frequency around each line.
+"""Local models of a frequency response: polynomials in frequency around each line.
 
 Around the frequency f, with d = (line - f) / scale and for each record r,
 
     Y_r(d) = G(d) U_r(d) + T_r(d) + V_r(d),     G(d) = sum_s G_s d^s,     T_r(d) = sum_s t_rs d^s
 
 (local polynomial method: Pintelon, Schoukens, Vandersteen and Barbe, Mech. Syst. Signal Process. 24, 2010; Pintelon
-and Schoukens, System Identification, 2nd ed., 2012, section 7.2), or with a denominator of its own for each output,
-a_i(d) Y_i = b_i(d) U + t_i(d) + V_i, a_i(0) = 1 (local rational method: McKelvey and Guerin, SYSID 2012). T_r is the
-transient, leakage included. Both are linear least squares.
+and Schoukens, System Identification, 2nd ed., 2012, section 7.2). T_r is the transient, leakage included. G and T_r
+are found by linear least squares.
 
 The records share G but not T_r. T_r is removed by projecting on the orthogonal complement of the polynomials over the
 window, a fixed matrix; what remains is compressed to a triangular factor per line, updated record by record. Records
@@ -16,7 +15,7 @@ of any number and length therefore need the memory of one factor per line.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -52,7 +51,7 @@ class LocalEstimate:
 
     frequency_Hz : (n,); value : (n, n_y, n_u); noise : (n, n_y, n_y) covariance of V on one line of one record;
     gram : (n, n_u, n_u) Gram matrix of the inputs' part that neither slopes nor transients explain;
-    dof : complex degrees of freedom of `noise`; transient : (n_records, n, n_y) or None.
+    dof : complex degrees of freedom of `noise`.
     """
 
     frequency_Hz: np.ndarray
@@ -61,15 +60,14 @@ class LocalEstimate:
     gram: np.ndarray
     dof: int
     half_width: int
-    transient: np.ndarray | None = None
 
 
-def degrees_of_freedom(records: int, n_u: int, order: int, half_width: int, rational: bool = False) -> int:
+def degrees_of_freedom(records: int, n_u: int, order: int, half_width: int) -> int:
     """Equations less unknowns of one line: records share G, each has its own transient."""
-    return records * (2 * half_width - order) - (order + 1) * n_u - (order if rational else 0)
+    return records * (2 * half_width - order) - (order + 1) * n_u
 
 
-def least_half_width(records: int, n_u: int, n_y: int, order: int, rational: bool = False, spacing: int = 1) -> int:
+def least_half_width(records: int, n_u: int, n_y: int, order: int, spacing: int = 1) -> int:
     """Smallest half width [lines] that leaves 2 n_y + 4 degrees of freedom: below n_y the covariance is singular, and
     its inverse is large on average by dof / (dof - n_y).
 
@@ -77,7 +75,7 @@ def least_half_width(records: int, n_u: int, n_y: int, order: int, rational: boo
     order + 1 excited lines and as many as G has unknowns over all records.
     """
     half_width = order + 1
-    while degrees_of_freedom(records, n_u, order, half_width, rational) < 2 * n_y + 4:
+    while degrees_of_freedom(records, n_u, order, half_width) < 2 * n_y + 4:
         half_width += 1
     excited = max(order + 1, -(-(order + 1) * n_u // records) + 1) if n_u else 0
     return half_width if spacing == 1 else max(half_width, -(-spacing * excited // 2))
@@ -93,26 +91,23 @@ class LocalFit:
     order : degree of the polynomials, 0 to 6.
     half_width : the window has 2 half_width + 1 lines; near the ends of the lines given it is shifted inwards.
     scale_Hz : unit of d, about half the window.
-    rational : local rational method.
 
     Raises
     ------
     InputError : an order or a width outside its range.
     """
 
-    def __init__(self, frequency_Hz: np.ndarray, n_u: int, n_y: int, order: int, half_width: int, scale_Hz: float,
-                 rational: bool = False):
+    def __init__(self, frequency_Hz: np.ndarray, n_u: int, n_y: int, order: int, half_width: int, scale_Hz: float):
         if order not in range(7):
             raise InputError("expected a whole order from 0 to 6", field="order", value=order)
         if 2 * half_width <= order:
             raise InputError(f"expected more than {order / 2:g} lines for polynomials of order {order}",
                              field="half_width", value=half_width)
         self.frequency_Hz = np.asarray(frequency_Hz, float)
-        self.n_u, self.n_y, self.order, self.half_width, self.rational = n_u, n_y, order, half_width, rational
-        self.scale_Hz, self._step_Hz = scale_Hz, scale_Hz / half_width
-        # Columns: [U d^R .. U d], U, [Y d^R .. Y d] where rational, Y: what G(f) needs stands in the lower corner.
+        self.n_u, self.n_y, self.order, self.half_width, self.scale_Hz = n_u, n_y, order, half_width, scale_Hz
+        # Columns: [U d^R .. U d], U, Y: what G(f) needs stands in the lower corner.
         self._lead = order * n_u
-        self._size = self._lead + n_u + n_y * (order + 1 if rational else 1)
+        self._size = self._lead + n_u + n_y
         self._factor = np.zeros((self.frequency_Hz.size, self._size, self._size), complex)
         self._unit: tuple[np.ndarray, np.ndarray] | None = None
         self.records = 0
@@ -122,7 +117,7 @@ class LocalFit:
 
     @property
     def dof(self) -> int:
-        return degrees_of_freedom(self.records, self.n_u, self.order, self.half_width, self.rational)
+        return degrees_of_freedom(self.records, self.n_u, self.order, self.half_width)
 
     def window(self, line_Hz: np.ndarray, keep: slice) -> tuple[np.ndarray, np.ndarray]:
         """Indices (b, m) of the lines around some of the frequencies, and d (b, m) there."""
@@ -158,12 +153,10 @@ class LocalFit:
             factor = _triangle(rows)
             self._factor[keep, :factor.shape[1]] = factor
         self.records += U.shape[0]
-        self._step_Hz = line_Hz[1] - line_Hz[0]
 
     def _columns(self, U: np.ndarray, Y: np.ndarray, d: np.ndarray) -> np.ndarray:
         powers = [d[:, :, None] ** s for s in range(self.order, 0, -1)]
-        slopes = [Y * p for p in powers] if self.rational else []
-        return np.concatenate([*(U * p for p in powers), U, *slopes, Y], axis=-1)
+        return np.concatenate([*(U * p for p in powers), U, Y], axis=-1)
 
     def _check(self, U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray) -> None:
         shape = (U.shape[0], line_Hz.size)
@@ -179,7 +172,7 @@ class LocalFit:
         """G, C and S on all lines.
 
         partial : inputs need not be told apart. S is singular then along what the inputs do not span on a line, where
-            G is not known; C and G along what they span are as with fewer inputs. Polynomial method only.
+            G is not known; C and G along what they span are as with fewer inputs.
 
         Raises
         ------
@@ -192,11 +185,11 @@ class LocalFit:
                              field="half_width", value=self.half_width)
         names = tuple(f"u{j}" for j in range(self.n_u)) if names is None else names
         dof = self.dof
-        if partial and not self.rational and np.any(self._weakest() < SETTINGS.span_tolerance):
+        if partial and np.any(self._weakest() < SETTINGS.span_tolerance):
             value, noise, gram, dof = self._spanned()
         else:
             self._check_rank(names)
-            value, noise, gram = self._rational() if self.rational else self._polynomial()
+            value, noise, gram = self._polynomial()
         unit_u, unit_y = self._unit
         return LocalEstimate(self.frequency_Hz, value * unit_y[:, None] / unit_u,
                              noise * unit_y[:, None] * unit_y, gram * unit_u[:, None] * unit_u, dof,
@@ -246,37 +239,6 @@ class LocalFit:
         residual = self._factor[:, self._lead + self.n_u:, self._lead + self.n_u:]
         return value, _covariance(residual) / self.dof, _covariance(own)
 
-    def _rational(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Output by output. The Gram matrix is the one whose inverse is the outputs' mean: each denominator costs a
-        little of what is known of its own numerator.
-
-        The equation's error is a(d) V. Where the response is smooth the least squares chooses a denominator that makes
-        this small rather than one that means something (1 - 5/3 d^2 for white noise, 4/9 of its power), so the
-        residual is divided by the mean of |a|^2 over the window to give the covariance of V.
-        """
-        n_y, order, first = self.n_y, self.order, self._lead + self.n_u
-        own, along = self._corner()
-        # Along the inputs' columns, and what of the outputs these leave.
-        along, left = np.linalg.solve(own, along), self._factor[:, first:, first:]
-        root = np.linalg.inv(own)
-        inverse = root @ np.swapaxes(root.conj(), 1, 2)
-        d = np.arange(-self.half_width, self.half_width + 1) * self._step_Hz / self.scale_Hz
-        powers = d ** np.arange(order, 0, -1)[:, None]
-        rows, residuals = [], []
-        for i in range(n_y):
-            slopes, here = [s * n_y + i for s in range(order)], order * n_y + i
-            q, r = np.linalg.qr(left[:, :, slopes])
-            # A dead channel has no slopes: their coefficients are then 0.
-            r += np.eye(order) * (np.einsum("nii->ni", r) == 0)[:, :, None]
-            a = np.linalg.solve(r, np.swapaxes(q.conj(), 1, 2) @ left[:, :, here:here + 1])
-            rows.append((along[:, :, here:here + 1] - along[:, :, slopes] @ a)[:, :, 0])
-            shrink = np.sqrt(np.mean(np.abs(1 - a[:, :, 0] @ powers) ** 2, axis=1))
-            residuals.append((left[:, :, here:here + 1] - left[:, :, slopes] @ a)[:, :, 0] / shrink[:, None])
-            cost = along[:, :, slopes] @ np.linalg.inv(r)
-            inverse += cost @ np.swapaxes(cost.conj(), 1, 2) / n_y
-        gram = np.swapaxes(np.linalg.inv(inverse), 1, 2)
-        return np.stack(rows, axis=1), _covariance(np.stack(residuals, axis=-1)) / self.dof, gram
-
     def _check_rank(self, names: tuple[str, ...]) -> None:
         if not self.n_u:
             return
@@ -318,54 +280,3 @@ def _triangle(rows: np.ndarray) -> np.ndarray:
 def _covariance(rows: np.ndarray) -> np.ndarray:
     """sum e e^H over stacked rows e^T: (n, m, k) to (n, k, k)."""
     return np.swapaxes(rows, 1, 2) @ rows.conj()
-
-
-def local_model(U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray, frequency_Hz: np.ndarray | None = None,
-                order: int = 2, half_width: int | None = None, rational: bool = False,
-                transient: bool = False) -> LocalEstimate:
-    """Local polynomial (or rational) estimate from spectra of whole records of one length.
-
-    Parameters
-    ----------
-    U, Y : (n_records, n_lines, n_u) and (n_records, n_lines, n_y) transforms over sqrt(samples) on consecutive lines.
-    line_Hz : (n_lines,) their frequencies.
-    frequency_Hz : where to estimate; the lines by default.
-    order : degree of the polynomials (2 to 4 is usual).
-    half_width : the window has 2 half_width + 1 lines; by default `least_half_width`.
-    rational : local rational method, a denominator for each output.
-    transient : also return the transients (polynomial method only).
-
-    Raises
-    ------
-    InputError : too few lines or degrees of freedom.
-    ComputationError : inputs that cannot be distinguished.
-    """
-    n_u, n_y = U.shape[2], Y.shape[2]
-    if half_width is None:
-        half_width = least_half_width(U.shape[0], n_u, n_y, order, rational)
-    step = line_Hz[1] - line_Hz[0]
-    where = line_Hz if frequency_Hz is None else np.asarray(frequency_Hz, float)
-    fit = LocalFit(where, n_u, n_y, order, half_width, half_width * step, rational)
-    fit.add(U, Y, line_Hz)
-    found = fit.estimate()
-    if not transient:
-        return found
-    return replace(found, transient=_transient(fit, U, Y, line_Hz))
-
-
-def _transient(fit: LocalFit, U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray) -> np.ndarray:
-    """(n_records, n, n_y): polynomials through what the inputs leave unexplained."""
-    if fit.rational or fit._unit is None:
-        raise InputError("expected the polynomial method", field="transient", value=True)
-    unit_u, unit_y = fit._unit
-    known = fit._lead + fit.n_u
-    slopes = np.linalg.solve(fit._factor[:, :known, :known], fit._factor[:, :known, known:])
-    result = np.empty((U.shape[0], fit.frequency_Hz.size, fit.n_y), complex)
-    for start in range(0, fit.frequency_Hz.size, SETTINGS.batch):
-        keep = slice(start, min(start + SETTINGS.batch, fit.frequency_Hz.size))
-        index, d = fit.window(line_Hz, keep)
-        columns = fit._columns(U[:, index] / unit_u, Y[:, index] / unit_y, d)
-        left = columns[..., known:] - columns[..., :known] @ slopes[keep]
-        basis = d[:, :, None] ** np.arange(fit.order + 1)
-        result[:, keep] = (np.linalg.pinv(basis)[:, :1] @ left)[:, :, 0]
-    return result * unit_y

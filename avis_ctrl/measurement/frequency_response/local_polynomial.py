@@ -58,16 +58,15 @@ class _Spectra(NamedTuple):
 
 
 def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
-                     order: int = 2, half_width: int | None = None, inputs: Sequence[str] | None = None,
-                     floor: bool | None = None, longest_piece: int | None = None,
-                     apart: bool = False, partial: bool = False) -> FrequencyResponse:
+                     order: int = 2, half_width: int | None = None, floor: bool | None = None,
+                     longest_piece: int | None = None, partial: bool = False) -> FrequencyResponse:
     """Local polynomial estimate, all records pooled (Pintelon and Schoukens 2012, section 7.2).
 
     The bias grows with the half width and the curvature of G: (half width / record length)^(order + 1). Nonlinear
     distortion counts as noise. Memory is one triangular factor per frequency and one piece of a record.
 
     Estimates whose windows overlap share lines, so that their errors are correlated: the covariance is that of each
-    frequency by itself. Whoever takes the errors of different frequencies as independent asks for `apart`.
+    frequency by itself.
 
     Parameters
     ----------
@@ -75,67 +74,40 @@ def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequen
     frequency_Hz : where to estimate; by default every line of the shortest piece.
     order : of the polynomials, 2 to 4 is usual.
     half_width : window of 2 half_width + 1 lines; by default the smallest that leaves 2 n_y + 4 degrees of freedom.
-    inputs : names of actuators; by default those that some record drives in the band.
     floor : the floor's velocity as additional inputs; by default where every record measured it. Records with u = 0
         take part only then.
     longest_piece : samples; longer records are read and used in pieces, each with its own transient.
-    apart : estimate at the centres of windows that do not overlap, in place of frequency_Hz.
     partial : inputs need not be told apart, as of drives that are played together along six axes: the Gram matrix is
         then singular along what they do not span (`FrequencyResponse.along` gives what they do).
 
     Raises
     ------
-    InputError : bands, names, windows or records that do not allow an estimate, `apart` beside frequency_Hz.
+    InputError : bands, windows or records that do not allow an estimate.
     ComputationError : inputs that cannot be distinguished, unless `partial`.
     """
-    if apart and frequency_Hz is not None:
-        raise InputError("expected frequencies, or windows that do not overlap, not both", field="apart", value=apart)
-    return _local_response(campaign, False, band_Hz, frequency_Hz, order, half_width, inputs, floor, longest_piece,
-                           apart, partial)
-
-
-def local_rational(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
-                   order: int = 2, half_width: int | None = None, inputs: Sequence[str] | None = None,
-                   floor: bool | None = None, longest_piece: int | None = None) -> FrequencyResponse:
-    """Local rational estimate with one denominator per output (McKelvey and Guerin 2012): for sharp resonances.
-
-    Parameters and errors as in `local_polynomial`. It is a linear least squares with noise among its regressors: meant
-    for signal-to-noise ratios above some 20 dB; below that the polynomial method is the better one.
-    """
-    return _local_response(campaign, True, band_Hz, frequency_Hz, order, half_width, inputs, floor, longest_piece)
-
-
-def _local_response(campaign: Campaign, rational: bool, band_Hz: Band | None, frequency_Hz: np.ndarray | None,
-                    order: int, half_width: int | None, inputs: Sequence[str] | None, floor: bool | None,
-                    longest: int | None, apart: bool = False, partial: bool = False) -> FrequencyResponse:
     records = taking_part(campaign, floor)
-    used = channels(campaign, records, inputs, floor)
+    used = channels(campaign, records, floor)
     band = checked_band(band_Hz, campaign.sample_rate_Hz)
-    plan = _Plan.of(campaign, records, longest)
-    moving, spacing, rank = _driven(records, used, band, plan)
-    driven = list(range(len(used.inputs))) if inputs is not None else moving
+    plan = _Plan.of(campaign, records, longest_piece)
+    driven, spacing, rank = _driven(records, used, band, plan)
     names = tuple(used.inputs[j] for j in driven)
     if not names:
         raise InputError("expected at least one input that is not zero in the band", field="inputs", value=used.inputs)
     n_y = len(used.outputs)
     width = half_width
     if width is None:
-        width = least_half_width(plan.count, min(rank, len(names)), n_y, order, rational, spacing)
+        width = least_half_width(plan.count, min(rank, len(names)), n_y, order, spacing)
     where = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
-    if apart:
-        where = _apart(where, width)
-    fit = LocalFit(where, len(names), n_y, order, width, width * campaign.sample_rate_Hz / plan.shortest, rational)
+    fit = LocalFit(where, len(names), n_y, order, width, width * campaign.sample_rate_Hz / plan.shortest)
     for part in _spectra(records, used, driven, band, width, plan):
         fit.add(*part)
     found = fit.estimate(names, partial)
-    kind = "rational" if rational else "polynomial"
-    left_out = [name for name in used.inputs if name not in names] if inputs is None else []
-    method = (f"local {kind} method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces"
+    left_out = [name for name in used.inputs if name not in names]
+    method = (f"local polynomial method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces"
               + (f"; not excited and left out: {', '.join(left_out)}" if left_out else ""))
     return FrequencyResponse(found.frequency_Hz, found.value, found.noise, found.gram, names, used.outputs,
                              used.input_unit, used.output_unit, float(found.dof), method=method,
-                             shared=1.0 if apart else _shared(where, width, order,
-                                                              campaign.sample_rate_Hz / plan.shortest))
+                             shared=_shared(where, width, order, campaign.sample_rate_Hz / plan.shortest))
 
 
 def _shared(where: np.ndarray, half_width: int, order: int, spacing_Hz: float) -> float:
@@ -172,7 +144,7 @@ def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz:
     records = tuple(r for r in campaign.records if r.header.excitation != "sine")
     if not records:
         raise InputError("expected a record other than a stepped sine", field="records")
-    used = channels(campaign, records, None, floor)
+    used = channels(campaign, records, floor)
     band = checked_band(band_Hz, campaign.sample_rate_Hz)
     plan = _Plan.of(campaign, records, longest_piece)
     driven, spacing, rank = _driven(records, used, band, plan)
@@ -185,7 +157,7 @@ def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz:
     asked = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
     if smooth_Hz is not None and not smooth_Hz > 0:
         raise InputError("expected a positive frequency", field="smooth_Hz", value=smooth_Hz)
-    centres = _apart(every, width)
+    centres = every[width:every.size - width:2 * width + 1]  # windows that share no line
     fit = LocalFit(centres, len(driven), n_y, order, width, width * step)
     for part in _spectra(records, used, driven, band, width, plan):
         fit.add(*part)
@@ -253,11 +225,6 @@ def _grid(frequency_Hz: np.ndarray | None, band: Band, samples: int, rate: float
         raise InputError(f"expected increasing frequencies from {every[0]:g} to {every[-1]:g} Hz, lines in the band",
                          field="frequency_Hz", value=asked if asked.size < 4 else f"{asked.size} values")
     return asked
-
-
-def _apart(every: np.ndarray, half_width: int) -> np.ndarray:
-    """Centres of windows that share no line."""
-    return every[half_width:every.size - half_width:2 * half_width + 1]
 
 
 def _spectra(records: Sequence[RecordSource], used: Channels, driven: list[int], band: Band, half_width: int,

@@ -22,41 +22,32 @@ Band = tuple[float, float]
 class Channels:
     """The inputs and outputs of an estimate.
 
-    inputs : names, the floor's after the actuators'; u : columns of Record.u that take part; floor : whether the
-    floor's velocity is an input.
+    inputs : names, the floor's after the actuators'; floor : whether the floor's velocity is an input.
     """
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    u: tuple[int, ...]
     floor: bool
     input_unit: str
     output_unit: str
 
     def of(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         """Samples of the inputs (samples, n_u) and of the outputs (samples, n_y)."""
-        u = record.u[:, self.u]
-        return (np.hstack([u, record.floor]) if self.floor and record.floor is not None else u), record.y
+        return np.hstack([record.u, record.floor]) if self.floor and record.floor is not None else record.u, record.y
 
 
-def channels(campaign: Campaign, records: Sequence[RecordSource], inputs: Sequence[str] | None,
-             floor: bool | None) -> Channels:
+def channels(campaign: Campaign, records: Sequence[RecordSource], floor: bool | None) -> Channels:
     """Inputs and outputs of an estimate.
 
     Parameters
     ----------
     records : those that take part.
-    inputs : names of actuators; all of them by default.
     floor : whether the floor's velocity counts as inputs; by default where every record measured it.
 
     Raises
     ------
-    InputError : an unknown input, a record without floor channels where they are asked for, different ones.
+    InputError : a record without floor channels where they are asked for, different ones.
     """
-    names = campaign.u_names if inputs is None else (inputs,) if isinstance(inputs, str) else tuple(inputs)
-    for name in names:
-        if name not in campaign.u_names:
-            raise InputError(f"expected some of {list(campaign.u_names)}", field="inputs", value=name)
     first = records[0].header
     lacking = [record.header.name for record in records if not record.header.floor_names]
     if floor and lacking:
@@ -67,8 +58,8 @@ def channels(campaign: Campaign, records: Sequence[RecordSource], inputs: Sequen
             raise InputError(f"expected {first.floor_names} as in record {first.name}",
                              field=f"record {record.header.name}: floor_names", value=record.header.floor_names)
     unit = f"{first.u_unit}; floor {first.floor_unit}" if use else first.u_unit
-    return Channels((*names, *(first.floor_names if use else ())), campaign.y_names,
-                    tuple(campaign.u_names.index(name) for name in names), use, unit, campaign.y_unit)
+    return Channels((*campaign.u_names, *(first.floor_names if use else ())), campaign.y_names, use, unit,
+                    campaign.y_unit)
 
 
 def taking_part(campaign: Campaign, floor: bool | None) -> tuple[RecordSource, ...]:

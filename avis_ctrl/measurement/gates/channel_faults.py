@@ -257,18 +257,16 @@ def _steps(n_y: int, n_u: int) -> list[tuple[str, int, int, tuple[float, float]]
     """(row or column, i, k, signs): flips have i = k."""
     signs = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))
     steps = [(what, i, i, (-1.0, 1.0)) for what, n in (("row", n_y), ("column", n_u)) for i in range(n)]
-    return steps + [
-        (what, i, k, flips)
-        for what, n in (("row", n_y), ("column", n_u))
-        for i in range(n)
-        for k in range(i)
-        for flips in signs
-    ]
+    return steps + [(what, i, k, flips)
+                    for what,
+                    n in (("row", n_y), ("column", n_u))
+          for i in range(n)
+          for k in range(i)
+          for flips in signs]
 
 
-def _after(
-    order: dict[str, np.ndarray], sign: dict[str, np.ndarray], what: str, i: int, k: int, flips: tuple[float, float]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _after(order: dict[str, np.ndarray], sign: dict[str, np.ndarray], what: str, i: int, k: int,
+           flips: tuple[float, float]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Order and signs after a step."""
     p, s = order[what].copy(), sign[what].copy()
     p[[i, k]] = p[[k, i]]

@@ -61,10 +61,8 @@ class ChannelMap(Gate):
         comparison = compare(_pairs(kept), response)
         faults = None if comparison is None else explain(comparison)
         why = "no model was given" if expectation.response is None else "too few driven samples"
-        return [
-            *ChannelOrder().conclude(kept, campaign, comparison, faults, why),
-            *Polarity().conclude(campaign, comparison, faults, why),
-        ]
+        return [*ChannelOrder().conclude(kept, campaign, comparison, faults, why),
+                *Polarity().conclude(campaign, comparison, faults, why)]
 
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
         copies = _copies(seen)
@@ -95,13 +93,9 @@ class ChannelOrder:
         if comparison is None or faults is None:
             if not found:
                 found.append(
-                    Finding(
-                        self.name,
-                        "ok" if why.startswith("no model") else "note",
-                        f"No channel is a copy of another; their order was not compared with a model ({why}).",
-                        picture=_copy_picture(kept),
-                    )
-                )
+                    Finding(self.name, "ok" if why.startswith("no model") else "note",
+                            f"No channel is a copy of another; their order was not compared with a model ({why}).",
+                            picture=_copy_picture(kept)))
             return found
         agreement = comparison.agreement(faults.q, faults.c)
         picture = _picture(faults.r[:, None] * agreement, campaign.y_names, comparison.settings.least_agreement)
@@ -116,35 +110,21 @@ class ChannelOrder:
         low, high = comparison.settings.delay_s
         alone = tuple(campaign.y_names[k] for k in np.flatnonzero(faults.other < enough))
         if alone and not faults.doubtful and 2 * len(alone) < len(faults.other):
-            return Finding(
-                self.name,
-                "warning",
-                f"Sensor {quoted(alone)} agrees with no response of the model (correlation as low as"
-                f" {faults.other[worst]:.2f}), while the others do. Its signal is more than {1000 * high:g} ms late or"
-                f" {-1000 * low:g} ms early, or the channel list is wrong, or the model lacks an effect there.",
-                alone,
-                value=float(faults.other[worst]),
-                limit=enough,
-                picture=picture,
-            )
+            return Finding(self.name, "warning",
+                           f"Sensor {quoted(alone)} agrees with no response of the model (correlation as low as "
+                           f"{faults.other[worst]:.2f}), while the others do. Its signal is more than {1000 * high:g} "
+                           f"ms late or {-1000 * low:g} ms early, or the channel list is wrong, or the model lacks an "
+                           "effect there.", alone, value=float(faults.other[worst]), limit=enough, picture=picture)
         least = f"the lowest correlation is {faults.other[worst]:.2f}, of {campaign.y_names[worst]!r}"
         if faults.doubtful:
             names = [(campaign.y_names if what == "row" else campaign.u_names)[k] for what, k in faults.doubtful]
-            sentence = (
-                "The agreement of model and records is too poor to check the order of the channels"
-                f" ({least}; another order or sign of {quoted(names)} would agree better, but an inaccurate model can"
-                " cause that, too). Check the channel list by hand."
-            )
+            sentence = (f"The agreement of model and records is too poor to check the order of the channels ({least}; "
+                        f"another order or sign of {quoted(names)} would agree better, but an inaccurate model can "
+                        "cause that, too). Check the channel list by hand.")
         else:
             sentence = f"No other order of the channels agrees better with the model ({least})."
-        return Finding(
-            self.name,
-            "note" if faults.doubtful else "ok",
-            sentence,
-            value=float(faults.other[worst]),
-            limit=comparison.settings.least_agreement,
-            picture=picture,
-        )
+        return Finding(self.name, "note" if faults.doubtful else "ok", sentence, value=float(faults.other[worst]),
+                       limit=comparison.settings.least_agreement, picture=picture)
 
     def _exchanged(self, faults: Faults, kind: str, names: tuple[str, ...], sensors: tuple[str, ...],
                    comparison: Comparison, picture: Picture) -> list[Finding]:
@@ -162,8 +142,7 @@ class ChannelOrder:
                 listed = "; ".join(
                     f"the correlation of {names[j]!r} with the model's {names[int(p[j])]!r} is {faults.other[j]:.2f},"
                     f" with its own {faults.own[j]:.2f}"
-                    for j in cycle
-                )
+                    for j in cycle)
             else:
                 of, before, after = faults.columns[i]
                 gain = after - before
@@ -171,17 +150,10 @@ class ChannelOrder:
             chance = max(faults.chance[kind, j] for j in cycle)
             verb = "are exchanged" if len(pair) == 2 else "are mixed up"
             found.append(
-                Finding(
-                    self.name,
-                    "stop",
-                    f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay are"
-                    f" fitted; p-value at most {chance:.1g}). Exchange their names or their cables.",
-                    pair,
-                    value=float(gain),
-                    limit=comparison.settings.least_agreement,
-                    picture=picture,
-                )
-            )
+                Finding(self.name, "stop",
+                        f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay are "
+                        f"fitted; p-value at most {chance:.1g}). Exchange their names or their cables.", pair,
+                        value=float(gain), limit=comparison.settings.least_agreement, picture=picture))
         return found
 
     def _copied(self, kept: list[_Kept], campaign: Campaign) -> list[Finding]:
@@ -198,18 +170,10 @@ class ChannelOrder:
                      " twice. Excite other axes, too." if alike else
                      "one signal was recorded twice. Check the wiring and the channel list; leave one of them out.")
             found.append(
-                Finding(
-                    self.name,
-                    "note" if alike else "stop",
-                    f"Channel {names[k]!r} is {names[i]!r} times {scale:.6g} within {100 * rest:.2g} % of its r.m.s. in"
-                    f" every record: {cause}",
-                    (names[i], names[k]),
-                    tuple(h[0] for h in hits),
-                    float(rest),
-                    COPIES.different,
-                    _copy_picture(kept),
-                )
-            )
+                Finding(self.name, "note" if alike else "stop",
+                        f"Channel {names[k]!r} is {names[i]!r} times {scale:.6g} within {100 * rest:.2g} % of its "
+                        f"r.m.s. in every record: {cause}", (names[i], names[k]), tuple(h[0] for h in hits),
+                        float(rest), COPIES.different, _copy_picture(kept)))
         return found
 
 
@@ -226,69 +190,38 @@ class Polarity:
                  ) -> list[Finding]:
         if comparison is None or faults is None:
             x = np.arange(len(campaign.y_names))
-            picture = Picture(
-                "Polarity of each sensor",
-                "sensor number",
-                "correlation [-]",
-                (Series("not known", x, 0.0 * x, "points"),),
-            )
-            return [
-                Finding(
-                    self.name,
-                    "ok" if why.startswith("no model") else "note",
-                    f"Polarity was not compared with a model ({why}).",
-                    picture=picture,
-                )
-            ]
+            picture = Picture("Polarity of each sensor", "sensor number", "correlation [-]",
+                              (Series("not known", x, 0.0 * x, "points"),))
+            return [Finding(self.name, "ok" if why.startswith("no model") else "note",
+                            f"Polarity was not compared with a model ({why}).", picture=picture)]
         r, c = faults.r, faults.c
-        picture = Picture(
-            "Correlation of each sensor with the model, sign as recorded",
-            "sensor",
-            "correlation [-]",
-            (Series("sensors", np.arange(len(r)), r * faults.other, "bars"),),
-            (Limit("opposite sign", -comparison.settings.least_agreement),),
-            x_names=campaign.y_names,
-        )
+        picture = Picture("Correlation of each sensor with the model, sign as recorded", "sensor", "correlation [-]",
+                          (Series("sensors", np.arange(len(r)), r * faults.other, "bars"),),
+                          (Limit("opposite sign", -comparison.settings.least_agreement),), x_names=campaign.y_names)
         both = np.count_nonzero(r < 0) + np.count_nonzero(c < 0)
         total = len(r) + np.count_nonzero(comparison.moving)
         doubt = " It is equally possible that all other channels are reversed." if 2 * both == total else ""
-        said = [
-            (campaign.y_names[k], "Sensor", -float(faults.other[k]),
-             f"correlation {-faults.other[k]:.2f} where +1 is expected", faults.chance["row", int(k)])
-            for k in np.flatnonzero(r < 0)
-        ] + [
-            (campaign.u_names[k], "Drive", faults.columns[k][1] - faults.columns[k][2],
-             f"reversing it raises the correlation of sensor {campaign.y_names[faults.columns[k][0]]!r} from"
-             f" {faults.columns[k][1]:.2f} to {faults.columns[k][2]:.2f}", faults.chance["column", k])
-            for k in map(int, np.flatnonzero(c < 0))
-        ]
+        said = [(campaign.y_names[k], "Sensor", -float(faults.other[k]),
+                 f"correlation {-faults.other[k]:.2f} where +1 is expected", faults.chance["row", int(k)])
+                for k in np.flatnonzero(r < 0)] + [
+                    (campaign.u_names[k], "Drive", faults.columns[k][1] - faults.columns[k][2],
+                     f"reversing it raises the correlation of sensor {campaign.y_names[faults.columns[k][0]]!r} from"
+                     f" {faults.columns[k][1]:.2f} to {faults.columns[k][2]:.2f}", faults.chance["column", k])
+                    for k in map(int, np.flatnonzero(c < 0))]
         found = [
-            Finding(
-                self.name,
-                "stop",
-                f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {chance:.1g}). Its leads"
-                f" are exchanged, or the model's axis has the opposite direction. Exchange the leads or reverse the"
-                f" sign of the channel.{doubt}",
-                (name,),
-                value=value,
-                limit=-comparison.settings.least_agreement,
-                picture=picture,
-            )
-            for name, what, value, how, chance in said
-        ]
+            Finding(self.name, "stop",
+                    f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {chance:.1g}). Its "
+                    "leads are exchanged, or the model's axis has the opposite direction. Exchange the leads or "
+                    f"reverse the sign of the channel.{doubt}", (name,), value=value,
+                    limit=-comparison.settings.least_agreement, picture=picture)
+            for name, what, value, how, chance in said]
         if not found:
             found.append(
-                Finding(
-                    self.name,
-                    "note" if faults.doubtful else "ok",
-                    "The signs could not be checked: the agreement of model and records is too poor."
-                    if faults.doubtful else
-                    f"All signs agree with the model (lowest correlation of a sensor {faults.other.min():.2f}).",
-                    value=float(faults.other.min()),
-                    limit=comparison.settings.least_agreement,
-                    picture=picture,
-                )
-            )
+                Finding(self.name, "note" if faults.doubtful else "ok",
+                        "The signs could not be checked: the agreement of model and records is too poor."
+                        if faults.doubtful else
+                        f"All signs agree with the model (lowest correlation of a sensor {faults.other.min():.2f}).",
+                        value=float(faults.other.min()), limit=comparison.settings.least_agreement, picture=picture))
         return found
 
 
@@ -356,22 +289,14 @@ def _difference(a: np.ndarray, b: np.ndarray) -> float:
 
 def _copy_picture(kept: list[_Kept]) -> Picture:
     count = np.array([len(k.copies) for k in kept])
-    return Picture(
-        "Pairs of channels that are copies",
-        "record number",
-        "pairs [-]",
-        (Series("pairs", np.arange(len(count)), count, "points"),),
-    )
+    return Picture("Pairs of channels that are copies", "record number", "pairs [-]",
+                   (Series("pairs", np.arange(len(count)), count, "points"),))
 
 
 def _picture(a: np.ndarray, names: tuple[str, ...], limit: float) -> Picture:
     x = np.arange(len(names))
     others = np.max(np.where(np.eye(len(a), dtype=bool), -np.inf, a), axis=1) if len(a) > 1 else np.zeros(1)
     return Picture(
-        "Sensors against the model",
-        "sensor",
-        "correlation [-]",
+        "Sensors against the model", "sensor", "correlation [-]",
         (Series("own expected response", x, np.diag(a), "points"), Series("best other", x, others, "points")),
-        (Limit("least that counts as evidence", limit),),
-        x_names=tuple(names),
-    )
+        (Limit("least that counts as evidence", limit),), x_names=tuple(names))

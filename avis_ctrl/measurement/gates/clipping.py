@@ -24,18 +24,28 @@ from avis_ctrl.measurement.gates.finding import (
 
 # A noise-free sine's top code is hit up to 2.42 times as often as the next one.
 SINE_TOP = 2.42
-# Tops flatter than a sine's, as two tones may make, reach 5.3 (fourth order); below this ratio nothing is concluded.
-FLATTER = 8.0
-# Steps that the signal's range has at least; a few codes of noise at rest have no tops.
-STEPS = 20
-# Widths of the top by the signal's range, beside the value itself: noise after the clipping rounds a flat top.
-WIDTHS = (1 / 4096, 1 / 1024, 1 / 256, 1 / 64)
-# More samples than this part at or beyond the range: not clipping but a wrong unit.
-UNIT = 0.5
-# An over-range level: its spread is at most this part of the jump into it.
-LEVEL_SPREAD = 0.05
-# ... and the jump at least so many times the median change over two samples.
-UNUSUAL = 10.0
+
+
+@dataclass(frozen=True)
+class ClippingSettings:
+    """flatter : samples at the top over those of the next values below which nothing is concluded [1]: tops flatter
+        than a sine's, as two tones may make, reach 5.3 (fourth order).
+    steps : that the signal's range has at least; a few codes of noise at rest have no tops.
+    widths : of the top by the signal's range, beside the value itself [1]: noise after the clipping rounds a flat top.
+    wrong_unit : part of the samples at or beyond the range from which the unit is wrong [1].
+    level_spread : of an over-range level, by the jump into it [1].
+    unusual : that jump over the median change over two samples, at least [1].
+    """
+
+    flatter: float = 8.0
+    steps: int = 20
+    widths: tuple[float, ...] = (1 / 4096, 1 / 1024, 1 / 256, 1 / 64)
+    wrong_unit: float = 0.5
+    level_spread: float = 0.05
+    unusual: float = 10.0
+
+
+SETTINGS = ClippingSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,52 +112,26 @@ class Clipping(Gate):
         top = max(peaks, key=lambda n: peaks[n])
         limits = () if expectation.y_range_V is None else (Limit("converter", expectation.y_range_V[1]),)
         x = np.arange(len(peaks))
-        picture = Picture(
-            "Largest absolute value of each channel",
-            "channel",
-            f"largest value [{campaign.y_unit}]",
-            (Series("peak", x, np.array(list(peaks.values())), "bars"),),
-            limits,
-            x_names=tuple(peaks),
-        )
-        return [
-            Finding(
-                self.name,
-                "ok",
-                f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}.",
-                value=peaks[top],
-                limit=None if not limits else limits[0].value,
-                picture=picture,
-            )
-        ]
+        picture = Picture("Largest absolute value of each channel", "channel", f"largest value [{campaign.y_unit}]",
+                          (Series("peak", x, np.array(list(peaks.values())), "bars"),), limits, x_names=tuple(peaks))
+        return [Finding(self.name, "ok", f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}.",
+                        value=peaks[top], limit=None if not limits else limits[0].value, picture=picture)]
 
-    def _unit(
-        self, rows: list[_Ends], names: tuple[str, ...], expectation: Expectation, campaign: Campaign
-    ) -> Finding:
+    def _unit(self, rows: list[_Ends], names: tuple[str, ...], expectation: Expectation, campaign: Campaign) -> Finding:
         """Most samples at or beyond the range, in some record."""
         row = max(rows, key=lambda r: r.count)
         assert row.t is not None and row.x is not None and expectation.y_range_V is not None
         t, x = thinned(row.t, row.x)
         return Finding(
-            self.name,
-            "stop",
-            f"{100 * row.count / row.samples:.0f} % of the samples of channel {row.channel!r} of record {row.record}"
-            f" are at or beyond the converter's range, which ends at {expectation.y_range_V[1]:.6g} {campaign.y_unit};"
-            f" the largest is {row.peak:.6g}. Channels concerned: {quoted(names)}. The unit or scale is probably wrong"
-            f" (mV given as {campaign.y_unit}?), or the range in the rig file. Correct it first; only then can clipping"
-            " be checked.",
-            names,
-            tuple(dict.fromkeys(r.record for r in rows)),
-            row.count / row.samples,
-            UNIT,
-            Picture(
-                f"Record {row.record}, {row.channel}",
-                "time [s]",
-                f"{row.channel} [{campaign.y_unit}]",
-                (Series(row.channel, t, x),),
-                (Limit("converter", expectation.y_range_V[1]),),
-            ),
-        )
+            self.name, "stop",
+            f"{100 * row.count / row.samples:.0f} % of the samples of channel {row.channel!r} of record {row.record} "
+            f"are at or beyond the converter's range, which ends at {expectation.y_range_V[1]:.6g} {campaign.y_unit}; "
+            f"the largest is {row.peak:.6g}. Channels concerned: {quoted(names)}. The unit or scale is probably wrong "
+            f"(mV given as {campaign.y_unit}?), or the range in the rig file. Correct it first; only then can clipping "
+            "be checked.", names, tuple(dict.fromkeys(r.record for r in rows)), row.count / row.samples,
+            SETTINGS.wrong_unit,
+            Picture(f"Record {row.record}, {row.channel}", "time [s]", f"{row.channel} [{campaign.y_unit}]",
+                    (Series(row.channel, t, x),), (Limit("converter", expectation.y_range_V[1]),)))
 
     def _finding(self, of: list[_Ends]) -> Finding:
         """Of the records in which one channel is clipped."""
@@ -156,35 +140,20 @@ class Clipping(Gate):
         severity: Severity = "stop" if part > 1e-3 else "warning"
         assert row.t is not None and row.x is not None
         t, x = thinned(row.t, row.x)
-        picture = Picture(
-            f"Record {row.record}, {row.channel}",
-            "time [s]",
-            row.channel,
-            (Series(row.channel, t, x),),
-            (Limit("clipped at", row.value),),
-        )
+        picture = Picture(f"Record {row.record}, {row.channel}", "time [s]", row.channel, (Series(row.channel, t, x),),
+                          (Limit("clipped at", row.value),))
         bursts = f" in {row.bursts} bursts" if row.bursts > 1 else ""
         others = [f"{r.record} ({r.count} samples at {r.value:.4g})" for r in of if r is not row]
         also = f" Also in record {', '.join(others)}." if others else ""
-        sentence = (
-            f"Channel {row.channel!r} of record {row.record} has {row.count} samples ({100 * part:.2g} %){bursts} at "
-            f"{row.value:.6g}: {row.why}.{also} Lower the level or the gain and repeat the record; until then leave"
-            " the record out."
-        )
+        sentence = (f"Channel {row.channel!r} of record {row.record} has {row.count} samples ({100 * part:.2g} "
+                    f"%){bursts} at {row.value:.6g}: {row.why}.{also} Lower the level or the gain and repeat the "
+                    "record; until then leave the record out.")
         records = tuple(r.record for r in of)
         return Finding(self.name, severity, sentence, (row.channel,), records, float(row.count), 0.0, picture)
 
 
-def _ends(
-    record: str,
-    channel: str,
-    t: np.ndarray,
-    x: np.ndarray,
-    bounds: tuple[float, float] | None,
-    lsb: float | None,
-    free: bool,
-    periods: int = 1,
-) -> _Ends:
+def _ends(record: str, channel: str, t: np.ndarray, x: np.ndarray, bounds: tuple[float, float] | None,
+          lsb: float | None, free: bool, periods: int = 1) -> _Ends:
     """Judge one channel; `free` looks for repeated extremes, over-range levels and a wrong unit too."""
     peak = float(np.max(np.abs(x)))
     best = _Ends(record, channel, len(x), peak)
@@ -202,7 +171,7 @@ def _ends(
         at = (x >= bounds[1] - margin) | (x <= bounds[0] + margin)
         if at.any():
             value = float(x[at][0])
-            if free and at.mean() > UNIT:
+            if free and at.mean() > SETTINGS.wrong_unit:
                 return replace(made(at, value, "", 0.0), unit=True)
             what = "the end of its range, where flat tops hide the true signal"
             return made(at, value, what, 0.0 if at.sum() > 1 else 1.0)
@@ -213,13 +182,9 @@ def _ends(
         if mask.any():
             near = np.convolve(mask, np.ones(3), "same") > 0  # a sample may fall within a jump
             inside = sign * np.max(sign * x[~near]) if not near.all() else float("nan")
-            return made(
-                mask,
-                float(np.median(x[mask])),
-                "a constant level outside the range of the signal, with jumps to and from it, as an "
-                f"instrument outputs when it is out of range (the rest of the record reaches {inside:.6g})",
-                0.0,
-            )
+            return made(mask, float(np.median(x[mask])),
+                        "a constant level outside the range of the signal, with jumps to and from it, as an instrument "
+                        f"outputs when it is out of range (the rest of the record reaches {inside:.6g})", 0.0)
         top, p, width = repeated_extreme(sign * x, periods)
         if p < best.p:
             flat = sign * x >= top - width
@@ -228,13 +193,10 @@ def _ends(
             if both:
                 flat |= -sign * x >= opposite - width
             best = made(
-                flat,
-                float(sign * top),
+                flat, float(sign * top),
                 ("here and at the opposite value " if both else "")
                 + "the extreme value repeats far more often than the next ones, a flat top as from a saturated"
-                " converter or preamplifier" + (" below the end of the known range" if bounds is not None else ""),
-                p,
-            )
+                " converter or preamplifier" + (" below the end of the known range" if bounds is not None else ""), p)
     return best
 
 
@@ -249,11 +211,11 @@ def repeated_extreme(x: np.ndarray, periods: int = 1) -> tuple[float, float, flo
     values, counts = np.unique(x, return_counts=True)
     top, extent = float(values[-1]), float(values[-1] - values[0])
     none = top, 1.0, 0.0
-    if len(values) <= STEPS or top - np.median(x) < 0.1 * extent:
+    if len(values) <= SETTINGS.steps or top - np.median(x) < 0.1 * extent:
         return none
     step = float(np.min(np.diff(values)))
     trials = [(0.0, int(counts[-1]), int(counts[-6:-1].max()))]
-    for part in WIDTHS:
+    for part in SETTINGS.widths:
         width = part * extent
         if width > 2 * step:
             near = np.searchsorted(values, top - width * np.arange(7) - 1e-9 * extent)
@@ -262,7 +224,7 @@ def repeated_extreme(x: np.ndarray, periods: int = 1) -> tuple[float, float, flo
     best = none
     for width, n, others in trials:
         others = max(others, periods)
-        if n >= max(5.0, FLATTER * others):
+        if n >= max(5.0, SETTINGS.flatter * others):
             p = len(trials) * float(stats.binom.sf(n - 1, n + others, SINE_TOP / (1 + SINE_TOP)))
             best = min(best, (top, p, width), key=lambda b: b[1])
             if p < FALSE_ALARM / 1000:  # the narrowest that is beyond doubt counts the samples best
@@ -277,7 +239,7 @@ def over_range(x: np.ndarray) -> np.ndarray:
     if top == low:
         return mask
     usual = float(np.median(np.abs(x[2:] - x[:-2]))) if len(x) > 2 else 0.0
-    near = np.concatenate([[False], x > top - LEVEL_SPREAD * (top - low), [False]])
+    near = np.concatenate([[False], x > top - SETTINGS.level_spread * (top - low), [False]])
     edges = np.flatnonzero(np.diff(near.astype(int)))
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
         run = x[start:stop]
@@ -285,10 +247,8 @@ def over_range(x: np.ndarray) -> np.ndarray:
             continue
         # One sample may fall within the jump itself.
         jump = min(run[0] - x[start - 2], run[-1] - x[min(stop + 1, len(x) - 1)])
-        if (
-            np.ptp(run) < LEVEL_SPREAD * jump
-            and jump > max(0.2 * (top - low), UNUSUAL * usual)
-            and np.ptp(x[start - 2 : start]) > 0
-        ):
+        if (np.ptp(run) < SETTINGS.level_spread * jump
+            and jump > max(0.2 * (top - low), SETTINGS.unusual * usual)
+            and np.ptp(x[start - 2 : start]) > 0):
             mask[start:stop] = True
     return mask

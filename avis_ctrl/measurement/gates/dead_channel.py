@@ -23,10 +23,19 @@ from avis_ctrl.measurement.gates.finding import (
 from avis_ctrl.measurement.gates.h1 import h1, segment_length, spectra, usable
 from avis_ctrl.measurement.gates.sine_fit import fit_sine
 
-# A stuck run is at least this long, and this many times as long as any other run of the channel.
-STUCK_SAMPLES, STUCK_FACTOR = 50, 5
-# A dead channel stays below this part of what chance may do, where the median channel exceeds it as often.
-RESPONDS = 10.0
+
+@dataclass(frozen=True)
+class DeadSettings:
+    """stuck_samples, stuck_factor : least length of a stuck run, in samples and over any other run of the channel [1].
+    responds : factor by which the median channel exceeds what chance may do where others count as dead [1].
+    """
+
+    stuck_samples: int = 50
+    stuck_factor: int = 5
+    responds: float = 10.0
+
+
+SETTINGS = DeadSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +55,11 @@ class DeadChannel(Gate):
     """Sensors that do not sense and drives that are never driven.
 
     Constant channels need no statistics. A stuck code is a run of equal samples, at least 50 and five times as long as
-    any
-    other such run of the channel. A channel is noise alone where its largest multiple coherence over the driven lines
-    is what
-    chance gives (beta distribution of n_u and K - n_u, 1 % shared over channels, records and lines) while half of the
-    channels exceed ten times as much in terms of coherence / (1 - coherence); that is judged over all driven records.
-    Of a
-    sine record the fitted sine's power is judged against the residual, by F(2, samples - 3).
-    On clean data the channel's signal-to-noise ratio would have to be at fault, so false alarms come from small signals
+    any other such run of the channel. A channel is noise alone where its largest multiple coherence over the driven
+    lines is what chance gives (beta distribution of n_u and K - n_u, 1 % shared over channels, records and lines) while
+    half of the channels exceed ten times as much in terms of coherence / (1 - coherence); that is judged over all
+    driven records. Of a sine record the fitted sine's power is judged against the residual, by F(2, samples - 3). On
+    clean data the channel's signal-to-noise ratio would have to be at fault, so false alarms come from small signals
     only.
     """
 
@@ -67,22 +73,13 @@ class DeadChannel(Gate):
             runs = equal_runs(y[:, k])
             longest[k] = runs[0][0]
             second = runs[1][0] if len(runs) > 1 else 1
-            if longest[k] < len(y) and longest[k] >= max(STUCK_SAMPLES, STUCK_FACTOR * second):
+            if longest[k] < len(y) and longest[k] >= max(SETTINGS.stuck_samples, SETTINGS.stuck_factor * second):
                 stuck[k] = runs[0]
         traces = {k: (t[(part := slice(max(0, at - n), at + 2 * n))], y[part, k]) for k, (n, at) in stuck.items()}
         codes = np.array([len(np.unique(y[: 1 << 14, k])) for k in range(y.shape[1])])
         spread = np.ptp(np.concatenate([p.u for p in seen.pieces]), axis=0)
-        return _Kept(
-            seen.header.name,
-            seen.driven,
-            np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0),
-            spread,
-            codes,
-            longest,
-            stuck,
-            _excess(seen),
-            traces,
-        )
+        return _Kept(seen.header.name, seen.driven, np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0), spread, codes,
+                     longest, stuck, _excess(seen), traces)
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         names = campaign.y_names
@@ -99,52 +96,30 @@ class DeadChannel(Gate):
             if dead:
                 constant.add(name)
                 found.append(
-                    Finding(
-                        self.name,
-                        "stop",
-                        f"Channel {name!r} is constant in {_records(dead, kept)}: the sensor is "
-                        "not connected or not recorded. Check its cable and input, or leave the channel out.",
-                        (name,),
-                        dead,
-                        0.0,
-                        0.0,
-                        picture,
-                    )
-                )
+                    Finding(self.name, "stop",
+                            f"Channel {name!r} is constant in {_records(dead, kept)}: the sensor is not connected or "
+                            "not recorded. Check its cable and input, or leave the channel out.", (name,), dead, 0.0,
+                            0.0, picture))
             for k in kept:
                 if j in k.stuck:
                     found.append(self._stuck(name, j, k, campaign))
-            if name not in constant and excess is not None and excess[j] < 1 and np.median(excess) > RESPONDS:
+            if name not in constant and excess is not None and excess[j] < 1 and np.median(excess) > SETTINGS.responds:
                 found.append(
-                    Finding(
-                        self.name,
-                        "stop",
-                        f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} r.m.s."
-                        f" ({int(np.median([k.codes[j] for k in kept]))} different values) in every driven record while"
-                        f" the other channels respond (its ratio of response to noise is {excess[j]:.2g} times the"
-                        f" limit for noise alone; the median of all channels is {np.median(excess):.3g} times it): not"
-                        " connected, or recorded under another name. Check its cable, or leave it out.",
-                        (name,),
-                        tuple(k.record for k in kept if k.response is not None),
-                        float(excess[j]),
-                        1.0,
-                        picture,
-                    )
-                )
+                    Finding(self.name, "stop",
+                            f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} "
+                            f"r.m.s. ({int(np.median([k.codes[j] for k in kept]))} different values) in every driven "
+                            "record while the other channels respond (its ratio of response to noise is "
+                            f"{excess[j]:.2g} times the limit for noise alone; the median of all channels is "
+                            f"{np.median(excess):.3g} times it): not connected, or recorded under another name. Check "
+                            "its cable, or leave it out.", (name,),
+                            tuple(k.record for k in kept if k.response is not None), float(excess[j]), 1.0, picture))
         found += self._never_driven(kept, campaign, picture)
         if not found:
             found.append(
-                Finding(
-                    self.name,
-                    "ok",
-                    f"All {len(names)} channels move; the quietest is "
-                    f"{names[int(np.argmin(rms.max(axis=0)))]!r} with {rms.max(axis=0).min():.3g} "
-                    f"{campaign.y_unit} r.m.s. in its strongest record.",
-                    value=float(rms.max(axis=0).min()),
-                    limit=0.0,
-                    picture=picture,
-                )
-            )
+                Finding(self.name, "ok",
+                        f"All {len(names)} channels move; the quietest is {names[int(np.argmin(rms.max(axis=0)))]!r} "
+                        f"with {rms.max(axis=0).min():.3g} {campaign.y_unit} r.m.s. in its strongest record.",
+                        value=float(rms.max(axis=0).min()), limit=0.0, picture=picture))
         return found
 
     def _never_driven(self, kept: list[_Kept], campaign: Campaign, picture: Picture) -> list[Finding]:
@@ -155,50 +130,27 @@ class DeadChannel(Gate):
         if not idle:
             return []
         return [
-            Finding(
-                self.name,
-                "note",
-                f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. "
-                "Drive it in a further record, or leave it out.",
-                idle,
-                picture=picture,
-            )
-        ]
+            Finding(self.name, "note",
+                    f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. Drive "
+                    "it in a further record, or leave it out.", idle, picture=picture)]
 
     def _stuck(self, name: str, j: int, kept: _Kept, campaign: Campaign) -> Finding:
         n, at = kept.stuck[j]
         rate = campaign.sample_rate_Hz
         t, x = kept.traces[j]
         severity: Severity = "warning"
-        picture = Picture(
-            f"Record {kept.record}, {name}",
-            "time [s]",
-            f"{name} [{campaign.y_unit}]",
-            (Series(name, *thinned(t, x)),),
-            (Limit("stuck from", at / rate, "x"),),
-        )
-        return Finding(
-            self.name,
-            severity,
-            f"Channel {name!r} of record {kept.record} repeats one value for {n} samples "
-            f"({n / rate:.3g} s) from {at / rate:.4g} s on: the converter or the data link was stuck. "
-            "Leave that part out or repeat the record.",
-            (name,),
-            (kept.record,),
-            float(n),
-            float(STUCK_SAMPLES),
-            picture,
-        )
+        picture = Picture(f"Record {kept.record}, {name}", "time [s]", f"{name} [{campaign.y_unit}]",
+                          (Series(name, *thinned(t, x)),), (Limit("stuck from", at / rate, "x"),))
+        return Finding(self.name, severity,
+                       f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) "
+                       f"from {at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or "
+                       "repeat the record.", (name,), (kept.record,), float(n), float(SETTINGS.stuck_samples), picture)
 
     def _picture(self, kept: list[_Kept], rms: np.ndarray, campaign: Campaign) -> Picture:
         x = np.arange(len(kept))
-        return Picture(
-            "R.m.s. of each channel by record",
-            "record number",
-            f"r.m.s. [{campaign.y_unit}]",
-            tuple(Series(name, x, rms[:, j], "points") for j, name in enumerate(campaign.y_names)),
-            y_scale="log",
-        )
+        return Picture("R.m.s. of each channel by record", "record number", f"r.m.s. [{campaign.y_unit}]",
+                       tuple(Series(name, x, rms[:, j], "points") for j, name in enumerate(campaign.y_names)),
+                       y_scale="log")
 
 
 def _records(names: tuple[str, ...], kept: list[_Kept]) -> str:

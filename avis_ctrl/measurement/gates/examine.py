@@ -15,25 +15,13 @@ from avis_ctrl.measurement.gates.finding import Expectation, Finding
 from avis_ctrl.measurement.gates.hum import Hum
 from avis_ctrl.measurement.gates.missing_samples import MissingSamples
 from avis_ctrl.measurement.gates.periodicity import Periodicity
-from avis_ctrl.measurement.gates.repeatability import LevelDependence, Repeatability
+from avis_ctrl.measurement.gates.repeatability import Comparison
 from avis_ctrl.measurement.gates.signal_quality import Coherence, SignalToNoise
 from avis_ctrl.measurement.gates.spikes import Spikes
 from avis_ctrl.measurement.gates.stepped_sine import SteppedSine
 
-GATES: tuple[type[Gate], ...] = (
-    Clipping,
-    Spikes,
-    DeadChannel,
-    ChannelMap,
-    SteppedSine,
-    MissingSamples,
-    Hum,
-    SignalToNoise,
-    Coherence,
-    Periodicity,
-    Repeatability,
-    LevelDependence,
-)
+GATES: tuple[type[Gate], ...] = (Clipping, Spikes, DeadChannel, ChannelMap, SteppedSine, MissingSamples, Hum,
+                                 SignalToNoise, Coherence, Periodicity, Comparison)
 # What rows that do not belong together spoil.
 CONSEQUENCES = ("signal to noise", "coherence", "periodicity", "repeatability", "level dependence", "spikes")
 # The same where no record is without them.
@@ -67,10 +55,8 @@ def examine(campaign: Campaign, expectation: Expectation | None = None, longest:
     findings = [f for gate, of in zip(gates, kept, strict=True) for f in gate.conclude(of, campaign, known)]
     findings = after_clipping(after_missing_samples(findings, {record.header.name for record in campaign.records}))
     if shortened:
-        said = (
-            f" (Of record {', '.join(shortened[:4])}{' and others' if len(shortened) > 4 else ''} only pieces with"
-            f" {longest} samples in all were examined.)"
-        )
+        said = (f" (Of record {', '.join(shortened[:4])}{' and others' if len(shortened) > 4 else ''} only pieces with "
+                f"{longest} samples in all were examined.)")
         findings = [replace(f, sentence=f.sentence + said) for f in findings]
     return tuple(findings)
 
@@ -82,10 +68,8 @@ def after_missing_samples(findings: list[Finding], names: Set[str]) -> list[Find
     what all records say together of channels and signs only where samples miss in each, of `names`.
     """
     records = {r for f in findings if f.gate == MissingSamples.name and f.severity == "stop" for r in f.records}
-    said = (
-        f" This is likely a consequence of the missing or doubled samples of record {', '.join(sorted(records))}:"
-        " check again without them."
-    )
+    said = (f" This is likely a consequence of the missing or doubled samples of record {', '.join(sorted(records))}: "
+            "check again without them.")
 
     def follows(f: Finding) -> bool:
         of = {name.removeprefix("record ") for name in f.records}

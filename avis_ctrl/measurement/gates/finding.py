@@ -116,11 +116,6 @@ class Expectation:
                 raise InputError("expected a positive number", field=name, value=value)
 
 
-def worst(severities: list[str]) -> str:
-    """The gravest of some severities; "ok" of none."""
-    return max(severities, key=SEVERITIES.index, default="ok")
-
-
 def quoted(names: tuple[str, ...] | list[str], most: int = 4) -> str:
     """'a', 'b' and 3 more."""
     shown = ", ".join(repr(name) for name in names[:most])

@@ -21,11 +21,26 @@ from avis_ctrl.measurement.gates.finding import (
 )
 
 MAINS_HZ = (50.0, 60.0)
-HARMONICS = 6
-# The mains stays within this of its nominal frequency.
-TOLERANCE = 0.004
-REFERENCE = 16
-GUARD = 3
+
+
+@dataclass(frozen=True)
+class HumSettings:
+    """harmonics : of 50 and of 60 Hz that are tested.
+    tolerance : within which the mains stays of its nominal frequency [1].
+    reference, guard : bins on either side that tell the floor, and bins left out next to the line's.
+    least_ratio : of a line's power to its floor [1]: floors are not quite flat.
+    large : part of the channel's r.m.s. from which a line is a warning [1].
+    """
+
+    harmonics: int = 6
+    tolerance: float = 0.004
+    reference: int = 16
+    guard: int = 3
+    least_ratio: float = 3.0
+    large: float = 0.01
+
+
+SETTINGS = HumSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,17 +69,13 @@ class _Kept:
 class Hum(Gate):
     """Narrow lines at k 50 Hz and k 60 Hz, k = 1 .. 6, within 0.4 %.
 
-    Power spectra are means over K Hann segments without overlap (K from 4 to 32). The largest bin within the
-    tolerance is compared with 16 bins on either side, the first three next to it left out; the louder side is the
-    floor.
-    Their ratio is F(2K, 2 16 K) distributed where the floor is locally flat, so that 1 % shared over bins, lines,
-    channels and
-    records controls false alarms; a line must moreover exceed its floor by a factor of 3, for floors that are not quite
-    flat.
-    Lines that the commanded u drives (bins with more than 1e-6 of the median power of its driven bins) are passed over:
-    they
-    are the experiment.
-    A line is a warning where it makes more than 1 % of the channel's r.m.s. in that record, otherwise a note.
+    Power spectra are means over K Hann segments without overlap (K from 4 to 32). The largest bin within the tolerance
+    is compared with 16 bins on either side, the first three next to it left out; the louder side is the floor. Their
+    ratio is F(2K, 2 16 K) distributed where the floor is locally flat, so that 1 % shared over bins, lines, channels
+    and records controls false alarms; a line must moreover exceed its floor by a factor of 3, for floors that are not
+    quite flat. Lines that the commanded u drives (bins with more than 1e-6 of the median power of its driven bins) are
+    passed over: they are the experiment. A line is a warning where it makes more than 1 % of the channel's r.m.s. in
+    that record, otherwise a note.
     """
 
     name = "hum"
@@ -79,7 +90,7 @@ class Hum(Gate):
         driven = _driven(Pu, h.excitation)
         lines, passed = [], 0
         for mains in MAINS_HZ:
-            for k in range(1, HARMONICS + 1):
+            for k in range(1, SETTINGS.harmonics + 1):
                 made = _tested(f, P, driven, k * mains, mains, K)
                 lines += made or []
                 passed += made is None
@@ -91,12 +102,8 @@ class Hum(Gate):
         names = campaign.y_names
         for j, name in enumerate(names):
             for mains in MAINS_HZ:
-                hits = [
-                    (k, line)
-                    for k in kept
-                    for line in k.lines
-                    if line.channel == j and line.mains_Hz == mains and line.p < FALSE_ALARM / tested and line.ratio > 3
-                ]
+                hits = [(k, line) for k in kept for line in k.lines if line.channel == j and line.mains_Hz == mains
+                        and line.p < FALSE_ALARM / tested and line.ratio > SETTINGS.least_ratio]
                 if hits:
                     found.append(self._finding(name, mains, hits, campaign.y_unit))
         passed = sum(k.passed_over for k in kept)
@@ -105,49 +112,28 @@ class Hum(Gate):
             what = "No mains hum was found" if tested else "No line of the mains could be tested"
             last = kept[-1]
             found.append(
-                Finding(
-                    self.name,
-                    "ok",
-                    f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).",
-                    value=None,
-                    limit=FALSE_ALARM,
-                    picture=self._picture(last, 0, names[0], campaign.y_unit, []),
-                )
-            )
+                Finding(self.name, "ok", f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).", value=None,
+                        limit=FALSE_ALARM, picture=self._picture(last, 0, names[0], campaign.y_unit, [])))
         return found
 
     def _finding(self, name: str, mains: float, hits: list[tuple[_Kept, _Line]], unit: str) -> Finding:
         record, line = max(hits, key=lambda hit: hit[1].ratio)
         part = max(hit.rms / max(k.rms[hit.channel], 1e-300) for k, hit in hits)
-        severity: Severity = "warning" if part > 0.01 else "note"
+        severity: Severity = "warning" if part > SETTINGS.large else "note"
         records = tuple(dict.fromkeys(k.record for k, _ in hits))
         at = sorted({round(hit.at_Hz / mains) for _, hit in hits})
         harmonics = ", ".join(f"{k * mains:g}" for k in at)
         picture = self._picture(record, line.channel, name, unit, [k * mains for k in at])
-        return Finding(
-            self.name,
-            severity,
-            f"Channel {name!r} carries mains hum at {harmonics} Hz: at {line.at_Hz:.4g} Hz {line.rms:.3g} {unit}"
-            f" r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, {100 * part:.2g} % of the channel's"
-            f" r.m.s. (record {record.record}). Check grounding and shielding; keep these lines out of the fit.",
-            (name,),
-            records,
-            float(line.ratio),
-            3.0,
-            picture,
-        )
+        return Finding(self.name, severity,
+                       f"Channel {name!r} carries mains hum at {harmonics} Hz: at {line.at_Hz:.4g} Hz {line.rms:.3g} "
+                       f"{unit} r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, {100 * part:.2g} % "
+                       f"of the channel's r.m.s. (record {record.record}). Check grounding and shielding; keep these "
+                       "lines out of the fit.", (name,), records, float(line.ratio), SETTINGS.least_ratio, picture)
 
     def _picture(self, kept: _Kept, j: int, name: str, unit: str, at: list[float]) -> Picture:
         f, a = thinned(kept.f[1:], kept.asd[1:, j])
-        return Picture(
-            f"Record {kept.record}, {name}",
-            "frequency [Hz]",
-            f"amplitude density [{unit}/sqrt(Hz)]",
-            (Series(name, f, a),),
-            tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ),
-            "log",
-            "log",
-        )
+        return Picture(f"Record {kept.record}, {name}", "frequency [Hz]", f"amplitude density [{unit}/sqrt(Hz)]",
+                       (Series(name, f, a),), tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ), "log", "log")
 
 
 def _length(samples: int, rate: float) -> int:
@@ -167,26 +153,24 @@ def _driven(Pu: np.ndarray, excitation: str) -> np.ndarray:
 def _tested(f: np.ndarray, P: np.ndarray, driven: np.ndarray, at: float, mains: float, K: int) -> list[_Line] | None:
     """The line at `at` in each channel; empty beyond the band, None where u drives it."""
     df = f[1]
-    width = max(1, int(np.ceil(TOLERANCE * at / df)))
+    width = max(1, int(np.ceil(SETTINGS.tolerance * at / df)))
     middle = round(at / df)
     low, high = middle - width, middle + width
-    if low - GUARD - REFERENCE < 1 or high + GUARD + REFERENCE >= len(f) - 1:
+    if low - SETTINGS.guard - SETTINGS.reference < 1 or high + SETTINGS.guard + SETTINGS.reference >= len(f) - 1:
         return []
-    around = slice(low - GUARD - REFERENCE, high + GUARD + REFERENCE + 1)
+    around = slice(low - SETTINGS.guard - SETTINGS.reference, high + SETTINGS.guard + SETTINGS.reference + 1)
     if driven[around].any():
         return None
     lines = []
     for j in range(P.shape[1]):
-        floor = max(
-            P[low - GUARD - REFERENCE : low - GUARD, j].mean(),
-            P[high + GUARD + 1 : high + GUARD + REFERENCE + 1, j].mean(),
-        )
+        floor = max(P[low - SETTINGS.guard - SETTINGS.reference : low - SETTINGS.guard, j].mean(),
+                    P[high + SETTINGS.guard + 1 : high + SETTINGS.guard + SETTINGS.reference + 1, j].mean())
         peak = low + int(np.argmax(P[low : high + 1, j]))
         if floor <= 0:
             continue
         ratio = float(P[peak, j] / floor)
         # The largest of 2 width + 1 bins; neighbouring Hann bins are dependent, which makes the bound safe.
-        p = min(1.0, (2 * width + 1) * float(stats.f.sf(ratio, 2 * K, 2 * K * REFERENCE)))
+        p = min(1.0, (2 * width + 1) * float(stats.f.sf(ratio, 2 * K, 2 * K * SETTINGS.reference)))
         around_peak = P[max(peak - 2, 0) : peak + 3, j] - floor
         lines.append(_Line(j, mains, float(f[peak]), p, ratio, float(np.sqrt(max(around_peak.sum(), 0.0) * df))))
     return lines

@@ -84,52 +84,28 @@ class MissingSamples(Gate):
             if k.block:
                 at, back, n = k.block
                 found.append(
-                    Finding(
-                        self.name,
-                        "stop",
-                        f"Record {name} repeats {n} rows at {at / rate:.5g} s that it already had "
-                        f"{back} samples before: a buffer was written twice. Repeat the record.",
-                        (),
-                        (name,),
-                        float(n),
-                        float(SETTINGS.block_rows),
-                        picture,
-                    )
-                )
+                    Finding(self.name, "stop",
+                            f"Record {name} repeats {n} rows at {at / rate:.5g} s that it already had {back} samples "
+                            "before: a buffer was written twice. Repeat the record.", (), (name,), float(n),
+                            float(SETTINGS.block_rows), picture))
             if k.clock is not None and np.any(k.clock != 0):
                 p = int(np.flatnonzero(k.clock)[0])
                 found.append(
-                    Finding(
-                        self.name,
-                        "stop",
-                        f"The commanded voltage of record {name} is {abs(k.clock[-1] or k.clock[p]):g} samples off its"
-                        f" period of {k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, or"
-                        " the stated period is wrong. Check period_s, or repeat the record.",
-                        (),
-                        (name,),
-                        float(k.clock[p]),
-                        0.0,
-                        picture,
-                    )
-                )
+                    Finding(self.name, "stop",
+                            f"The commanded voltage of record {name} is {abs(k.clock[-1] or k.clock[p]):g} samples off "
+                            f"its period of {k.header.period_s:g} s from period {p + 1} on: rows are missing or "
+                            "doubled, or the stated period is wrong. Check period_s, or repeat the record.", (),
+                            (name,), float(k.clock[p]), 0.0, picture))
             step = largest_step(k.stepped, level)
             if step is not None and abs(step[1]) > SETTINGS.jump_samples:
                 at, size = step
                 found.append(
-                    Finding(
-                        self.name,
-                        "stop",
-                        f"In record {name} the delay of the measured channels after the commanded voltage becomes"
-                        f" {abs(size):.1f} samples {'shorter' if size < 0 else 'longer'} at about"
-                        f" {k.t[at] - k.header.start_s:.4g} s: about {max(1, round(abs(size)))} samples were"
-                        f" {'lost' if size < 0 else 'doubled'}. Repeat the record, or use only the part before.",
-                        (),
-                        (name,),
-                        float(size),
-                        SETTINGS.jump_samples,
-                        picture,
-                    )
-                )
+                    Finding(self.name, "stop",
+                            f"In record {name} the delay of the measured channels after the commanded voltage becomes "
+                            f"{abs(size):.1f} samples {'shorter' if size < 0 else 'longer'} at about "
+                            f"{k.t[at] - k.header.start_s:.4g} s: about {max(1, round(abs(size)))} samples were "
+                            f"{'lost' if size < 0 else 'doubled'}. Repeat the record, or use only the part before.", (),
+                            (name,), float(size), SETTINGS.jump_samples, picture))
         if not found:
             longest = max(kept, key=lambda k: len(k.t))
             told = [k for k in kept if len(k.t) > 3 and np.std(k.delay[0]) < SETTINGS.jump_samples]
@@ -138,16 +114,10 @@ class MissingSamples(Gate):
             said = f"; the delay scatters by at most {scatter:.2g} samples r.m.s." if told else ""
             said += f"; in {vague} the correlation of y with u is too low for this check" if vague else ""
             found.append(
-                Finding(
-                    self.name,
-                    "ok",
-                    f"No lost or repeated samples were found ({len(told)} of {len(kept)} records could be compared with"
-                    f" a moving commanded voltage{said}).",
-                    value=scatter if told else None,
-                    limit=SETTINGS.jump_samples,
-                    picture=_picture(longest),
-                )
-            )
+                Finding(self.name, "ok",
+                        f"No lost or repeated samples were found ({len(told)} of {len(kept)} records could be compared "
+                        f"with a moving commanded voltage{said}).", value=scatter if told else None,
+                        limit=SETTINGS.jump_samples, picture=_picture(longest)))
         return found
 
     def _overlaps(self, kept: list[_Kept]) -> list[Finding]:
@@ -159,18 +129,11 @@ class MissingSamples(Gate):
             end = a.header.start_s + a.header.duration_s
             if b.header.start_s < end - 1.5 / a.header.sample_rate_Hz:
                 found.append(
-                    Finding(
-                        self.name,
-                        "warning",
-                        f"Record {b.header.name} starts at {b.header.start_s:.6g} s, before record {a.header.name} ends"
-                        f" at {end:.6g} s: the clocks or the sample rate are wrong. Check start_s and sample_rate_Hz.",
-                        (),
-                        (a.header.name, b.header.name),
-                        float(b.header.start_s - end),
-                        0.0,
-                        _picture(a),
-                    )
-                )
+                    Finding(self.name, "warning",
+                            f"Record {b.header.name} starts at {b.header.start_s:.6g} s, before record {a.header.name} "
+                            f"ends at {end:.6g} s: the clocks or the sample rate are wrong. Check start_s and "
+                            "sample_rate_Hz.", (), (a.header.name, b.header.name), float(b.header.start_s - end), 0.0,
+                            _picture(a)))
         return found[:3]
 
 
@@ -281,9 +244,8 @@ def repeated_block(y: np.ndarray, period: int | None) -> tuple[int, int, int] | 
     moving, rows = np.ptp(y, axis=0) > 0, SETTINGS.block_rows
     if not moving.any() or len(y) < 2 * rows:
         return None
-    _, codes = np.unique(
-        np.ascontiguousarray(y[:, moving]).view(np.dtype((np.void, 8 * int(moving.sum())))).ravel(), return_inverse=True
-    )
+    _, codes = np.unique(np.ascontiguousarray(y[:, moving]).view(np.dtype((np.void, 8 * int(moving.sum())))).ravel(),
+                         return_inverse=True)
     changed = np.concatenate([[True], np.diff(codes) != 0])
     factors = np.random.default_rng(0).integers(1, 1 << 62, rows, dtype=np.int64) | 1
     windows = np.lib.stride_tricks.sliding_window_view(codes.astype(np.int64), rows)
@@ -318,10 +280,6 @@ def _clock(seen: Excerpt) -> np.ndarray | None:
 
 def _picture(kept: _Kept) -> Picture:
     t = kept.t - kept.header.start_s
-    return Picture(
-        f"Record {kept.header.name}: delay of y behind the response to u",
-        "time [s]",
-        "delay [samples]",
-        (Series("delay", t, kept.delay[0], "points"),),
-        (Limit("half a sample", SETTINGS.jump_samples), Limit("half a sample", -SETTINGS.jump_samples)),
-    )
+    return Picture(f"Record {kept.header.name}: delay of y behind the response to u", "time [s]", "delay [samples]",
+                   (Series("delay", t, kept.delay[0], "points"),),
+                   (Limit("half a sample", SETTINGS.jump_samples), Limit("half a sample", -SETTINGS.jump_samples)))

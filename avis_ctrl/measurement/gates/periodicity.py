@@ -21,10 +21,18 @@ from avis_ctrl.measurement.gates.finding import (
     times,
 )
 
-# Lines over which the noise level is averaged, and lines looked at: those that carry most of the power.
-SMOOTH = 9
-# A steady drift over the last half of the record below this part of the signal is passed.
-DRIFT = 0.01
+
+@dataclass(frozen=True)
+class PeriodicitySettings:
+    """smooth : lines over which the noise level is averaged.
+    drift : part of the signal below which a steady drift over the last half of the record is passed [1].
+    """
+
+    smooth: int = 9
+    drift: float = 0.01
+
+
+SETTINGS = PeriodicitySettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +53,11 @@ class Periodicity(Gate):
     """Each period against the mean of the last half, line by line and channel by channel.
 
     Differences pass a Hann window, which keeps low frequencies from leaking into all lines. With noise variances from
-    the periods of the
-    reference, smoothed over 9 lines, T is F(L, L (R - 1)) distributed for L independent lines and R reference periods;
-    1 % is
-    shared over periods, channels and records. Periods up to the last one before the reference that fails are to be
-    dropped: a note, for a rig that starts at rest always has a transient. Where the reference's first period itself
-    fails against the
-    others, or where the reference's periods change steadily (slope against what it leaves, F(L, L (R - 2)), and more
-    than 1 % of the signal), the response drifts: a warning.
+    the periods of the reference, smoothed over 9 lines, T is F(L, L (R - 1)) distributed for L independent lines and R
+    reference periods; 1 % is shared over periods, channels and records. Periods up to the last one before the reference
+    that fails are to be dropped: a note, for a rig that starts at rest always has a transient. Where the reference's
+    first period itself fails against the others, or where the reference's periods change steadily (slope against what
+    it leaves, F(L, L (R - 2)), and more than 1 % of the signal), the response drifts: a warning.
     """
 
     name = "periodicity"
@@ -74,14 +79,8 @@ class Periodicity(Gate):
         judged = [k for k in kept if k.T is not None]
         if not judged:
             why = "no record is periodic with four periods or more"
-            return [
-                Finding(
-                    self.name,
-                    "ok",
-                    f"Periodicity was not tested: {why}.",
-                    picture=Picture("Periods against the last ones", "period", "ratio to noise [-]", ()),
-                )
-            ]
+            return [Finding(self.name, "ok", f"Periodicity was not tested: {why}.",
+                            picture=Picture("Periods against the last ones", "period", "ratio to noise [-]", ()))]
         tests = sum(k.T.size for k in judged if k.T is not None)
         found, drops = [], {}
         for k in judged:
@@ -91,13 +90,9 @@ class Periodicity(Gate):
             P = len(k.T)
             reference = P - P // 2
             picture = Picture(
-                f"Record {k.record}: periods against the last {P // 2}",
-                "period",
-                "difference by noise, power [-]",
+                f"Record {k.record}: periods against the last {P // 2}", "period", "difference by noise, power [-]",
                 tuple(Series(n, np.arange(1, P + 1), k.T[:, j], "points") for j, n in enumerate(campaign.y_names)),
-                (Limit("1 % limit for noise", limit),),
-                y_scale="log",
-            )
+                (Limit("1 % limit for noise", limit),), y_scale="log")
             if (drifting := self._drifting(k, tests, campaign, picture)) is not None:
                 found.append(drifting)
                 continue
@@ -105,20 +100,12 @@ class Periodicity(Gate):
             if drop > reference:
                 bad = tuple(n for j, n in enumerate(campaign.y_names) if (k.T[reference - 1 :, j] > limit).any())
                 found.append(
-                    Finding(
-                        self.name,
-                        "warning",
-                        f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s:"
-                        f" {quoted(bad)} still differ by {times(float(np.sqrt(k.T[drop - 1].max())))} the noise,"
-                        f" {percent(k.relative[drop - 1].max())} of the signal. The rig drifts, or the transient is"
-                        " longer than the record. Wait longer before recording, or look for drift.",
-                        bad,
-                        (k.record,),
-                        float(k.T[drop - 1].max()),
-                        limit,
-                        picture,
-                    )
-                )
+                    Finding(self.name, "warning",
+                            f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s: "
+                            f"{quoted(bad)} still differ by {times(float(np.sqrt(k.T[drop - 1].max())))} the noise, "
+                            f"{percent(k.relative[drop - 1].max())} of the signal. The rig drifts, or the transient is "
+                            "longer than the record. Wait longer before recording, or look for drift.", bad,
+                            (k.record,), float(k.T[drop - 1].max()), limit, picture))
             else:
                 drops[k.record] = (drop, k, limit, picture)
         late = {r: d for r, d in drops.items() if d[0] > 0}
@@ -127,34 +114,18 @@ class Periodicity(Gate):
             periods = f"{most} period{'s' if most > 1 else ''}"
             assert k.relative is not None and k.T is not None
             found.append(
-                Finding(
-                    self.name,
-                    "note",
-                    f"The initial transient lasts {periods} of {k.period_s:g} s"
-                    f" (record {k.record}: the first differs from the last ones by {100 * k.relative[0].max():.2g} % of"
-                    f" the signal). A fit that includes the transient, as in avis identify, needs no change;"
-                    f" otherwise drop the first {periods} of each record.",
-                    (),
-                    tuple(late),
-                    float(most),
-                    0.0,
-                    picture,
-                )
-            )
+                Finding(self.name, "note",
+                        f"The initial transient lasts {periods} of {k.period_s:g} s (record {k.record}: the first "
+                        f"differs from the last ones by {100 * k.relative[0].max():.2g} % of the signal). A fit that "
+                        "includes the transient, as in avis identify, needs no change; otherwise drop the first "
+                        f"{periods} of each record.", (), tuple(late), float(most), 0.0, picture))
         elif drops and not found:
             _, k, limit, picture = next(iter(drops.values()))
             assert k.T is not None
             found.append(
-                Finding(
-                    self.name,
-                    "ok",
-                    f"All periods repeat within the noise (largest ratio {k.T.max():.2f}, limit for noise alone"
-                    f" {limit:.2f}).",
-                    value=float(k.T.max()),
-                    limit=limit,
-                    picture=picture,
-                )
-            )
+                Finding(self.name, "ok",
+                        f"All periods repeat within the noise (largest ratio {k.T.max():.2f}, limit for noise alone "
+                        f"{limit:.2f}).", value=float(k.T.max()), limit=limit, picture=picture))
         return found
 
     def _drifting(self, k: _Kept, tests: int, campaign: Campaign, picture: Picture) -> Finding | None:
@@ -162,23 +133,16 @@ class Periodicity(Gate):
             return None
         T, drift = k.drift
         limit = float(stats.f.isf(FALSE_ALARM / tests, k.lines, k.lines * (k.dof - 1)))
-        bad = (limit < T) & (drift > DRIFT)
+        bad = (limit < T) & (drift > SETTINGS.drift)
         if not bad.any():
             return None
         names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-        return Finding(
-            self.name,
-            "warning",
-            f"Record {k.record} drifts: over its last {len(k.T) // 2} periods of {k.period_s:g} s {quoted(names)}"
-            f" change steadily by {percent(drift[bad].max())} of the signal ({times(float(T[bad].max()))} the noise"
-            f" power; limit for noise alone {limit:.2f}). The rig drifts, or the transient is longer than the record."
-            " Wait longer before recording, or find the cause of the drift.",
-            names,
-            (k.record,),
-            float(T[bad].max()),
-            limit,
-            picture,
-        )
+        return Finding(self.name, "warning",
+                       f"Record {k.record} drifts: over its last {len(k.T) // 2} periods of {k.period_s:g} s "
+                       f"{quoted(names)} change steadily by {percent(drift[bad].max())} of the signal "
+                       f"({times(float(T[bad].max()))} the noise power; limit for noise alone {limit:.2f}). The rig "
+                       "drifts, or the transient is longer than the record. Wait longer before recording, or find the "
+                       "cause of the drift.", names, (k.record,), float(T[bad].max()), limit, picture)
 
 
 def windowed(difference: np.ndarray) -> np.ndarray:
@@ -188,7 +152,7 @@ def windowed(difference: np.ndarray) -> np.ndarray:
     return np.fft.rfft(difference * window, axis=-2)[..., 2:-1:2, :]
 
 
-def smoothed(power: np.ndarray, width: int = SMOOTH) -> np.ndarray:
+def smoothed(power: np.ndarray, width: int = SETTINGS.smooth) -> np.ndarray:
     """(lines, n_y) moving mean over lines."""
     kernel = np.ones(min(width, len(power)))
     count = np.convolve(np.ones(len(power)), kernel, "same")
@@ -216,7 +180,7 @@ def compared(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
 
 def unbiased(dof: int) -> float:
     """Mean of a power by its smoothed variance is 1 / (1 - 1 / m), m = dof times lines smoothed over: F's mean."""
-    return 1 - 1 / (SMOOTH * dof)
+    return 1 - 1 / (SETTINGS.smooth * dof)
 
 
 def trend(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

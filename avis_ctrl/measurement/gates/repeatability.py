@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -21,7 +22,7 @@ from avis_ctrl.measurement.gates.finding import (
     percent,
     quoted,
 )
-from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, octaves, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.h1 import Spectra, h1, octaves, segment_length, spectra, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
 
@@ -51,30 +52,36 @@ SETTINGS = ComparisonSettings()
 
 
 @dataclass(frozen=True, eq=False)
+class _Mean:
+    """Mean period after the first, u and y (samples, channels), with the variance of its windowed lines."""
+
+    u: np.ndarray
+    y: np.ndarray
+    variance: np.ndarray
+    dof: int
+
+
+@dataclass(frozen=True, eq=False)
 class _Kept:
-    """u, y: mean period after the first (samples, channels) with the variance of its windowed lines, where periodic."""
+    """mean : of a periodic record."""
 
     record: str
     kind: str
     level: float
     rate: float
-    u: np.ndarray | None
-    y: np.ndarray | None
-    variance: np.ndarray | None
-    dof: int
-    of: Spectra | None
+    of: Spectra
+    mean: _Mean | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """Of two records (or levels): T (n_y,) mean |difference|^2 by variance in the octave that
-    stands out most, divided by what chance gives at 1 % (limit 1), relative (n_y,) difference there, free of noise,
-    band_Hz (n_y, 2) where that is."""
+    """Of two records (or levels): T (n_y,) mean |difference|^2 by variance in the octave that stands out most, divided
+    by what noise alone exceeds with 1 % probability, relative (n_y,) difference there, free of noise, band_Hz (n_y, 2)
+    where that is."""
 
     a: str
     b: str
     T: np.ndarray
-    limit: float
     relative: np.ndarray
     band_Hz: np.ndarray
     f: np.ndarray
@@ -82,8 +89,20 @@ class Difference:
     noise: float
 
 
-class _Records(Gate):
-    """What both gates look at."""
+class Comparison(Gate):
+    """Records of one kind of excitation: of one level against the first of them (repeatability), and of levels at least
+    a factor 1.4 apart (level dependence; closer ones show leakage and drift rather than nonlinearity).
+
+    Where two records repeat one periodic u up to a factor, their mean periods are compared line by line against the
+    variance between periods (Hann-windowed, smoothed over 9 lines): T, the mean over the L lines of an octave, is
+    F(L, L (P - 1)). Otherwise their H1 estimates are, with their covariance: T = mean of d* inv(V) d over every second
+    line of an octave, F(n_u L, K L) distributed; of levels over all records of a level. 1 % is shared over octaves,
+    pairs and channels, by either gate. Of H1 from different u leakage at resonances is the largest part of V: small
+    shifts of lightly damped resonances stay hidden. What is significant but below 1 % of the response (free of noise)
+    is passed; above 5 % is a warning.
+    """
+
+    name = "repeatability"
 
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept | None:
         h = seen.header
@@ -92,158 +111,74 @@ class _Records(Gate):
         u, y, wrap = usable(seen)
         of = spectra(u, y, h.sample_rate_Hz, segment_length(len(u), int(np.count_nonzero(np.ptp(u, axis=0)))), wrap)
         if not wrap or (periods := seen.periods("y")[1:]).shape[0] < 3:
-            return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, None, None, None, 0, of)
+            return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, of)
         P = len(periods)
-        lines = windowed(periods - y)
-        variance = smoothed(np.sum(np.abs(lines) ** 2, axis=0) / (P - 1)) / P
-        return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, u, y, variance, P - 1, of)
-
-    def _picture(self, d: Difference, names: tuple[str, ...]) -> Picture:
-        return Picture(
-            f"{d.a} against {d.b}",
-            "frequency [Hz]",
-            "relative difference [-]",
-            tuple(Series(n, d.f, d.by_line[:, j]) for j, n in enumerate(names)),
-            (Limit("large", SETTINGS.large),),
-            "log",
-            "log",
-        )
-
-    def _alike(self, differences: list[Difference], campaign: Campaign, what: str) -> Finding:
-        """Nothing stands out; a note where that means little."""
-        d = max(differences, key=lambda d: d.noise)
-        severity: Severity = "note" if d.noise > SETTINGS.blind else "ok"
-        hint = (
-            " Smaller changes would not be detected; records with the same periodic voltage allow a more sensitive"
-            " comparison."
-            if severity == "note"
-            else ""
-        )
-        return Finding(
-            self.name,
-            severity,
-            f"{what} within their noise, which is up to {100 * d.noise:.2g} % of the response in an octave "
-            f"({d.a} against {d.b}), or within 1 %.{hint}",
-            value=float(d.T.max()),
-            limit=d.limit,
-            picture=self._picture(d, campaign.y_names),
-        )
-
-
-class Repeatability(_Records):
-    """Records of the same kind of excitation and level against the first of them.
-
-    Where two records repeat one periodic u, their mean periods are compared line by line against the variance between
-    periods (Hann-windowed, smoothed
-    over 9 lines): T, the mean over the L lines of an octave, is F(L, L (P - 1)). Otherwise their H1 estimates are, with
-    their covariance: T = mean of
-    d* inv(V) d over every second line of an octave, F(n_u L, K L) distributed. 1 % is shared over octaves, pairs and
-    channels. Of
-    H1 from different u leakage at resonances is the largest part of V: small shifts of lightly damped resonances stay
-    hidden. What is
-    significant but below 1 % of the response (free of noise) is passed; above 5 % is a warning.
-    """
-
-    name = "repeatability"
+        variance = smoothed(np.sum(np.abs(windowed(periods - y)) ** 2, axis=0) / (P - 1)) / P
+        return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, of, _Mean(u, y, variance, P - 1))
 
     def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        groups = _by_kind_and_level(kept)
+        groups, n_y = _by_kind_and_level(kept), len(campaign.y_names)
         pairs = [(group[0], other) for group in groups.values() for other in group[1:]]
-        level = FALSE_ALARM / max(1, len(pairs) * len(campaign.y_names))
-        differences = [d for a, b in pairs if (d := difference(a, b, level)) is not None]
-        if not differences:
-            return [
-                Finding(
-                    self.name,
-                    "ok",
-                    "Repeatability was not tested: no two driven records of one level and enough length.",
-                    picture=Picture("Repeatability", "frequency [Hz]", "relative difference [-]", ()),
-                )
-            ]
-        found = []
-        for d in differences:
-            bad = (d.limit < d.T) & (d.relative > SETTINGS.notable)
-            if bad.any():
-                names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-                severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
-                found.append(
-                    Finding(
-                        self.name,
-                        severity,
-                        f"{d.b.capitalize()} does not repeat {d.a}: {quoted(names)} differ by up to"
-                        f" {percent(d.relative[bad].max())} of the response, {beyond_chance(d.T[bad].max())}. The rig"
-                        " drifted or was changed in between; treat its"
-                        " parameters as uncertain by this amount, or use only one of the two.",
-                        names,
-                        (d.a, d.b),
-                        float(d.T[bad].max()),
-                        d.limit,
-                        self._picture(d, campaign.y_names),
-                    )
-                )
-        if not found:
-            found.append(
-                self._alike(
-                    differences,
-                    campaign,
-                    f"{len(differences)} pair{'s' if len(differences) > 1 else ''} of records agree",
-                )
-            )
+        level = FALSE_ALARM / max(1, len(pairs) * n_y)
+        repeats = [d for a, b in pairs if (d := difference(a, b, level)) is not None]
+        apart = [(a, b) for a, b in combinations(sorted(groups), 2) if a[0] == b[0] and b[1] >= SETTINGS.apart * a[1]]
+        level = FALSE_ALARM / max(1, len(apart) * n_y)
+        levels = [d for a, b in apart if (d := _of_levels(groups[a], groups[b], level)) is not None]
+        many = "s" if len(repeats) > 1 else ""
+        return [*_judged(self.name, repeats, campaign, _drifted, f"{len(repeats)} pair{many} of records agree",
+                         "Repeatability was not tested: no two driven records of one level and enough length."),
+                *_judged("level dependence", levels, campaign, _nonlinear, "The responses at all levels agree",
+                         "Dependence on the level was not tested: no driven records of one kind and enough length at "
+                         f"two levels, at least a factor {SETTINGS.apart:g} apart.")]
+
+
+def _drifted(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
+    """Sentence and records."""
+    return (f"{d.b.capitalize()} does not repeat {d.a}: {quoted(names)} differ by up to "
+            f"{percent(d.relative[bad].max())} of the response, {beyond_chance(d.T[bad].max())}. The rig drifted or "
+            "was changed in between; treat its parameters as uncertain by this amount, or use only one of the two."
+            ), (d.a, d.b)
+
+
+def _nonlinear(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
+    low, high = d.band_Hz[int(np.argmax(np.where(bad, d.relative, 0)))]
+    return (f"The response depends on the level: from {d.a} to {d.b} {quoted(names)} change by up to "
+            f"{percent(d.relative[bad].max())} (most from {low:.3g} to {high:.3g} Hz), "
+            f"{beyond_chance(d.T[bad].max())}: nonlinearity. Identify at the level of use, and include the difference "
+            "in the uncertainty."), ()
+
+
+def _judged(gate: str, differences: list[Difference], campaign: Campaign,
+            said: Callable[[Difference, np.ndarray, tuple[str, ...]], tuple[str, tuple[str, ...]]], agreed: str,
+            untested: str) -> list[Finding]:
+    """What stands out, or that nothing does; a note where that means little."""
+    if not differences:
+        return [Finding(gate, "ok", untested, picture=Picture(gate.capitalize(), "frequency [Hz]",
+                                                              "relative difference [-]", ()))]
+    found = []
+    for d in differences:
+        bad = (d.T > 1) & (d.relative > SETTINGS.notable)
+        if bad.any():
+            names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
+            severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
+            sentence, records = said(d, bad, names)
+            found.append(Finding(gate, severity, sentence, names, records, float(d.T[bad].max()), 1.0,
+                                 _picture(d, campaign.y_names)))
+    if found:
         return found
+    d = max(differences, key=lambda d: d.noise)
+    blind = d.noise > SETTINGS.blind
+    hint = (" Smaller changes would not be detected; records with the same periodic voltage allow a more sensitive "
+            "comparison." if blind else "")
+    return [Finding(gate, "note" if blind else "ok", f"{agreed} within their noise, which is up to {100 * d.noise:.2g} "
+                    f"% of the response in an octave ({d.a} against {d.b}), or within 1 %.{hint}",
+                    value=float(d.T.max()), limit=1.0, picture=_picture(d, campaign.y_names))]
 
 
-class LevelDependence(_Records):
-    """The response at different level_V, compared as in `Repeatability` (scaled where u is the same up to a factor).
-
-    Compared are records of one kind of excitation at levels at least a factor 1.4 apart: closer ones show leakage and
-    drift rather than nonlinearity. H1 estimates are taken over all records of a level. 1 % is shared over pairs of
-    levels and channels.
-    """
-
-    name = "level dependence"
-
-    def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        groups = _by_kind_and_level(kept)
-        pairs = [
-            (a, b) for a, b in combinations(sorted(groups), 2) if a[0] == b[0] and b[1] >= SETTINGS.apart * a[1]
-        ]
-        level = FALSE_ALARM / max(1, len(pairs) * len(campaign.y_names))
-        differences = [d for a, b in pairs if (d := _of_levels(groups[a], groups[b], level)) is not None]
-        if not differences:
-            return [
-                Finding(
-                    self.name,
-                    "ok",
-                    "Dependence on the level was not tested: no driven records of one kind and enough length at"
-                    f" two levels, at least a factor {SETTINGS.apart:g} apart.",
-                    picture=Picture("Level dependence", "frequency [Hz]", "relative difference [-]", ()),
-                )
-            ]
-        found = []
-        for d in differences:
-            bad = (d.limit < d.T) & (d.relative > SETTINGS.notable)
-            if bad.any():
-                names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-                severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
-                low, high = d.band_Hz[int(np.argmax(np.where(bad, d.relative, 0)))]
-                found.append(
-                    Finding(
-                        self.name,
-                        severity,
-                        f"The response depends on the level: from {d.a} to {d.b} {quoted(names)} change by up to"
-                        f" {percent(d.relative[bad].max())} (most from {low:.3g} to {high:.3g} Hz),"
-                        f" {beyond_chance(d.T[bad].max())}: nonlinearity. Identify at the level of use, and"
-                        " include the difference in the uncertainty.",
-                        names,
-                        (),
-                        float(d.T[bad].max()),
-                        d.limit,
-                        self._picture(d, campaign.y_names),
-                    )
-                )
-        if not found:
-            found.append(self._alike(differences, campaign, "The responses at all levels agree"))
-        return found
+def _picture(d: Difference, names: tuple[str, ...]) -> Picture:
+    return Picture(f"{d.a} against {d.b}", "frequency [Hz]", "relative difference [-]",
+                   tuple(Series(n, d.f, d.by_line[:, j]) for j, n in enumerate(names)),
+                   (Limit("large", SETTINGS.large),), "log", "log")
 
 
 def _by_kind_and_level(kept: list[_Kept | None]) -> dict[tuple[str, float], list[_Kept]]:
@@ -263,7 +198,9 @@ def _rounded(level: float) -> float:
 def difference(a: _Kept, b: _Kept, level: float) -> Difference | None:
     """Two records; None where they cannot be compared."""
     names = f"record {a.record}", f"record {b.record}"
-    return _same_input(a, b, level, names) or _by_h1(a.of, b.of, level, names)
+    if (found := _same_input(a, b, level, names)) is not None or len(a.of.f) != len(b.of.f):
+        return found
+    return _compared([a.of], [b.of], level, names)
 
 
 def _of_levels(a: list[_Kept], b: list[_Kept], level: float) -> Difference | None:
@@ -273,55 +210,42 @@ def _of_levels(a: list[_Kept], b: list[_Kept], level: float) -> Difference | Non
             if (d := _same_input(one, other, level, names)) is not None:
                 return d
 
-    def of(group: list[_Kept]) -> list[Spectra]:
-        first = next(k.of for k in group if k.of is not None)
-        return [k.of for k in group if k.of is not None and len(k.of.f) == len(first.f)]
-
-    return _compare(h1(of(a)), h1(of(b)), level, names)
+    first, second = ([k.of for k in group if len(k.of.f) == len(group[0].of.f)] for group in (a, b))
+    return _compared(first, second, level, names)
 
 
 def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Difference | None:
     """Where u of b is u of a times a constant: y of b against y of a times it."""
-    if (
-        a.u is None
-        or b.u is None
-        or a.y is None
-        or b.y is None
-        or a.variance is None
-        or b.variance is None
-        or a.u.shape != b.u.shape
-    ):
+    first, second = a.mean, b.mean
+    if first is None or second is None or first.u.shape != second.u.shape:
         return None
-    power = float(np.sum(a.u * a.u))
-    scale = float(np.sum(a.u * b.u)) / power if power else 0.0
-    if scale <= 0 or np.max(np.abs(b.u - scale * a.u)) > 1e-3 * np.max(np.abs(b.u)):
+    power = float(np.sum(first.u * first.u))
+    scale = float(np.sum(first.u * second.u)) / power if power else 0.0
+    if scale <= 0 or np.max(np.abs(second.u - scale * first.u)) > 1e-3 * np.max(np.abs(second.u)):
         return None
-    D = windowed(b.y - scale * a.y)
-    variance = np.maximum(b.variance + scale**2 * a.variance, 1e-300)
-    size = np.abs(windowed(b.y - b.y.mean(axis=0))) ** 2
-    f = np.fft.rfftfreq(len(a.y), 1 / a.rate)[2:-1:2]
-    driven = np.sum(np.abs(windowed(b.u)) ** 2, axis=1)
+    D = windowed(second.y - scale * first.y)
+    variance = np.maximum(second.variance + scale**2 * first.variance, 1e-300)
+    size = np.abs(windowed(second.y - second.y.mean(axis=0))) ** 2
+    f = np.fft.rfftfreq(len(first.y), 1 / a.rate)[2:-1:2]
+    driven = np.sum(np.abs(windowed(second.u)) ** 2, axis=1)
     keep = driven > 1e-3 * driven.max()
     keep &= driven > SETTINGS.excited * np.median(driven[keep])
     power = np.abs(D) ** 2
     by_line = np.sqrt(power / np.maximum(size, 1e-300))
-    T, relative, band = _by_band(
-        f[keep], (power / variance)[keep], (power - variance)[keep], size[keep], 1, min(a.dof, b.dof), level
-    )
+    T, relative, band = _by_band(f[keep], (power / variance)[keep], (power - variance)[keep], size[keep], 1,
+                                 min(first.dof, second.dof), level)
     noise = _noise(f[keep], variance[keep], size[keep])
-    return Difference(*names, T, 1.0, relative, band, f[keep], by_line[keep], noise)
+    return Difference(*names, T, relative, band, f[keep], by_line[keep], noise)
 
 
 def _noise(f: np.ndarray, spread: np.ndarray, size: np.ndarray) -> float:
     """Noise of the difference by the response, r.m.s. in the octave where it is largest."""
     return max(
-        float(np.sqrt(np.max(spread[b].sum(axis=0) / np.maximum(size[b].sum(axis=0), 1e-300)))) for b in octaves(f)
-    )
+        float(np.sqrt(np.max(spread[b].sum(axis=0) / np.maximum(size[b].sum(axis=0), 1e-300)))) for b in octaves(f))
 
 
-def _by_band(
-    f: np.ndarray, ratio: np.ndarray, excess: np.ndarray, size: np.ndarray, n_u: int, dof: int, level: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _by_band(f: np.ndarray, ratio: np.ndarray, excess: np.ndarray, size: np.ndarray, n_u: int, dof: int,
+             level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(n_y,) of the octave that stands out most: mean ratio by the limit of F(n_u L, dof L), relative excess, and its
     ends (n_y, 2)."""
     bands = octaves(f)
@@ -337,13 +261,9 @@ def _by_band(
     return T, relative, ends
 
 
-def _by_h1(a: Spectra | None, b: Spectra | None, level: float, names: tuple[str, str]) -> Difference | None:
-    if a is None or b is None or len(a.f) != len(b.f):
-        return None
-    return _compare(h1([a]), h1([b]), level, names)
-
-
-def _compare(a: H1 | None, b: H1 | None, level: float, names: tuple[str, str]) -> Difference | None:
+def _compared(first: list[Spectra], second: list[Spectra], level: float, names: tuple[str, str]) -> Difference | None:
+    """By H1 over the spectra of each; None where there are too few segments."""
+    a, b = h1(first), h1(second)
     if a is None or b is None:
         return None
     f, ia, ib = np.intersect1d(a.f, b.f, return_indices=True)
@@ -364,7 +284,7 @@ def _compare(a: H1 | None, b: H1 | None, level: float, names: tuple[str, str]) -
     size, power = np.sum(np.abs(Ga) ** 2, axis=2), np.sum(np.abs(D) ** 2, axis=2)
     T, relative, band = _by_band(f, ratio, power - spread, size, rank, min(a.dof, b.dof), level)
     by_line = np.sqrt(power / np.maximum(size, 1e-300))
-    return Difference(*names, T, 1.0, relative, band, f, by_line, _noise(f, spread, size))
+    return Difference(*names, T, relative, band, f, by_line, _noise(f, spread, size))
 
 
 def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -20,12 +20,25 @@ from avis_ctrl.measurement.gates.finding import (
     quoted,
 )
 from avis_ctrl.measurement.gates.h1 import H1, h1, octaves, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.periodicity import smoothed
 
-LOW_DB, POOR_DB = 10.0, 0.0
-LOW_COHERENCE = 0.5
-# Records within this factor of the largest level are taken together.
-SAME_LEVEL = 1.4
-NOISE_FACTOR = 3.0
+
+@dataclass(frozen=True)
+class QualitySettings:
+    """low_dB, poor_dB : signal to noise below which a band is a note, and all bands a warning [dB].
+    low_coherence : mean coherence of a band below which it is a note [1].
+    same_level : factor of the largest level within which records are taken together [1].
+    noise_factor : noise at rest over the stated one from which it is a warning [1].
+    """
+
+    low_dB: float = 10.0
+    poor_dB: float = 0.0
+    low_coherence: float = 0.5
+    same_level: float = 1.4
+    noise_factor: float = 3.0
+
+
+SETTINGS = QualitySettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +58,10 @@ class SignalToNoise(Gate):
 
     Of a periodic record: power of the mean of the periods after the first by the variance between them, over the driven
     lines; of others coherence / (1 - coherence) without its bias. No alarm is raised by a test: the numbers are
-    estimates
-    with an error of less than 1 dB where a band holds 30 lines x periods. A note is below 10 dB in some band, a warning
-    below 0 dB
-    in every band. Where the sensors' noise is known, records at rest are compared with it: white noise of 3 times the
-    stated
-    r.m.s. above half the Nyquist frequency is a warning (chi-square with thousands of degrees of freedom: chance has no
-    part).
+    estimates with an error of less than 1 dB where a band holds 30 lines x periods. A note is below 10 dB in some band,
+    a warning below 0 dB in every band. Where the sensors' noise is known, records at rest are compared with it: white
+    noise of 3 times the stated r.m.s. above half the Nyquist frequency is a warning (chi-square with thousands of
+    degrees of freedom: chance has no part).
     """
 
     name = "signal to noise"
@@ -66,70 +76,39 @@ class SignalToNoise(Gate):
         measured = [(k.f, k.snr, k.segment_s) for k in kept if k.snr is not None and len(k.f)]
         if not measured:
             picture = Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ())
-            return found or [
-                Finding(self.name, "ok", "No driven record is long enough to separate signal and noise.",
-                        picture=picture)
-            ]
+            return found or [Finding(self.name, "ok", "No driven record is long enough to separate signal and noise.",
+                                     picture=picture)]
         f, snr, segment_s = max(measured, key=lambda m: float(np.median(m[1])))
-        advice = (
-            f": noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. A periodic"
-            " excitation would distinguish them; a higher level helps only against noise."
-            if segment_s
-            else ". Such bands have little weight in a fit; excite them more if they are important."
-        )
+        advice = (f": noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. A periodic"
+                  " excitation would distinguish them; a higher level helps only against noise."
+                  if segment_s
+                  else ". Such bands have little weight in a fit; excite them more if they are important.")
         bands = octaves(f)
         dB = np.array([10 * np.log10(np.maximum(snr[band].mean(axis=0), 1e-6)) for band in bands])
         middle = np.array([np.sqrt(f[band][0] * f[band][-1]) for band in bands])
-        picture = Picture(
-            "Signal to noise of the best record",
-            "frequency [Hz]",
-            "ratio [dB]",
-            tuple(Series(n, middle, dB[:, j], "points") for j, n in enumerate(campaign.y_names)),
-            (Limit("low", LOW_DB),),
-            "log",
-        )
+        picture = Picture("Signal to noise of the best record", "frequency [Hz]", "ratio [dB]",
+                          tuple(Series(n, middle, dB[:, j], "points") for j, n in enumerate(campaign.y_names)),
+                          (Limit("low", SETTINGS.low_dB),), "log")
         for j, name in enumerate(campaign.y_names):
             weakest = int(np.argmin(dB[:, j]))
-            if dB[:, j].max() < POOR_DB:
+            if dB[:, j].max() < SETTINGS.poor_dB:
                 found.append(
-                    Finding(
-                        self.name,
-                        "warning",
-                        f"Channel {name!r} has more noise than signal in every band (at best {dB[:, j].max():.1f} dB at"
-                        f" {middle[np.argmax(dB[:, j])]:.3g} Hz). Raise the level, or average longer.",
-                        (name,),
-                        value=float(dB[:, j].max()),
-                        limit=POOR_DB,
-                        picture=picture,
-                    )
-                )
-            elif dB[weakest, j] < LOW_DB:
-                weak = np.flatnonzero(dB[:, j] < LOW_DB)
+                    Finding(self.name, "warning",
+                            f"Channel {name!r} has more noise than signal in every band (at best {dB[:, j].max():.1f} "
+                            f"dB at {middle[np.argmax(dB[:, j])]:.3g} Hz). Raise the level, or average longer.",
+                            (name,), value=float(dB[:, j].max()), limit=SETTINGS.poor_dB, picture=picture))
+            elif dB[weakest, j] < SETTINGS.low_dB:
+                weak = np.flatnonzero(dB[:, j] < SETTINGS.low_dB)
                 low = ", ".join(f"{middle[b]:.3g} Hz {round(float(dB[b, j]))} dB" for b in weak)
                 found.append(
-                    Finding(
-                        self.name,
-                        "note",
-                        f"Channel {name!r} has little signal around {low}{advice}",
-                        (name,),
-                        value=float(dB[weakest, j]),
-                        limit=LOW_DB,
-                        picture=picture,
-                    )
-                )
+                    Finding(self.name, "note", f"Channel {name!r} has little signal around {low}{advice}", (name,),
+                            value=float(dB[weakest, j]), limit=SETTINGS.low_dB, picture=picture))
         if not found:
             b, j = divmod(int(np.argmin(dB)), dB.shape[1])
             found.append(
-                Finding(
-                    self.name,
-                    "ok",
-                    f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest {campaign.y_names[j]!r}"
-                    f" around {middle[b]:.3g} Hz).",
-                    value=float(dB[b, j]),
-                    limit=LOW_DB,
-                    picture=picture,
-                )
-            )
+                Finding(self.name, "ok",
+                        f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest {campaign.y_names[j]!r} "
+                        f"around {middle[b]:.3g} Hz).", value=float(dB[b, j]), limit=SETTINGS.low_dB, picture=picture))
         return found
 
     def _noisy(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> list[Finding]:
@@ -139,28 +118,16 @@ class SignalToNoise(Gate):
             return []
         rms = np.median(levels, axis=0)
         x = np.arange(len(rms))
-        picture = Picture(
-            "Noise of each channel, from above half the Nyquist frequency",
-            "channel",
-            f"r.m.s. [{campaign.y_unit}]",
-            (Series("measured", x, rms, "bars"),),
-            (Limit("stated", stated),),
-            y_scale="log",
-            x_names=campaign.y_names,
-        )
+        picture = Picture("Noise of each channel, from above half the Nyquist frequency", "channel",
+                          f"r.m.s. [{campaign.y_unit}]", (Series("measured", x, rms, "bars"),),
+                          (Limit("stated", stated),), y_scale="log", x_names=campaign.y_names)
         return [
-            Finding(
-                self.name,
-                "warning",
-                f"Channel {name!r} has sensor noise of {rms[j]:.3g} {campaign.y_unit} r.m.s., {rms[j] / stated:.1f}"
-                " times what the rig file states. Check its preamplifier and cable, or correct the rig file.",
-                (name,),
-                value=float(rms[j]),
-                limit=NOISE_FACTOR * stated,
-                picture=picture,
-            )
+            Finding(self.name, "warning",
+                    f"Channel {name!r} has sensor noise of {rms[j]:.3g} {campaign.y_unit} r.m.s., {rms[j] / stated:.1f}"
+                    " times what the rig file states. Check its preamplifier and cable, or correct the rig file.",
+                    (name,), value=float(rms[j]), limit=SETTINGS.noise_factor * stated, picture=picture)
             for j, name in enumerate(campaign.y_names)
-            if rms[j] > NOISE_FACTOR * stated
+            if rms[j] > SETTINGS.noise_factor * stated
         ]
 
 
@@ -178,13 +145,12 @@ class _Coherence:
 class Coherence(Gate):
     """Multiple coherence of each channel with all inputs, over the driven records near the largest level.
 
-    Records within a factor 1.4 of the largest level count together, which leaves long segments; the lowest frequency
-    is that of the second line of a segment, and the sentence says so where the voltage begins lower.
-    Estimates are freed of their bias,
-    gamma^2 - (1 - gamma^2) n_u / (K - n_u), and averaged over thirds of octaves: what is drawn is what is judged. A
-    mean under 0.5 is a note. A channel that is low in all bands by more than chance (normal approximation of the mean,
-    1 % shared over bands and channels) is a warning. Segments leak where a mode decays longer than they last, which
-    lowers the coherence there without any fault; the sentence states their length.
+    Records within a factor 1.4 of the largest level count together, which leaves long segments; the lowest frequency is
+    that of the second line of a segment, and the sentence says so where the voltage begins lower. Estimates are freed
+    of their bias, gamma^2 - (1 - gamma^2) n_u / (K - n_u), and averaged over thirds of octaves: what is drawn is what
+    is judged. A mean under 0.5 is a note. A channel that is low in all bands by more than chance (normal approximation
+    of the mean, 1 % shared over bands and channels) is a warning. Segments leak where a mode decays longer than they
+    last, which lowers the coherence there without any fault; the sentence states their length.
     """
 
     name = "coherence"
@@ -197,17 +163,11 @@ class Coherence(Gate):
     def conclude(self, kept: list[_Coherence | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         driven = [k for k in kept if k is not None]
         top = max((k.level for k in driven), default=0.0)
-        chosen = [k for k in driven if k.level * SAME_LEVEL >= top]
+        chosen = [k for k in driven if k.level * SETTINGS.same_level >= top]
         best, seconds = _pooled(chosen)
         if best is None:
-            return [
-                Finding(
-                    self.name,
-                    "ok",
-                    "No driven record is long enough for a coherence of all inputs together.",
-                    picture=Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ()),
-                )
-            ]
+            return [Finding(self.name, "ok", "No driven record is long enough for a coherence of all inputs together.",
+                            picture=Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ()))]
         n_u = best.rank
         free = best.coherence - (1 - best.coherence) * n_u / best.dof
         bands = thirds(best.f)
@@ -216,76 +176,47 @@ class Coherence(Gate):
         # Standard deviation of an estimate of 0.5: (1 - g) sqrt(2 g / K), Bendat and Piersol table 9.6.
         z = stats.norm.isf(FALSE_ALARM / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
-        surely = np.all(mean < LOW_COHERENCE - margin[:, None], axis=0)
-        picture = Picture(
-            f"Multiple coherence at {top:.3g} V, thirds of octaves",
-            "frequency [Hz]",
-            "coherence [-]",
-            tuple(Series(n, middle, mean[:, j]) for j, n in enumerate(campaign.y_names)),
-            (Limit("low", LOW_COHERENCE),),
-            "log",
-        )
+        surely = np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)
+        picture = Picture(f"Multiple coherence at {top:.3g} V, thirds of octaves", "frequency [Hz]", "coherence [-]",
+                          tuple(Series(n, middle, mean[:, j]) for j, n in enumerate(campaign.y_names)),
+                          (Limit("low", SETTINGS.low_coherence),), "log")
         below, excited = "", _lowest_driven(chosen)
         if best.f[0] > 1.5 * excited:
-            below = (
-                f" Below {best.f[0]:.3g} Hz, down to {excited:.3g} Hz where the voltage begins, the records are too"
-                " short for a coherence of all inputs."
-            )
-        low = np.any(mean < LOW_COHERENCE, axis=0)
+            below = (f" Below {best.f[0]:.3g} Hz, down to {excited:.3g} Hz where the voltage begins, the records are "
+                     "too short for a coherence of all inputs.")
+        low = np.any(mean < SETTINGS.low_coherence, axis=0)
         groups = [[int(j)] for j in np.flatnonzero(surely)] + [[int(j) for j in np.flatnonzero(low & ~surely)]]
-        found = [
-            self._low(campaign.y_names, group, middle, mean, bool(surely[group[0]]), seconds, below, picture)
-            for group in groups
-            if group
-        ]
+        found = [self._low(campaign.y_names, group, middle, mean, bool(surely[group[0]]), seconds, below, picture)
+                 for group in groups
+                 if group]
         if found:
             return found
         b, j = divmod(int(np.argmin(mean)), mean.shape[1])
         return [
-            Finding(
-                self.name,
-                "ok",
-                f"Multiple coherence is at least {mean[b, j]:.2f} in every third of an octave from {best.f[0]:.3g} to"
-                f" {best.f[-1]:.3g} Hz (lowest {quoted((campaign.y_names[j],))} around {middle[b]:.3g} Hz).{below}",
-                value=float(mean[b, j]),
-                limit=LOW_COHERENCE,
-                picture=picture,
-            )
-        ]
+            Finding(self.name, "ok",
+                    f"Multiple coherence is at least {mean[b, j]:.2f} in every third of an octave from {best.f[0]:.3g} "
+                    f"to {best.f[-1]:.3g} Hz (lowest {quoted((campaign.y_names[j],))} around {middle[b]:.3g} "
+                    f"Hz).{below}", value=float(mean[b, j]), limit=SETTINGS.low_coherence, picture=picture)]
 
-    def _low(
-        self,
-        names: tuple[str, ...],
-        group: list[int],
-        middle: np.ndarray,
-        mean: np.ndarray,
-        surely: bool,
-        seconds: float,
-        below: str,
-        picture: Picture,
-    ) -> Finding:
+    def _low(self, names: tuple[str, ...], group: list[int], middle: np.ndarray, mean: np.ndarray, surely: bool,
+             seconds: float, below: str, picture: Picture) -> Finding:
         """One channel that is low everywhere, or all those that are low somewhere."""
         severity: Severity = "warning" if surely else "note"
         ordered = sorted(group, key=lambda j: float(mean[:, j].min()))
         said = []
         for j in ordered[:4]:
             b = int(np.argmin(mean[:, j]))
-            count = int(np.count_nonzero(mean[:, j] < LOW_COHERENCE))
+            count = int(np.count_nonzero(mean[:, j] < SETTINGS.low_coherence))
             said.append(f"{names[j]!r} {max(mean[b, j], 0):.2f} around {middle[b]:.3g} Hz (low in {count} bands)")
         more = f" and {len(group) - 4} more channels" if len(group) > 4 else ""
-        return Finding(
-            self.name,
-            severity,
-            f"Multiple coherence is below {LOW_COHERENCE:g} in {'all' if surely else 'some'} of the"
-            f" {len(middle)} thirds of octaves: {'; '.join(said)}{more}. Causes are noise, an input that is not"
-            f" recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that decays more slowly"
-            f" than the segments of {seconds:.3g} s. Longer records distinguish leakage from the other causes; a higher"
-            f" level reduces the influence of noise.{below}",
-            tuple(names[j] for j in ordered),
-            value=float(mean[:, group].min()),
-            limit=LOW_COHERENCE,
-            picture=picture,
-        )
+        return Finding(self.name, severity,
+                       f"Multiple coherence is below {SETTINGS.low_coherence:g} in {'all' if surely else 'some'} of "
+                       f"the {len(middle)} thirds of octaves: {'; '.join(said)}{more}. Causes are noise, an input that "
+                       "is not recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that "
+                       f"decays more slowly than the segments of {seconds:.3g} s. Longer records distinguish "
+                       f"leakage from the other causes; a higher level reduces the influence of noise.{below}",
+                       tuple(names[j] for j in ordered), value=float(mean[:, group].min()),
+                       limit=SETTINGS.low_coherence, picture=picture)
 
 
 def _pooled(chosen: list[_Coherence]) -> tuple[H1 | None, float]:
@@ -333,8 +264,8 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
         P = len(Y)
         noise = np.sum(np.abs(Y - Y.mean(axis=0)) ** 2, axis=0)[keep] / (P - 1)
         # Neighbouring lines share their noise level: a mean over nine lines keeps the ratio from dividing by chance.
-        noise = _smooth(noise, 9)
-        signal = np.maximum(_smooth(np.abs(Y.mean(axis=0)[keep]) ** 2, 9) - noise / P, 0.0)
+        noise = smoothed(noise)
+        signal = np.maximum(smoothed(np.abs(Y.mean(axis=0)[keep]) ** 2) - noise / P, 0.0)
         f = np.fft.rfftfreq(periods.shape[1], 1 / rate)[keep]
         return f, signal / np.maximum(noise, 1e-300), 0.0
     u, y, wrap = usable(seen)
@@ -345,14 +276,6 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
         return np.zeros(0), None, 0.0
     free = np.maximum(estimate.coherence - (1 - estimate.coherence) * estimate.rank / estimate.dof, 0.0)
     return estimate.f, free / np.maximum(1 - free, 1e-12), length / rate
-
-
-def _smooth(a: np.ndarray, width: int) -> np.ndarray:
-    """Moving mean over lines, narrower at the ends."""
-    width = min(width, len(a))
-    kernel = np.ones(width)
-    count = np.convolve(np.ones(len(a)), kernel, "same")
-    return np.stack([np.convolve(a[:, j], kernel, "same") / count for j in range(a.shape[1])], axis=1)
 
 
 def _high_noise(seen: Excerpt) -> np.ndarray | None:

@@ -12,15 +12,26 @@ from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Pic
 
 # Cubic through the two neighbours on either side: x0 - (4 (x-1 + x1) - (x-2 + x2)) / 6, and what a spike of 1 leaves.
 SHAPE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6
-# A spike exceeds the median departure around it this many times (Gaussian noise: 13.5 standard deviations), and the
-# converter's step five times. Noise that grows with the signal, as of a real laser sensor, reaches 15 times.
-FACTOR, STEPS = 20.0, 5.0
-# Samples over which the median departure is taken.
-AROUND = 512
 # What a corner leaves: of a flat top, or of the signal's slope.
 CORNER = np.array([0.0, -1.0, 2.0, -1.0, 0.0])
-# Departures left beside a spike once it is taken out, at most, by the spike.
-LEFT = 0.3
+
+
+@dataclass(frozen=True)
+class SpikeSettings:
+    """factor : a spike over the median departure around it [1]: 13.5 standard deviations of Gaussian noise. Noise that
+        grows with the signal, as of a real laser sensor, reaches 15 times.
+    steps : a spike over the converter's step [1].
+    around : samples over which the median departure is taken.
+    left : departures left beside a spike once it is taken out, at most, by the spike [1].
+    """
+
+    factor: float = 20.0
+    steps: float = 5.0
+    around: int = 512
+    left: float = 0.3
+
+
+SETTINGS = SpikeSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,66 +76,34 @@ class Spikes(Gate):
                     part = slice(max(0, k - 100), k + 100)
                     expected = float(x[k] - departure(x[k - 2 : k + 3])[0])
                     found.append(
-                        _Kept(
-                            seen.header.name,
-                            name,
-                            len(where),
-                            k + round(float(t[0]) * seen.header.sample_rate_Hz),
-                            float(t[k]),
-                            float(x[k]),
-                            expected,
-                            float(ratio.max()),
-                            t[part],
-                            x[part],
-                        )
-                    )
+                        _Kept(seen.header.name, name, len(where), k + round(float(t[0]) * seen.header.sample_rate_Hz),
+                              float(t[k]), float(x[k]), expected, float(ratio.max()), t[part], x[part]))
         return found, least
 
-    def conclude(
-        self, kept: list[tuple[list[_Kept], float]], campaign: Campaign, expectation: Expectation
-    ) -> list[Finding]:
+    def conclude(self, kept: list[tuple[list[_Kept], float]], campaign: Campaign,
+                 expectation: Expectation) -> list[Finding]:
         found = [self._finding(k, campaign.y_unit) for of, _ in kept for k in of]
         if found:
             return found
-        least = np.array([FACTOR * one for _, one in kept])
-        return [
-            Finding(
-                self.name,
-                "ok",
-                "No single sample differs from its neighbours; a spike of more than"
-                f" {least.max():.2g} {campaign.y_unit} would be found in every record.",
-                value=float(least.max()),
-                picture=Picture(
-                    "Least spike that is found",
-                    "record",
-                    f"spike [{campaign.y_unit}]",
-                    (Series("least spike", np.arange(len(least)), least, "bars"),),
-                    x_names=tuple(r.header.name for r in campaign.records),
-                ),
-            )
-        ]
+        least = np.array([SETTINGS.factor * one for _, one in kept])
+        return [Finding(self.name, "ok",
+                        f"No single sample differs from its neighbours; a spike of more than {least.max():.2g} "
+                        f"{campaign.y_unit} would be found in every record.", value=float(least.max()),
+                        picture=Picture("Least spike that is found", "record", f"spike [{campaign.y_unit}]",
+                                        (Series("least spike", np.arange(len(least)), least, "bars"),),
+                                        x_names=tuple(r.header.name for r in campaign.records)))]
 
     def _finding(self, k: _Kept, unit: str) -> Finding:
         many = f"{k.count} single samples, the worst" if k.count > 1 else "a single sample"
-        return Finding(
-            self.name,
-            "warning",
-            f"Channel {k.channel!r} of record {k.record} has {many} far from the neighbours, at {k.at_s:.6g} s"
-            f" (sample {k.sample}): {k.value:.4g} {unit}, while interpolation gives {k.expected:.4g}. The deviation is"
-            f" {times(k.ratio)} the usual one (limit {FACTOR:g}): an electrical disturbance or a faulty conversion."
-            " Check cables and grounding; repeat the record, or replace the sample by the interpolated value.",
-            (k.channel,),
-            (k.record,),
-            k.ratio,
-            FACTOR,
-            Picture(
-                f"Record {k.record}, {k.channel}",
-                "time [s]",
-                f"{k.channel} [{unit}]",
-                (Series(k.channel, k.t, k.x),),
-                (Limit("spike", k.at_s, "x"),),
-            ),
-        )
+        return Finding(self.name, "warning",
+                       f"Channel {k.channel!r} of record {k.record} has {many} far from the neighbours, at "
+                       f"{k.at_s:.6g} s (sample {k.sample}): {k.value:.4g} {unit}, while interpolation gives "
+                       f"{k.expected:.4g}. The deviation is {times(k.ratio)} the usual one (limit {SETTINGS.factor:g}):"
+                       " an electrical disturbance or a faulty conversion. Check cables and grounding; repeat the "
+                       "record, or replace the sample by the interpolated value.", (k.channel,), (k.record,), k.ratio,
+                       SETTINGS.factor,
+                       Picture(f"Record {k.record}, {k.channel}", "time [s]", f"{k.channel} [{unit}]",
+                               (Series(k.channel, k.t, k.x),), (Limit("spike", k.at_s, "x"),)))
 
 
 def spikes(x: np.ndarray, lsb: float | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -135,19 +114,19 @@ def spikes(x: np.ndarray, lsb: float | None = None) -> tuple[np.ndarray, np.ndar
     if lsb is None:
         lsb = float(np.min(np.diff(np.unique(x[: 1 << 14])), initial=np.inf))
         lsb = lsb if np.isfinite(lsb) else 0.0
-    floor = STEPS * lsb / FACTOR + 1e-12 * float(np.max(np.abs(x)))
-    blocks = np.array_split(np.abs(r), max(1, len(r) // AROUND))
+    floor = SETTINGS.steps * lsb / SETTINGS.factor + 1e-12 * float(np.max(np.abs(x)))
+    blocks = np.array_split(np.abs(r), max(1, len(r) // SETTINGS.around))
     spread = np.maximum([np.median(block) for block in blocks], floor)
     # A stretch that has just become loud is judged by itself and by its neighbours.
     wide = np.max([spread, np.append(spread[1:], 0), np.append(0, spread[:-1])], axis=0)
     ratio = np.abs(r) / np.repeat(wide, [len(block) for block in blocks])
-    near = np.flatnonzero(ratio > FACTOR)
+    near = np.flatnonzero(ratio > SETTINGS.factor)
     single = []
     for k in near[(near >= 4) & (near < len(x) - 4)]:
         here = r[k - 2 : k + 3]
         left = here - r[k] * SHAPE
         largest = abs(r[k]) >= np.max(np.abs(here))
-        if largest and np.max(np.abs(left)) < LEFT * abs(r[k]) and np.sum(left**2) < jump_corner(here):
+        if largest and np.max(np.abs(left)) < SETTINGS.left * abs(r[k]) and np.sum(left**2) < jump_corner(here):
             single.append(int(k))
     return np.array(single, int), ratio[single], spread
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from avis_ctrl.gap.axis.result import AxisGap
 from avis_ctrl.gap.effects.base import Reported
-from avis_ctrl.gap.result import NamedEffect, sized, spoken
+from avis_ctrl.gap.result import NamedEffect, spoken
 from avis_ctrl.report.identification.gate_figures import figure_of
 from avis_ctrl.report.pieces import Bullets, Document, Paragraph, Piece, Section, table
 from avis_ctrl.report.sections.provenance import provenance_table, stamp_of
@@ -69,9 +69,9 @@ def _remaining(gap: AxisGap) -> Section:
 
 
 def _sizes(one: NamedEffect) -> str:
-    return ", ".join(f"{spoken(name, p.unit)} {sized(p)}" for name, p in one.parameters.items())
+    return ", ".join(f"{spoken(name, p.unit)} {p}" for name, p in one.parameters.items())
 
 
 def _values(caption: str, values: Mapping[str, Reported]) -> Piece:
-    rows: Sequence[tuple[str, str]] = [(name, sized(p)) for name, p in values.items()]
+    rows: Sequence[tuple[str, str]] = [(name, str(p)) for name, p in values.items()]
     return table(caption, ("parameter", "value"), rows)
