@@ -8,6 +8,7 @@ rig = "halcyonics_loaded"
 sections = {
     "title": "Halcyonics, loaded: z and phi_x under one controller",
     "keep": ["z", "phi_x"],
+    "electronics": {"anti_alias_order": 3, "anti_alias_corner_Hz": 300.0},
     "loop": {"amplifier_corner_Hz": 300.0, "integrator_corner_Hz": 0.1},
     "uncertainty": {"parameters_percent": {"load.mass": 10.0, "k_s?": 15.0, "d3": 30.0, "d4": 30.0},
                     "parameters_absolute": {"load.L8": 0.01},

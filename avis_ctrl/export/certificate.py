@@ -20,6 +20,7 @@ from avis_ctrl.lti.norms import decibels
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.simulation.discrete import spectral_radius
 from avis_ctrl.simulation.sampled_loop import SampledLoop
+from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.simulation import with_delta
 
@@ -97,6 +98,7 @@ def certify(folder: DesignFolder, controller: SampledController, files: Mapping[
                "worst_case_band_transmissibility_dB": decibels(found.band.upper),
                "rounding_noise_m_per_s": float(np.linalg.norm(noise)),
                "step_time_us": None if files is None else step_time_us(files, controller),
+               "at_rest": {**at_rest(loop).as_dict(), "gain_Ns_per_m": axes.gain_at_rest()},
                "between_samples": {"worst_case_gain_dB": decibels(found.all_times),
                                    "floor_above_half_rate_dB": decibels(found.above)}}
     return Certificate(content, loop, worst, (*unstable, *unproved))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ from avis_ctrl.export.design_folder import DesignFolder
 from avis_ctrl.export.protection import protection
 from avis_ctrl.export.replay import Replay, replay_worst_plant
 from avis_ctrl.export.sampled_controller import Arithmetic, SampledController, parse_controller, read_controller
-from avis_ctrl.export.vectors import as_csv, vectors
+from avis_ctrl.export.vectors import agreement_V, as_csv, vectors
 from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.study.files import as_json
 
@@ -73,15 +74,22 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
         replay = replay_worst_plant(folder, certificate, controller, plain)
         if replay.record.diverged:
             raise ComputationError("the worst plant diverged under the compiled code; nothing was written")
-    contents = {CONTROLLER: text}
+    contents, content = {CONTROLLER: text}, dict(certificate.content)
     if "c" in formats:
         files = c_files(controller, guard, _provenance(folder, controller, certificate))
         contents |= {key: value.encode() for key, value in files.items()}
-        contents[VECTORS] = as_csv(controller, *vectors(controller, guard)).encode()
+        y, u = vectors(controller, guard)
+        contents[VECTORS] = as_csv(controller, y, u).encode()
+        content["test_vectors"] = {"samples": len(y), "tolerance_V": agreement_V(controller, guard, y, u)}
     if "mat" in formats:
         contents[MAT] = _mat(controller)
-    contents[CERTIFICATE] = as_json(certificate.content)
+    content["files"] = {name: _sha256(data) for name, data in contents.items()}
+    contents[CERTIFICATE] = as_json(content)
     return Package(controller, certificate, contents, replay)
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def _provenance(folder: DesignFolder, controller: SampledController, certificate: Certificate) -> Provenance:
@@ -124,7 +132,9 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
                   settings: CheckSettings = CheckSettings()) -> list[str]:
     """What does not agree in an exported folder, each as a line; empty if all does.
 
-    The hash of controller.json, the numbers in the C and .mat files, and the certificate computed again.
+    First the files: those that are missing, the hashes, the numbers in the C and .mat files; each finding goes to
+    `progress` at once. Then the certificate is computed again, unless controller.json is unchanged and another file is
+    not.
 
     Raises
     ------
@@ -132,13 +142,18 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     """
     stored = read_json(out / CERTIFICATE, "avis-certificate")
     controller = read_controller(out / CONTROLLER)
-    found = []
-    if stored.get("controller_sha256") != controller.sha256:
+    found, changed = [], stored.get("controller_sha256") != controller.sha256
+    if changed:
         found.append(f"{CONTROLLER} is not the file that the certificate names: its hash differs")
+    found += _wrong_files(out, stored.get("files"))
     if (out / SOURCE).exists():
         found += _differences(SOURCE, controller, _numbers_in_c(out / SOURCE, controller))
     if (out / MAT).exists():
         found += _differences(MAT, controller, _numbers_in_mat(out / MAT))
+    for line in found:
+        progress(line)
+    if found and not changed:
+        return found
     try:
         content = certify(folder, controller, None, progress).content
     except AvisError as error:
@@ -147,6 +162,20 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
         tolerance = settings.direct if key == "rounding_noise_m_per_s" else settings.searched
         if key not in ("controller_sha256", "step_time_us") and not _alike(stored.get(key), value, tolerance):
             found.append(f"{key}: {stored.get(key)} in {CERTIFICATE}, {value} computed from {CONTROLLER}")
+    return found
+
+
+def _wrong_files(out: Path, hashes: object) -> list[str]:
+    """Files that the certificate lists and that are missing, or are not the ones that were exported."""
+    found = []
+    for name, digest in (hashes.items() if isinstance(hashes, dict) else ()):
+        try:
+            data = (out / Path(name).name).read_bytes()
+        except OSError as error:
+            found.append(f"{name} is missing" if not (out / name).exists() else f"{name}: {error.strerror}")
+            continue
+        if name != CONTROLLER and _sha256(data) != digest:
+            found.append(f"{name} is not the file that was exported: its hash differs")
     return found
 
 

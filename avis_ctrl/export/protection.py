@@ -13,6 +13,7 @@ minimum-phase D it is B D^-1, the conditioning of Hanus, Kinnaert and Henrotte, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg as la
@@ -93,23 +94,29 @@ def _significant(values: np.ndarray, digits: int) -> np.ndarray:
 class Processor:
     """The code's arithmetic in double precision, sample by sample: what the compiled code is compared with.
 
+    dtype : another precision.
+
     Attributes
     ----------
     x : (n,) state. gain : 0 to 1. wait : samples of valid inputs still to come before the gain rises.
     """
 
-    def __init__(self, controller: SampledController, guard: Protection):
-        self.system, self.limits_V, self.guard = controller.system, controller.limits_V, guard
-        self.x, self.gain, self.wait = np.zeros(controller.system.nstates), 0.0, guard.wait
+    def __init__(self, controller: SampledController, guard: Protection, dtype: type[np.floating] = np.float64):
+        self.limits_V, self.guard, self.dtype = controller.limits_V.astype(dtype), guard, dtype
+        self.A, self.B, self.C, self.D = (matrix.astype(dtype) for matrix in controller.matrices().values())
+        self.L, self.fall, self.rise = guard.anti_windup.astype(dtype), dtype(guard.fall), dtype(guard.rise)
+        self.x, self.wait = np.zeros(controller.system.nstates, dtype), guard.wait
+        self.gain: Any = dtype(0)
 
     def step(self, y: np.ndarray) -> np.ndarray:
         """Drive volts (n_u,) for sensor volts (n_y,)."""
-        guard, K = self.guard, self.system
+        guard = self.guard
         valid = bool(np.all(np.abs(y) < guard.input_limit_V))
-        v = np.clip(np.where(np.isnan(y), 0.0, y), -guard.input_limit_V, guard.input_limit_V)
+        v = np.clip(np.where(np.isnan(y), 0.0, y), -guard.input_limit_V, guard.input_limit_V).astype(self.dtype)
         self.wait = guard.wait if not valid else max(self.wait - 1, 0)
-        self.gain = max(self.gain - guard.fall, 0.0) if self.wait else min(self.gain + guard.rise, 1.0)
-        demanded = self.gain * (K.C @ self.x + K.D @ v)
+        self.gain = max(self.gain - self.fall, self.dtype(0)) if self.wait else min(self.gain + self.rise,
+                                                                                   self.dtype(1))
+        demanded = self.gain * (self.C @ self.x + self.D @ v)
         u = np.clip(demanded, -self.limits_V, self.limits_V)
-        self.x = K.A @ self.x + K.B @ v + guard.anti_windup @ (u - demanded)
+        self.x = self.A @ self.x + self.B @ v + self.L @ (u - demanded)
         return u

@@ -13,13 +13,15 @@ Gaussian signal passes once in ten minutes (`study.analysis.PEAK_FACTOR` times t
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.export.sampled_controller import SampledController
 from avis_ctrl.rigs.rigid_body import COORDINATES
-from avis_ctrl.simulation.discrete import N_Q, disturbed_period_map
+from avis_ctrl.simulation.discrete import N_Q, disturbed_period_map, gain_at_rest
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
 from avis_ctrl.simulation.sampled_response import open_response
 from avis_ctrl.study.analysis import PEAK_FACTOR
@@ -75,10 +77,14 @@ def _levels(loop: SampledLoop, points: int) -> tuple[np.ndarray, np.ndarray]:
     floor = np.zeros((omega.size, N_Q))
     for name, spectrum in loop.floor.items():
         floor[:, COORDINATES.index(name)] = spectrum.asd(omega / (2 * np.pi), "velocity")
-    noise = np.sqrt(2 * loop.period_s * loop.sensors.white_variance_V2)
-    y = np.concatenate([closed @ (G.sensed_floor * floor[:, None, :]), closed * noise], axis=2)
+    noise = np.sqrt(loop.sensors.noise_psd(omega / (2 * np.pi), loop.period_s))
+    y = np.concatenate([closed @ (G.sensed_floor * floor[:, None, :]), closed * noise[:, None, :]], axis=2)
     states = np.linalg.solve(np.exp(1j * omega * loop.period_s)[:, None, None] * np.eye(K.nstates) - K.A, K.B @ y)
 
     def peak(density: np.ndarray) -> np.ndarray:
         return PEAK_FACTOR * np.sqrt(np.trapezoid(np.sum(np.abs(density) ** 2, axis=2), omega / (2 * np.pi), axis=0))
-    return peak(y), peak(states)
+    # The offsets of the channels beside that, each of either sign; at rest nothing is fed back but by position sensors.
+    offset = np.array([one.offset_V for one in loop.rig.sensors()])
+    to_states = replace(K, C=np.eye(K.nstates), D=np.zeros((K.nstates, K.ninputs)), outputs=(), states=())
+    held = np.abs(gain_at_rest(to_states)) @ offset
+    return peak(y) + offset, peak(states) + held

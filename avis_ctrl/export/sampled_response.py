@@ -13,11 +13,12 @@ G the table from forces to seen velocities, the controller sees (G + E) times it
     |E| <= sum over k != 0 of |F(omega) / F(omega_k)| |G(omega_k)| |omega / omega_k|,
 
 |G| taken over the whole uncertainty set, each image with a perturbation of its own, which the true ones cannot exceed.
+An anti-alias filter is known and the same in all channels: |G| is bounded without it, and its magnitude multiplied.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -36,6 +37,7 @@ from avis_ctrl.rigs.sensing import Filter, conditioning
 from avis_ctrl.robust.mu_peak import worst_case_gain
 from avis_ctrl.robust.mu_upper import skewed_upper_bound
 from avis_ctrl.study.analysis import SLACK
+from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 
@@ -44,12 +46,14 @@ class ResponseSettings:
     """images : pairs of images summed one by one; the rest is bounded by the decay of hold and table together, at least
     as k^-2. points, order : of the function that bounds the table's gain above half the sample rate, where it falls
     smoothly: the frequencies it is fitted to and its order. lowest : where it begins, as a fraction of half the rate:
-    the intervals of the grid reach a little beyond theirs."""
+    the intervals of the grid reach a little beyond theirs. rest : a frequency far below every pole, as a fraction of
+    half the rate, at which the gain at rest is taken: position sensors have none at zero itself."""
 
     images: int = 8
     points: int = 12
     order: int = 3
     lowest: float = 0.99
+    rest: float = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +136,10 @@ class SampledAxes:
     def response(self, omega: np.ndarray) -> np.ndarray:
         """(n_omega, n, n) R without the design model's delay: what stands in the place of its controller."""
         return (self.hold(omega) / self.pade(omega))[:, None, None] * (self.forces @ self.volts(omega))
+
+    def gain_at_rest(self) -> float:
+        """Largest gain from the seen velocities of the axes to their forces far below every pole [N s/m]."""
+        return float(np.linalg.norm(self.response(np.array([self.settings.rest * self.half_rate]))[0], 2))
 
     def controller_error(self, K: StateSpace, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
         """(n,) bound over |omega - centre| <= half of |R - K exp(-j omega tau)| and of what rounded decoding adds
@@ -227,6 +235,14 @@ class SampledAxes:
                  for image in self._images(centre)]
         return np.sqrt(np.sum(terms, axis=0))
 
+    @cached_property
+    def _unfiltered(self) -> DesignPlant:
+        folder = self.folder
+        if not folder.rig.electronics.anti_alias_order:
+            return folder.plant
+        bare = replace(folder.rig.electronics, anti_alias_order=0, anti_alias_corner_Hz=None)
+        return build_plant(folder.design, folder.rig.with_electronics(bare))
+
     @property
     def high_grid(self) -> np.ndarray:
         """(points,) rad/s from half the sample rate on; the first image of half the rate lies there."""
@@ -244,7 +260,10 @@ class SampledAxes:
     def _high_gain(self, source: str, target: str, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
         """(n,) bound of the gain over the uncertainty set and over intervals above half the rate."""
         bound = self._high_bound(source, target)
-        return roots_jet(bound.zeros(), bound.poles(), bound.gain, centre, half).size
+        size = roots_jet(bound.zeros(), bound.poles(), bound.gain, centre, half).size
+        if target == "seen" and (lags := self.folder.rig.electronics.low_pass()):
+            size = size * roots_jet((), lags, float(np.prod(np.abs(lags))), centre, half).size
+        return size
 
     @cache  # noqa: B019 (one object per export)
     def _high_bound(self, source: str, target: str) -> Rational:
@@ -270,8 +289,10 @@ class SampledAxes:
         return found.upper
 
     def _part(self, source: str, target: str) -> tuple[StateSpace, BlockStructure]:
-        """The open table with its blocks, from forces or floor to seen velocities or velocities."""
-        plant, blocks, P = self.folder.plant, self.folder.plant.full.blocks, self.folder.plant.full.P
+        """The open table without anti-alias filter, with its blocks, from forces or floor to seen velocities or
+        velocities."""
+        plant = self._unfiltered
+        blocks, P = plant.full.blocks, plant.full.P
         names = {"force": plant.full.u, "floor": plant.floor_velocities, "seen": plant.full.y,
                  "velocity": plant.velocities}
         part = P.select([*P.outputs[:blocks.n_z], *names[target]], [*P.inputs[:blocks.n_w], *names[source]])

@@ -69,7 +69,8 @@ def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str, undo_chain: bo
     if len(kinds) != 1 or not sensors[0].inertial:
         raise InputError("expected geophones or accelerometers of one kind: the filter inverts a single sensor chain",
                          field="y names", value=list(y_names))
-    gain = np.array([one.gain for one in sensors])
+    # Of the chain's poles and zeros alone; without them, in the passband.
+    gain = np.array([one.gain * (one.leading if undo_chain else 1.0) for one in sensors])
     chain = np.array(sensors[0].poles, complex) if undo_chain else none
     # Velocity is the voltage over the chain: of an accelerometer its zero at rest and the integration.
     at_rest = len(sensors[0].zeros) if undo_chain else 0

@@ -168,10 +168,12 @@ def study_inputs(source: Any, **sections: Any) -> tuple[Design, Rig]:
     path = Path(source) if isinstance(source, (str, Path)) else None
     if path is not None and path.suffix == ".toml":
         made, table = read_study(path)
-        return (_changed(made, sections) if sections else made), table
+        made = _changed(made, sections) if sections else made
+        return made, made.equipped(table)
     table = _rig(source)
     name = str(source) if path is not None else table.name
-    return design_from_table({"rig": name, **sections}), table
+    made = design_from_table({"rig": name, **sections})
+    return made, made.equipped(table)
 
 
 def _identified(source: IdentificationStudy, sections: dict[str, Any]) -> tuple[Design, Rig]:

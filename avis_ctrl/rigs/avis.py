@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
+from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
 from avis_ctrl.rigs.instruments import Drive, FloorSensor, GeophoneAt, Instrument, Sensor, Tolerances, Triple, with_gain
 from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
 from avis_ctrl.rigs.rig import Parameter, Place, Rig
@@ -85,6 +85,7 @@ class AvisTable(Rig):
     instruments: tuple[Instrument, ...] = ()
     floor_sensors: tuple[FloorSensor, ...] = ()
     tolerances: Tolerances | None = None
+    electronics: Electronics = field(default_factory=Electronics)
 
     def __post_init__(self) -> None:
         self.mounted_body()  # refuses a mass or an inertia that is not positive
@@ -286,7 +287,9 @@ class AvisTable(Rig):
 
     @cached_property
     def _sensors(self) -> tuple[Sensor, ...]:
-        return tuple(one.sensor(self.acquisition, self.ambient) for one in (*self._attached(), *self.instruments))
+        return tuple(one.sensor(self.acquisition, self.ambient).with_electronics(
+            self.electronics, one.preamplifier_gain, self.converter, self.sample_rate_Hz)
+                     for one in (*self._attached(), *self.instruments))
 
     def _attached(self) -> tuple[GeophoneAt, ...]:
         if (g := self.geophones) is None:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 
 @dataclass(frozen=True)
 class Geophones:
@@ -55,3 +57,58 @@ class Ambient:
 
     floor_velocity_rms_m_per_s: float
     sensor_noise_rms_V: float
+
+
+@dataclass(frozen=True)
+class Electronics:
+    """Offset, 1/f noise and anti-alias filter of the channels, the same in each.
+
+    Defaults are those of data sheets. Amplifier: INA128 (Texas Instruments, SBOS051), offset at its input typically
+    10 uV + 100 uV / G with the gain G; 10 nV/sqrt(Hz) at 10 Hz and 8 nV/sqrt(Hz) at 1 kHz, hence 1/f noise of
+    19 nV/sqrt(Hz) at 1 Hz. Converter: an offset of two codes, which data sheets of converters by successive
+    approximation state as the largest; no 1/f noise beside its rounding, which is white.
+
+    Attributes
+    ----------
+    sensor_offset_V : largest offset of a sensor with its amplifier, at the converter, of either sign; None for that of
+        the data sheet with the sensor's preamplifier gain.
+    sensor_flicker_corner_Hz : frequency at which the density of a sensor's 1/f noise is that of its white noise; None
+        for the 1/f noise of the data sheet with the sensor's preamplifier gain.
+    converter_offset_V : largest offset of the converter, of either sign; None for two codes (zero without a converter).
+    converter_flicker_corner_Hz : as that of the sensors, relative to the converter's rounding noise.
+    anti_alias_order, anti_alias_corner_Hz : Butterworth low-pass before the converter; order 0 for none.
+    """
+
+    sensor_offset_V: float | None = None
+    sensor_flicker_corner_Hz: float | None = None
+    converter_offset_V: float | None = None
+    converter_flicker_corner_Hz: float = 0.0
+    anti_alias_order: int = 0
+    anti_alias_corner_Hz: float | None = None
+
+    def offset_V(self, preamplifier_gain: float, code_V: float) -> float:
+        """Largest offset of one channel, amplifier and converter together; code_V : volts of one code."""
+        sensor = 10e-6 * preamplifier_gain + 100e-6 if self.sensor_offset_V is None else self.sensor_offset_V
+        return sensor + (2 * code_V if self.converter_offset_V is None else self.converter_offset_V)
+
+    def flicker_rms_V(self, preamplifier_gain: float, noise_rms_V: float, rounding_rms_V: float, sample_rate_Hz: float
+                      ) -> float:
+        """R.m.s. of one sample of white noise with the density that the 1/f noise of a channel has at 1 Hz.
+
+        noise_rms_V, rounding_rms_V : of one sample, of the sensor's white noise and of the converter's rounding.
+        """
+        if self.sensor_flicker_corner_Hz is None:
+            sensor = 19e-9 * preamplifier_gain * np.sqrt(sample_rate_Hz / 2)
+        else:
+            sensor = noise_rms_V * np.sqrt(self.sensor_flicker_corner_Hz)
+        return float(np.hypot(sensor, rounding_rms_V * np.sqrt(self.converter_flicker_corner_Hz)))
+
+    def low_pass(self) -> tuple[complex, ...]:
+        """Poles of the anti-alias filter [rad/s]; its gain at zero frequency is one."""
+        n = self.anti_alias_order
+        angles = np.pi * (2 * np.arange(n) + n + 1) / (2 * max(n, 1))
+        poles = 2 * np.pi * (self.anti_alias_corner_Hz or 0.0) * np.exp(1j * angles)
+        # Exact pairs, and a real pole without a trace of an imaginary part.
+        upper = [complex(pole) for pole in poles[:n // 2]]
+        real = [complex(-abs(poles[n // 2]))] if n % 2 else []
+        return (*upper, *real, *(pole.conjugate() for pole in upper))

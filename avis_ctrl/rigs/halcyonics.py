@@ -6,13 +6,13 @@ second derivatives in eq. 4, K(4,4) = (k_a + k_s) L_2^2 + 2 k_a L_6^2, E(3,1..4)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
+from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
 from avis_ctrl.rigs.instruments import Sensor, Tolerances, Triple, white_rms
 from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
 from avis_ctrl.rigs.rig import Parameter, Place, Rig
@@ -123,6 +123,7 @@ class Halcyonics(Rig):
     acquisition: Acquisition | None = None
     ambient: Ambient | None = None
     tolerances: Tolerances | None = None
+    electronics: Electronics = field(default_factory=Electronics)
 
     def __post_init__(self) -> None:
         if len(self.k_s) != 4 or len(self.e) != 8 or len(self.actuator_names) != 8:
@@ -256,9 +257,9 @@ class Halcyonics(Rig):
         axes, acc = self.actuator_axes(), self.accelerometers
         noise = white_rms(acc.noise_m_per_s2_rtHz, acc.sensitivity_Vs2_per_m, acc.sample_rate_Hz)
         pole = complex(-2 * np.pi * acc.low_corner_Hz)
-        return tuple(Sensor(f"acc_{name}", _triple(axes[name][0]), _triple(axes[name][1]), "acceleration", (0j,),
-                            (pole,), acc.sensitivity_Vs2_per_m, noise, noise_density=acc.noise_m_per_s2_rtHz)
-                     for name in acc.at)
+        bare = [Sensor(f"acc_{name}", _triple(axes[name][0]), _triple(axes[name][1]), "acceleration", (0j,), (pole,),
+                       acc.sensitivity_Vs2_per_m, noise, noise_density=acc.noise_m_per_s2_rtHz) for name in acc.at]
+        return tuple(one.with_electronics(self.electronics, 1.0, self.converter, self.sample_rate_Hz) for one in bare)
 
     def parameters(self) -> dict[str, Parameter]:
         """Symbols of the source; k_s1..k_s4 by corner (k_s: their mean), e1..e8, load.mass, load.L7, load.Ixx .."""

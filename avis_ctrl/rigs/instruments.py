@@ -17,7 +17,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.converter import Converter, white_density
-from avis_ctrl.rigs.equipment import Acquisition, Ambient
+from avis_ctrl.rigs.equipment import Acquisition, Ambient, Electronics
 
 Quantity = Literal["velocity", "acceleration", "displacement"]
 Triple = tuple[float, float, float]
@@ -63,6 +63,9 @@ class Sensor:
     noise_rms_V : white noise of one sample, before the converter.
     suspension : corner [Hz] and damping ratio of a geophone's own suspension, None for other kinds.
     noise_density : the same noise as motion in the passband [unit/sqrt(Hz)], where the rig's file states it so.
+    low_pass : those of `poles` that are the anti-alias filter's.
+    offset_V : largest offset of the channel, of either sign.
+    flicker_rms_V : of one sample of white noise with the density that the 1/f noise has at 1 Hz.
     """
 
     name: str
@@ -75,6 +78,9 @@ class Sensor:
     noise_rms_V: float
     suspension: tuple[float, float] | None = None
     noise_density: float | None = None
+    low_pass: tuple[complex, ...] = ()
+    offset_V: float = 0.0
+    flicker_rms_V: float = 0.0
 
     @property
     def inertial(self) -> bool:
@@ -84,8 +90,8 @@ class Sensor:
     @property
     def leading(self) -> float:
         """Leading coefficient of the chain for a passband gain of one."""
-        excess = len(self.poles) - len(self.zeros)
-        return float(np.prod(np.abs(self.poles))) if excess else 1.0
+        lags = self.low_pass if self.inertial else self.poles
+        return float(np.prod(np.abs(lags)))
 
     def chain(self, gain: float | None = None) -> StateSpace:
         """Motion -> volts; `gain` in the place of its own where given."""
@@ -99,6 +105,20 @@ class Sensor:
         if self.noise_density is not None:
             return float(np.hypot(self.noise_density, rounding / self.gain))
         return float(np.hypot(rounding, white_density(self.noise_rms_V, sample_rate_Hz)) / self.gain)
+
+    def flicker_density(self, sample_rate_Hz: float) -> float:
+        """One-sided density of the 1/f noise at 1 Hz as motion in the passband [unit/sqrt(Hz)]."""
+        return white_density(self.flicker_rms_V, sample_rate_Hz) / self.gain
+
+    def with_electronics(self, electronics: Electronics, preamplifier_gain: float, converter: Converter | None,
+                         sample_rate_Hz: float) -> Sensor:
+        """The sensor with offset, 1/f noise and anti-alias filter of its channel."""
+        lags = electronics.low_pass()
+        code, rounding = (converter.lsb_V, converter.noise_rms_V) if converter else (0.0, 0.0)
+        return replace(self, poles=(*self.poles, *lags), low_pass=lags,
+                       offset_V=electronics.offset_V(preamplifier_gain, code),
+                       flicker_rms_V=electronics.flicker_rms_V(preamplifier_gain, self.noise_rms_V, rounding,
+                                                               sample_rate_Hz))
 
     def as_velocity(self, omega: np.ndarray) -> np.ndarray:
         """(n,) complex, the chain of unit gain from velocity; omega > 0."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.converter import Converter
-from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
+from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
 from avis_ctrl.rigs.instruments import FloorSensor, Sensor, Tolerances
 from avis_ctrl.rigs.mounted_body import MountedBody
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, point_map
@@ -48,6 +48,7 @@ class Rig(ABC):
     ambient: Ambient | None
     tolerances: Tolerances | None
     floor_sensors: tuple[FloorSensor, ...] = ()
+    electronics: Electronics = Electronics()
 
     @property
     @abstractmethod
@@ -75,6 +76,10 @@ class Rig(ABC):
     @abstractmethod
     def with_loop_delay(self, delay_s: float) -> Self:
         """The rig with another delay from sample to drive voltage."""
+
+    def with_electronics(self, electronics: Electronics) -> Self:
+        """The rig with another offset, 1/f noise or anti-alias filter of its channels."""
+        return replace(self, electronics=electronics)  # type: ignore[type-var]
 
     @property
     @abstractmethod

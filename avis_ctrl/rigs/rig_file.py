@@ -16,7 +16,7 @@ from pydantic import BaseModel
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.avis import AvisTable, Isolator, LinearMotor
-from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Geophones
+from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
 from avis_ctrl.rigs.file_errors import read_toml, validated
 from avis_ctrl.rigs.halcyonics import Halcyonics, Load, ReactionMass
 from avis_ctrl.rigs.instruments import (
@@ -130,7 +130,7 @@ def _avis(file: AvisFile) -> AvisTable:
                       Acquisition(**_tuples(file.acquisition)), _ambient(file.ambient), drives=drives,
                       instruments=_instruments(file),
                       floor_sensors=tuple(FloorSensor(**_tuples(one)) for one in file.floor_sensor),
-                      tolerances=_tolerances(file.tolerances))
+                      tolerances=_tolerances(file.tolerances), electronics=Electronics(**_tuples(file.electronics)))
     _distinct("drive", [one.name for one in table.all_drives])
     _distinct("geophone, accelerometer, position_sensor", [one.name for one in table.sensors()])
     _distinct("floor_sensor.axis", [one.axis for one in table.floor_sensors], some=False)
@@ -208,7 +208,7 @@ def _halcyonics(file: HalcyonicsFile, loaded: bool) -> Halcyonics:
                                             actuators.free_constant_N_per_V),
                       accelerometers=Accelerometers(**_tuples(file.accelerometers)),
                       ambient=_ambient(file.ambient), load=load if loaded else None,
-                      tolerances=_tolerances(file.tolerances))
+                      tolerances=_tolerances(file.tolerances), electronics=Electronics(**_tuples(file.electronics)))
 
 
 def _ambient(section: AmbientSection | None) -> Ambient | None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator
 
 from avis_ctrl.rigs.converter import bits_of
+from avis_ctrl.rigs.equipment import Electronics
 from avis_ctrl.rigs.file_errors import Section
 from avis_ctrl.rigs.floor_spectrum import shipped_spectra
 from avis_ctrl.rigs.instruments import Tolerances
@@ -153,6 +154,24 @@ class TolerancesSection(Section):
     product_of_inertia_kgm2: NotNegative = Tolerances.product_of_inertia_kgm2
 
 
+class ElectronicsSection(Section):
+    """Offset, 1/f noise and anti-alias filter of the channels; what is left out takes the default."""
+
+    sensor_offset_V: NotNegative | None = None
+    sensor_flicker_corner_Hz: NotNegative | None = None
+    converter_offset_V: NotNegative | None = None
+    converter_flicker_corner_Hz: NotNegative = Electronics.converter_flicker_corner_Hz
+    anti_alias_order: Annotated[int, Field(ge=0, le=8)] = Electronics.anti_alias_order
+    anti_alias_corner_Hz: Annotated[Positive | None, Field(validate_default=True)] = None
+
+    @field_validator("anti_alias_corner_Hz")
+    @classmethod
+    def _with_an_order(cls, corner: float | None, info: ValidationInfo) -> float | None:
+        if (corner is None) != (info.data.get("anti_alias_order", 0) == 0):
+            raise ValueError("expected anti_alias_order and anti_alias_corner_Hz, both or neither")
+        return corner
+
+
 class AcquisitionSection(Section):
     sample_rate_Hz: Positive
     adc_bits: Annotated[int, BeforeValidator(bits_of)]
@@ -179,6 +198,7 @@ class AvisFile(Section):
     acquisition: AcquisitionSection
     ambient: AmbientSection | None = None
     tolerances: TolerancesSection | None = None
+    electronics: ElectronicsSection = ElectronicsSection()
 
 
 class PlateSection(Section):
@@ -248,3 +268,4 @@ class HalcyonicsFile(Section):
     load: LoadSection | None = None
     ambient: AmbientSection | None = None
     tolerances: TolerancesSection | None = None
+    electronics: ElectronicsSection = ElectronicsSection()

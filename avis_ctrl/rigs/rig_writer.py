@@ -11,7 +11,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.avis import AXES, INERTIA, AvisTable
-from avis_ctrl.rigs.equipment import Ambient
+from avis_ctrl.rigs.equipment import Ambient, Electronics
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.instruments import AccelerometerAt, Drive, GeophoneAt, Instrument
 from avis_ctrl.rigs.rig import Rig
@@ -159,7 +159,10 @@ def _along(kind: str, thing: Drive | Instrument) -> tuple[str, ...]:
 
 
 def _tolerances(rig: Rig) -> list[_Section]:
-    return [("[tolerances]", "tolerances", _all(rig.tolerances))] if rig.tolerances else []
+    found = [("[tolerances]", "tolerances", _all(rig.tolerances))] if rig.tolerances else []
+    if rig.electronics != Electronics():
+        found.append(("[electronics]", "electronics", _all(rig.electronics)))
+    return found
 
 
 def _halcyonics_sections(rig: Halcyonics) -> list[_Section]:

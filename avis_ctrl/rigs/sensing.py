@@ -74,10 +74,14 @@ class NoiseGroup:
 
     shape : unit white density -> noise of the noisiest of them as seen velocity [m/s/sqrt(Hz)].
     share : (n_s,) each sensor's noise over that; zero for sensors of other groups.
+    flicker, offset_rtHz : 1/f noise density at 1 Hz, and offset [sqrt(Hz)], the largest of each, over the white noise
+        density of the noisiest of them.
     """
 
     shape: StateSpace
     share: np.ndarray
+    flicker: float
+    offset_rtHz: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,28 +143,33 @@ def conditioning(rig: Rig, integrator_corner_Hz: float) -> tuple[Filter, ...]:
 def _targets(rig: Rig, integrator_corner_Hz: float) -> tuple[Filter | None, Filter | None]:
     """From velocity in space, and from displacement against the chassis, to seen velocity; None without such sensors.
     """
+    # The anti-alias filters are alike, and stay: their poles are in what is seen.
+    lags = next((one.low_pass for one in rig.sensors()), ())
+    size = float(np.prod(np.abs(lags)))
     own = [_high_pass(one, integrator_corner_Hz) for one in rig.sensors() if one.inertial]
     target = max(own, key=lambda poles: float(np.prod(np.abs(poles)))) if own else None
     against = [one for one in rig.sensors() if not one.inertial]
     relative = None
     if against:
         corner = 2 * np.pi * SETTINGS.differentiator_share * rig.sample_rate_Hz
-        slowest = min((one.poles for one in against), key=lambda poles: abs(poles[0]) if poles else np.inf)
-        poles = (*slowest, complex(-corner))
+        own = [one.poles[:len(one.poles) - len(lags)] for one in against]
+        slowest = min(own, key=lambda poles: abs(poles[0]) if poles else np.inf)
+        poles = (*slowest, *lags, complex(-corner))
         relative = Filter((0j,), poles, float(np.prod(np.abs(poles))))
-    return Filter((0j, 0j), target) if target else None, relative
+    return Filter((0j, 0j), (*target, *lags), size) if target else None, relative
 
 
 def _high_pass(sensor: Sensor, integrator_corner_Hz: float) -> tuple[complex, ...]:
     """Poles of the high-pass of second order that a sensor is on velocity, its integrator included."""
-    if sensor.quantity == "velocity":
-        return sensor.poles
-    return (*sensor.poles, complex(-2 * np.pi * integrator_corner_Hz))
+    own = sensor.poles[:len(sensor.poles) - len(sensor.low_pass)]
+    return own if sensor.quantity == "velocity" else (*own, complex(-2 * np.pi * integrator_corner_Hz))
 
 
 def _noise(rig: Rig, filters: Sequence[Filter], used: np.ndarray) -> tuple[NoiseGroup, ...]:
     sensors, groups = rig.sensors(), []
     density = np.array([one.motion_density(rig.converter, rig.sample_rate_Hz) for one in sensors])
+    flicker = np.array([one.flicker_density(rig.sample_rate_Hz) for one in sensors])
+    offset = np.array([one.offset_V / one.gain for one in sensors])
     # What is integrated falls as 1/s up to half the clock, and is white above, where sampling folds it back.
     nyquist = np.pi * rig.sample_rate_Hz
     for one in dict.fromkeys(f for f, in_use in zip(filters, used, strict=True) if in_use):
@@ -169,7 +178,9 @@ def _noise(rig: Rig, filters: Sequence[Filter], used: np.ndarray) -> tuple[Noise
         excess = len(one.poles) - len(one.zeros)
         zeros, leading = (*one.zeros, *[complex(-nyquist)] * excess), one.leading * largest / nyquist ** excess
         shape = gain([[largest]]) if one.is_one else Filter(zeros, one.poles, leading).system()
-        groups.append(NoiseGroup(shape, np.where(own, density / largest if largest else 1.0, 0.0)))
+        share = np.where(own, density / largest if largest else 1.0, 0.0)
+        groups.append(NoiseGroup(shape, share, *(float(np.max(values[own])) / largest if largest else 0.0
+                                                 for values in (flicker, offset))))
     if not groups:
         raise InputError("expected sensors that measure the axes", field="sensors", value=[one.name for one in sensors])
     return tuple(groups)

@@ -128,6 +128,17 @@ def residualise_fast(K: StateSpace, limit: float, also_unstable: bool = False) -
     return replace(slow, D=slow.D + fast.dcgain())
 
 
+def truncate_slow(K: StateSpace, limit: float) -> StateSpace:
+    """K without its stable poles slower than `limit` [rad/s]; its response far above them is kept.
+
+    Synthesis leaves such poles where no weight changes any more. They hardly act, but a processor carries their states
+    for hours. Raises InputError for sampled K.
+    """
+    if K.dt:
+        raise InputError("expected a continuous controller", field="K.dt", value=K.dt)
+    return split(K, lambda re, im: re >= 0 or np.hypot(re, im) >= limit)[0]
+
+
 def split(K: StateSpace, first: Callable[[float, float], bool]) -> tuple[StateSpace, StateSpace]:
     """K as a sum of the part with the poles that `first` picks (and the direct term), and the rest."""
     n = K.nstates

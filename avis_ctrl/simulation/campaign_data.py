@@ -95,7 +95,8 @@ def open_loop(rig: Rig, plan: CampaignPlan) -> SampledLoop:
     """The rig with its sensors as the plan has them, and no controller."""
     corner = plan.amplifier_corner_Hz
     # What the controller does in each channel does not act on what is recorded.
-    bank = replace(rig_bank(rig, 1.0), conditioning=None)
+    # Offset and 1/f noise are left out: a campaign's noise model is white.
+    bank = replace(rig_bank(rig, 1.0).white(), conditioning=None)
     if "acceleration" in bank.quantities:
         corner = corner or ACCELEROMETER_AMPLIFIER_HZ
     bank = replace(bank, noise_rms_V=bank.noise_rms_V if plan.sensors.noise else np.zeros(len(bank.chains)),

@@ -10,7 +10,7 @@ second-order error in it vanishes, at one evaluation a step.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -170,6 +170,42 @@ def step_arrays(loop: SampledLoop, extra_substeps: int = 1) -> StepArrays:
     packed = np.ascontiguousarray
     return StepArrays(packed(advance), packed(observe), packed(sense), packed(control),
                       rig_arrays(loop.plant.mounted_body()))
+
+
+@dataclass(frozen=True, eq=False)
+class RestState:
+    """Linear loop at rest with constant offsets of its channels and a floor at rest.
+
+    volts : (n_u,) demanded. state : of `linear_part`. controller : of the digital controller.
+    """
+
+    volts: np.ndarray
+    state: np.ndarray
+    controller: np.ndarray
+
+
+def rest_state(loop: SampledLoop) -> RestState:
+    """Where the loop rests with `loop.sensors.offset_V`; limits and rounding are left out."""
+    linear, K = linear_part(loop), digital_controller(loop)
+    n_s, n_u = len(loop.sensors.chains), loop.n_drives
+    free = np.r_[:2 * N_Q, 3 * N_Q:linear.nstates]
+    by_volts = -la.solve(linear.A[np.ix_(free, free)], linear.B[free, :n_u])
+    sensed = linear.C[-n_s:][:, free] @ by_volts + linear.D[-n_s:, :n_u]
+    kept = la.solve(np.eye(K.nstates) - K.A, K.B) if K.nstates else np.zeros((0, n_s))
+    gain = K.C @ kept + K.D
+    volts = la.solve(np.eye(n_u) - gain @ sensed, gain @ loop.sensors.offset_V)
+    state = np.zeros(linear.nstates)
+    state[free] = by_volts @ volts
+    return RestState(volts, state, kept @ (loop.sensors.offset_V + sensed @ volts))
+
+
+def gain_at_rest(K: StateSpace) -> np.ndarray:
+    """(n_u, n_y) of a system at zero frequency; inf where it has a pole there."""
+    edge = np.eye(K.nstates) - K.A if K.dt else -K.A
+    try:
+        return K.D + K.C @ np.linalg.solve(edge, K.B)
+    except np.linalg.LinAlgError:
+        return np.full(K.D.shape, np.inf)
 
 
 def spectral_radius(loop: SampledLoop) -> float:

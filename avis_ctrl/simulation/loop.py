@@ -13,7 +13,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.floor_spectrum import realise
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation import kernel
-from avis_ctrl.simulation.discrete import linear_part, step_arrays
+from avis_ctrl.simulation.discrete import linear_part, rest_state, step_arrays
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
 
 Code = Callable[[np.ndarray], np.ndarray]
@@ -73,6 +73,21 @@ def floor_velocity(loop: SampledLoop, samples: int, rng: np.random.Generator) ->
     return velocity
 
 
+def flicker(samples: int, period_s: float, rng: np.random.Generator, channels: int) -> np.ndarray:
+    """(samples, channels) Gaussian noise of one-sided density 2 period_s / f from the first line of the record on.
+
+    Unit density at 1 Hz relative to white noise of variance one; the mean is zero, and the record repeats.
+    """
+    frequency = np.fft.rfftfreq(samples, period_s)
+    rms = np.zeros(frequency.size)
+    rms[1:] = np.sqrt(2 * period_s / frequency[1:] / (samples * period_s))
+    if samples % 2 == 0:
+        rms[-1] = 0.0
+    draw = rng.standard_normal((2, frequency.size, channels))
+    # Lines of variance rms^2: half of it in the real and half in the imaginary part.
+    return np.fft.irfft(0.5 * samples * rms[:, None] * (draw[0] + 1j * draw[1]), samples, axis=0)
+
+
 def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int, ...] = 1, *, settle_s: float = 10.0,
              nonlinear: bool = True, extra_substeps: int = 1, floor: np.ndarray | None = None,
              initial: np.ndarray | None = None, drive: np.ndarray | None = None, code: Code | None = None
@@ -107,8 +122,12 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
     drive = np.zeros((samples, n_u)) if drive is None else np.ascontiguousarray(drive, float)
     if drive.shape != (samples, n_u) or not np.all(np.isfinite(drive)):
         raise InputError(f"expected finite voltages of shape {(samples, n_u)}", field="drive", value=drive.shape)
-    noise = rng.standard_normal((samples, n_s)) * loop.sensors.noise_rms_V
-    state = np.zeros(linear_part(loop).nstates)
+    noise = rng.standard_normal((samples, n_s)) * loop.sensors.noise_rms_V + loop.sensors.offset_V
+    if np.any(loop.sensors.flicker_rms_V):
+        noise += flicker(samples, loop.period_s, rng, n_s) * loop.sensors.flicker_rms_V
+    # An offset has been there for long: the loop starts where it rests with it.
+    rest = rest_state(loop) if np.any(loop.sensors.offset_V) and code is None else None
+    state = np.zeros(linear_part(loop).nstates) if rest is None else rest.state
     if initial is not None:
         state[:12] = initial
     converter = loop.sensors.converter
@@ -116,6 +135,9 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
     records = kernel.Records(*(np.empty((samples, width)) for width in (6, 6, n_u, n_u, n_s)))
     arrays = step_arrays(loop, extra_substeps)
     work = kernel.workspace(arrays, state, loop.delay_substeps * extra_substeps)
+    if rest is not None:
+        work.u[:] = np.clip(rest.volts, -loop.limits_V, loop.limits_V)
+        work.control_in[:rest.controller.size] = rest.controller
     run = kernel.run if code is None else partial(kernel.run_stepwise, code)
     done = run(arrays, work, floor, noise, drive, loop.substeps * extra_substeps, nonlinear,
                "acceleration" in loop.sensors.quantities, adc, loop.limits_V, STOPS, records)

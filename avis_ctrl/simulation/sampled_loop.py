@@ -47,6 +47,8 @@ class SensorBank:
     converter : None for unlimited resolution.
     conditioning : done by the controller in each channel after division by the gain (an accelerometer's
         integrator), one for all or one a sensor; None for nothing.
+    flicker_rms_V : (n_s,) of white noise with the density that the 1/f noise has at 1 Hz.
+    offset_V : (n_s,) constant voltage that each channel reads too much; zero by default.
     """
 
     quantity: str | tuple[str, ...]
@@ -55,6 +57,8 @@ class SensorBank:
     noise_rms_V: np.ndarray
     converter: Converter | None = None
     conditioning: StateSpace | tuple[StateSpace | None, ...] | None = None
+    flicker_rms_V: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    offset_V: np.ndarray = field(default_factory=lambda: np.zeros(1))
 
     def __post_init__(self) -> None:
         n = len(self.chains)
@@ -63,9 +67,9 @@ class SensorBank:
                              value=self.quantity)
         if len(self.filters) != n:
             raise InputError(f"one filter, or {n}", field="conditioning", value=len(self.filters))
-        for name in ("gain_V", "noise_rms_V"):
+        for name in ("gain_V", "noise_rms_V", "flicker_rms_V", "offset_V"):
             values = np.array(np.broadcast_to(getattr(self, name), (n,)), dtype=float)
-            if not np.all(np.isfinite(values)) or np.any(values < 0):
+            if not np.all(np.isfinite(values)) or (name != "offset_V" and np.any(values < 0)):
                 raise InputError(f"{n} finite numbers, not negative", field=name, value=values.tolist())
             object.__setattr__(self, name, values)
 
@@ -85,6 +89,14 @@ class SensorBank:
         """(n_s,) variance of one sample: noise, and rounding as if white, true where signal or noise moves by codes."""
         return self.noise_rms_V ** 2 + (self.converter.noise_rms_V ** 2 if self.converter else 0.0)
 
+    def noise_psd(self, frequency_Hz: np.ndarray, period_s: float) -> np.ndarray:
+        """(n, n_s) one-sided density of all noise at the converters [V^2/Hz]; frequency_Hz (n,) positive."""
+        return 2 * period_s * (self.white_variance_V2 + self.flicker_rms_V ** 2 / np.asarray(frequency_Hz)[:, None])
+
+    def white(self) -> SensorBank:
+        """Without 1/f noise."""
+        return replace(self, flicker_rms_V=np.zeros(1))
+
 
 def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
     """The sensors of a rig as its file says, and what the controller does in each channel (`rigs.sensing`).
@@ -102,7 +114,8 @@ def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
                       tuple(chains[replace(one, name="", position=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0))]
                             for one in sensors),
                       np.array([one.gain for one in sensors]), np.array([one.noise_rms_V for one in sensors]),
-                      rig.converter, made[0] if len(set(filters)) == 1 else made)
+                      rig.converter, made[0] if len(set(filters)) == 1 else made,
+                      np.array([one.flicker_rms_V for one in sensors]))
 
 
 @dataclass(frozen=True, eq=False)

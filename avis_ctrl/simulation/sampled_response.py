@@ -61,8 +61,8 @@ class SampledResponse:
             # A realisation has no lines below the band of its model.
             floor[:, COORDINATES.index(name)] = np.where(frequency >= spectrum.low_Hz * (1 - 1e-9),
                                                          spectrum.asd(frequency, "velocity") ** 2, 0.0)
-        noise = 2 * self.loop.period_s * self.loop.sensors.white_variance_V2
-        return (np.abs(of_floor) ** 2 @ floor[:, :, None])[..., 0] + np.abs(of_noise) ** 2 @ noise
+        noise = self.loop.sensors.noise_psd(frequency, self.loop.period_s)
+        return sum((np.abs(of) ** 2 @ psd[:, :, None])[..., 0] for of, psd in ((of_floor, floor), (of_noise, noise)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -146,7 +146,9 @@ def site_response(plant: DesignPlant, full: StateSpace, controlled: bool, band_H
     from_noise = full.select(outputs, list(plant.noises)).frequency_response(omega)
     # Directions of the floor and the sensors are independent of each other.
     by_floor = np.linalg.norm(from_floor, axis=2) * floor[:, None]
-    by_noise = np.linalg.norm(from_noise, axis=2) * plant.floor_density
+    # The noise itself, where its weight is above it or ends.
+    real = np.stack([weight.asked(omega) / weight.magnitude(omega) for weight in plant.noises.values()], axis=1)
+    by_noise = np.linalg.norm(from_noise * real[:, None, :], axis=2) * plant.floor_density
     if not controlled:
         # No volts and no sensor noise in the motion: exactly, not to round-off.
         by_floor[:, len(plant.axes):], by_noise[:] = 0.0, 0.0

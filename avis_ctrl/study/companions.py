@@ -218,8 +218,7 @@ class _Search:
         for name, spectrum in bare.floor.items():
             inside = omega >= 2 * np.pi * spectrum.low_Hz
             floor[inside, COORDINATES.index(name)] = spectrum.asd(omega[inside] / (2 * np.pi), "velocity")
-        noise = np.sqrt(2 * bare.period_s * bare.sensors.white_variance_V2)
-        self.sources = np.hstack([floor, np.broadcast_to(noise, (omega.size, noise.size))])
+        self.sources = np.hstack([floor, np.sqrt(bare.sensors.noise_psd(omega / (2 * np.pi), bare.period_s))])
         self._units: dict[str, np.ndarray] = {}
         self._filters: dict[tuple[float, float], np.ndarray] = {}
         equations = bare.rig.equations_of_motion()

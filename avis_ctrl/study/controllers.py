@@ -14,15 +14,16 @@ from avis_ctrl.robust.frequency_grid import merged, resonances
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn import MuSynthesis, musyn
-from avis_ctrl.robust.reduction import reduce_controller, residualise_fast
+from avis_ctrl.robust.reduction import reduce_controller, residualise_fast, truncate_slow
 from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.plant import DesignPlant
 
 # Coarse: it only ranks controllers of different order; what is reported is computed on the one chosen. The resonances
-# of the table at rest and the peak of mu join it, for both are narrower than its steps.
-REDUCTION_HZ = np.geomspace(0.05, 300.0, 25)
+# of the table at rest and the peak of mu join it, for both are narrower than its steps. Below the band mu bounds what
+# the offset of the electronics costs.
+REDUCTION_HZ = np.concatenate([np.geomspace(1e-3, 0.03, 5), np.geomspace(0.05, 300.0, 25)])
 
 
 def passive() -> Candidate:
@@ -51,14 +52,15 @@ def mu_optimal(design: Design, plant: DesignPlant, rig: Rig, callback: Callable[
                  polish=asked.polish is not False, max_iterations=asked.max_iterations,
                  backoff=asked.backoff_percent / 100, starts=[one.K for one in rivals if one.K is not None],
                  sample_rate_Hz=rig.sample_rate_Hz)
-    K, note = _reduced(plant, rig, made, asked.reduction_cost_percent / 100)
+    K, note = _reduced(plant, rig, made, asked.reduction_cost_percent / 100, design.control_effort.offset_corner_Hz)
     before = tuple(f"before reduction: {one}" for one in made.notes)
     old = ("synthesis.time_limit_s is ignored: max_iterations and target_mu end the iteration",)
     notes = (made.status, *(old if asked.time_limit_s is not None else ()), *before, note)
     return Candidate("mu", "mu synthesis", "mu", K, notes), made
 
 
-def _reduced(plant: DesignPlant, rig: Rig, made: MuSynthesis, cost: float) -> tuple[StateSpace, str]:
+def _reduced(plant: DesignPlant, rig: Rig, made: MuSynthesis, cost: float, offset_corner_Hz: float
+             ) -> tuple[StateSpace, str]:
     """The controller of lowest order whose complex mu grows by no more than the cost, and a note that says so."""
     P = plant.synthesis
     blocks = P.all_blocks.complexified()
@@ -69,7 +71,12 @@ def _reduced(plant: DesignPlant, rig: Rig, made: MuSynthesis, cost: float) -> tu
     # Poles beyond the Nyquist frequency cannot be implemented; what removing them costs is in the measured figure.
     full, slow = peak_on_grid(made.K), residualise_fast(made.K, np.pi * rig.sample_rate_Hz)
     harmless = P.closed(slow).is_stable() and peak_on_grid(slow) <= (1 + cost) * full
-    reduced = reduce_controller(P.P, slow if harmless else made.K, peak_on_grid, cost)
+    start = slow if harmless else made.K
+    # Below the corner to which the offset may drift no weight changes.
+    lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
+    if P.closed(lasting).is_stable() and peak_on_grid(lasting) <= (1 + cost) * full:
+        start = lasting
+    reduced = reduce_controller(P.P, start, peak_on_grid, cost)
     return reduced.K, (f"reduced from {made.K.nstates} to {reduced.order} states: complex mu on a grid of {omega.size} "
                        f"frequencies changes from {full:.4f} to {reduced.figure:.4f}")
 

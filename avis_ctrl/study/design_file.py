@@ -7,6 +7,7 @@ was expected; a misspelt key is answered with the nearest one.
 from __future__ import annotations
 
 import difflib
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,7 +24,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.file_errors import Section, read_toml, validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import SHIPPED, load_rig
-from avis_ctrl.rigs.rig_sections import LIMIT, Band, Spectrum
+from avis_ctrl.rigs.rig_sections import LIMIT, Band, ElectronicsSection, Spectrum
 from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty
 from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter
 
@@ -124,11 +125,17 @@ class TransmissibilitySection(Section):
 
 
 class EffortSection(Section):
-    """The floor velocity that may use the whole drive up to the bandwidth; above it the drive is rolled off."""
+    """The floor velocity that may use the whole drive up to the bandwidth; above it the drive is rolled off.
+
+    offset_percent : of the drive's range that the offset of the electronics may use. offset_corner_Hz : up to here the
+        offset may drift.
+    """
 
     floor_velocity_m_per_s: Positive
     bandwidth_Hz: Positive
     reduction: Annotated[float, Field(gt=1, le=LIMIT)] = 30.0
+    offset_percent: Percent = 10.0
+    offset_corner_Hz: Positive = 0.003
 
 
 class ComplianceSection(Section):
@@ -206,7 +213,8 @@ class RequirementSection(Section):
 
 
 class Design(Section):
-    """A whole design file. loaded : with the load of the rig file's [load] section on the table.
+    """A whole design file. loaded : with the load of the rig file's [load] section on the table. electronics : keys
+    in place of those of the rig file.
 
     compare_with : controllers that the mu controller is compared with, beside the table without control.
     """
@@ -214,6 +222,7 @@ class Design(Section):
     title: str
     rig: str
     loaded: bool = False
+    electronics: ElectronicsSection = ElectronicsSection()
     keep: Annotated[list[Axis], Field(min_length=1), AfterValidator(_different)]
     compare_with: Annotated[list[Rival], AfterValidator(_different)] = ["hinf", "skyhook_classical", "skyhook"]
     loop: LoopSection = LoopSection()
@@ -226,6 +235,16 @@ class Design(Section):
     skyhook: SkyhookSection = SkyhookSection()
     simulation: SimulationSection = SimulationSection()
     requirement: list[RequirementSection] = []
+
+    @field_serializer("electronics")
+    def _only_given(self, electronics: ElectronicsSection) -> dict[str, Any]:
+        """A key that is written would replace the rig file's."""
+        return electronics.model_dump(exclude_unset=True)
+
+    def equipped(self, rig: Rig) -> Rig:
+        """The rig with what the design file says of its electronics."""
+        given = {name: getattr(self.electronics, name) for name in self.electronics.model_fields_set}
+        return rig.with_electronics(replace(rig.electronics, **given)) if given else rig
 
 
 def read_design(path: str | Path) -> Design:
@@ -289,7 +308,7 @@ def study_of(design: Design, path: Path) -> tuple[Design, Rig]:
         raise InputError(f"expected one of {', '.join(SHIPPED)}, or the path of a rig file relative to the design file",
                          file=path, field="rig", value=design.rig)
     named = design.uncertainty.identified
-    rig = load_rig(design.rig if design.rig in SHIPPED else beside, design.loaded, check=named is None)
+    rig = design.equipped(load_rig(design.rig if design.rig in SHIPPED else beside, design.loaded, check=named is None))
     if isinstance(named, str):
         content = read_uncertainty(path.parent / named)
         design = design.model_copy(update={"uncertainty": design.uncertainty.model_copy(

@@ -12,6 +12,7 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import ReductionError
 from avis_ctrl.simulation.culprit import Culprit
 from avis_ctrl.simulation.design_check import SimulationCheck
+from avis_ctrl.study.at_rest import AtRest
 from avis_ctrl.study.companions import Companions
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.plant import DesignPlant
@@ -93,6 +94,7 @@ class ControllerResult:
     compliance : (n,) largest singular value of force -> displacement [m/N] at `transmissibility.omega`, floor at rest.
     peak_transmissibility : nominal, largest singular value over all frequencies.
     fastest_pole_Hz : of the controller, continuous.
+    rest : the controller at zero frequency, alone; None without a controller.
     """
 
     name: str
@@ -112,6 +114,7 @@ class ControllerResult:
     fastest_pole_Hz: float
     notes: tuple[str, ...] = ()
     gamma_slicot: float | None = None
+    rest: AtRest | None = None
 
     @property
     def order(self) -> int:
@@ -141,6 +144,7 @@ class Simulated:
     digital : sensor volts to demanded drive volts at the rig's rate, decoding, companion loops and allocation included;
         delay_samples from a sample to the voltage it causes.
     culprit : why the first unstable plant is unstable; None if every plant is stable.
+    rest : `digital` at zero frequency.
     """
 
     companions: Companions
@@ -148,6 +152,7 @@ class Simulated:
     digital: StateSpace
     delay_samples: float
     culprit: Culprit | None
+    rest: AtRest | None = None
 
 
 @dataclass(frozen=True)

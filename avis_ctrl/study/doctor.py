@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -32,7 +34,8 @@ def examine() -> list[Check]:
     checks += [_attempt("processors and BLAS threads", _threads), _attempt("SLICOT H-infinity norm", _slicot),
                _attempt("clarabel solves an LMI", _clarabel), _attempt("mu bounds (compiled)", _mu),
                _attempt("nonlinear simulation (compiled)", _simulation),
-               _attempt("typst compiles a PDF", _typst), _attempt("own H-infinity synthesis", _synthesis)]
+               _attempt("gcc, for avis export", _gcc), _attempt("typst compiles a PDF", _typst),
+               _attempt("own H-infinity synthesis", _synthesis)]
     return checks
 
 
@@ -101,6 +104,15 @@ def _simulation() -> str:
     if np.any(record.q):
         raise ArithmeticError(f"it moved by {np.max(np.abs(record.q)):.3g} m")
     return f"{record.time.size} samples at rest"
+
+
+def _gcc() -> str:
+    """Without gcc everything works but what needs the exported C code compiled."""
+    path = shutil.which("gcc")
+    if path is None:
+        return "not installed: exported C code is neither compiled, timed nor replayed"
+    done = subprocess.run([path, "-dumpfullversion"], capture_output=True, text=True, check=True, timeout=30)
+    return done.stdout.strip()
 
 
 def _typst() -> str:

@@ -144,11 +144,16 @@ def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> Sta
 
 
 def _sensor_chain(plant: DesignPlant, axis: str) -> StateSpace:
-    """s^2/(s^2 + a s + b) on what is sensed and 1/(s^2 + a s + b) on gravity's rate, in two states."""
-    _, a, b = np.real(np.poly(plant.sensor_chain.poles()))
+    """s^2/(s^2 + a s + b) on what is sensed and 1/(s^2 + a s + b) on gravity's rate, in two states; then the anti-alias
+    filter."""
+    poles = sorted(plant.sensor_chain.poles(), key=abs)
+    _, a, b = np.real(np.poly(poles[:2]))
     A, B = np.array([[-a, 1.0], [-b, 0.0]]), np.array([[-a, 0.0], [-b, 1.0]])
-    return StateSpace(A, B, np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]), 0.0,
-                      (f"sensed_{axis}_dot", f"tilt_{axis}"), (f"clean_{axis}_dot",))
+    high_pass = StateSpace(A, B, np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]), 0.0,
+                           (f"sensed_{axis}_dot", f"tilt_{axis}"), (f"clean_{axis}_dot",))
+    lags = np.real_if_close(np.array(poles[2:], complex))
+    low_pass = cascade([], lags, float(np.prod(np.abs(lags))), f"clean_{axis}_dot", f"clean_{axis}_dot")
+    return low_pass @ high_pass if lags.size else high_pass
 
 
 def six_dof_is_stable(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace, when: float = 0.0) -> bool:

@@ -124,7 +124,8 @@ def identification_design(content: UncertaintyFile, template: Design, rig: Rig) 
     if asked.sensor_chains is not None:
         uncertainty["sensor_chains"] = asked.sensor_chains.model_dump()
     uncertainty |= {"identified": UNCERTAINTY_FILE, "confidence_percent": asked.confidence_percent}
-    table = template.model_dump(exclude_none=True) | {"rig": RIG_FILE, "uncertainty": uncertainty}
+    # The electronics are those of the rig that was measured.
+    table = template.model_dump(exclude_none=True) | {"rig": RIG_FILE, "uncertainty": uncertainty, "electronics": {}}
     if isinstance(rig, Halcyonics) and rig.load is not None:
         table["loaded"] = True
     return design_toml(design_from_table(table))

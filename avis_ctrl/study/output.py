@@ -66,13 +66,14 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
             "order": c.order, "gamma": c.gamma, "mu_upper": c.mu.upper, "mu_lower": c.mu.lower,
             "mu_peak_Hz": c.mu.omega / (2 * np.pi), "stable": c.stable,
             "peak_transmissibility_dB": decibels(c.peak_transmissibility),
-            "worst_case_peak_transmissibility_dB": decibels(c.worst_peak.upper), "note": "; ".join(c.notes)}
+            "worst_case_peak_transmissibility_dB": decibels(c.worst_peak.upper), "note": "; ".join(c.notes),
+            "at_rest": c.rest.as_dict() if c.rest is not None else None}
 
 
 def _failed_row(c: FailedController) -> dict[str, Any]:
     """A controller that could not be analysed: the reason is in its note."""
     figures = ("gamma", "mu_upper", "mu_lower", "mu_peak_Hz", "peak_transmissibility_dB",
-               "worst_case_peak_transmissibility_dB")
+               "worst_case_peak_transmissibility_dB", "at_rest")
     return {"name": c.name, "kind": c.kind, "file": None, "order": None, "stable": False, **dict.fromkeys(figures),
             "note": c.reason}
 
@@ -86,7 +87,7 @@ def _all_axes(loop: Simulated | None) -> dict[str, Any]:
             "modulus_margin_asked": loop.companions.settings.modulus_margin,
             "passive": [{"axis": axis, "reason": why} for axis, why in loop.companions.passive],
             "notes": loop.companions.remarks(),
-            "culprit": culprit}
+            "culprit": culprit, "at_rest": loop.rest.as_dict() if loop.rest is not None else None}
 
 
 def sampled_controller_dict(result: DesignResult, loop: Simulated) -> dict[str, Any]:

@@ -9,8 +9,8 @@ compliance, volts, noise) that analysis reports, so that both speak of one plant
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,16 +24,24 @@ from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.rigs.sensing import NoiseGroup, Sensing, sensing
-from avis_ctrl.study.design_file import ChainUncertainty, Design
+from avis_ctrl.study.design_file import ChainUncertainty, Design, EffortSection
 from avis_ctrl.study.identified_uncertainty import RESPONSE, InDesign, in_design
 from avis_ctrl.uncertainty.blocks import ComplexFull
 from avis_ctrl.uncertainty.generalized_plant import Diagram, GeneralizedPlant
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain, UncertainRig, uncertain_rig
 from avis_ctrl.uncertainty.weight_base import Weight
-from avis_ctrl.uncertainty.weights import Band, ComplianceBound, ControlEffort, NeglectedDynamics, TransmissibilityBound
+from avis_ctrl.uncertainty.weights import (
+    Band,
+    ComplianceBound,
+    ControlEffort,
+    FlickerNoise,
+    NeglectedDynamics,
+    TransmissibilityBound,
+)
 
 # Of the weight on the drives in `DesignPlant.weights`; followed by the axis where the drives' limits differ.
 EFFORT = "control effort"
+NOISE = "1/f noise"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +60,8 @@ class DesignPlant:
     sensor_chain : velocity -> seen velocity of one axis, unit passband gain.
     sensor_noise : unit white noise density -> noise of one sensor as velocity [m/s/sqrt(Hz)]; where the sensors are of
         several kinds, of the first.
-    noises : inputs of the sensors' noise. relative : axes whose velocity is measured relative to the chassis.
+    noises : inputs of the sensors' noise, with the weight of the 1/f noise of each. relative : axes whose velocity is
+        measured relative to the chassis.
     floor_density : mean velocity density of the floor [m/s/sqrt(Hz)]: the unit of the noise inputs.
     floor : spectrum of the floor's motion, each kept axis alike.
     weights : the weighting filters by name, with their meaning, for the report.
@@ -73,7 +82,7 @@ class DesignPlant:
     floor: SpectrumModel
     weights: dict[str, Weight]
     identified: InDesign | None = None
-    noises: tuple[str, ...] = ()
+    noises: Mapping[str, FlickerNoise] = field(default_factory=dict)
     relative: tuple[str, ...] = ()
 
     @property
@@ -148,20 +157,25 @@ def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Seq
     low, high = design.floor.band_Hz
     reference = floor.rms(low, high) / np.sqrt(high - low)
     errors = design.uncertainty.sensor_chains
-    noises = _sensor_side(diagram, axes, seen, decoding, rows, reference, errors is not None)
+    flicker = [FlickerNoise(one.flicker, design.floor.band_Hz[0]) for one in seen.noise]
+    noises = _sensor_side(diagram, axes, seen, decoding, rows, flicker, reference, errors is not None)
+    weights |= {f"{NOISE}{one.tag}": one.weight for one in noises if one.weight.flicker}
     if errors is not None:
         _sensor_errors(diagram, errors, axes, decoder.sensors, rows, decoding, weights)
-    _performance(diagram, design, axes, matrix[used], rig.limits_of(actuators), weights)
-    w = [*(f"floor_{a}_dot" for a in axes), *noises, *(f"force_{a}" for a in axes)]
+    offset = max(_offset(design.control_effort, one, weight, len(axes), reference)
+                 for one, weight in zip(seen.noise, flicker, strict=True))
+    _performance(diagram, design, axes, matrix[used], rig.limits_of(actuators), offset, weights)
+    inputs = {name: one.weight for one in noises for name in one.inputs}
+    w = [*(f"floor_{a}_dot" for a in axes), *inputs, *(f"force_{a}" for a in axes)]
     weighted = [*(f"e_{a}" for a in axes), *(f"effort_{a}" for a in axes)]
     compliance = [f"compliance_{a}" for a in axes] if design.compliance else []
     physical = [*(f"{a}_dot" for a in axes), *(f"{a}_rel" for a in axes), *(f"{n}_command" for n in actuators)]
     u, y = [f"command_{a}" for a in axes], [f"seen_{a}_dot" for a in axes]
     full = diagram.plant(w, [*weighted, *compliance, *physical], u, y)
-    asked = w if design.compliance else w[:len(axes) + len(noises)]
+    asked = w if design.compliance else w[:len(axes) + len(inputs)]
     return DesignPlant(full, full.restricted(asked, [*weighted, *compliance]), uncertain, axes, actuators,
                        decoder.sensors, matrix[used], decoding, seen.chain, seen.noise[0].shape, reference, floor,
-                       weights, identified, tuple(noises), tuple(
+                       weights, identified, inputs, tuple(
                            axis for axis, name in zip(axes, design.keep, strict=True) if name in seen.relative))
 
 
@@ -284,13 +298,26 @@ def _chains(diagram: Diagram, uncertainty: ChainUncertainty | None, names: tuple
         diagram.uncertain(ComplexFull(1, 1, label), [f"w:{label}"], [f"z:{label}"])
 
 
+def _offset(effort: EffortSection, group: NoiseGroup, noise: FlickerNoise, axes: int, reference: float) -> float:
+    """By what the control effort's weight is larger at rest, so that mu below 1 bounds what the offset costs.
+
+    A unit of noise accompanies 1 m/s of floor velocity (`_sensor_side`) and may use the drive as a floor velocity of
+    floor_velocity_m_per_s does; the offset may use offset_percent of it. Offsets of n sensors, each of either sign, lie
+    within sqrt(n) times the ellipsoid of independent ones, and the voltages of m axes add to sqrt(m) times their norm.
+    """
+    spread = np.sqrt(np.count_nonzero(group.share) * axes)
+    allowed = effort.offset_percent / 100 * effort.floor_velocity_m_per_s
+    return float(spread * group.offset_rtHz * reference / allowed / noise.magnitude(np.zeros(1))[0])
+
+
 def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decoding: np.ndarray, rows: np.ndarray,
-                 reference: float, uncertain: bool) -> list[str]:
-    """Sensor chains of the logical axes (alike, so that decoding and chain commute) and their noise; its inputs.
+                 flicker: Sequence[FlickerNoise], reference: float, uncertain: bool) -> list[_Noise]:
+    """Sensor chains of the logical axes (alike, so that decoding and chain commute) and their noise.
 
     One unit of noise is what accompanies 1 m/s of floor velocity: sensor density over floor density.
     """
-    groups = [_Noise.of(axes, seen.noise[k], decoding, reference, k) for k in range(len(seen.noise))]
+    groups = [_Noise.of(axes, group, weight, decoding, reference, k)
+              for k, (group, weight) in enumerate(zip(seen.noise, flicker, strict=True))]
     inertial = seen.decoder.inertial
     # The decoding applied to motion in space and to motion relative to the chassis.
     by_velocity, by_relative = decoding[:, inertial] @ rows[inertial], decoding[:, ~inertial] @ rows[~inertial]
@@ -315,7 +342,7 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decodin
     for one in groups:
         diagram.add(f"noise mixing{one.tag}", gain(one.mix, one.inputs, [f"mixed_{name}" for name in one.inputs]),
                     "allocation")
-    return [name for one in groups for name in one.inputs]
+    return groups
 
 
 def _chain_of(diagram: Diagram, axes: tuple[str, ...], k: int, row: np.ndarray, of: str, chain: StateSpace, label: str,
@@ -336,18 +363,21 @@ class _Noise:
     """Noise of one kind of sensors in the axes decoded from them, correlated as the decoding mixes it."""
 
     shape: StateSpace
+    weight: FlickerNoise
     axes: tuple[str, ...]
     mix: np.ndarray
     tag: str
 
     @staticmethod
-    def of(axes: tuple[str, ...], group: NoiseGroup, decoding: np.ndarray, reference: float, number: int) -> _Noise:
+    def of(axes: tuple[str, ...], group: NoiseGroup, weight: FlickerNoise, decoding: np.ndarray, reference: float,
+           number: int) -> _Noise:
         own = decoding * group.share
         served = [k for k in range(len(axes)) if np.any(np.abs(own[k]) > 1e-9)]
         # own = L Q: a square root of own own' also where fewer sensors of this kind than axes make it singular.
         root = np.asarray(np.linalg.qr(own[served].T, mode="r"))
         mix = (root * np.where(np.diag(root) < 0, -1.0, 1.0)[:, None]).T / reference
-        return _Noise(group.shape, tuple(axes[k] for k in served), mix, f"_{number + 1}" if number else "")
+        shape = group.shape @ weight.system(*group.shape.inputs, *group.shape.inputs)
+        return _Noise(shape, weight, tuple(axes[k] for k in served), mix, f"_{number + 1}" if number else "")
 
     @property
     def inputs(self) -> list[str]:
@@ -380,7 +410,7 @@ def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty, axes: tuple[
 
 
 def _performance(diagram: Diagram, design: Design, axes: tuple[str, ...], allocation: np.ndarray, limits_V: np.ndarray,
-                 weights: dict[str, Weight]) -> None:
+                 offset: float, weights: dict[str, Weight]) -> None:
     """Weighted outputs, per m/s of floor velocity (compliance: per newton); limits_V (n_actuators,)."""
     asked, effort = design.transmissibility, design.control_effort
     band = Band(asked.band_Hz[0], asked.band_Hz[1], asked.band_dB)
@@ -392,7 +422,7 @@ def _performance(diagram: Diagram, design: Design, axes: tuple[str, ...], alloca
         # Volts on the channel that this axis brings to its limit first.
         first = int(np.argmax(load[:, k]))
         weight = ControlEffort(float(limits_V[first]), effort.floor_velocity_m_per_s, effort.bandwidth_Hz,
-                               effort.reduction)
+                               effort.reduction, 1, offset, effort.offset_corner_Hz)
         weights[f"{EFFORT} {axis}" if np.ptp(limits_V) else EFFORT] = weight
         volts = weight.system(f"command_{axis}", f"effort_{axis}").scaled(right=float(np.abs(allocation[first, k])))
         diagram.add(f"W_u {axis}", volts, "weight")

@@ -8,6 +8,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.simulation.design_check import SimulationCheck
+from avis_ctrl.study.at_rest import AtRest
 from avis_ctrl.study.design_file import Design, Quantity
 from avis_ctrl.study.design_result import ControllerResult, Requirement
 from avis_ctrl.study.limits import no_better_than_none
@@ -28,9 +29,11 @@ def _advantage(skyhook: ControllerResult, mu: ControllerResult) -> float:
     return decibel(skyhook.worst_band.lower) - decibel(mu.worst_band.upper)
 
 
-def judge_loop(check: SimulationCheck) -> tuple[Requirement, ...]:
+def judge_loop(check: SimulationCheck, rest: AtRest | None = None, offset_percent: float = 100.0
+               ) -> tuple[Requirement, ...]:
     """What every design must meet whatever its file asks: for each plant the sampled loop of all axes is stable, stays
-    within its voltage limits, and moves as the linear model predicts."""
+    within its voltage limits, and moves as the linear model predicts; the offset of the electronics uses at most that
+    part of a drive's range."""
     n = len(check.plants)
 
     def row(name: str, kept: int, note: str) -> Requirement:
@@ -41,7 +44,10 @@ def judge_loop(check: SimulationCheck) -> tuple[Requirement, ...]:
         row("voltages stay within the limits of drives and converter", sum(p.within_limits for p in check.plants),
             f"nonlinear simulation of {check.duration_s:g} s"),
         row("motion agrees with the linear prediction", sum(p.agrees for p in check.plants),
-            f"in third octaves; probability {check.false_alarm:g} that noise alone makes at least one plant fail"))
+            f"in third octaves; probability {check.false_alarm:g} that noise alone makes at least one plant fail"),
+        *(() if rest is None else (Requirement(
+            "drive voltage that the electronics' offset costs at rest, of its limit", offset_percent, rest.percent, "%",
+            rest.percent <= offset_percent, "at most", rest.words()),)))
 
 
 def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requirement, ...]:

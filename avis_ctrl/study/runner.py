@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import MuSynthesis
 from avis_ctrl.study.analysis import analyse
+from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
 from avis_ctrl.study.design_file import Design
@@ -26,7 +27,7 @@ from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.requirements import judge, judge_loop
-from avis_ctrl.study.simulation import simulate_study, six_dof_check
+from avis_ctrl.study.simulation import bare_loop, simulate_study, six_dof_check
 from avis_ctrl.study.skyhooks import classical_skyhook, tuned_skyhook
 from avis_ctrl.study.workers import Workers
 
@@ -103,7 +104,8 @@ def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesi
         passive_axes = [f"The axis {axis} remains passive: {why}." for axis, why in compared.loop.companions.passive]
         notes = tuple(text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.remarks())
                       if text)
-    requirements = (*judge_loop(compared.loop.check), *judge(design, controllers))
+    requirements = (*judge_loop(compared.loop.check, compared.loop.rest, design.control_effort.offset_percent),
+                    *judge(design, controllers))
     return DesignResult(design, rig, plant, controllers, synthesis.history, requirements, reduction, six_dof,
                         compared.loop, design_provenance(design, source, rig, seconds), seconds, notes, compared.failed)
 
@@ -154,7 +156,8 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
     if isinstance(rest := found["passive"], FailedController):
         raise ComputationError(f"the table without control could not be analysed: {rest.reason}")
     every = [*failed, *(one for one in found.values() if isinstance(one, FailedController))]
-    measured = {name: one for name, one in found.items() if isinstance(one, ControllerResult)}
+    measured = {name: replace(one, rest=at_rest(bare_loop(design, rig, plant, one.K)) if one.K is not None else None)
+                for name, one in found.items() if isinstance(one, ControllerResult)}
     return Compared(tuple(measured[name] for name in ORDER if name in measured),
                     tuple(sorted(every, key=lambda one: ORDER.index(one.name))), loop)
 

@@ -1,4 +1,5 @@
-"""Weighting filters with a physical meaning: transmissibility, compliance, control effort, neglected dynamics."""
+"""Weighting filters with a physical meaning: transmissibility, compliance, control effort, neglected dynamics, 1/f
+noise."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from avis_ctrl.checks import require
+from avis_ctrl.checks import require, require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.rational import Rational
 from avis_ctrl.uncertainty.weight_base import Role, Weight, smallest_cover
@@ -178,7 +179,8 @@ class ControlEffort(Weight):
     """Voltage of an actuator: at most its limit when the normalised disturbance has the level expected.
 
     W = (level / limit) ((s/wb + 1)/(s/(R wb) + 1))^order: up to wb the whole limit may be used, far above it only
-    a share 1/R^order, which rolls the controller off.
+    a share 1/R^order, which rolls the controller off. Below a corner w0 it is larger by the factor (s + k w0)/(s + w0),
+    k = sqrt(1 + offset^2), which rolls the controller off towards zero frequency.
 
     Parameters
     ----------
@@ -187,6 +189,8 @@ class ControlEffort(Weight):
     bandwidth_Hz : wb; None for a constant weight.
     reduction : R > 1, how much less is allowed per order far above wb.
     order : 1 or 2.
+    offset, offset_corner_Hz : at rest, of the same input, an offset that large over its unit; up to the corner it may
+        drift. 0 for none.
     """
 
     limit_V: float
@@ -194,6 +198,8 @@ class ControlEffort(Weight):
     bandwidth_Hz: float | None = None
     reduction: float = 10.0
     order: int = 1
+    offset: float = 0.0
+    offset_corner_Hz: float = 0.003
 
     role: ClassVar[Role] = "limit"
     unit: ClassVar[str] = "V per unit of disturbance"
@@ -204,25 +210,73 @@ class ControlEffort(Weight):
         require(self.reduction, "reduction", 1.0)
         if self.bandwidth_Hz is not None:
             require(self.bandwidth_Hz, "bandwidth_Hz")
+        require(self.offset_corner_Hz, "offset_corner_Hz")
+        require_positive(self.offset, "offset", zero_allowed=True)
         if self.order not in (1, 2):
             raise InputError("1 or 2", field="order", value=self.order)
 
     @cached_property
     def shape(self) -> Rational:
-        gain = self.disturbance_level / self.limit_V
+        gain, w0 = self.disturbance_level / self.limit_V, 2 * np.pi * self.offset_corner_Hz
+        zeros, poles = ((w0 * np.hypot(1, self.offset),), (w0,)) if self.offset else ((), ())
         if self.bandwidth_Hz is None:
-            return Rational(gain)
+            return Rational(gain, real_zeros=zeros, real_poles=poles)
         wb = 2 * np.pi * self.bandwidth_Hz
-        return Rational(gain * self.reduction ** self.order, real_zeros=(wb,) * self.order,
-                        real_poles=(self.reduction * wb,) * self.order)
+        return Rational(gain * self.reduction ** self.order, real_zeros=(*zeros, *(wb,) * self.order),
+                        real_poles=(*poles, *(self.reduction * wb,) * self.order))
 
     @property
     def meaning(self) -> str:
         text = f"at most {self.limit_V:g} V when the disturbance has the level {self.disturbance_level:.3g}"
+        if self.offset:
+            text += (f"; {np.hypot(1, self.offset):.3g} times stricter below {self.offset_corner_Hz:g} Hz, for the "
+                     "offset of the electronics")
         if self.bandwidth_Hz is None:
             return text
         return text + (f" up to {self.bandwidth_Hz:g} Hz, falling with order {self.order} to a fraction "
                        f"{self.reduction ** -self.order:.2g} of it")
+
+
+@dataclass(frozen=True)
+class FlickerNoise(Weight):
+    """1/f noise of a sensor's electronics: sqrt(1 + flicker^2 / f) over its white noise.
+
+    Parameters
+    ----------
+    flicker : density of the 1/f noise at 1 Hz over that of the white noise; its square is the corner [Hz].
+    lowest_Hz : below it the weight is constant.
+    """
+
+    flicker: float
+    lowest_Hz: float
+    tolerance_dB: float = 1.0
+    max_order: int = 4
+
+    role: ClassVar[Role] = "level"
+    unit: ClassVar[str] = "white noise"
+
+    def __post_init__(self) -> None:
+        require(self.lowest_Hz, "lowest_Hz")
+        require_positive(self.flicker, "flicker", zero_allowed=True)
+
+    def asked(self, omega: np.ndarray) -> np.ndarray:
+        """The density over that of the white noise, at omega > 0 [rad/s]."""
+        return np.sqrt(1 + self.flicker ** 2 / (np.asarray(omega, float) / (2 * np.pi)))
+
+    @cached_property
+    def shape(self) -> Rational:
+        if not self.flicker:
+            return Rational(1.0)
+        corner = self.flicker ** 2
+        # Far below and above, where the weight is constant, it must cover, too.
+        omega = 2 * np.pi * np.geomspace(self.lowest_Hz / 100, 1000 * max(corner, self.lowest_Hz), 120)
+        level = self.asked(np.maximum(omega, 2 * np.pi * self.lowest_Hz))
+        return smallest_cover(omega, level, level, self.tolerance_dB, self.max_order, "the 1/f noise")
+
+    @property
+    def meaning(self) -> str:
+        return (f"1/f noise of the sensors' electronics over their white noise, corner {self.flicker ** 2:.3g} Hz; "
+                f"constant below {self.lowest_Hz:g} Hz; realised with {self.shape.order} states")
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import scipy.signal
 from avis_ctrl.export.c_source import HEADER, SOURCE, Provenance, c_files, constants_of
 from avis_ctrl.export.compiled import STRICT, CompiledController, step_time_us
 from avis_ctrl.export.protection import Processor, protection
-from avis_ctrl.export.vectors import vectors
+from avis_ctrl.export.vectors import agreement_V, vectors
 from avis_ctrl.simulation.discrete import digital_controller
 
 ARITHMETIC = ("float64", "float32")
@@ -47,7 +48,23 @@ def test_test_vectors_reach_limits_and_fall_back(skyhook, gcc, arithmetic, toler
     assert np.any(np.abs(u) == controller.limits_V)
     assert np.any(np.abs(y) >= guard.input_limit_V)
     code = CompiledController(files, controller)
-    assert np.max(np.abs(np.array([code.step(row) for row in y]) - u)) < tolerance
+    differ = np.max(np.abs(np.array([code.step(row) for row in y]) - u))
+    assert differ < tolerance
+    assert differ <= agreement_V(controller, guard, y, u) < 1e-3
+
+
+def test_test_vectors_outlast_the_start_at_any_rate(skyhook):
+    """At 2 kHz the start takes 3000 samples; a quarter of the rows is at full gain."""
+    controller, _, _ = exported(skyhook, "float64")
+    fast = replace(controller, system=replace(controller.system, dt=5e-4))
+    guard = protection(fast, skyhook.rig)
+    y, _ = vectors(fast, guard)
+    processor, gains = Processor(fast, guard), []
+    for row in y[:-50]:
+        processor.step(row)
+        gains.append(processor.gain)
+    assert len(y) == 4000
+    assert np.count_nonzero(np.array(gains) == 1) > 900
 
 
 @pytest.mark.parametrize("arithmetic", ARITHMETIC)

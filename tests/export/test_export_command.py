@@ -22,7 +22,7 @@ from avis_ctrl.simulation.discrete import digital_controller
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
 CERTIFICATE_KEYS = {"format", "version", "controller_sha256", "mu_upper", "mu_lower", "guaranteed", "stable",
                     "worst_case_peak_transmissibility_dB", "worst_case_band_transmissibility_dB",
-                    "rounding_noise_m_per_s", "step_time_us", "between_samples"}
+                    "rounding_noise_m_per_s", "step_time_us", "between_samples", "at_rest", "files", "test_vectors"}
 CONTROLLER_KEYS = {"format", "version", "name", "sample_rate_Hz", "arithmetic", "A", "B", "C", "D", "inputs", "outputs",
                    "input_units", "output_units", "limits_V", "delay_samples"}
 
@@ -69,6 +69,28 @@ def test_exported_numbers_are_those_of_the_simulated_controller(skyhook, out):
     omega = np.geomspace(0.1, 0.99 * np.pi / K.dt, 80)
     a, b = K.frequency_response(omega), read_controller(out / "controller.json").system.frequency_response(omega)
     assert np.max(np.abs(a - b)) < 1e-3 * np.max(np.abs(a))
+
+
+@pytest.mark.parametrize(("file", "words"), [
+    ("controller.mat", "controller.mat is missing"), ("avis_controller.h", "avis_controller.h is missing"),
+    ("test_vectors.csv", "test_vectors.csv is missing")])
+def test_a_deleted_file_is_named_before_anything_is_computed(skyhook, out, tmp_path, file, words, monkeypatch):
+    from avis_ctrl.export import package
+
+    monkeypatch.setattr(package, "certify", None)  # would be called otherwise
+    folder = shutil.copytree(out, tmp_path / "out")
+    (folder / file).unlink()
+    told = []
+    assert package.check_package(skyhook, folder, told.append) == [words] == told
+
+
+def test_a_changed_byte_of_a_file_is_named(skyhook, out, tmp_path):
+    folder = shutil.copytree(out, tmp_path / "out")
+    with (folder / "test_vectors.csv").open("a") as file:
+        file.write("\n")
+    from avis_ctrl.export.package import check_package
+
+    assert check_package(skyhook, folder) == ["test_vectors.csv is not the file that was exported: its hash differs"]
 
 
 def test_header_says_where_it_comes_from(out):

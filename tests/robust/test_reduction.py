@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, connect, gain, hinf_norm, lft_lower, summing_junction, tf
 from avis_ctrl.robust.hinfsyn import hinfsyn
-from avis_ctrl.robust.reduction import discretise_controller, reduce_controller, split_stable
+from avis_ctrl.robust.reduction import discretise_controller, reduce_controller, split_stable, truncate_slow
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +85,17 @@ def test_sampled_controller_reports_its_fastest_pole():
     assert fast.pole_ratio > 1 and "too fast" in fast.note
     s = 2j * np.pi * 3
     assert slow.K(np.exp(s * 1e-3))[0, 0] == pytest.approx(K(s)[0, 0], rel=1e-3)
+
+
+def test_slow_poles_are_left_out_and_nothing_else(rng):
+    """Of a sum in hidden coordinates the slow stable part goes; an unstable slow pole stays."""
+    kept = StateSpace(np.diag([-1.0, -20.0]), rng.normal(size=(2, 2)), rng.normal(size=(1, 2)), [[0.3, 0.1]])
+    growing = StateSpace([[1e-5]], rng.normal(size=(1, 2)), [[1.0]], np.zeros((1, 2)))
+    slow = StateSpace(np.diag([-1e-4, -2e-3]), rng.normal(size=(2, 2)), rng.normal(size=(1, 2)), np.zeros((1, 2)))
+    whole = kept + growing + slow
+    T = rng.normal(size=(5, 5))
+    hidden = StateSpace(np.linalg.solve(T, whole.A @ T), np.linalg.solve(T, whole.B), whole.C @ T, whole.D)
+    found, expected = truncate_slow(hidden, 0.01), kept + growing
+    assert found.nstates == 3
+    omega = np.geomspace(1e-3, 100.0, 20)
+    assert found.frequency_response(omega) == pytest.approx(expected.frequency_response(omega), rel=1e-6)

@@ -23,7 +23,7 @@ def tones_response(loop, nonlinear: bool):
         for line in lines:
             floor[:, column] += 1e-6 * np.cos(2 * np.pi * (line * t + rng.uniform()))
     periods = 10
-    silent = replace(loop, sensors=replace(loop.sensors, noise_rms_V=0.0, converter=None), floor={})
+    silent = replace(loop, sensors=replace(loop.sensors.white(), noise_rms_V=0.0, converter=None), floor={})
     whole = np.vstack([np.tile(floor, (periods, 1)), floor[:1]])
     record = simulate(silent, PERIOD * 1e-3, settle_s=(periods - 1) * PERIOD * 1e-3, floor=whole, nonlinear=nonlinear)
     F, V, U = (np.fft.rfft(series, axis=0) for series in (floor, record.q_dot, record.demanded))

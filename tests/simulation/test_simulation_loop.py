@@ -157,7 +157,7 @@ def test_a_seed_gives_one_record(make_loop):
 @pytest.mark.parametrize(("name", "delay_s"), [("avis", 1e-3), ("avis", 1.5e-3), ("halcyonics_loaded", 2.25e-3)])
 def test_spectral_radius_is_the_growth_of_an_unstable_loop(make_loop, name, delay_s):
     loop = make_loop(name, 40.0, loop_delay_s=delay_s, limit_V=1e30, floor={})
-    silent = replace(loop, sensors=replace(loop.sensors, noise_rms_V=0.0, converter=None))
+    silent = replace(loop, sensors=replace(loop.sensors.white(), noise_rms_V=0.0, converter=None))
     record = simulate(silent, 20.0, settle_s=0.0, floor=at_rest(20000), initial=START * 1e-250, nonlinear=False)
     assert record.diverged
     # In the end the fastest pair is alone: v[k+1] = a v[k] - b v[k-1] throughout, roots of modulus sqrt(b).

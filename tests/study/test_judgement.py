@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.lti import gain, hinf_norm
+from avis_ctrl.rigs.equipment import Electronics
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.controllers import passive, reduction_grid
@@ -71,7 +72,8 @@ def test_rotation_is_seen_as_edge_velocity(shipped):
 
 def test_sensor_noise_is_that_of_the_rig_file(shipped):
     """1 mV r.m.s. and the rounding of 14 bits over 20 V, white to 500 Hz, over 3125 V s/m, through the decoding."""
-    _, plant = shipped
+    design, _ = shipped
+    plant = build_plant(design, load_rig("avis").with_electronics(Electronics(sensor_flicker_corner_Hz=0.0)))
     density = np.hypot(1e-3, 20 / 2 ** 14 / np.sqrt(12)) * np.sqrt(2 / 1000) / 3125
     inputs = [f"noise_{a}" for a in plant.axes]
     # Far above all loops' band nothing but the noise path is left: take it without the rig by u = 0.

@@ -37,7 +37,7 @@ CONTROLLER_KEYS = {"format", "version", "name", "A", "B", "C", "D", "dt", "input
                    "output_units"}
 RESULT_KEYS = {"format", "version", "plant", "controllers", "dk_history", "requirements", "simulation", "seconds"}
 ROW_KEYS = {"name", "kind", "file", "order", "gamma", "mu_upper", "mu_lower", "mu_peak_Hz", "stable",
-            "peak_transmissibility_dB", "worst_case_peak_transmissibility_dB", "note"}
+            "peak_transmissibility_dB", "worst_case_peak_transmissibility_dB", "note", "at_rest"}
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -40,11 +40,15 @@ def _system(c: ControllerResult) -> StateSpace:
 def _files(result: DesignResult, made: list[ControllerResult]) -> Table:
     rate = result.rig.sample_rate_Hz
     rows = [(c.title, f"controllers/{c.name}.json", str(c.order), f"{words.number(c.fastest_pole_Hz)} Hz",
-             words.number(2 * c.fastest_pole_Hz / rate), words.yes(_system(c).is_stable())) for c in made]
+             words.number(2 * c.fastest_pole_Hz / rate), words.yes(_system(c).is_stable()),
+             f"{words.number(c.rest.gain_Ns_per_m)} N s/m" if c.rest else "",
+             f"{words.number(c.rest.percent)} %" if c.rest else "") for c in made]
     return table(f"The controllers and their state-space files. The fastest pole is compared with half the sample "
-                 f"rate of {words.number(rate, 4)} Hz.",
-                 ("controller", "file", "order", "fastest pole", "relative to half the rate", "stable itself"), rows,
-                 "llrrrc")
+                 f"rate of {words.number(rate, 4)} Hz. The gain at rest turns the offset of the sensors' electronics "
+                 "into drive voltage: the last column is the part of a drive's range that the largest offsets of the "
+                 "rig file cost, each with its worst sign.",
+                 ("controller", "file", "order", "fastest pole", "relative to half the rate", "stable itself",
+                  "gain at rest", "offset costs"), rows, "llrrrcrr")
 
 
 def _gains(made: list[ControllerResult]) -> Figure:
