@@ -71,8 +71,9 @@ class SensorModel:
     """Sensors of a rig: names, what motion each chain takes in, and the chain (unit sensitivity).
 
     motions, chains, poles, sensitivity_units : one a sensor. chain None for an ideal sensor; poles the coefficients
-    (ascending) of the chain's denominator, [1] without a chain. sensitivity : (n_y,) unit of y per unit of motion, in
-    the passband. relative : (n_y,) which read the payload against the chassis.
+    (ascending) of the chain's denominator without the anti-alias filter, whose transients are as smooth as the aliases
+    (`chain_transients`), [1] without a chain. sensitivity : (n_y,) unit of y per unit of motion, in the passband.
+    relative : (n_y,) which read the payload against the chassis.
     """
 
     names: tuple[str, ...]
@@ -189,7 +190,8 @@ def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) 
     return SensorModel(chosen, tuple(one.quantity for one in sensors),
                        tuple(systems[one.zeros, one.poles, one.quantity] for one in sensors),
                        np.array([one.gain for one in sensors]), "V", tuple(units[one.quantity] for one in sensors),
-                       tuple(tuple(np.atleast_1d(np.real(np.poly(one.poles)))[::-1].tolist()) for one in sensors),
+                       tuple(tuple(np.atleast_1d(np.real(np.poly(one.poles[:len(one.poles) - len(one.low_pass)])))
+                                   [::-1].tolist()) for one in sensors),
                        np.array([not one.inertial for one in sensors]),
                        tuple(one.suspension for one in sensors), tuple(one.suspension for one in sensors))
 
