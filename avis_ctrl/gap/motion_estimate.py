@@ -20,10 +20,9 @@ from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.large_motion import second_order
-from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.predictor import model_inputs
 from avis_ctrl.identification.response import N_Q
-from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
+from avis_ctrl.measurement.campaign import Campaign, Portion, Record, RecordSource
 
 
 @dataclass(frozen=True)

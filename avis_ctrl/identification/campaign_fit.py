@@ -15,14 +15,13 @@ from avis_ctrl.identification.fit_settings import SETTINGS as FIT
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, Prior, fit
 from avis_ctrl.identification.noise import noise_from_residuals, relative_noise, residual_noise
-from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.priors import Tolerance
 from avis_ctrl.identification.response import MOMENTS, ResponseModel
 from avis_ctrl.identification.second_order import chosen_turning, terms, without
 from avis_ctrl.identification.spectra import record_block, response_block, thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.tolerance_fit import as_likelihood_fit, begin, end
-from avis_ctrl.measurement.campaign import Campaign, RecordSource
+from avis_ctrl.measurement.campaign import Campaign, Portion, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import noise_covariance
 from avis_ctrl.rigs.avis import AvisTable

@@ -10,10 +10,9 @@ from avis_ctrl.checks import places
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification import model_error
 from avis_ctrl.identification.campaign_fit import SETTINGS
-from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.identification.spread import kept_axes
-from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.campaign import Campaign, Portion
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
 from avis_ctrl.rigs.rigid_body import COORDINATES

@@ -14,11 +14,10 @@ import scipy.fft
 
 from avis_ctrl.identification.large_motion import Turning
 from avis_ctrl.identification.maximum_likelihood import added_terms
-from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.predictor import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.measurement.campaign import Campaign, RecordSource, ranges
+from avis_ctrl.measurement.campaign import Campaign, Portion, RecordSource, ranges
 
 # Samples that are worked on at once.
 PIECE = 1 << 17

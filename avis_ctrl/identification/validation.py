@@ -18,7 +18,6 @@ from avis_ctrl.identification.campaign_fit import SETTINGS, CampaignFit, measure
 from avis_ctrl.identification.modes import MeasuredModes, ModeRow, measured_modes, mode_table
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.overlays import ResponseOverlay, measured_response, overlay
-from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.predictor import predict
 from avis_ctrl.identification.response import ResponseModel
@@ -26,7 +25,7 @@ from avis_ctrl.identification.second_order import terms, without
 from avis_ctrl.identification.spectra import record_block, response_block
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.whiteness import Whiteness, whiteness
-from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
+from avis_ctrl.measurement.campaign import Campaign, Portion, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 # Level of the intervals.

@@ -128,7 +128,7 @@ def read_json(path: Path, form: str, expected: str = "a file of avis design") ->
     content = _read(path, json.loads, "JSON", expected)
     found = content.get("format") if isinstance(content, dict) else None
     if found != form:
-        raise InputError(f"expected {form!r}", file=path, field="format", value=found)
+        raise InputError(f"expected {form!r}, {expected}", file=path, field="format", value=found)
     return content
 
 

@@ -15,9 +15,8 @@ from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn import MuSynthesis, musyn
 from avis_ctrl.robust.reduction import reduce_controller, residualise_fast, truncate_slow
-from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.design_result import ControllerResult
+from avis_ctrl.study.design_result import Candidate, ControllerResult
 from avis_ctrl.study.plant import DesignPlant
 
 # Coarse: it only ranks controllers of different order; what is reported is computed on the one chosen. The resonances

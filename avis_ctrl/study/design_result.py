@@ -21,6 +21,17 @@ ControllerKind = Literal["mu", "hinf", "skyhook", "passive"]
 
 
 @dataclass(frozen=True, eq=False)
+class Candidate:
+    """A controller to be analysed."""
+
+    name: str
+    title: str
+    kind: ControllerKind
+    K: StateSpace | None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class Bound:
     """Bounds of a supremum over frequency and perturbations.
 

@@ -18,10 +18,9 @@ from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import MuSynthesis
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.at_rest import at_rest
-from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.design_result import ControllerResult, DesignResult, FailedController, Simulated
+from avis_ctrl.study.design_result import Candidate, ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.limits import best_found
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.provenance import provenance

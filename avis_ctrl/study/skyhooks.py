@@ -18,8 +18,8 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_peak import MuPeak, worst_case_gain
 from avis_ctrl.study.analysis import SLACK
-from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.design_result import Candidate
 from avis_ctrl.study.plant import DesignPlant
 
 # Tilt corner well below the table's modes, roll-off well above its loops' band.

@@ -14,10 +14,9 @@ from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.motion_estimate import motion_of
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
-from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.predictor import Predictor
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
+from avis_ctrl.measurement.campaign import Campaign, Portion, Record, RecordHeader
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.nonlinear import payload_acceleration, rig_arrays
 from avis_ctrl.simulation.campaign_data import simulate_campaign

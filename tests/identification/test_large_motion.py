@@ -14,12 +14,11 @@ from truth.table import draw_plant
 from avis_ctrl.identification.excited_space import excited_space
 from avis_ctrl.identification.large_motion import Turning, turned_force, turned_reading
 from avis_ctrl.identification.noise import relative_noise
-from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.predictor import Predictor
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.second_order import chosen_turning, terms, without
 from avis_ctrl.identification.spectra import record_block
-from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
+from avis_ctrl.measurement.campaign import Campaign, Portion, Record, RecordHeader
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.nonlinear import rig_arrays

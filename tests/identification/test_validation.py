@@ -18,14 +18,13 @@ from avis_ctrl.identification.modes import measured_modes, mode_table, model_mod
 from avis_ctrl.identification.noise import residual_noise
 from avis_ctrl.identification.overlays import overlay
 from avis_ctrl.identification.parameter_sets import default_parameters
-from avis_ctrl.identification.portion import Portion
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import record_block
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.validation import floor_interval, validate, verdict_of
 from avis_ctrl.identification.whiteness import whiteness
-from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.campaign import Campaign, Portion
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import open_loop

@@ -14,10 +14,9 @@ from avis_ctrl.classical.tuning import TuningRange
 from avis_ctrl.lti import gain
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.mu_peak import worst_case_gain
-from avis_ctrl.study.candidate import Candidate
 from avis_ctrl.study.controllers import best_of, mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
-from avis_ctrl.study.design_result import Bound, ControllerResult
+from avis_ctrl.study.design_result import Bound, Candidate, ControllerResult
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.skyhooks import at_limits, classical_skyhook, critical_gains, tuned_skyhook
 
