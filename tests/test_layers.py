@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,8 @@ PROJECT = ("avis_ctrl", "tests", "benchmarks", "designs")
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 
-def imports(path: Path) -> Iterator[tuple[str, bool]]:
+@cache
+def imports(path: Path) -> tuple[tuple[str, bool], ...]:
     """(dotted name, whether it is imported when the module is) of each import."""
     package = [*path.relative_to(PACKAGE.parent).parent.parts]
 
@@ -33,7 +35,7 @@ def imports(path: Path) -> Iterator[tuple[str, bool]]:
             else:
                 inside = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
                 yield from walk(child, at_once and not inside)
-    yield from walk(ast.parse(path.read_text(encoding="utf-8")), True)
+    return tuple(walk(ast.parse(path.read_text(encoding="utf-8")), True))
 
 
 def layer(path: Path) -> str:
@@ -63,8 +65,7 @@ def test_the_walk_sees_an_upward_import(tmp_path, monkeypatch):
     path = tmp_path / "avis_ctrl" / "lti" / "bad.py"
     path.parent.mkdir(parents=True)
     path.write_text("from ..study import runner\ndef f():\n    import avis_ctrl.cli\n    from . import norms\n")
-    assert list(imports(path)) == [("avis_ctrl.study.runner", True), ("avis_ctrl.cli", False),
-                                   ("avis_ctrl.lti.norms", False)]
+    assert imports(path) == (("avis_ctrl.study.runner", True), ("avis_ctrl.cli", False), ("avis_ctrl.lti.norms", False))
 
 
 def modules_imported_by(path: Path, known: set[str]) -> set[str]:

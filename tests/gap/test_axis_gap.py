@@ -64,6 +64,11 @@ def searched(extra, seed, own=(), **how):
     return find_axis_gap("oscillator", records=[Signals("a", u, y)], rate=RATE, band_Hz=(2.0, 180.0), own=own)
 
 
+def slow(*cases):
+    """Cases of `make test-slow`: the same search from other seeds."""
+    return [pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow) for case in cases]
+
+
 def stops(y, v):
     return 0.5 * math.copysign(max(abs(y) - 3.0, 0.0), y)
 
@@ -96,7 +101,7 @@ def test_two_effects_are_named_both():
     assert found["quadratic_damping"] == pytest.approx(2e-6, rel=0.01)
 
 
-@pytest.mark.parametrize(("seed", "noise"), [(1, 1e-3), (2, 1e-3), (3, 1e-3), (4, 0.1)])
+@pytest.mark.parametrize(("seed", "noise"), [(1, 1e-3), *slow((2, 1e-3), (3, 1e-3)), (4, 0.1)])
 def test_nothing_is_named_where_nothing_is_missing(seed, noise):
     gap = searched(lambda y, v: 0.0, seed, n=16_384, noise=noise)
     assert gap.verdict == "none" and not gap.effects and gap.where
@@ -241,7 +246,7 @@ def test_drive_that_slows_down_in_one_direction_only():
     assert value(found) == pytest.approx(-40, rel=0.1)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("seed", [0, *slow(1, 2, 3, 4)])
 def test_joint_with_friction_and_a_constant_force(seed):
     gap = friction_gap(joint(seed), 500.0)
     assert set(names(gap)) == {"coulomb_friction", "force_offset"}
@@ -252,7 +257,7 @@ def test_joint_with_friction_and_a_constant_force(seed):
     assert gap.stages[-1].nrmse < gap.stages[0].nrmse / 5
 
 
-@pytest.mark.parametrize(("shift", "seed"), [(5, 0), (5, 1), (10, 2)])
+@pytest.mark.parametrize(("shift", "seed"), [(5, 0), *slow((5, 1), (10, 2))])
 def test_a_force_logged_late_is_a_negative_delay(shift, seed):
     data = drive(coulomb, seed)
     gap = friction_gap(data | {"force": np.roll(data["force"], shift)})

@@ -91,7 +91,8 @@ def test_emps_first_half_alone_says_the_same(data):
     assert Fc == pytest.approx(20.39, rel=0.12) and abs(Fc - 20.39) < 2 * deviation
 
 
-@pytest.mark.parametrize("cutoff", [*(pytest.param(f, marks=pytest.mark.slow) for f in (30.0, 100.0)), None])
+@pytest.mark.slow
+@pytest.mark.parametrize("cutoff", [30.0, 100.0, None])
 def test_emps_with_pulses_has_a_pure_delay_at_every_cutoff(data, cutoff):
     """The phase of force over acceleration is a straight line to 190 Hz, 0.77 ms; the pulses do not repeat."""
     options = {} if cutoff is None else {"cutoff_Hz": cutoff}
