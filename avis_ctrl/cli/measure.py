@@ -86,6 +86,8 @@ def simulate_campaign(
     orthogonal: Annotated[bool, typer.Option("--orthogonal", help="default plan with orthogonal multisines")] = False,
     duration_s: Annotated[float, typer.Option("--duration", help="length of each record of the default plan "
                                            "in seconds")] = 60.0,
+    effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="Python file with effects of "
+                                                 "your own that the plan names (docs/own_effect.md)")] = None,
     seed: Annotated[int, typer.Option("--seed", help="seed of excitation, floor, noise and perturbation; for another "
                                       "campaign of the same table, use the file written by --truth as --rig")] = 1,
 ) -> None:
@@ -95,24 +97,28 @@ def simulate_campaign(
     from avis_ctrl.files import write_whole
     from avis_ctrl.measurement.formats.hdf5 import write_campaign
     from avis_ctrl.rigs import load_rig
-    from avis_ctrl.simulation import rehearse
     from avis_ctrl.study.files import require_other
+    from avis_ctrl.study.hidden_effects import rehearsed
     from avis_ctrl.study.plan_file import default_plan, plan_toml, read_plan
 
     for written in (out, write_plan, truth):
         if written is not None:
-            require_other(written, plan, rig)
+            require_other(written, plan, rig, effects)
     if plan and (perturbed or orthogonal):
         raise InputError("these belong to the default plan; in a plan, write perturb_percent under [truth] and scheme "
                          "under [multisine]", field="--perturbed, --orthogonal")
+    if effects is not None:
+        from avis_ctrl.gap.effects.user_effects import load_effects
+
+        load_effects(effects)
     console = Console(highlight=False)
     table = load_rig(rig)
     chosen = read_plan(plan) if plan else default_plan(table, "orthogonal" if orthogonal else "zippered",
                                                        perturbed=perturbed, duration_s=duration_s)
     with Progress(console) as progress:
         try:
-            rehearsal = rehearse(table, chosen, seed,
-                                 lambda k, total, name: progress(f"record {name}, {k} of {total}"))
+            rehearsal = rehearsed(table, chosen, seed,
+                                  lambda k, total, name: progress(f"record {name}, {k} of {total}"))
         except InputError as error:
             section = re.split(r"\W", error.field or "")[0]
             of_plan = plan and not error.file and section in type(chosen).model_fields

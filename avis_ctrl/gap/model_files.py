@@ -194,16 +194,21 @@ def _require_answer(model: TableModel) -> None:
                          value=[f"{one.label} {one.by_name}" for one in model.effects])
 
 
-def _effect(model: TableModel, one: EffectFile, field: str) -> ActiveEffect:
+def effect_at(model: TableModel, name: str, place: str, field: str) -> Effect:
+    """The effect of the library with this name, which acts at this place, or at any where it is empty; InputError."""
     known: dict[str, Effect] = {**library(), LargeMotion.name: LargeMotion()}
-    if one.name not in known:
+    if name not in known:
         raise InputError(f"expected one of {', '.join(known)}; an effect of your own by --effects FILE.py",
-                         field=f"{field}.name", value=one.name)
-    effect = known[one.name]
-    places = effect.places(model)
-    if one.place not in places:
+                         field=f"{field}.name", value=name)
+    places = known[name].places(model)
+    if place not in places and (place or len(places) != 1):
         raise InputError(f"expected one of {', '.join(places) or 'none: this rig has no place for it'}",
-                         field=f"{field}.place", value=one.place)
+                         field=f"{field}.place", value=place)
+    return known[name]
+
+
+def _effect(model: TableModel, one: EffectFile, field: str) -> ActiveEffect:
+    effect = effect_at(model, one.name, one.place, field)
     parameters = effect.parameters(model, one.place)
     if set(one.values) != {parameter.name for parameter in parameters}:
         raise InputError(f"expected {', '.join(parameter.name for parameter in parameters)}", field=f"{field}.values",

@@ -291,7 +291,9 @@ def _moved_on(problem: Problem, state: State) -> State:
     assert state.path is not None and state.last is not None and state.points is not None
     if state.phase == "D-K" and state.path.mu >= state.round_mu:
         return replace(state, phase="other start")
-    if state.phase != "growth" or state.path.mu > (1 - SETTINGS.round) * state.round_mu:
+    # Where neither descent nor growth found a step, D-K iteration would only repeat its last one.
+    over = state.path.mu > (1 - SETTINGS.round) * state.round_mu or state.history[-1].kind == "D-K"
+    if state.phase != "growth" or over:
         return replace(state, phase=FOLLOWING[state.phase])
     points = state.points
     if state.last is not state.path:

@@ -42,6 +42,9 @@ _SIGNALS, _FLOOR, _NOISE, _FLOOR_SENSOR = range(1, 5)
 # What fits into memory: a record takes some 600 bytes a sample while it is simulated, and 150 after that.
 MOST_SAMPLES, MOST_SAMPLES_IN_ALL = 4_000_000, 20_000_000
 
+# (u (samples, n_u) [V], floor (samples, 3) [m/s], time of the first sample [s], first and last time of the campaign
+# [s]) -> (samples, n_y) [V] that effects outside the rig file add to the sensor signals
+SensorChange = Callable[[np.ndarray, np.ndarray, float, tuple[float, float]], np.ndarray]
 # (records done, records in all, name of the one just done)
 Progress = Callable[[int, int, str], None]
 
@@ -57,7 +60,7 @@ class _Planned:
 
 
 def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig | None = None,
-                      progress: Progress | None = None) -> Campaign:
+                      change: SensorChange | None = None, progress: Progress | None = None) -> Campaign:
     """The records of the plan, with notes of levels, clipping and what was assumed.
 
     Parameters
@@ -65,6 +68,7 @@ def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig
     rig : as its file has it; sensors, converter, delay, limits and levels are its.
     seed : of all signals, floors and noise; the same seed gives the same campaign.
     truth : the table that moves; `rig` by default (`perturbed_truth` makes one).
+    change : of the sensor signals by effects that neither has.
 
     Raises
     ------
@@ -74,15 +78,19 @@ def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig
     """
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError("expected a whole number, 0 or more", field="seed", value=seed)
+    if plan.effect and change is None:
+        raise InputError("expected the change of the signals by the effects of the plan (study.hidden_effects)",
+                         field="change")
     loop = open_loop(rig, plan).with_plant("truth", truth)
     if truth is not None and truth.sensors() != rig.sensors():
         loop = replace(loop, sensors=replace(loop.sensors, chains=rig_bank(truth, 1.0).chains))
     ambient = _ambient(rig, plan)
     planned = list(_signals(loop, plan, seed))
     records, notes, start_s = [], _assumptions(loop, plan, seed, ambient), 0.0
+    ends_s = sum(plan.settle_s + len(one.u) / rig.sample_rate_Hz for one in planned)
     for k, one in enumerate(planned):
         start_s += plan.settle_s
-        record, note = _record(loop, plan, one, ambient, (seed, k), start_s)
+        record, note = _record(loop, plan, one, ambient, (seed, k), start_s, change, (plan.settle_s, ends_s))
         records.append(record)
         notes.append(note)
         start_s += record.header.duration_s
@@ -206,7 +214,8 @@ def _run(loop: SampledLoop, u: np.ndarray, settle: int, floor: np.ndarray | None
 
 
 def _record(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: SpectrumModel | None,
-            seed: tuple[int, int], start_s: float) -> tuple[Record, str]:
+            seed: tuple[int, int], start_s: float, change: SensorChange | None,
+            campaign_s: tuple[float, float]) -> tuple[Record, str]:
     """One record, and a sentence on its levels."""
     fs, samples, name = loop.sample_rate_Hz, len(one.u), f"{seed[1]:02d}"
     settle = round(plan.settle_s * fs)
@@ -217,6 +226,10 @@ def _record(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: Spect
                                cause="the level or the floor motion is far too large",
                                measured=f"{np.max(np.abs(run.q[-1, :3])):.3g} m from rest",
                                next_step="lower the level of this record in the plan")
+    if change is not None:
+        u = np.concatenate([np.zeros((settle, one.u.shape[1])), one.u])
+        added = change(u, floor[:-1, :3], start_s - settle / fs, campaign_s)
+        run = replace(run, sensed=run.sensed + added[settle:])
     converter = loop.sensors.converter
     y = converter.convert(run.sensed) if converter else run.sensed
     header = RecordHeader(name, fs, samples, loop.rig.equations_of_motion().actuators, loop.rig.sensor_rows()[0],

@@ -101,6 +101,17 @@ class TruthPlan(Section):
     nonlinear: bool = True
 
 
+class EffectPlan(Section):
+    """An effect of the table that its rig file does not contain: of the library of `avis gap`, or of the user's own.
+
+    place : where it acts; may be left out where there is only one. values : its parameters by name, in their units.
+    """
+
+    name: str
+    place: str = ""
+    values: dict[str, float] = {}
+
+
 class CampaignPlan(Section):
     """A whole campaign.
 
@@ -119,4 +130,5 @@ class CampaignPlan(Section):
     floor_sensor: FloorSensorPlan = FloorSensorPlan()
     sensors: SensorPlan = SensorPlan()
     truth: TruthPlan = TruthPlan()
+    effect: list[EffectPlan] = []
     record: Annotated[list[RecordPlan], Field(min_length=1)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,8 +18,8 @@ from avis_ctrl.rigs.instruments import Triple, unit_vector
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
-from avis_ctrl.simulation.campaign_data import Progress, simulate_campaign
-from avis_ctrl.simulation.campaign_plan import CampaignPlan
+from avis_ctrl.simulation.campaign_data import Progress, SensorChange, simulate_campaign
+from avis_ctrl.simulation.campaign_plan import CampaignPlan, EffectPlan
 
 # Flat names of parameters, AVIS and Halcyonics.
 STIFF_OR_HEAVY = re.compile(r"mass|J[123]|I(xx|yy|zz)|isolator\d+\.k_[xyz]|k_[atr]|k_s\d|load\.mass")
@@ -33,28 +34,37 @@ class Rehearsal:
 
     truth : the table that moved. true_values : the parameters that were changed, by flat name.
     factors : true over file's value of each whose value in the file is not zero.
+    effects : what the table has beside them, and no rig file can hold.
     """
 
     campaign: Campaign
     truth: Rig
     true_values: dict[str, float]
     factors: dict[str, float]
+    effects: tuple[EffectPlan, ...] = ()
 
     def truth_toml(self) -> str:
         """The truth as a rig file, the changed lines marked with the change."""
         values = {name: f"{name} x {factor:.6f}" for name, factor in self.factors.items()}
-        return rig_toml(self.truth, values, "The simulated table of a campaign: the values that an identification "
-                                            "should find.")
+        header = ["The simulated table of a campaign: the values that an identification should find."]
+        header += [f"Its effects that a rig file does not contain: {one.name}, {one.place or 'everywhere'}, "
+                   + ", ".join(f"{name} = {value:g}" for name, value in one.values.items()) for one in self.effects]
+        return rig_toml(self.truth, values, "\n".join(header))
 
 
-def rehearse(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | None = None) -> Rehearsal:
-    """Perturb the rig as `plan.truth` says and record the campaign on it; raises as `simulate_campaign` does."""
+def rehearse(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | None = None,
+             hidden: Callable[[Rig], SensorChange] | None = None) -> Rehearsal:
+    """Perturb the rig as `plan.truth` says and record the campaign on it; raises as `simulate_campaign` does.
+
+    hidden : what effects outside the rig file add to the sensor signals of that table (`study.hidden_effects`).
+    """
     truth = perturbed_truth(rig, plan.truth.perturb_percent, plan.truth.perturb_damping_percent, seed)
     old, new = rig.parameters(), truth.parameters()
     changed = {name: new[name].value for name in old if new[name].value != old[name].value}
-    campaign = simulate_campaign(rig, plan, seed, truth=truth, progress=progress)
+    campaign = simulate_campaign(rig, plan, seed, truth=truth, progress=progress,
+                                 change=None if hidden is None else hidden(truth))
     return Rehearsal(campaign, truth, changed, {name: value / old[name].value for name, value in changed.items()
-                                            if old[name].value})
+                                            if old[name].value}, tuple(plan.effect))
 
 
 def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.0, seed: int = 1) -> Rig:

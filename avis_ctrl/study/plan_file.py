@@ -60,14 +60,17 @@ def default_plan(rig: Rig, scheme: Literal["zippered", "orthogonal"] = "zippered
 def plan_toml(plan: CampaignPlan) -> str:
     """The plan as a file that `read_plan` reads back; keys that are absent by default stay so."""
     content = plan.model_dump(exclude_none=True)
-    records = content.pop("record")
+    records, effects = content.pop("record"), content.pop("effect")
     sections = [("", {key: value for key, value in content.items() if not isinstance(value, dict)})]
     sections += [(f"[{key}]", value) for key, value in content.items() if isinstance(value, dict)]
+    sections += [("[[effect]]", effect) for effect in effects]
     sections += [("[[record]]", record) for record in records]
     return "\n".join("\n".join([title] * bool(title) + [f"{key} = {_toml(value)}" for key, value in lines.items()])
                      + "\n" for title, lines in sections)
 
 
 def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_toml(key)} = {_toml(one)}" for key, one in value.items()) + " }"
     # JSON writes numbers, booleans, strings and lists as TOML does, but for one character, which TOML wants escaped.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.gap.effects.library import library
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import simulate_campaign
-from avis_ctrl.simulation.campaign_plan import RecordPlan
+from avis_ctrl.simulation.campaign_plan import EffectPlan, RecordPlan
 from avis_ctrl.study.plan_file import CampaignPlan, default_plan, plan_from_table, plan_toml, read_plan
 
 TEXT = """
@@ -151,4 +152,6 @@ def test_the_guide_lists_every_key_of_a_plan_and_no_other():
     kept = CampaignPlan.model_fields
     sections = {key: field.annotation for key, field in kept.items() if hasattr(field.annotation, "model_fields")}
     expected = {key: set(section.model_fields) for key, section in sections.items()}
-    assert listed == {**expected, "record": set(RecordPlan.model_fields), "": set(kept) - set(sections) - {"record"}}
+    assert listed == {**expected, "record": set(RecordPlan.model_fields),
+                      "effect": {*EffectPlan.model_fields, *library()},
+                      "": set(kept) - set(sections) - {"record", "effect"}}
