@@ -310,7 +310,8 @@ def _chains(table: ReducedTable, names: list[str]) -> StateSpace:
         chain = gain([[1.0]])
     else:
         # Without the zeros at rest: from the rate of acceleration to what the chain makes of it.
-        tilt = cascade([], list(np.roots(model.sensors.transient_poles[::-1])), 1.0)
+        tilt = cascade([], list(np.roots(model.sensors.transient_poles[::-1])),
+                       float(np.prod(np.abs(model.sensors.low_pass))))
     motion = append(*[chain] * n_y).scaled(S, np.hstack([nominal, np.eye(n_y), np.zeros((n_y, n_y))]))
     felt = append(*[tilt] * n_y).scaled(S, np.hstack([np.zeros((n_y, len(names) + n_y)), np.eye(n_y)]))
     sensors = model.sensors.names

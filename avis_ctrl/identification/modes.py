@@ -278,7 +278,8 @@ def _rows(block: SpectralBlock, model: ResponseModel, driven: np.ndarray) -> tup
     chain = model.sensors.sense(omega)[:, 0]
     if model.period_s:
         drive = hold(omega, model.period_s, model.delay_s)
-        folded = aliases(omega, model.period_s, model.delay_s, model.sensors.motion, model.amplifier_corner_Hz)
+        folded = aliases(omega, model.period_s, model.delay_s, model.sensors.motion, model.amplifier_corner_Hz,
+                         model.sensors.low_pass)
     else:
         drive, folded = np.exp(-s * model.delay_s), np.zeros(len(omega), complex)
     if model.amplifier_corner_Hz:

@@ -71,9 +71,9 @@ class SensorModel:
     """Sensors of a rig: names, what motion each chain takes in, and the chain (unit sensitivity).
 
     motions, chains, poles, sensitivity_units : one a sensor. chain None for an ideal sensor; poles the coefficients
-    (ascending) of the chain's denominator without the anti-alias filter, whose transients are as smooth as the aliases
-    (`chain_transients`), [1] without a chain. sensitivity : (n_y,) unit of y per unit of motion, in the passband.
-    relative : (n_y,) which read the payload against the chassis.
+    (ascending) of the chain's denominator, [1] without a chain. sensitivity : (n_y,) unit of y per unit of motion, in
+    the passband. relative : (n_y,) which read the payload against the chassis. low_pass : poles of the anti-alias
+    filter, which every chain contains.
     """
 
     names: tuple[str, ...]
@@ -87,6 +87,7 @@ class SensorModel:
     # Corner [Hz] and damping ratio of each geophone's suspension, as it is and as its filter assumes; None without one.
     suspensions: tuple[tuple[float, float] | None, ...] = ()
     assumed: tuple[tuple[float, float] | None, ...] = ()
+    low_pass: tuple[complex, ...] = ()
 
     def _detuned(self, s: np.ndarray, k: int) -> np.ndarray | float:
         """Factor on a geophone's response whose suspension is not the one that its filter assumes."""
@@ -126,7 +127,8 @@ class SensorModel:
         def of(values: tuple) -> tuple:
             return tuple(values[k] for k in index)
         return SensorModel(of(self.names), of(self.motions), of(self.chains), self.sensitivity[list(index)], self.unit,
-                           of(self.sensitivity_units), of(self.poles), self.relative[list(index)])
+                           of(self.sensitivity_units), of(self.poles), self.relative[list(index)],
+                           low_pass=self.low_pass)
 
     @property
     def alike(self) -> bool:
@@ -161,10 +163,11 @@ class SensorModel:
                          enumerate(zip(self.chains, self.motions, strict=True))], axis=1)
 
     def folded(self, omega: np.ndarray, period_s: float, delay_s: float, corner_Hz: float | None) -> np.ndarray:
-        """(n, n_y) `aliases` of each sensor's motion, which pass its chain far above its corners."""
-        own = {motion: aliases(omega, period_s, delay_s, motion, corner_Hz) for motion in dict.fromkeys(self.motions)}
-        passband = [1.0 if chain is None else float(chain.D[0, 0]) for chain in self.chains]
-        return np.stack([own[motion] * gain for motion, gain in zip(self.motions, passband, strict=True)], axis=1)
+        """(n, n_y) `aliases` of each sensor's motion, which pass its chain far above its corners: with a gain of one,
+        but for the anti-alias filter."""
+        own = {motion: aliases(omega, period_s, delay_s, motion, corner_Hz, self.low_pass)
+               for motion in dict.fromkeys(self.motions)}
+        return np.stack([own[motion] for motion in self.motions], axis=1)
 
 
 def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) -> SensorModel:
@@ -190,10 +193,10 @@ def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) 
     return SensorModel(chosen, tuple(one.quantity for one in sensors),
                        tuple(systems[one.zeros, one.poles, one.quantity] for one in sensors),
                        np.array([one.gain for one in sensors]), "V", tuple(units[one.quantity] for one in sensors),
-                       tuple(tuple(np.atleast_1d(np.real(np.poly(one.poles[:len(one.poles) - len(one.low_pass)])))
-                                   [::-1].tolist()) for one in sensors),
+                       tuple(tuple(np.atleast_1d(np.real(np.poly(one.poles)))[::-1].tolist()) for one in sensors),
                        np.array([not one.inertial for one in sensors]),
-                       tuple(one.suspension for one in sensors), tuple(one.suspension for one in sensors))
+                       tuple(one.suspension for one in sensors), tuple(one.suspension for one in sensors),
+                       sensors[0].low_pass if sensors else ())
 
 
 class Matrices(NamedTuple):
@@ -484,10 +487,12 @@ class ResponseModel:
         """(n, n_y, 2 m) transients 1/p and s/p of the suspensions of m geophones, p the polynomial of each, at the
         corner that its filter assumes: what a corner within its tolerance changes of them is of second order."""
         s, known = 1j * omega, [(k, own) for k, own in enumerate(self.sensors.assumed) if own is not None]
+        lags = np.array(self.sensors.low_pass)
+        filtered = np.prod(lags / (lags - s[:, None]), axis=1)
         found = np.zeros((len(omega), len(self.sensors.names), len(known), 2), complex)
         for j, (k, (corner, damping)) in enumerate(known):
             w = 2 * np.pi * corner
-            ring = w ** 2 / (s ** 2 + 2 * damping * w * s + w ** 2)
+            ring = filtered * w ** 2 / (s ** 2 + 2 * damping * w * s + w ** 2)
             found[:, k, j] = np.stack([ring, s / w * ring], axis=-1)
         return found.reshape(*found.shape[:2], -1)
 

@@ -5,18 +5,21 @@ The voltage is held between samples and delayed; y is sampled. With H(s) from vo
     G(e^{jwT}) = sum over k of H(jw + jk ws) h(jw + jk ws),    h(s) = (1 - e^{-sT}) / (sT) e^{-s tau}.
 
 The term k = 0 is the continuous response times hold and delay. At the others, half the sample rate and more, a table
-is only its mass: there H is 1/s (a velocity per force and mass) or 1 (an acceleration), and their sum is known in
-closed form. That leaves an error of the order of the damping over mass and frequency, below 1e-4 of the response in
-the band of a table (a test measures it against the exact discretisation).
+is only its mass: there H is 1/s (a velocity per force and mass) or 1 (an acceleration), times amplifier and anti-alias
+filter, and their sum is known in closed form. That leaves an error of the order of the damping over mass and frequency,
+below 1e-4 of the response in the band of a table (a test measures it against the exact discretisation).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 
 Motion = Literal["displacement", "velocity", "acceleration"]
+# Relative distance by which equal poles are moved apart: the error is of its order, the round-off of the inverse's.
+DISTINCT = 1e-6
 
 
 def hold(omega: np.ndarray, period_s: float, delay_s: float = 0.0) -> np.ndarray:
@@ -25,14 +28,14 @@ def hold(omega: np.ndarray, period_s: float, delay_s: float = 0.0) -> np.ndarray
     return np.sinc(half / np.pi) * np.exp(-1j * omega * (period_s / 2 + delay_s))
 
 
-def sampled_pole(omega: np.ndarray, period_s: float, delay_s: float, pole: float) -> np.ndarray:
-    """Sampled response, (n,), of 1/(s - pole) behind hold and delay, exact (modified z-transform); pole <= 0 real."""
+def sampled_pole(omega: np.ndarray, period_s: float, delay_s: float, pole: complex) -> np.ndarray:
+    """Sampled response, (n,), of 1/(s - pole) behind hold and delay, exact (modified z-transform); real part <= 0."""
     whole, part = divmod(delay_s / period_s, 1.0)
     if part > 1 - 1e-9:  # a delay of whole samples that rounding put below
         whole, part = whole + 1, 0.0
     z = np.exp(1j * np.asarray(omega, float) * period_s)
 
-    def integral(low: float, high: float) -> float:
+    def integral(low: float, high: float) -> complex:
         """Of e^(pole t) from low to high sample periods."""
         if pole == 0:
             return (high - low) * period_s
@@ -43,25 +46,26 @@ def sampled_pole(omega: np.ndarray, period_s: float, delay_s: float, pole: float
 
 
 def aliases(omega: np.ndarray, period_s: float, delay_s: float, motion: Motion,
-            amplifier_corner_Hz: float | None = None) -> np.ndarray:
+            amplifier_corner_Hz: float | None = None, low_pass: Sequence[complex] = ()) -> np.ndarray:
     """(n,) what the terms k != 0 add to the motion per force and mass: the exact sampled response less the term k = 0.
 
-    displacement : taken as zero, for it falls off as the square of the frequency. acceleration : without an amplifier
-    the force jumps at the sampling instant; the sample is taken just after it.
+    displacement : taken as zero, for it falls off as the square of the frequency. acceleration : without amplifier and
+    anti-alias filter the force jumps at the sampling instant; the sample is taken just after it.
+    low_pass : poles [rad/s] of the anti-alias filter, whose gain at rest is one.
     """
     omega = np.asarray(omega, float)
-    direct = hold(omega, period_s, delay_s)
     if motion == "displacement":
         return np.zeros(omega.shape, complex)
+    lags = np.array([*low_pass, *([-2 * np.pi * amplifier_corner_Hz] if amplifier_corner_Hz else [])], complex)
+    # Partial fractions need distinct poles.
+    lags *= 1 + DISTINCT * np.arange(lags.size)
+    poles = np.append(lags, 0.0) if motion == "velocity" else lags
     with np.errstate(divide="ignore", invalid="ignore"):
-        if motion == "velocity":
-            exact, continuous = sampled_pole(omega, period_s, delay_s, 0.0), direct / (1j * omega)
-        else:
-            exact, continuous = np.exp(-1j * omega * period_s * np.ceil(delay_s / period_s - 1e-9)), direct
-        if amplifier_corner_Hz:
-            corner = 2 * np.pi * amplifier_corner_Hz
-            lag = sampled_pole(omega, period_s, delay_s, -corner)
-            exact = exact - lag if motion == "velocity" else corner * lag
-            continuous = continuous / (1 + 1j * omega / corner)
+        continuous = hold(omega, period_s, delay_s) * np.prod(-lags) / np.prod(1j * omega[:, None] - poles, axis=1)
+        exact = np.exp(-1j * omega * period_s * np.ceil(delay_s / period_s - 1e-9))
+        if poles.size:
+            residues = [np.prod(-lags) / np.prod(pole - np.delete(poles, k)) for k, pole in enumerate(poles)]
+            exact = sum(residue * sampled_pole(omega, period_s, delay_s, pole)
+                        for residue, pole in zip(residues, poles, strict=True))
         # At rest both integrators are infinite and their difference is finite, but no velocity is measured there.
         return np.where(omega == 0, 0.0, exact - continuous)

@@ -88,9 +88,12 @@ def test_derivatives_against_differences(rig, names):
         assert np.max(np.abs(numeric - dY[j])) < 3e-6 * np.max(np.abs(dY[j])), names[j]
 
 
-def test_a_record_is_response_and_transient(avis):
-    """Noise-free record that starts at rest: what the model leaves is rounding, though the transient is large."""
+@pytest.mark.parametrize(("order", "corner"), [(0, None), (1, 80.0), (3, 200.0), (8, 300.0)])
+def test_a_record_is_response_and_transient(avis, order, corner):
+    """Noise-free record that starts at rest: what the model leaves is rounding, though the transient is large. With an
+    anti-alias filter, its states have a transient, too."""
     rng = np.random.default_rng(2)
+    avis = avis.with_electronics(replace(avis.electronics, anti_alias_order=order, anti_alias_corner_Hz=corner))
     u = multisine(rng, 0.3)
     measured = record(avis, u, np.zeros((len(u), 3)), rng, noise_V=0.0, quantised=False)
     model = ResponseModel.of(avis, ["mass"])

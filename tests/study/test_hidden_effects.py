@@ -11,7 +11,9 @@ from avis_ctrl.cli import app
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.formats import read_measurements
 from avis_ctrl.rigs import load_rig
+from avis_ctrl.rigs.equipment import Electronics
 from avis_ctrl.simulation.rehearsal import rehearse
+from avis_ctrl.study.gap import find_gap
 from avis_ctrl.study.hidden_effects import rehearsed
 from avis_ctrl.study.plan_file import plan_from_table, plan_toml, read_plan
 
@@ -114,3 +116,18 @@ def test_the_command_with_an_effect_of_ones_own(tmp_path):
     y = read_measurements(files["c.h5"]).records[0].load().y
     assert np.std(y[:, k] - 0.5 * plain[:, k]) < 0.02 * np.std(plain[:, k])
     assert "half_gain, Sy1, gain = 0.5" in (tmp_path / "truth.toml").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("effect", "parameter", "true"), [
+    ({"name": "actuator_lag", "place": "actuators", "values": {"time_constant_s": 1.3e-3}}, "time_constant_s", 1.3e-3),
+    ({"name": "geophone_corner", "place": "Sz2", "values": {"corner_Hz": 4.95}}, "corner_Hz", 4.95)])
+def test_an_effect_is_named_behind_an_anti_alias_filter(effect, parameter, true):
+    rig = RIG.with_electronics(Electronics(anti_alias_order=3, anti_alias_corner_Hz=200.0))
+    plan = {"duration_s": 30.0, "band_Hz": [0.5, 60.0], "floor_sensor": {"recorded": False}, "effect": [effect],
+            "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
+            "record": [{"excitation": "noise", "level_V": level, "records": 2} for level in (0.08, 0.2, 0.4)]}
+    gap = find_gap(rehearsed(rig, plan_from_table(plan), 4).campaign, rig).gap
+    assert [one.name for one in gap.effects] == [effect["name"]] and gap.verdict == "explained"
+    found = gap.effects[0].parameters[parameter]
+    assert found.value == pytest.approx(true, abs=3 * found.std)
