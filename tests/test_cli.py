@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 
 import avis_ctrl
 from avis_ctrl import cli
+from avis_ctrl.cli.console import StopRequest
 from avis_ctrl.errors import ComputationError, InputError
 
 DESIGNS = Path(__file__).resolve().parents[1] / "designs"
@@ -159,6 +161,48 @@ def test_interrupt_leaves_nothing_half_written(tmp_path):
     assert complained.splitlines()[-1] == "avis: interrupted; no partial results were written"
     assert "Traceback" not in complained + said
     assert not out.exists()
+
+
+@pytest.mark.slow
+def test_an_interrupt_of_the_iteration_keeps_the_best_controller(tmp_path):
+    out = tmp_path / "out"
+    child = subprocess.Popen([sys.executable, "-u", "-c", "from avis_ctrl.cli import main; main()", "design",
+                              str(DESIGNS / "avis_z_phix.toml"), "--out", str(out)], stdout=subprocess.PIPE,
+                             stderr=subprocess.PIPE, text=True, env=ONE_THREAD)
+    try:
+        assert child.stdout is not None
+        next(line for line in child.stdout if "D-K iteration" in line)
+        child.send_signal(signal.SIGINT)
+        child.communicate(timeout=500)
+    finally:
+        child.kill()
+    assert child.returncode == 0
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    mu = next(one for one in result["controllers"] if one["name"] == "mu")
+    assert "stopped by the caller, before the iteration had ended" in mu["note"]
+    assert len(result["dk_history"]) <= 6 and mu["mu_upper"] < 2
+
+
+def test_the_first_interrupt_asks_and_the_second_ends():
+    said = []
+
+    def usual(number, frame):
+        raise KeyboardInterrupt
+    before = signal.signal(signal.SIGINT, usual)
+    try:
+        with pytest.raises(KeyboardInterrupt), StopRequest(said.append):
+            os.kill(os.getpid(), signal.SIGINT)  # nothing to keep yet
+            time.sleep(1)
+        with StopRequest(said.append) as asked:
+            assert not asked()
+            os.kill(os.getpid(), signal.SIGINT)
+            assert asked() and len(said) == 1 and "again Ctrl-C" in said[0]
+            with pytest.raises(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(1)
+        assert signal.getsignal(signal.SIGINT) is usual
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 SWALLOWS = """

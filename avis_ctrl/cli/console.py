@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import time
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
 
 
 class Progress:
@@ -23,3 +27,31 @@ class Progress:
     def __exit__(self, kind, value, trace) -> None:
         if self.status:
             self.status.stop()
+
+
+class StopRequest:
+    """Ctrl-C as a request: from the first call on, it lets a computation end with the best result so far instead of
+    ending the command. A second one ends the command as usual.
+    """
+
+    def __init__(self, say: Callable[[str], None]):
+        self.say, self.asked = say, False
+        self.usual: Any = None
+
+    def __enter__(self) -> StopRequest:
+        return self
+
+    def __call__(self) -> bool:
+        if self.usual is None:
+            self.usual = signal.signal(signal.SIGINT, self._heard)
+        return self.asked
+
+    def _heard(self, number: int, frame: FrameType | None) -> None:
+        self.asked = True
+        signal.signal(signal.SIGINT, self.usual)
+        self.say("Ctrl-C: after this iteration the design continues with the best controller so far; "
+                 "again Ctrl-C to end without results")
+
+    def __exit__(self, kind, value, trace) -> None:
+        if self.usual is not None:
+            signal.signal(signal.SIGINT, self.usual)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from avis_ctrl.cli.console import Progress
+from avis_ctrl.cli.console import Progress, StopRequest
 
 
 def design(
@@ -19,7 +19,8 @@ def design(
 
     Writes report.html, report.pdf, controllers/NAME.json, sampled_controller.json (the controller for the processor,
     sensor volts to drive volts, all axes), study.json (the inputs, for avis export), plant.json and result.json into
-    DIR. Exit code 3 if the closed loop is unstable for any simulated plant; the first sentence names the cause.
+    DIR. Ctrl-C during the D-K iteration continues with the best controller so far, a second Ctrl-C ends the command.
+    Exit code 3 if the closed loop is unstable for any simulated plant; the first sentence names the cause.
     """
     from rich.console import Console
 
@@ -35,7 +36,7 @@ def design(
         from avis_ctrl.study.runner import run_design
         from avis_ctrl.study.verdict import refuse_unstable
 
-        result = run_design(design, rig, progress, source=file)
+        result = run_design(design, rig, progress, source=file, stop=StopRequest(progress))
         progress("report")
         files = write_study(result, folder, *rendered(document(result)))
     _verdict(console, result)

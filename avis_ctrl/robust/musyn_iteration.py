@@ -34,7 +34,7 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 # Which phase follows which.
 FOLLOWING = {"first start": "D-K", "D-K": "descent", "other start": "descent", "descent": "growth",
              "growth": "last start", "last start": DONE}
-STOPPED = "stopped by the callback"
+STOPPED = "stopped by the caller, before the iteration had ended"
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ VERSION = 4
 DONE = "done"
 GIVEN = "given"
 NOMINAL = "nominal"
+# Kinds of the controllers that the iteration starts from.
+STARTS = ("H-infinity", NOMINAL, GIVEN)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import MuSynthesis
+from avis_ctrl.robust.musyn_state import STARTS
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
@@ -34,19 +36,25 @@ Progress = Callable[[str], None]
 SAMPLES = 60
 
 
-def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
-               source: Path | None = None) -> DesignResult:
+# Entered around the D-K iteration; what it gives is asked after each step whether the user has had enough.
+Stop = AbstractContextManager[Callable[[], bool]]
+NEVER: Stop = nullcontext(lambda: False)
+
+
+def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None, source: Path | None = None,
+               stop: Stop = NEVER) -> DesignResult:
     """Run a design on a rig.
 
     Parameters
     ----------
     progress : called with a line of text at each step.
     source : design file, hashed into the provenance.
+    stop : ends the D-K iteration before its time; the design continues with the best controller so far.
     """
     began = time.monotonic()
     progress("model: rig, uncertainty, weights")
     plant = build_plant(design, rig)
-    candidates, failed, synthesis = synthesise(design, plant, rig, progress)
+    candidates, failed, synthesis = synthesise(design, plant, rig, progress, stop)
     compared = compare(design, plant, rig, candidates, failed, progress)
     return conclude(design, plant, rig, synthesis, compared, time.monotonic() - began, source)
 
@@ -60,8 +68,8 @@ class Compared:
     loop: Simulated
 
 
-def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress = lambda text: None
-               ) -> tuple[list[Candidate], list[FailedController], MuSynthesis]:
+def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress = lambda text: None,
+               stop: Stop = NEVER) -> tuple[list[Candidate], list[FailedController], MuSynthesis]:
     """The mu controller and, of those it is compared with, nominal H-infinity and classical skyhook; the table without
     control; the D-K iteration.
 
@@ -79,12 +87,17 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress 
         if "skyhook_classical" in design.compare_with:
             rivals.append(classical_skyhook(plant, rig, design))
 
-        def shown(row: Any) -> None:
-            progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, "
-                     f"order {row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s"
-                     + (" (large values are usual before the first D-scales)" if row.iteration == 1 and row.gamma > 10
-                        else ""))
-        mu, made = mu_optimal(design, plant, rig, shown, rivals)
+        def shown(row: Any) -> bool:
+            """After each iteration; False ends it."""
+            onward = row.kind in STARTS or not asked()
+            if row.kind in STARTS:
+                progress(f"controller to start from ({row.kind}): peak mu {row.mu_upper:.5g}, order {row.order}")
+            else:
+                progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, order "
+                         f"{row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
+            return onward
+        with stop as asked:
+            mu, made = mu_optimal(design, plant, rig, shown, rivals)
         progress(mu.notes[-1])
         return [mu, *rivals, passive()], failed, made
 

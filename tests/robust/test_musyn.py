@@ -165,7 +165,7 @@ def test_callback_stops_and_resuming_equals_running_on():
     P, blocks = table()
     seen = []
     stopped = musyn(P, blocks, 1, 1, callback=lambda row: seen.append(row) or (False if row.iteration == 1 else None))
-    assert stopped.status == "stopped by the callback"
+    assert stopped.status == "stopped by the caller, before the iteration had ended"
     assert len(seen) == len(stopped.history) == 2
     resumed = musyn(P, blocks, 1, 1, state=json.loads(json.dumps(stopped.saved_state)), max_iterations=4)
     through = musyn(P, blocks, 1, 1, max_iterations=4)
