@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ class DesignFolder:
     """What a design's folder holds.
 
     result : result.json. plant : the generalized plant of the design, built from its inputs.
+    added : controllers of the logical axes by name that were made from those of the folder.
     """
 
     path: Path
@@ -35,6 +37,7 @@ class DesignFolder:
     rig: Rig
     result: dict[str, Any]
     plant: DesignPlant
+    added: Mapping[str, StateSpace] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -43,13 +46,19 @@ class DesignFolder:
 
     def controller(self, name: str) -> StateSpace:
         """The continuous controller of the logical axes. Raises InputError with the names that there are."""
+        if name in self.added:
+            return self.added[name]
         if name not in self.names:
             raise InputError(f"expected one of {', '.join(self.names)}", field="--controller", value=name)
-        path = self.path / "controllers" / f"{name}.json"
+        return self.read_controller(self.path / "controllers" / f"{name}.json")
+
+    def read_controller(self, path: Path) -> StateSpace:
+        """A controller of the logical axes from its file."""
         content = read_json(path, "avis-controller")
         try:
             A, B, C, D = (np.array(content[part], float) for part in "ABCD")
-            K = StateSpace(A, B, C, D, float(content["dt"]), tuple(content["inputs"]), tuple(content["outputs"]))
+            K = StateSpace(A, B.reshape(len(A), -1), C.reshape(-1, len(A)), D, float(content["dt"]),
+                           tuple(content["inputs"]), tuple(content["outputs"]))
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"expected a controller as avis design writes it; {error!r}", file=path) from None
         if K.D.shape != (len(self.design.keep),) * 2:

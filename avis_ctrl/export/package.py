@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +24,12 @@ from avis_ctrl.export.sampled_controller import Arithmetic, SampledController, p
 from avis_ctrl.export.vectors import agreement_V, as_csv, vectors
 from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.study.files import as_json
+from avis_ctrl.study.output import controller_form
 
 CONTROLLER, CERTIFICATE, MAT, VECTORS = "controller.json", "certificate.json", "controller.mat", "test_vectors.csv"
-FILES = (CONTROLLER, HEADER, SOURCE, MAT, VECTORS, CERTIFICATE)
+# The controller of the logical axes from which the exported one was made, where the design's folder has it not.
+CONTINUOUS = "continuous_controller.json"
+FILES = (CONTROLLER, CONTINUOUS, HEADER, SOURCE, MAT, VECTORS, CERTIFICATE)
 FORMATS = ("c", "mat", "json")
 
 
@@ -67,7 +70,7 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
         other = "double precision (without --float32)" if arithmetic == "float32" else "single precision (--float32)"
         raise ComputationError(f"the loop of the exported controller {name!r} is not proved stable; nothing was "
                                "written", measured="; ".join(dict.fromkeys(certificate.reasons)),
-                               next_step=f"try {other}, or another controller of the folder")
+                               next_step=f"try {other}, another controller of the folder, or a larger --order")
     replay = None
     if compiler() is not None:
         progress("replay of the worst plant through the compiled code, on the nonlinear table")
@@ -75,6 +78,8 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
         if replay.record.diverged:
             raise ComputationError("the worst plant diverged under the compiled code; nothing was written")
     contents, content = {CONTROLLER: text}, dict(certificate.content)
+    if name in folder.added:
+        contents[CONTINUOUS] = as_json(controller_form(name, folder.added[name]))
     if "c" in formats:
         files = c_files(controller, guard, _provenance(folder, controller, certificate))
         contents |= {key: value.encode() for key, value in files.items()}
@@ -142,6 +147,8 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     """
     stored = read_json(out / CERTIFICATE, "avis-certificate")
     controller = read_controller(out / CONTROLLER)
+    if (out / CONTINUOUS).exists():
+        folder = replace(folder, added={controller.name: folder.read_controller(out / CONTINUOUS)})
     found, changed = [], stored.get("controller_sha256") != controller.sha256
     if changed:
         found.append(f"{CONTROLLER} is not the file that the certificate names: its hash differs")

@@ -12,6 +12,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
 from avis_ctrl.lti.norms import decibels
+from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.files import as_json
 from avis_ctrl.study.saved import STUDY, study_dict
@@ -26,7 +27,12 @@ def controller_dict(result: ControllerResult) -> dict[str, Any]:
     K = result.K
     if K is None:
         raise InputError("a passive rig has no controller", field="controller", value=result.name)
-    return {"format": "avis-controller", "version": 1, "name": result.name, "A": K.A, "B": K.B, "C": K.C, "D": K.D,
+    return controller_form(result.name, K)
+
+
+def controller_form(name: str, K: StateSpace) -> dict[str, Any]:
+    """The contract's avis-controller form of a controller of the logical axes."""
+    return {"format": "avis-controller", "version": 1, "name": name, "A": K.A, "B": K.B, "C": K.C, "D": K.D,
             "dt": K.dt, "inputs": K.inputs, "outputs": K.outputs, "input_units": ["m/s"] * K.ninputs,
             "output_units": ["N"] * K.noutputs}
 

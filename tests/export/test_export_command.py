@@ -15,7 +15,7 @@ import pytest
 import scipy.io
 
 from avis_ctrl.export.design_folder import open_design
-from avis_ctrl.export.package import FILES
+from avis_ctrl.export.package import CONTINUOUS, FILES
 from avis_ctrl.export.sampled_controller import read_controller
 from avis_ctrl.simulation.discrete import digital_controller
 
@@ -41,7 +41,7 @@ def out(skyhook_dir, tmp_path_factory) -> Path:
 
 
 def test_files_follow_the_contract(out):
-    assert {one.name for one in out.iterdir()} == set(FILES)
+    assert {one.name for one in out.iterdir()} == set(FILES) - {CONTINUOUS}  # which belongs to --order
     controller, certificate = (json.loads((out / name).read_text()) for name in ("controller.json", "certificate.json"))
     assert set(controller) == CONTROLLER_KEYS
     assert set(certificate) == CERTIFICATE_KEYS
@@ -107,6 +107,7 @@ def test_header_says_where_it_comes_from(out):
     (("DESIGN", "--controller", "skyhook_classical", "--out", "OUT", "--format", "c,fortran"), "c,mat,json"),
     (("DESIGN", "--controller", "skyhook_classical", "--out", "FILE"), "--out"),
     (("DESIGN", "--controller", "skyhook_classical", "--out", "/proc/nothing"), "--out"),
+    (("DESIGN", "--controller", "skyhook_classical", "--order", "4", "--out", "OUT"), "expected 1 to 3"),
     (("EMPTY", "--out", "OUT"), "result.json"),
     (("DESIGN", "--out", "OUT", "--check"), "certificate.json")])
 def test_wrong_input_is_one_line_and_writes_nothing(skyhook_dir, tmp_path, arguments, words):
