@@ -20,6 +20,7 @@ VERSION = 4
 DONE = "done"
 GIVEN = "given"
 NOMINAL = "nominal"
+HINF = "H-infinity"
 
 
 @dataclass(frozen=True)

@@ -156,6 +156,10 @@ class BlockStructure:
         """Every real scalar replaced by a complex one: a superset of perturbations."""
         return BlockStructure(tuple(ComplexScalar(b.rows, b.name) if b.kind == "real" else b for b in self.blocks))
 
+    def unrepeated(self) -> BlockStructure:
+        """Every repeated complex scalar replaced by a full block: a superset of perturbations, and scalar scalings."""
+        return BlockStructure(tuple(ComplexFull(b.rows, b.cols, b.name) if b.repeated else b for b in self.blocks))
+
     def assemble(self, values: Sequence[complex | np.ndarray]) -> np.ndarray:
         """Delta (n_w, n_z) from one value a block: a number for scalars, an array for full blocks."""
         delta = np.zeros((self.n_w, self.n_z), complex)
