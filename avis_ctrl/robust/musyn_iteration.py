@@ -121,9 +121,10 @@ def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -
     state, failure = State(), None
     many = len(problem.structure.blocks) > GROUPS.blocks
     candidates = _candidates(problem, starts, options)
-    # With many blocks unscaled, that of the plant as it is does nothing, and takes longest.
-    for kind, make in [*candidates[1:], candidates[0]] if many else candidates:
-        if many and kind == HINF and state.best is not None:
+    # With many blocks unscaled, that of the plant as it is does nothing, and takes longest: only where the ones given,
+    # or that of the nominal plant, do not stabilise.
+    for kind, make in reversed(candidates) if many else candidates:
+        if many and kind != GIVEN and state.best is not None:
             break
         began = time.monotonic()
         try:
