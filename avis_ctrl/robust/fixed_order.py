@@ -15,7 +15,7 @@ It starts from the full controller, shortened mode by mode, each time by the one
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,10 +23,10 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, append, balanced_truncation, lft_lower
-from avis_ctrl.robust.frequency_grid import frequency_grid, merged
+from avis_ctrl.robust.frequency_grid import frequency_grid, merged, resonances
 from avis_ctrl.robust.mu_lmi import Array, dagger, residual
 from avis_ctrl.robust.mu_scan import refine_maxima
-from avis_ctrl.robust.mu_upper import upper_bound
+from avis_ctrl.robust.mu_upper import UpperBound, block_balance, expand, upper_bound
 from avis_ctrl.robust.reduction import reduce_controller, split, split_stable
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -45,6 +45,7 @@ class FixedOrderSettings:
         nearer one makes the slope less smooth, a farther one less true.
     armijo, wolfe : fractions of the slope that a step must gain, and may leave (Lewis and Overton 2013).
     trials : most points of a line search.
+    narrow : damping ratio of a mode of the loop below which its resonance joins the frequencies of every step.
     same_pole : relative distance up to which two computations of a pole are one.
     """
 
@@ -58,31 +59,47 @@ class FixedOrderSettings:
     armijo: float = 1e-4
     wolfe: float = 0.5
     trials: int = 25
+    narrow: float = 0.2
     same_pole: float = 1e-9
 
 
 SETTINGS = FixedOrderSettings()
+# Frequencies whose weight in the smoothed maximum is below exp(-NEGLIGIBLE) are left out: below its rounding errors.
+NEGLIGIBLE = 30.0
+LOOKED_AT_FIRST = 3
 
 
-def fixed_order(P: StateSpace, structure: BlockStructure, K: StateSpace, order: int, decentralised: bool = False,
-                settings: FixedOrderSettings = SETTINGS) -> tuple[StateSpace, float]:
+def fixed_order(P: StateSpace, structure: BlockStructure, starts: Sequence[StateSpace], order: int,
+                decentralised: bool = False, settings: FixedOrderSettings = SETTINGS) -> tuple[StateSpace, float]:
     """A controller of at most an order with small peak complex mu, and that peak on its last frequency grid.
 
-    P continuous, u and y last; `structure` complex, performance last; K a controller that stabilises P. A decentralised
-    one moves u_k by y_k alone. ComputationError where no shortened controller, or not the diagonal part of K,
-    stabilises P.
+    P continuous, u and y last; `structure` complex, performance last; `starts` controllers that stabilise P: each is
+    shortened, and the one that the first stage brings lowest goes on. A decentralised controller moves u_k by y_k
+    alone. ComputationError where no start can be shortened so far, or has a diagonal part that stabilises P.
     """
-    if decentralised:
-        K = _diagonal_part(K)
-        if not lft_lower(P, K).is_stable():
-            raise ComputationError("the diagonal part of the full controller does not stabilise the plant",
-                                   cause="the axes are too strongly coupled for loops of their own",
-                                   next_step="choose other coordinates for u and y")
-    K = _shortened(P, structure, K, order, decentralised, settings)
+    shortened, reason = [], None
+    for K in starts:
+        try:
+            start = _diagonal_part(P, K) if decentralised else K
+            shortened.append(_shortened(P, structure, start, order, decentralised, settings))
+        except ComputationError as error:
+            reason = reason or error
+    if reason is not None and not shortened:
+        raise reason
+    first, *rest = settings.sharpness
+    stages = (first,), tuple(rest)
+    found = [_descended(P, structure, K, stages[0], decentralised, settings) for K in shortened]
+    K, _ = min(found, key=lambda one: one[1])
+    return _descended(P, structure, K, stages[1], decentralised, settings)
+
+
+def _descended(P: StateSpace, structure: BlockStructure, K: StateSpace, stages: Sequence[float], decentralised: bool,
+               settings: FixedOrderSettings) -> tuple[StateSpace, float]:
+    """The best controller after each of some stages of descent from K, K among them, and its peak mu on the grid."""
     closed = lft_lower(P, K)
     omega, beta = _with_peaks(closed, structure, frequency_grid(closed), settings)
     best, best_mu = K, float(np.max(beta))
-    for sharpness in settings.sharpness:
+    for sharpness in stages:
         K = _improved(P, structure, K, omega, sharpness, decentralised, settings)
         closed = lft_lower(P, K)
         omega, beta = _with_peaks(closed, structure, merged(omega, frequency_grid(closed)), settings)
@@ -91,13 +108,18 @@ def fixed_order(P: StateSpace, structure: BlockStructure, K: StateSpace, order: 
     return best, best_mu
 
 
-def _diagonal_part(K: StateSpace) -> StateSpace:
+def _diagonal_part(P: StateSpace, K: StateSpace) -> StateSpace:
     """K with its entries off the diagonal zero, each one on it without the states that it does not need."""
     parts = []
     for k in range(K.noutputs):
         stable, unstable = split_stable(K.select([k], [k]))
         parts.append(balanced_truncation(stable, tolerance=SETTINGS.unneeded) + unstable)
-    return append(*parts)
+    diagonal = append(*parts)
+    if not lft_lower(P, diagonal).is_stable():
+        raise ComputationError("the diagonal part of the full controller does not stabilise the plant",
+                               cause="the axes are too strongly coupled for loops of their own",
+                               next_step="choose other coordinates for u and y")
+    return diagonal
 
 
 def _improved(P: StateSpace, structure: BlockStructure, K: StateSpace, omega: Array, sharpness: float,
@@ -227,7 +249,7 @@ def _modal(K: StateSpace, decentralised: bool) -> tuple[Array, Array, Array, Arr
     """
     n, vectors, sizes, channels = K.nstates, [], [], []
     values, V = la.eig(K.A)
-    output = np.argmax(np.abs(K.C @ V), axis=0) * decentralised
+    output = np.argmax(np.abs(K.C @ V), axis=0)
     for k in np.lexsort((np.abs(values), output)):
         if values[k].imag > 0:
             vectors += [V[:, k].real, V[:, k].imag]
@@ -259,26 +281,32 @@ class Objective:
     omega: Array
     sharpness: float
     accuracy: float
+    narrow: float = SETTINGS.narrow
 
     def value(self, x: Array) -> tuple[float, Array]:
         """log of the smoothed peak and its slope; inf where the loop is unstable."""
         K = self.form.controller(x)
         try:
-            if not lft_lower(self.P, K).is_stable():
-                return np.inf, np.zeros(x.size)
+            closed = lft_lower(self.P, K)
         except ComputationError:
             return np.inf, np.zeros(x.size)
+        if not closed.is_stable():
+            return np.inf, np.zeros(x.size)
+        # A grid cannot follow modes narrower than its steps; descent would hide peaks there.
+        narrow = resonances(closed.poles(), light=self.narrow)
+        omega = np.concatenate([self.omega, narrow])
         n_u, n_y = K.noutputs, K.ninputs
-        p = self.response
+        p = np.concatenate([self.response, self.P.frequency_response(narrow)])
         z, w = p.shape[1] - n_y, p.shape[2] - n_u
-        phi = np.linalg.inv(1j * self.omega[:, None, None] * np.eye(K.nstates) - K.A)
+        phi = np.linalg.inv(1j * omega[:, None, None] * np.eye(K.nstates) - K.A)
         k = K.C @ phi @ K.B + K.D
         # With E = inv(I - P22 K): dM = P12 (I + K E P22) dK E P21.
         E = np.linalg.inv(np.eye(n_y) - p[:, z:, w:] @ k)
         R = E @ p[:, z:, :w]
         M = p[:, :z, :w] + p[:, :z, w:] @ k @ R
         L = p[:, :z, w:] @ (np.eye(n_u) + k @ E @ p[:, z:, w:])
-        bound = upper_bound(M[:, None], self.structure, self.accuracy)
+        near, bound = self._highest(M)
+        M, L, R, phi = M[near], L[near], R[near], phi[near]
         lam = bound.beta ** 2 * (1 + self.accuracy)
         dual = np.linalg.inv(residual(M[:, None], bound.scalings, lam, np.ones(w, bool))[:, 0])
         dual /= np.trace(bound.scalings.X_w @ dual, axis1=1, axis2=2).real[:, None, None]
@@ -298,6 +326,18 @@ class Objective:
         slope[n:, :n] = np.sum(into @ G, axis=0).real.T
         slope[n:, n:] = np.sum(G, axis=0).real.T
         return total, self.form.slope(slope)
+
+    def _highest(self, M: Array) -> tuple[Array, UpperBound]:
+        """The frequencies that count in the smoothed maximum, and the bounds of mu there; M (n_omega, n_z, n_w).
+
+        The norm after Osborne's scaling, which is cheap and no less than the bound, tells which ones cannot.
+        """
+        d_z, d_w = expand(self.structure, block_balance(M[:, None], self.structure))
+        size = np.linalg.norm(M * d_z[:, :, None] / d_w[:, None, :], ord=2, axis=(1, 2))
+        first = np.argsort(size)[-LOOKED_AT_FIRST:]
+        top = float(np.max(upper_bound(M[first][:, None], self.structure, self.accuracy).beta))
+        near = np.flatnonzero(size >= top * np.exp(-NEGLIGIBLE / self.sharpness))
+        return near, upper_bound(M[near][:, None], self.structure, self.accuracy)
 
     @property
     def response(self) -> Array:
