@@ -27,7 +27,7 @@ from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
 from avis_ctrl.robust.gamma_descent import ScaledProblem, descend, grown
 from avis_ctrl.robust.hinfsyn import Synthesis, hinfsyn
 from avis_ctrl.robust.mu_upper import upper_bound
-from avis_ctrl.robust.musyn_state import DONE, GIVEN, NOMINAL, Iteration, Loop, State, analysed
+from avis_ctrl.robust.musyn_state import DONE, GIVEN, HINF, NOMINAL, Iteration, Loop, State, analysed
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -119,7 +119,13 @@ def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -
     the uncertainty is felt by a controller that does its work, while large uncertainty unscaled forbids any work.
     """
     state, failure = State(), None
-    for kind, make in _candidates(problem, starts, options):
+    many = problem.structure.many
+    candidates = _candidates(problem, starts, options)
+    # With many blocks unscaled, that of the plant as it is does nothing, and takes longest: only where the ones given,
+    # or that of the nominal plant, do not stabilise.
+    for kind, make in reversed(candidates) if many else candidates:
+        if many and kind != GIVEN and state.best is not None:
+            break
         began = time.monotonic()
         try:
             loop, points = _start(problem, make())
@@ -146,7 +152,7 @@ def _candidates(problem: Problem, starts: tuple[StateSpace, ...],
         return hinfsyn(P, problem.nmeas, problem.ncon, backoff=options.backoff).K
     performance = problem.structure.blocks[-1]
     n_z, n_w = problem.structure.n_z - performance.cols, problem.structure.n_w - performance.rows
-    made: list[tuple[str, Callable[[], StateSpace]]] = [("H-infinity", lambda: optimal(problem.P))]
+    made: list[tuple[str, Callable[[], StateSpace]]] = [(HINF, lambda: optimal(problem.P))]
     if n_w:
         made.append((NOMINAL, lambda: optimal(problem.P.select(slice(n_z, None), slice(n_w, None)))))
     return made + [(GIVEN, partial(_itself, K)) for K in starts]
