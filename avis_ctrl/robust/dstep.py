@@ -302,7 +302,7 @@ def _closeness(points: PointwiseScalings) -> np.ndarray:
 
 
 def _sensitivities(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
-    """(n_omega, n_blocks) what a misfit costs: closeness to the peak times the block's share in the singular vectors."""
+    """(n_omega, n_blocks) what a misfit costs: closeness to the peak times the share in the singular vectors."""
     left, right = scalings.response(points.omega)
     U, _, Vh = np.linalg.svd(left @ points.M @ right)
     share = np.stack([np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)

@@ -72,7 +72,7 @@ def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5,
 
 
 def enough(M: Array, structure: BlockStructure, tolerance: float, goal: float) -> UpperBound:
-    """`upper_bound` with a goal > 0; of many blocks first with one number for each, in full where that is not enough."""
+    """`upper_bound` with a goal > 0; of many blocks first with one number each, in full where that is not enough."""
     if not structure.many:
         return upper_bound(M, structure, tolerance, goal)
     found = upper_bound(M, structure.simplified(), tolerance, goal)
