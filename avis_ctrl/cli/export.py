@@ -14,9 +14,9 @@ def export(
     design_dir: Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="folder that avis design wrote")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the controller's files")],
     controller: Annotated[str, typer.Option("--controller", metavar="NAME", help="a controller of the design")] = "mu",
-    order: Annotated[int | None, typer.Option("--order", metavar="N", help="at most N states for the axes of the "
-                                              "design: a new controller, found by descent on mu, is exported instead; "
-                                              "a minute")] = None,
+    order: Annotated[int | None, typer.Option("--order", metavar="N", help="export a new controller with at most "
+                                              "N states for the axes of the design, found by descent on mu (about a "
+                                              "minute)")] = None,
     formats: Annotated[str, typer.Option("--format", metavar="LIST", help="some of c,mat,json; controller.json and "
                                          "certificate.json are always written")] = "c,mat,json",
     float32: Annotated[bool, typer.Option("--float32", help="numbers and arithmetic in single precision")] = False,
@@ -46,11 +46,10 @@ def export(
             raise InputError("; ".join(wrong), file=out)
         console.print(f"{out}: the files belong together, and the certificate is that of controller.json.")
         return
-    folder.controller(controller)  # a wrong name is said before anything is created
+    K = folder.controller(controller)  # a wrong name is said before anything is created
     with output_folder(out, FILES) as path, Progress(console) as progress:
         if order is not None:
-            progress(f"controller of {order} states: descent on mu from the one with "
-                     f"{folder.controller(controller).nstates} states")
+            progress(f"controller of {order} states: descent on mu from the one with {K.nstates} states")
             folder, controller = with_fewer_states(folder, controller, order)
         made = make_package(folder, controller, "float32" if float32 else "float64", asked, progress)
         files = write_together(path, made.contents, [path / name for name in FILES])

@@ -98,7 +98,7 @@ def simulate_campaign(
     from avis_ctrl.measurement.formats.hdf5 import write_campaign
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.files import require_other
-    from avis_ctrl.study.hidden_effects import rehearsed
+    from avis_ctrl.study.hidden_effects import rehearse_with_effects
     from avis_ctrl.study.plan_file import default_plan, plan_toml, read_plan
 
     for written in (out, write_plan, truth):
@@ -117,7 +117,7 @@ def simulate_campaign(
                                                        perturbed=perturbed, duration_s=duration_s)
     with Progress(console) as progress:
         try:
-            rehearsal = rehearsed(table, chosen, seed,
+            rehearsal = rehearse_with_effects(table, chosen, seed,
                                   lambda k, total, name: progress(f"record {name}, {k} of {total}"))
         except InputError as error:
             section = re.split(r"\W", error.field or "")[0]

@@ -29,7 +29,7 @@ class DesignFolder:
     """What a design's folder holds.
 
     result : result.json. plant : the generalized plant of the design, built from its inputs.
-    added : controllers of the logical axes by name that were made from those of the folder.
+    added : further controllers of the logical axes, by name, that were made from those of the folder.
     """
 
     path: Path
@@ -50,15 +50,14 @@ class DesignFolder:
             return self.added[name]
         if name not in self.names:
             raise InputError(f"expected one of {', '.join(self.names)}", field="--controller", value=name)
-        return self.read_controller(self.path / "controllers" / f"{name}.json")
+        return self.controller_in(self.path / "controllers" / f"{name}.json")
 
-    def read_controller(self, path: Path) -> StateSpace:
-        """A controller of the logical axes from its file."""
+    def controller_in(self, path: Path) -> StateSpace:
+        """The controller of the logical axes that a file has. Raises InputError."""
         content = read_json(path, "avis-controller")
         try:
             A, B, C, D = (np.array(content[part], float) for part in "ABCD")
-            K = StateSpace(A, B.reshape(len(A), -1), C.reshape(-1, len(A)), D, float(content["dt"]),
-                           tuple(content["inputs"]), tuple(content["outputs"]))
+            K = StateSpace(A, B, C, D, float(content["dt"]), tuple(content["inputs"]), tuple(content["outputs"]))
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"expected a controller as avis design writes it; {error!r}", file=path) from None
         if K.D.shape != (len(self.design.keep),) * 2:

@@ -12,10 +12,10 @@ from avis_ctrl.robust.fixed_order import fixed_order
 
 
 def with_fewer_states(folder: DesignFolder, name: str, order: int) -> tuple[DesignFolder, str]:
-    """The folder with a controller of at most `order` states in the logical axes beside its own, and its name.
+    """The folder with one controller more, of at most `order` states in the logical axes, and that controller's name.
 
-    It is made from the controller `name` by descent on the peak of mu (`fixed_order`). The states of the sensors'
-    decoding and of the other axes' loops are not among those counted.
+    It is made from the controller `name` by descent on the peak of mu (`fixed_order`). The states that decode the
+    sensors and those of the other axes' loops are not counted.
 
     Raises
     ------
@@ -27,6 +27,6 @@ def with_fewer_states(folder: DesignFolder, name: str, order: int) -> tuple[Desi
         raise InputError(f"expected 1 to {K.nstates - 1}: the controller {name!r} of this design has {K.nstates} "
                          "states", field="--order", value=order)
     with threadpool_limits(1):
-        found, _ = fixed_order(P.P, P.all_blocks.complexified(), [K], order)
+        found, _ = fixed_order(P.P, P.all_blocks.complexified(), K, order)
     made = f"{name}_{order}"
     return replace(folder, added={made: found.renamed(K.inputs, K.outputs)}), made

@@ -27,7 +27,7 @@ from avis_ctrl.study.files import as_json
 from avis_ctrl.study.output import controller_form
 
 CONTROLLER, CERTIFICATE, MAT, VECTORS = "controller.json", "certificate.json", "controller.mat", "test_vectors.csv"
-# The controller of the logical axes from which the exported one was made, where the design's folder has it not.
+# The controller of the logical axes from which the exported one was made, where the design's folder does not have it.
 CONTINUOUS = "continuous_controller.json"
 FILES = (CONTROLLER, CONTINUOUS, HEADER, SOURCE, MAT, VECTORS, CERTIFICATE)
 FORMATS = ("c", "mat", "json")
@@ -68,9 +68,10 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     certificate = certify(folder, controller, plain, progress)
     if not certificate.content["stable"]:
         other = "double precision (without --float32)" if arithmetic == "float32" else "single precision (--float32)"
+        further = "a larger --order" if name in folder.added else "another controller of the folder"
         raise ComputationError(f"the loop of the exported controller {name!r} is not proved stable; nothing was "
                                "written", measured="; ".join(dict.fromkeys(certificate.reasons)),
-                               next_step=f"try {other}, another controller of the folder, or a larger --order")
+                               next_step=f"try {other}, or {further}")
     replay = None
     if compiler() is not None:
         progress("replay of the worst plant through the compiled code, on the nonlinear table")
@@ -148,7 +149,7 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     stored = read_json(out / CERTIFICATE, "avis-certificate")
     controller = read_controller(out / CONTROLLER)
     if (out / CONTINUOUS).exists():
-        folder = replace(folder, added={controller.name: folder.read_controller(out / CONTINUOUS)})
+        folder = replace(folder, added={controller.name: folder.controller_in(out / CONTINUOUS)})
     found, changed = [], stored.get("controller_sha256") != controller.sha256
     if changed:
         found.append(f"{CONTROLLER} is not the file that the certificate names: its hash differs")

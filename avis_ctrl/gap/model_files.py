@@ -194,23 +194,28 @@ def _require_answer(model: TableModel) -> None:
                          value=[f"{one.label} {one.by_name}" for one in model.effects])
 
 
-def effect_at(model: TableModel, name: str, place: str, field: str) -> Effect:
-    """The effect of the library with this name, which acts at this place, or at any where it is empty; InputError."""
+def effect_at(model: TableModel, name: str, place: str | None, field: str) -> tuple[Effect, str]:
+    """An effect by its name, and the place where it acts: the one given, or the only one there is for None.
+
+    Raises InputError with the names, or the places, that there are.
+    """
     known: dict[str, Effect] = {**library(), LargeMotion.name: LargeMotion()}
     if name not in known:
         raise InputError(f"expected one of {', '.join(known)}; an effect of your own by --effects FILE.py",
                          field=f"{field}.name", value=name)
     places = known[name].places(model)
-    if place not in places and (place or len(places) != 1):
+    if place is None and len(places) == 1:
+        place = places[0]
+    if place not in places:
         raise InputError(f"expected one of {', '.join(places) or 'none: this rig has no place for it'}",
                          field=f"{field}.place", value=place)
-    return known[name]
+    return known[name], place
 
 
 def _effect(model: TableModel, one: EffectFile, field: str) -> ActiveEffect:
-    effect = effect_at(model, one.name, one.place, field)
-    parameters = effect.parameters(model, one.place)
+    effect, place = effect_at(model, one.name, one.place, field)
+    parameters = effect.parameters(model, place)
     if set(one.values) != {parameter.name for parameter in parameters}:
         raise InputError(f"expected {', '.join(parameter.name for parameter in parameters)}", field=f"{field}.values",
                          value=list(one.values))
-    return ActiveEffect(effect, one.place, parameters, tuple(one.values[parameter.name] for parameter in parameters))
+    return ActiveEffect(effect, place, parameters, tuple(one.values[parameter.name] for parameter in parameters))

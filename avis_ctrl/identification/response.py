@@ -163,8 +163,8 @@ class SensorModel:
                          enumerate(zip(self.chains, self.motions, strict=True))], axis=1)
 
     def folded(self, omega: np.ndarray, period_s: float, delay_s: float, corner_Hz: float | None) -> np.ndarray:
-        """(n, n_y) `aliases` of each sensor's motion, which pass its chain far above its corners: with a gain of one,
-        but for the anti-alias filter."""
+        """(n, n_y) `aliases` of each sensor's motion, which pass its chain far above its corners: its gain is that of
+        the anti-alias filter alone."""
         own = {motion: aliases(omega, period_s, delay_s, motion, corner_Hz, self.low_pass)
                for motion in dict.fromkeys(self.motions)}
         return np.stack([own[motion] for motion in self.motions], axis=1)

@@ -13,13 +13,24 @@ below 1e-4 of the response in the band of a table (a test measures it against th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 Motion = Literal["displacement", "velocity", "acceleration"]
-# Relative distance by which equal poles are moved apart: the error is of its order, the round-off of the inverse's.
-DISTINCT = 1e-6
+
+
+@dataclass(frozen=True)
+class AliasSettings:
+    """apart : relative step from lag to lag by which their poles are moved apart [1], for partial fractions need
+    distinct ones: the result is off by about as much, and by round-off over it where two were equal.
+    """
+
+    apart: float = 1e-6
+
+
+SETTINGS = AliasSettings()
 
 
 def hold(omega: np.ndarray, period_s: float, delay_s: float = 0.0) -> np.ndarray:
@@ -57,14 +68,14 @@ def aliases(omega: np.ndarray, period_s: float, delay_s: float, motion: Motion,
     if motion == "displacement":
         return np.zeros(omega.shape, complex)
     lags = np.array([*low_pass, *([-2 * np.pi * amplifier_corner_Hz] if amplifier_corner_Hz else [])], complex)
-    # Partial fractions need distinct poles.
-    lags *= 1 + DISTINCT * np.arange(lags.size)
+    lags *= 1 + SETTINGS.apart * np.arange(lags.size)
     poles = np.append(lags, 0.0) if motion == "velocity" else lags
+    gain = np.prod(-lags)
     with np.errstate(divide="ignore", invalid="ignore"):
-        continuous = hold(omega, period_s, delay_s) * np.prod(-lags) / np.prod(1j * omega[:, None] - poles, axis=1)
+        continuous = hold(omega, period_s, delay_s) * gain / np.prod(1j * omega[:, None] - poles, axis=1)
         exact = np.exp(-1j * omega * period_s * np.ceil(delay_s / period_s - 1e-9))
         if poles.size:
-            residues = [np.prod(-lags) / np.prod(pole - np.delete(poles, k)) for k, pole in enumerate(poles)]
+            residues = [gain / np.prod(pole - np.delete(poles, k)) for k, pole in enumerate(poles)]
             exact = sum(residue * sampled_pole(omega, period_s, delay_s, pole)
                         for residue, pole in zip(residues, poles, strict=True))
         # At rest both integrators are infinite and their difference is finite, but no velocity is measured there.

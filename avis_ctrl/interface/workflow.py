@@ -21,7 +21,7 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.design_file import Design, design_from_table, read_study
 from avis_ctrl.study.gap import GapOptions, find_gap
-from avis_ctrl.study.hidden_effects import rehearsed
+from avis_ctrl.study.hidden_effects import rehearse_with_effects
 from avis_ctrl.study.identification import IdentifyOptions
 from avis_ctrl.study.identification import identify as identify_rig
 from avis_ctrl.study.plan_file import default_plan, plan_from_table, read_plan
@@ -86,7 +86,7 @@ def simulate_campaign(table: Rig | str, plan: Mapping[str, Any] | str | Path | N
     chosen = (default_plan(table) if plan is None else plan_from_table(dict(plan)) if isinstance(plan, Mapping)
               else read_plan(plan))
     record_done = None if progress is None else lambda k, total, name: progress(f"record {name}, {k} of {total}")
-    return rehearsed(table, chosen, seed, record_done).campaign
+    return rehearse_with_effects(table, chosen, seed, record_done).campaign
 
 
 def identify(measured: Campaign | FrequencyResponse | str | Path, table: Rig | str, *, progress: Progress | None = None,

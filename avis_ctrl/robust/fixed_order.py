@@ -15,7 +15,7 @@ It starts from the full controller, shortened mode by mode, each time by the one
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +46,9 @@ class FixedOrderSettings:
     armijo, wolfe : fractions of the slope that a step must gain, and may leave (Lewis and Overton 2013).
     trials : most points of a line search.
     narrow : damping ratio of a mode of the loop below which its resonance joins the frequencies of every step.
+    negligible : weight in the smoothed maximum, relative to the largest, below which a frequency is left out: less than
+        rounding errors change.
+    first : frequencies of the largest balanced norms, whose mu tells which others count.
     same_pole : relative distance up to which two computations of a pole are one.
     """
 
@@ -60,46 +63,33 @@ class FixedOrderSettings:
     wolfe: float = 0.5
     trials: int = 25
     narrow: float = 0.2
+    negligible: float = 1e-13
+    first: int = 3
     same_pole: float = 1e-9
 
 
 SETTINGS = FixedOrderSettings()
-# Frequencies whose weight in the smoothed maximum is below exp(-NEGLIGIBLE) are left out: below its rounding errors.
-NEGLIGIBLE = 30.0
-LOOKED_AT_FIRST = 3
 
 
-def fixed_order(P: StateSpace, structure: BlockStructure, starts: Sequence[StateSpace], order: int,
-                decentralised: bool = False, settings: FixedOrderSettings = SETTINGS) -> tuple[StateSpace, float]:
+def fixed_order(P: StateSpace, structure: BlockStructure, K: StateSpace, order: int, decentralised: bool = False,
+                settings: FixedOrderSettings = SETTINGS) -> tuple[StateSpace, float]:
     """A controller of at most an order with small peak complex mu, and that peak on its last frequency grid.
 
-    P continuous, u and y last; `structure` complex, performance last; `starts` controllers that stabilise P: each is
-    shortened, and the one that the first stage brings lowest goes on. A decentralised controller moves u_k by y_k
-    alone. ComputationError where no start can be shortened so far, or has a diagonal part that stabilises P.
+    P continuous, u and y last; `structure` complex, performance last; K a controller that stabilises P. A decentralised
+    one moves u_k by y_k alone. ComputationError where no shortened controller, or not the diagonal part of K,
+    stabilises P.
     """
-    shortened, reason = [], None
-    for K in starts:
-        try:
-            start = _diagonal_part(P, K) if decentralised else K
-            shortened.append(_shortened(P, structure, start, order, decentralised, settings))
-        except ComputationError as error:
-            reason = reason or error
-    if reason is not None and not shortened:
-        raise reason
-    first, *rest = settings.sharpness
-    stages = (first,), tuple(rest)
-    found = [_descended(P, structure, K, stages[0], decentralised, settings) for K in shortened]
-    K, _ = min(found, key=lambda one: one[1])
-    return _descended(P, structure, K, stages[1], decentralised, settings)
-
-
-def _descended(P: StateSpace, structure: BlockStructure, K: StateSpace, stages: Sequence[float], decentralised: bool,
-               settings: FixedOrderSettings) -> tuple[StateSpace, float]:
-    """The best controller after each of some stages of descent from K, K among them, and its peak mu on the grid."""
+    if decentralised:
+        K = _diagonal_part(K)
+        if not lft_lower(P, K).is_stable():
+            raise ComputationError("the diagonal part of the full controller does not stabilise the plant",
+                                   cause="the axes are too strongly coupled for loops of their own",
+                                   next_step="choose other coordinates for u and y")
+    K = _shortened(P, structure, K, order, decentralised, settings)
     closed = lft_lower(P, K)
     omega, beta = _with_peaks(closed, structure, frequency_grid(closed), settings)
     best, best_mu = K, float(np.max(beta))
-    for sharpness in stages:
+    for sharpness in settings.sharpness:
         K = _improved(P, structure, K, omega, sharpness, decentralised, settings)
         closed = lft_lower(P, K)
         omega, beta = _with_peaks(closed, structure, merged(omega, frequency_grid(closed)), settings)
@@ -108,25 +98,20 @@ def _descended(P: StateSpace, structure: BlockStructure, K: StateSpace, stages: 
     return best, best_mu
 
 
-def _diagonal_part(P: StateSpace, K: StateSpace) -> StateSpace:
+def _diagonal_part(K: StateSpace) -> StateSpace:
     """K with its entries off the diagonal zero, each one on it without the states that it does not need."""
     parts = []
     for k in range(K.noutputs):
         stable, unstable = split_stable(K.select([k], [k]))
         parts.append(balanced_truncation(stable, tolerance=SETTINGS.unneeded) + unstable)
-    diagonal = append(*parts)
-    if not lft_lower(P, diagonal).is_stable():
-        raise ComputationError("the diagonal part of the full controller does not stabilise the plant",
-                               cause="the axes are too strongly coupled for loops of their own",
-                               next_step="choose other coordinates for u and y")
-    return diagonal
+    return append(*parts)
 
 
 def _improved(P: StateSpace, structure: BlockStructure, K: StateSpace, omega: Array, sharpness: float,
               decentralised: bool, settings: FixedOrderSettings) -> StateSpace:
     """K after one stage of descent on the frequencies omega."""
     form = Entries.of(K, decentralised)
-    problem = Objective(P, structure, form, omega, sharpness, settings.accuracy)
+    problem = Objective(P, structure, form, omega, sharpness, settings.accuracy, settings)
     return form.controller(_bfgs(problem.value, form.start, settings))
 
 
@@ -210,7 +195,7 @@ class Entries:
 
     @staticmethod
     def of(K: StateSpace, decentralised: bool = False) -> Entries:
-        A, B, C, rate, channel = _modal(K, decentralised)
+        A, B, C, rate, channel = _modal(K)
         n = rate.size
         whole = np.block([[A, B], [C, K.D]])
         free = np.ones(whole.shape, bool)
@@ -242,10 +227,10 @@ class Entries:
         return whole[self.rows, self.cols] * self.size
 
 
-def _modal(K: StateSpace, decentralised: bool) -> tuple[Array, Array, Array, Array, Array]:
+def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array, Array]:
     """A of 2 x 2 blocks, real poles in pairs of neighbours, with rows of B as long as columns of C; and |poles|.
 
-    Last the output (n,) that each state belongs to; the states are in the order of these where K is decentralised.
+    Last the output (n,) that each state moves most; the states are in the order of these.
     """
     n, vectors, sizes, channels = K.nstates, [], [], []
     values, V = la.eig(K.A)
@@ -281,7 +266,7 @@ class Objective:
     omega: Array
     sharpness: float
     accuracy: float
-    narrow: float = SETTINGS.narrow
+    settings: FixedOrderSettings = SETTINGS
 
     def value(self, x: Array) -> tuple[float, Array]:
         """log of the smoothed peak and its slope; inf where the loop is unstable."""
@@ -292,8 +277,8 @@ class Objective:
             return np.inf, np.zeros(x.size)
         if not closed.is_stable():
             return np.inf, np.zeros(x.size)
-        # A grid cannot follow modes narrower than its steps; descent would hide peaks there.
-        narrow = resonances(closed.poles(), light=self.narrow)
+        # Narrow modes move from step to step; on the grid alone descent would hide their peaks between its points.
+        narrow = resonances(closed.poles(), damping=self.settings.narrow)
         omega = np.concatenate([self.omega, narrow])
         n_u, n_y = K.noutputs, K.ninputs
         p = np.concatenate([self.response, self.P.frequency_response(narrow)])
@@ -328,15 +313,16 @@ class Objective:
         return total, self.form.slope(slope)
 
     def _highest(self, M: Array) -> tuple[Array, UpperBound]:
-        """The frequencies that count in the smoothed maximum, and the bounds of mu there; M (n_omega, n_z, n_w).
+        """Indices of the frequencies that count in the smoothed maximum, and the bounds of mu there.
 
-        The norm after Osborne's scaling, which is cheap and no less than the bound, tells which ones cannot.
+        M (n_omega, n_z, n_w). The norm after Osborne's scaling is cheap and no less than the bound: where it is small,
+        the frequency does not count.
         """
         d_z, d_w = expand(self.structure, block_balance(M[:, None], self.structure))
         size = np.linalg.norm(M * d_z[:, :, None] / d_w[:, None, :], ord=2, axis=(1, 2))
-        first = np.argsort(size)[-LOOKED_AT_FIRST:]
+        first = np.argsort(size)[-self.settings.first:]
         top = float(np.max(upper_bound(M[first][:, None], self.structure, self.accuracy).beta))
-        near = np.flatnonzero(size >= top * np.exp(-NEGLIGIBLE / self.sharpness))
+        near = np.flatnonzero(size >= top * self.settings.negligible ** (1 / self.sharpness))
         return near, upper_bound(M[near][:, None], self.structure, self.accuracy)
 
     @property

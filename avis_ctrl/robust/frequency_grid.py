@@ -30,11 +30,11 @@ def frequency_grid(system: StateSpace, change: float = 1e-3) -> np.ndarray:
     return merged(np.concatenate([even, ends]), resonances(poles, low, high))
 
 
-def resonances(poles: np.ndarray, low: float = 0.0, high: float = np.inf, light: float = 0.4) -> np.ndarray:
-    """Peaks of modes [rad/s] with a damping ratio below `light`, with points at half a bandwidth to either side."""
-    light_ones = poles[(poles.imag > 0) & (np.abs(poles.real) < light * np.abs(poles))]
-    centre = np.sqrt(np.maximum(np.abs(light_ones) ** 2 - 2 * light_ones.real ** 2, 0.0))
-    points = np.concatenate([centre, centre + light_ones.real, centre - light_ones.real])
+def resonances(poles: np.ndarray, low: float = 0.0, high: float = np.inf, damping: float = 0.4) -> np.ndarray:
+    """Peaks of modes [rad/s] with a damping ratio below `damping`, with points at half a bandwidth to either side."""
+    light = poles[(poles.imag > 0) & (np.abs(poles.real) < damping * np.abs(poles))]
+    centre = np.sqrt(np.maximum(np.abs(light) ** 2 - 2 * light.real ** 2, 0.0))
+    points = np.concatenate([centre, centre + light.real, centre - light.real])
     return points[(points > low) & (points < high)]
 
 

@@ -142,8 +142,7 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
         assert current.best is not None
         best, notes = current.best, tuple[str, ...]()
         if apart or (order is not None and best.K.nstates > order):
-            K, peak = fixed_order(problem.P, complexified, [best.K], best.K.nstates if order is None else order,
-                                  apart)
+            K, peak = fixed_order(problem.P, complexified, best.K, best.K.nstates if order is None else order, apart)
             notes = (f"{structure}, order {K.nstates} instead of {best.K.nstates}: complex mu on the grid {peak:.4g} "
                      f"instead of {best.mu:.4g}",)
             best = Loop(K, best.scalings, np.nan, peak)

@@ -27,7 +27,7 @@ from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
 from avis_ctrl.robust.gamma_descent import ScaledProblem, descend, grown
 from avis_ctrl.robust.hinfsyn import Synthesis, hinfsyn
 from avis_ctrl.robust.mu_upper import upper_bound
-from avis_ctrl.robust.musyn_state import DONE, GIVEN, NOMINAL, Iteration, Loop, State, analysed
+from avis_ctrl.robust.musyn_state import DONE, GIVEN, HINF, NOMINAL, Iteration, Loop, State, analysed
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -146,7 +146,7 @@ def _candidates(problem: Problem, starts: tuple[StateSpace, ...],
         return hinfsyn(P, problem.nmeas, problem.ncon, backoff=options.backoff).K
     performance = problem.structure.blocks[-1]
     n_z, n_w = problem.structure.n_z - performance.cols, problem.structure.n_w - performance.rows
-    made: list[tuple[str, Callable[[], StateSpace]]] = [("H-infinity", lambda: optimal(problem.P))]
+    made: list[tuple[str, Callable[[], StateSpace]]] = [(HINF, lambda: optimal(problem.P))]
     if n_w:
         made.append((NOMINAL, lambda: optimal(problem.P.select(slice(n_z, None), slice(n_w, None)))))
     return made + [(GIVEN, partial(_itself, K)) for K in starts]

@@ -20,8 +20,9 @@ VERSION = 4
 DONE = "done"
 GIVEN = "given"
 NOMINAL = "nominal"
+HINF = "H-infinity"
 # Kinds of the controllers that the iteration starts from.
-STARTS = ("H-infinity", NOMINAL, GIVEN)
+STARTS = (HINF, NOMINAL, GIVEN)
 
 
 @dataclass(frozen=True)

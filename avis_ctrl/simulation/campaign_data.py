@@ -68,7 +68,7 @@ def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig
     rig : as its file has it; sensors, converter, delay, limits and levels are its.
     seed : of all signals, floors and noise; the same seed gives the same campaign.
     truth : the table that moves; `rig` by default (`perturbed_truth` makes one).
-    change : of the sensor signals by effects that neither has.
+    change : what the effects of the plan add to the sensor signals; required where the plan has effects.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError("expected a whole number, 0 or more", field="seed", value=seed)
     if plan.effect and change is None:
-        raise InputError("expected the change of the signals by the effects of the plan (study.hidden_effects)",
+        raise InputError("expected what the effects of the plan add to the signals, as by study.hidden_effects",
                          field="change")
     loop = open_loop(rig, plan).with_plant("truth", truth)
     if truth is not None and truth.sensors() != rig.sensors():

@@ -34,7 +34,7 @@ class Rehearsal:
 
     truth : the table that moved. true_values : the parameters that were changed, by flat name.
     factors : true over file's value of each whose value in the file is not zero.
-    effects : what the table has beside them, and no rig file can hold.
+    effects : of the table; a rig file does not contain them.
     """
 
     campaign: Campaign
@@ -47,8 +47,9 @@ class Rehearsal:
         """The truth as a rig file, the changed lines marked with the change."""
         values = {name: f"{name} x {factor:.6f}" for name, factor in self.factors.items()}
         header = ["The simulated table of a campaign: the values that an identification should find."]
-        header += [f"Its effects that a rig file does not contain: {one.name}, {one.place or 'everywhere'}, "
-                   + ", ".join(f"{name} = {value:g}" for name, value in one.values.items()) for one in self.effects]
+        for one in self.effects:
+            said = [one.name, one.place, *(f"{name} = {value:g}" for name, value in one.values.items())]
+            header.append("An effect that a rig file does not contain: " + ", ".join(filter(None, said)))
         return rig_toml(self.truth, values, "\n".join(header))
 
 

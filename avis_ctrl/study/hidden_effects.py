@@ -1,4 +1,4 @@
-"""Effects in a simulated campaign that the rig file does not contain: what a search for them is tested on."""
+"""Simulated campaigns with effects that the rig file does not contain, to test the search for them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.model_files import effect_at
 from avis_ctrl.gap.simulation import simulate
-from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_data import Progress, SensorChange, open_loop
@@ -18,18 +18,18 @@ from avis_ctrl.simulation.campaign_plan import CampaignPlan, EffectPlan
 from avis_ctrl.simulation.rehearsal import Rehearsal, rehearse
 
 
-def rehearsed(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | None = None) -> Rehearsal:
-    """The campaign of a plan on the perturbed table, with the plan's effects; raises as `rehearse` and below."""
+def rehearse_with_effects(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | None = None) -> Rehearsal:
+    """The campaign of a plan on the perturbed table, with its effects; raises as `rehearse` and `hidden_effects`."""
+    if not plan.effect:
+        return rehearse(rig, plan, seed, progress)
     corner = open_loop(rig, plan).amplifier_corner_Hz
-    hidden = partial(hidden_effects, plan.effect, amplifier_corner_Hz=corner) if plan.effect else None
-    return rehearse(rig, plan, seed, progress, hidden)
+    return rehearse(rig, plan, seed, progress, partial(hidden_effects, plan.effect, amplifier_corner_Hz=corner))
 
 
 def hidden_effects(plans: Sequence[EffectPlan], truth: Rig, amplifier_corner_Hz: float | None = None) -> SensorChange:
     """What the effects of a plan add to the sensor signals of a table.
 
-    The signals of the table with the effects less those without them, both by `gap.simulation`: linear about rest, but
-    for the forces and voltages of the effects.
+    The difference of two simulations of the linearised table by `gap.simulation`, with and without the effects.
 
     Raises
     ------
@@ -47,23 +47,21 @@ def hidden_effects(plans: Sequence[EffectPlan], truth: Rig, amplifier_corner_Hz:
 
 
 def _active(model: TableModel, plan: EffectPlan, field: str) -> ActiveEffect:
-    """The effect of a plan; parameters that the plan leaves out have the first value of a search."""
-    effect = effect_at(model, plan.name, plan.place, field)
-    place = plan.place or effect.places(model)[0]
-    parameters = effect.parameters(model, place)
+    """The effect of a plan; parameters that the plan leaves out keep the first starting value of a search."""
+    effect, place = effect_at(model, plan.name, plan.place or None, field)
+    begun = active(effect, model, place)
+    known = {one.name: one for one in begun.parameters}
     for name, value in plan.values.items():
-        known = next((one for one in parameters if one.name == name), None)
-        if known is None:
+        if name not in known:
             listed = ", ".join(f"{one.name} ({one.description}; {one.low:g} to {one.high:g} {one.unit})"
-                               for one in parameters)
+                               for one in begun.parameters)
             raise InputError(f"expected parameters of this effect: {listed}", field=f"{field}.values", value=name)
-        if not known.low <= value <= known.high:
-            raise InputError(f"expected {known.low:g} to {known.high:g} {known.unit}", field=f"{field}.values.{name}",
+        one = known[name]
+        if not one.low <= value <= one.high:
+            raise InputError(f"expected {one.low:g} to {one.high:g} {one.unit}", field=f"{field}.values.{name}",
                              value=value)
-    start = effect.starts(model, place)[0]
-    values = [plan.values.get(one.name, float(first)) for one, first in zip(parameters, start, strict=True)]
-    if all(value == one.none for one, value in zip(parameters, values, strict=True) if one.linear or not plan.values):
-        listed = ", ".join(one.name for one in parameters)
-        raise InputError(f"expected a value with an effect; the parameters are {listed}", field=f"{field}.values",
-                         value=plan.values)
-    return ActiveEffect(effect, place, parameters, tuple(values))
+    values = begun.by_name | plan.values
+    if all(values[name] == one.none for name, one in known.items() if one.linear or not plan.values):
+        raise InputError(f"expected a value with an effect; the parameters are {', '.join(known)}",
+                         field=f"{field}.values", value=plan.values)
+    return begun.at(list(values.values()))

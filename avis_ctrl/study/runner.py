@@ -34,9 +34,7 @@ from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
 SAMPLES = 60
-
-
-# Entered around the D-K iteration; what it gives is asked after each step whether the user has had enough.
+# Entered around the D-K iteration; gives a function that is called after each step and returns whether to stop.
 Stop = AbstractContextManager[Callable[[], bool]]
 NEVER: Stop = nullcontext(lambda: False)
 
@@ -89,14 +87,14 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress 
 
         def shown(row: Any) -> bool:
             """After each iteration; False ends it."""
-            onward = row.kind in STARTS or not asked()
             if row.kind in STARTS:
                 progress(f"controller to start from ({row.kind}): peak mu {row.mu_upper:.5g}, order {row.order}")
-            else:
-                progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, order "
-                         f"{row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
-            return onward
-        with stop as asked:
+                return True
+            ends = enough()  # before the line: from when it is seen, Ctrl-C keeps this controller
+            progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, order "
+                     f"{row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
+            return not ends
+        with stop as enough:
             mu, made = mu_optimal(design, plant, rig, shown, rivals)
         progress(mu.notes[-1])
         return [mu, *rivals, passive()], failed, made

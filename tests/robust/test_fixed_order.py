@@ -56,7 +56,7 @@ def test_slope_is_that_of_differences(full, states):
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_less_states_than_the_full_controller_and_less_mu_than_its_truncation(full, order):
     P, _, made = full
-    K, on_grid = fixed_order(P, ONE_DRIVE, [made.K], order)
+    K, on_grid = fixed_order(P, ONE_DRIVE, made.K, order)
     assert K.nstates <= order
     reached = peak_by_slicot(lft_lower(P, K))
     assert reached == pytest.approx(on_grid, rel=0.01)

@@ -14,7 +14,7 @@ from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.equipment import Electronics
 from avis_ctrl.simulation.rehearsal import rehearse
 from avis_ctrl.study.gap import find_gap
-from avis_ctrl.study.hidden_effects import rehearsed
+from avis_ctrl.study.hidden_effects import rehearse_with_effects
 from avis_ctrl.study.plan_file import plan_from_table, plan_toml, read_plan
 
 RIG = load_rig("avis")
@@ -24,7 +24,7 @@ QUIET = {"duration_s": 8.0, "settle_s": 2.0, "ambient": {"velocity_rms_m_per_s":
 
 
 def signals(*effects, **changed):
-    return [one.y for one in rehearsed(RIG, plan_from_table(QUIET | {"effect": list(effects)} | changed), 4
+    return [one.y for one in rehearse_with_effects(RIG, plan_from_table(QUIET | {"effect": list(effects)} | changed), 4
                                        ).campaign.records]
 
 
@@ -127,7 +127,7 @@ def test_an_effect_is_named_behind_an_anti_alias_filter(effect, parameter, true)
     plan = {"duration_s": 30.0, "band_Hz": [0.5, 60.0], "floor_sensor": {"recorded": False}, "effect": [effect],
             "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
             "record": [{"excitation": "noise", "level_V": level, "records": 2} for level in (0.08, 0.2, 0.4)]}
-    gap = find_gap(rehearsed(rig, plan_from_table(plan), 4).campaign, rig).gap
+    gap = find_gap(rehearse_with_effects(rig, plan_from_table(plan), 4).campaign, rig).gap
     assert [one.name for one in gap.effects] == [effect["name"]] and gap.verdict == "explained"
     found = gap.effects[0].parameters[parameter]
     assert found.value == pytest.approx(true, abs=3 * found.std)
