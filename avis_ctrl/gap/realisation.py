@@ -15,7 +15,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.drives import time_constants
-from avis_ctrl.gap.effects.sensors import GRAVITY, suspensions
+from avis_ctrl.gap.effects.sensors import suspensions
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.state_space import SETTINGS, ReducedTable, addition, chassis, has_addition
 from avis_ctrl.gap.table_model import TableModel
@@ -24,7 +24,7 @@ from avis_ctrl.lti.connect import connect
 from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.actuator import pade_delay, zero_order_hold
-from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.rigs.rigid_body import COORDINATES, GRAVITY
 from avis_ctrl.uncertainty.uncertain_rig import edge_name, uncertain_rig
 
 FLOOR = ("vx", "vy", "vz")

@@ -102,6 +102,25 @@ def minimal(system: StateSpace, tolerance: float = 1e-9) -> StateSpace:
     return replace(system, A=W.T @ A @ W, B=W.T @ B, C=C @ W, states=())
 
 
+def with_rate_input(system: StateSpace, name: str, times: int) -> StateSpace:
+    """A system of one input u with a second one, v, that acts as u = v/s^times, without an integrator.
+
+    C inv(s - A) B/s = C inv(s - A) inv(A) B where the system has a zero at s = 0: each one takes an integration.
+
+    Raises InputError where the system has fewer zeros there, or a pole.
+    """
+    B, D, size = system.B, system.D, float(np.max(np.abs(system.frequency_response([1.0]))))
+    for _ in range(times):
+        try:
+            B = np.linalg.solve(system.A, B)
+        except np.linalg.LinAlgError as error:
+            raise InputError("a pole at zero frequency", field="rate input", value=name) from error
+        if abs((D - system.C @ B).item()) > 1e-6 * size:
+            raise InputError(f"expected {times} zeros at zero frequency", field="rate input", value=name)
+        D = np.zeros((1, 1))
+    return replace(system, B=np.hstack([system.B, B]), D=np.hstack([system.D, D]), inputs=(*system.inputs, name))
+
+
 def discretise(system: StateSpace, dt: float, method: Literal["zoh", "tustin"] = "tustin") -> StateSpace:
     """Sampled system of period dt [s]: zero-order hold on the inputs ("zoh"), or the bilinear map ("tustin").
 

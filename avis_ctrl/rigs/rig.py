@@ -15,7 +15,7 @@ from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
 from avis_ctrl.rigs.instruments import FloorSensor, Sensor, Tolerances
 from avis_ctrl.rigs.mounted_body import MountedBody
-from avis_ctrl.rigs.rigid_body import EquationsOfMotion, point_map
+from avis_ctrl.rigs.rigid_body import EquationsOfMotion, point_map, tilt_row
 
 
 @dataclass(frozen=True)
@@ -143,6 +143,10 @@ class Rig(ABC):
         """Sensor names and the (n, 6) matrix from q to the displacement along each sensor's axis."""
         axes = self.sensor_axes()
         return tuple(axes), np.array([direction @ point_map(place) for place, direction in axes.values()])
+
+    def tilt_rows(self) -> np.ndarray:
+        """(n, 6) from q to the acceleration that gravity feigns to each sensor; zero for those against the chassis."""
+        return np.array([one.inertial * tilt_row(one.direction) for one in self.sensors()])
 
     def with_parameters(self, changes: Mapping[str, float]) -> Self:
         """The rig with some parameters changed.

@@ -17,6 +17,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace
 
 COORDINATES = ("x", "y", "z", "phi_x", "phi_y", "phi_z")
+# Standard acceleration of gravity [m/s^2] (CGPM 1901).
+GRAVITY = 9.80665
 
 
 def cross_matrix(r: ArrayLike) -> np.ndarray:
@@ -29,6 +31,15 @@ def point_map(p: ArrayLike) -> np.ndarray:
     """G(p) = [I, -S(p)], (3, 6): displacement of the body-fixed point p [m] for a small motion q."""
     x, y, z = np.asarray(p)
     return np.array([[1.0, 0.0, 0.0, 0.0, z, -y], [0.0, 1.0, 0.0, -z, 0.0, x], [0.0, 0.0, 1.0, y, -x, 0.0]])
+
+
+def tilt_row(direction: ArrayLike) -> np.ndarray:
+    """(6,) acceleration per unit of q that gravity feigns to a proof mass moving along a body-fixed unit direction d.
+
+    A turned body lays d over by phi x d: the mass feels d . (a + g e_z), in which g e_z . (phi x d) is new.
+    """
+    x, y, _ = np.asarray(direction)
+    return GRAVITY * np.array([0.0, 0.0, 0.0, y, -x, 0.0])
 
 
 def rotation_matrix(angles: ArrayLike) -> np.ndarray:

@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
-G = 9.80665
+from avis_ctrl.rigs.rigid_body import GRAVITY
+
+G = GRAVITY
 INCH = 0.0254
 KILO = 1e3
 # Unit at the end of a key, with units used by mistake: (factor to the key's unit, the unit that was meant), the most

@@ -13,12 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.cluster.hierarchy as hierarchy
 import scipy.optimize as so
 
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.dscale_fit import fit_magnitude
 from avis_ctrl.robust.dscale_matrix import fit_hermitian
-from avis_ctrl.robust.gamma_descent import free_parameters, parameter_box, parameters, with_parameters
+from avis_ctrl.robust.gamma_descent import parameter_box, parameters, with_parameters
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.scalings import MAX_ORDER, MatrixScaling, Part, ScalarScaling, Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
@@ -34,6 +35,17 @@ BROAD_FLOOR, DETAILED_FLOOR = 0.5, 0.3
 # Points of the check between the grid's, and the excess there that sends its peaks back into the grid.
 CHECKED_POINTS = 400
 BETWEEN = 1.02
+
+
+@dataclass(frozen=True)
+class GroupSettings:
+    """groups : of many blocks, those whose best scalings have the most similar course over frequency share their roots:
+    one root of each would add more states than the plant has. Their gains remain their own."""
+
+    groups: int = 4
+
+
+GROUPS = GroupSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +225,7 @@ def _evaluated(points: PointwiseScalings, scalings: Scalings) -> DStep:
 
 
 def _constants(points: PointwiseScalings) -> Scalings:
-    """Constant scalings from the frequencies near the peak."""
+    """Constant scalings from the frequencies near the peak, in groups."""
     weight = _closeness(points)
     parts = list(Scalings.identity(points.structure).parts)
     for k in range(len(parts) - 1):
@@ -221,45 +233,66 @@ def _constants(points: PointwiseScalings) -> Scalings:
             parts[k] = fit_hermitian(points.omega, points.shape(k), 0, weight, MATRIX_FIT_TOLERANCE).scaling
         d = fit_magnitude(points.omega, np.exp(points.log_d[:, k]), 0, weight).scaling
         parts[k] = parts[k].with_scalar(d)
-    return Scalings(points.structure, tuple(parts))
+    return Scalings(points.structure, tuple(parts), _groups(points))
 
 
-def _raised(points: PointwiseScalings, step: DStep, blocks: np.ndarray, max_states: int, by: int,
+def _groups(points: PointwiseScalings) -> tuple[int, ...]:
+    """Number of the group of each block; empty where there are few blocks, or repeated ones."""
+    n = len(points.structure.blocks) - 1
+    if not points.structure.many or points.X:
+        return ()
+    weight = _closeness(points)[:, None]
+    course = points.log_d[:, :n] - np.average(points.log_d[:, :n], axis=0, weights=weight[:, 0])
+    tree = hierarchy.linkage((np.sqrt(weight) * course).T, "ward")
+    return (*hierarchy.fcluster(tree, GROUPS.groups, "maxclust").tolist(), 0)
+
+
+def _raised(points: PointwiseScalings, step: DStep, groups: np.ndarray, max_states: int, by: int,
             matrices: bool) -> DStep | None:
-    """The step with some blocks refitted at a higher order and everything refined; None where they may not grow.
+    """The step with some groups refitted at a higher order and everything refined; None where they may not grow.
 
     matrices : raise the orders of repeated blocks by matrices of that order, instead of by their scalar factors.
     """
     scalings = step.scalings
-    if matrices and not any(k in points.X for k in blocks):
+    members = [scalings.members[number] for number in groups]
+    if matrices and not any(k in points.X for blocks in members for k in blocks):
         return None
-    for k in blocks:
+    for blocks in members:
+        k = blocks[0]
         part = scalings.parts[k]
         if matrices and isinstance(part, MatrixScaling):
             order = part.order // points.structure.blocks[k].rows + by
             if order > MAX_ORDER // 2:
                 return None
-            weight = _sensitivity(points, step.scalings, k)
+            weight = _sensitivities(points, step.scalings)[:, k]
             part = fit_hermitian(points.omega, points.X[k], order, weight, MATRIX_FIT_TOLERANCE).scaling
         else:
             order = part.scalar.order + by
             if order > MAX_ORDER:
                 return None
-            part = _fitted(points, step.scalings, k, order)
+            for k, part in zip(blocks, _fitted(points, step.scalings, blocks, order), strict=True):
+                scalings = scalings.replace(k, part)
+            continue
         scalings = scalings.replace(k, part)
     if scalings.added_states > max_states:
         return None
     return _evaluated(points, _refined(points, scalings))
 
 
-def _fitted(points: PointwiseScalings, scalings: Scalings, k: int, order: int) -> Part:
-    """Block k with d(s) fitted to its best scalings at each frequency, weighted by what a misfit costs."""
-    part, target = scalings.parts[k], points.log_d[:, k]
+def _fitted(points: PointwiseScalings, scalings: Scalings, blocks: tuple[int, ...], order: int) -> list[Part]:
+    """A group's blocks with d(s) fitted to their best scalings at each frequency, weighted by what a misfit costs."""
+    weights = _sensitivities(points, scalings)[:, blocks]
+    part, target = scalings.parts[blocks[0]], points.log_d[:, blocks]
     if isinstance(part, MatrixScaling):
         size = np.linalg.norm(part.system.frequency_response(points.omega), axis=(1, 2))
-        target = target - np.log(size / np.sqrt(part.system.ninputs))
-    fit = fit_magnitude(points.omega, np.exp(target), order, _sensitivity(points, scalings, k), FIT_TOLERANCE)
-    return part.with_scalar(fit.scaling.within(band_of(points.omega)))
+        target = target - np.log(size / np.sqrt(part.system.ninputs))[:, None]
+    # What is left of each where the course of all is taken away is its gain.
+    own = np.average(target, axis=0, weights=weights) if len(blocks) > 1 else np.zeros(1)
+    common = np.average(target - own, axis=1, weights=weights)
+    fit = fit_magnitude(points.omega, np.exp(common), order, np.max(weights, axis=1), FIT_TOLERANCE)
+    theta = fit.scaling.within(band_of(points.omega)).theta
+    return [scalings.parts[k].with_scalar(ScalarScaling(np.r_[theta[0] + gain, theta[1:]]))
+            for k, gain in zip(blocks, own, strict=True)]
 
 
 def _closeness(points: PointwiseScalings) -> np.ndarray:
@@ -268,18 +301,18 @@ def _closeness(points: PointwiseScalings) -> np.ndarray:
     return 0.03 / (0.03 + room)
 
 
-def _sensitivity(points: PointwiseScalings, scalings: Scalings, k: int) -> np.ndarray:
-    """What a misfit of block k costs: closeness to the peak times the block's share in the singular vectors."""
+def _sensitivities(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
+    """(n_omega, n_blocks) what a misfit costs: closeness to the peak times the share in the singular vectors."""
     left, right = scalings.response(points.omega)
     U, _, Vh = np.linalg.svd(left @ points.M @ right)
-    _, w, z = list(points.structure.slices())[k]
-    share = np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
-    weight = _closeness(points) * np.maximum(share / np.max(share), 1e-2)
-    return np.maximum(weight / np.max(weight), 1e-3)
+    share = np.stack([np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
+                      for _, w, z in points.structure.slices()], axis=1)
+    weight = _closeness(points)[:, None] * np.maximum(share / np.max(share, axis=0), 1e-2)
+    return np.maximum(weight / np.max(weight, axis=0), 1e-3)
 
 
 def _blame(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
-    """How much of the excess over the peak each block's misfit explains (n_blocks,), to first order."""
+    """How much of the excess over the peak each group's misfit explains (n_groups,), to first order."""
     left, right = scalings.response(points.omega)
     U, s, Vh = np.linalg.svd(left @ points.M @ right)
     excess = np.maximum(np.log(s[:, 0] / points.yardstick), 0.0)
@@ -296,13 +329,12 @@ def _blame(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
             distance = np.max(np.abs(np.log(np.abs(np.linalg.eigvals(ratio)))), axis=1)
             weight = np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
             share[k] = float(np.max(excess * weight * distance)) / 2
-    share[-1] = 0.0
-    return share
+    return np.array([np.sum(share[list(blocks)]) for blocks in scalings.members])
 
 
 def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 5) -> Scalings:
     """Sequential linear programs in a trust region on max over frequency of log sigma_max(D N D^-1)."""
-    if not free_parameters(scalings):
+    if len(scalings.parts) < 2:
         return scalings
     box = np.array(parameter_box(scalings, band_of(points.omega)))
     theta, radius = np.clip(parameters(scalings), box[:, 0], box[:, 1]), 0.5
@@ -334,13 +366,12 @@ def _linearised(points: PointwiseScalings, scalings: Scalings, kept: int = 3) ->
     top = np.argwhere(log_s - log_ref[:, None] > np.max(log_s[:, 0] - log_ref) - 0.7)
     at, which = top[:, 0], top[:, 1]
     u, v = np.swapaxes(U, 1, 2)[at, which], Vh[at, which]
-    columns = []
-    places = list(points.structure.slices())
-    for k in free_parameters(scalings):
-        _, w, z = places[k]
+    places = scalings.places()
+    slopes = np.zeros((at.size, 1 + max(int(own.max()) for own in places)))
+    for (_, w, z), part, own in zip(points.structure.slices(), scalings.parts, places, strict=False):
         slope = np.sum(np.abs(u[:, z]) ** 2, axis=1) - np.sum(np.abs(v[:, w]) ** 2, axis=1)
-        columns.append(slope[:, None] * scalings.parts[k].scalar.jacobian(points.omega)[at])
-    return (log_s - log_ref[:, None])[at, which], np.hstack(columns)
+        slopes[:, own] += slope[:, None] * part.scalar.jacobian(points.omega)[at]
+    return (log_s - log_ref[:, None])[at, which], slopes
 
 
 def _trust_step(values: np.ndarray, slopes: np.ndarray, low: np.ndarray,

@@ -71,24 +71,19 @@ class Descent:
     evaluations: int
 
 
-def free_parameters(scalings: Scalings) -> tuple[int, ...]:
-    """Blocks whose scaling, or its scalar factor, may move: all but the performance block, whose d is one."""
-    return tuple(range(len(scalings.parts) - 1))
-
-
 def parameters(scalings: Scalings) -> np.ndarray:
-    """theta of all free scalings in a row."""
-    return np.concatenate([scalings.parts[k].scalar.theta for k in free_parameters(scalings)])
+    """theta of all free scalings in a row; what the scalings of a group have in common is there once."""
+    places = scalings.places()
+    theta = np.zeros(1 + max((int(at.max()) for at in places), default=-1))
+    for part, at in zip(scalings.parts, places, strict=False):
+        theta[at] = part.scalar.theta
+    return theta
 
 
 def with_parameters(scalings: Scalings, theta: np.ndarray) -> Scalings:
     """The scalings moved to theta."""
-    start = 0
-    for k in free_parameters(scalings):
-        part = scalings.parts[k]
-        size = part.scalar.theta.size
-        scalings = scalings.replace(k, part.with_scalar(ScalarScaling(theta[start:start + size])))
-        start += size
+    for k, at in enumerate(scalings.places()):
+        scalings = scalings.replace(k, scalings.parts[k].with_scalar(ScalarScaling(theta[at])))
     return scalings
 
 
@@ -235,8 +230,9 @@ def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[
     problem = ScaledProblem.of(P, nmeas, ncon)
     places = np.geomspace(*band, max(3, int(2 * np.log10(band[1] / band[0]))))[1:-1]
     room = max_states - scalings.added_states
-    free = [k for k in free_parameters(scalings) if scalings.parts[k].scalar.order < MAX_ORDER
-            and scalings.structure.blocks[k].rows + scalings.structure.blocks[k].cols <= room]
+    blocks = scalings.structure.blocks
+    free = [group for group in scalings.members if scalings.parts[group[0]].scalar.order < MAX_ORDER
+            and sum(blocks[k].rows + blocks[k].cols for k in group) <= room]
     if not free:
         return None
     slopes = np.array([_neutral_slopes(problem, scalings, free, place) for place in places])
@@ -246,30 +242,39 @@ def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[
     strength = np.abs(slopes[best, range(len(free))])
     for threshold in (share, 0.999):
         larger = scalings
-        for at, k, size in zip(best, free, strength, strict=True):
-            part = scalings.parts[k]
+        for number, (at, group, size) in enumerate(zip(best, free, strength, strict=True)):
             if size >= threshold * np.max(strength):
-                split = -0.02 * np.sign(slopes[at, free.index(k)])
-                larger = larger.replace(k, part.with_scalar(part.scalar.with_neutral_pair(places[at], split)))
+                split = -0.02 * np.sign(slopes[at, number])
+                larger = _with_pair(larger, group, places[at], split)
         if larger.added_states <= max_states:
             return larger
     return None
 
 
-def _neutral_slopes(problem: ScaledProblem, scalings: Scalings, free: list[int], place: float) -> np.ndarray:
-    """d log gamma / d split of a neutral pair at a frequency, for each block."""
+def _with_pair(scalings: Scalings, group: tuple[int, ...], place: float, split: float = 0.0) -> Scalings:
+    """The scalings with a neutral pair in each block of a group."""
+    for k in group:
+        part = scalings.parts[k]
+        scalings = scalings.replace(k, part.with_scalar(part.scalar.with_neutral_pair(place, split)))
+    return scalings
+
+
+def _neutral_slopes(problem: ScaledProblem, scalings: Scalings, free: list[tuple[int, ...]], place: float
+                    ) -> np.ndarray:
+    """d log gamma / d split of a neutral pair at a frequency, for each group of blocks."""
     base = scalings
-    for k in free:
-        part = base.parts[k]
-        base = base.replace(k, part.with_scalar(part.scalar.with_neutral_pair(place)))
+    for group in free:
+        base = _with_pair(base, group, place)
     try:
         slope, gamma, of_gamma = _coupling(problem, base, None)
     except ComputationError:
         return np.zeros(len(free))
     result = np.zeros(len(free))
-    for at, k in enumerate(free):
-        part = scalings.parts[k]
-        moved = base.replace(k, part.with_scalar(part.scalar.with_neutral_pair(place, STEP)))
+    for at, group in enumerate(free):
+        moved = base
+        for k in group:
+            part = scalings.parts[k]
+            moved = moved.replace(k, part.with_scalar(part.scalar.with_neutral_pair(place, STEP)))
         result[at] = -slope.along(problem.normal(moved).plant, gamma) / STEP / of_gamma / gamma
     return result
 
@@ -278,9 +283,11 @@ def parameter_box(scalings: Scalings, band: tuple[float, float]) -> list[tuple[f
     """Bounds: gains within 1e-6..1e6 of where they are, roots in the band, damping from 0.05 to 50."""
     box: list[tuple[float, float]] = []
     slow, fast = np.log(band[0]), np.log(band[1])
-    for k in free_parameters(scalings):
+    for k, at in enumerate(scalings.places()):
         part = scalings.parts[k].scalar
         box.append((part.theta[0] - np.log(1e6), part.theta[0] + np.log(1e6)))
+        if at[-1] != at[0] + part.theta.size - 1:  # the roots are those of an earlier block
+            continue
         for _ in range(2):
             box += [(slow, fast), (np.log(0.05), np.log(50.0))] * (part.order // 2) + [(slow, fast)] * (part.order % 2)
     return box

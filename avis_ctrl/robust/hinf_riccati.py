@@ -19,7 +19,8 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import StateSpace, balance, hinf_norm, lft_lower
+from avis_ctrl.lti import StateSpace, balance, lft_lower
+from avis_ctrl.lti.norms import norm_is_below
 from avis_ctrl.robust.hinf_plant import NormalForm, Plant, pointwise
 from avis_ctrl.robust.hinf_settings import SETTINGS
 from avis_ctrl.robust.riccati import ROUND_OFF, refined_balanced, solve_riccati
@@ -125,7 +126,7 @@ def keeps(plant: Plant, test: GammaTest) -> bool:
         K = central_controller(form, test)
         P = StateSpace(plant.A, np.hstack([plant.B1, plant.B2]), np.vstack([plant.C1, plant.C2]),
                        np.block([[plant.D11, plant.D12], [plant.D21, plant.D22]]))
-        return hinf_norm(lft_lower(P, balance(K))).gain <= test.gamma * (1 + SETTINGS.norm_accuracy)
+        return norm_is_below(lft_lower(P, balance(K)), test.gamma * (1 + SETTINGS.norm_accuracy))
     except (ComputationError, InputError, np.linalg.LinAlgError):
         return False
 

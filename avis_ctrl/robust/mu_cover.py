@@ -25,7 +25,7 @@ import scipy.linalg as la
 
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.mu_lmi import Array, Scalings, dagger, residual
-from avis_ctrl.robust.mu_upper import upper_bound
+from avis_ctrl.robust.mu_upper import enough
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Interval = tuple[float, float]
@@ -155,7 +155,7 @@ def _one_round(N: StateSpace, structure: BlockStructure, scaled: Callable[[State
     gaps, state.gaps = state.gaps, []
     omega = np.array([_points(*gap) for gap in gaps])
     M = unit.frequency_response(omega.ravel()).reshape(*omega.shape, unit.noutputs, unit.ninputs)
-    shared = upper_bound(M, structure, max(slack / 5, 1e-4), 1.0)
+    shared = enough(M, structure, max(slack / 5, 1e-4), 1.0)
     open_gaps = []
     for k, gap in enumerate(gaps):
         if shared.beta[k] >= 1.0:

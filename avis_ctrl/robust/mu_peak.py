@@ -24,7 +24,7 @@ from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_lmi import Array, Scalings
 from avis_ctrl.robust.mu_lower import SETTINGS, LowerBound, lower_bound, singular_frequency
 from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
-from avis_ctrl.robust.mu_upper import UpperBound, skewed_upper_bound, upper_bound
+from avis_ctrl.robust.mu_upper import UpperBound, highest, skewed_upper_bound, upper_bound
 from avis_ctrl.robust.one_thread import one_thread
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
@@ -205,7 +205,7 @@ def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: fl
              known_upper: float | None = None, dt: float = 0.0) -> MuPeak:
     """mu_peak of a continuous system, or of the image of one sampled at dt."""
     accuracy = _tolerance(slack)
-    scan = _Scan.of(N, band, lambda M: upper_bound(M, structure, accuracy), slack)
+    scan = _Scan.of(N, band, lambda M: highest(M, structure, accuracy), slack)
     # One stage draws the curve; the search goes on at the peaks only.
     lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9, stages=1)
     if known_upper is not None and known_upper <= (1 + KNOWN_SLACK) * scan.level:

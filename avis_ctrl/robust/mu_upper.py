@@ -16,6 +16,8 @@ from avis_ctrl.robust.mu_lmi import Array, Scalings, ScalingSpace, dagger, follo
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 BATCH_BYTES = 64e6
+# Of many blocks, the matrices whose bound with one number a block is above this share of the largest get the full one.
+WORTH = 0.97
 
 
 class UpperBound(NamedTuple):
@@ -67,6 +69,36 @@ def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5,
              for k in range(0, M.shape[0], n_chunk)]
     return UpperBound(np.concatenate([p.beta for p in parts]),
                       Scalings(*(np.concatenate(s) for s in zip(*(p.scalings for p in parts), strict=True))))
+
+
+def enough(M: Array, structure: BlockStructure, tolerance: float, goal: float) -> UpperBound:
+    """`upper_bound` with a goal > 0; of many blocks first with one number each, in full where that is not enough."""
+    if not structure.many:
+        return upper_bound(M, structure, tolerance, goal)
+    found = upper_bound(M, structure.simplified(), tolerance, goal)
+    _improve(found, np.flatnonzero(found.beta >= goal), M, structure, tolerance, goal)
+    return found
+
+
+def highest(M: Array, structure: BlockStructure, tolerance: float) -> UpperBound:
+    """`upper_bound`; of many blocks in full only where that decides on the largest of all."""
+    if not structure.many:
+        return upper_bound(M, structure, tolerance)
+    found, full = upper_bound(M, structure.simplified(), tolerance), np.zeros(M.shape[0], bool)
+    while not full[np.argmax(found.beta)]:
+        left = np.flatnonzero(~full & (found.beta >= WORTH * np.max(found.beta)))
+        _improve(found, left, M, structure, tolerance)
+        full[left] = True
+    return found
+
+
+def _improve(found: UpperBound, which: Array, M: Array, structure: BlockStructure, tolerance: float,
+             goal: float = 0.0) -> None:
+    """Bounds of some matrices replaced by those with full scalings."""
+    if which.size:
+        better = upper_bound(M[which], structure, tolerance, goal)
+        for whole, part in zip((found.beta, *found.scalings), (better.beta, *better.scalings), strict=True):
+            whole[which] = part
 
 
 def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Array) -> UpperBound:

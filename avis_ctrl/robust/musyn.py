@@ -151,7 +151,8 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
 
 def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: int,
                 ncon: int) -> tuple[BlockStructure, BlockStructure]:
-    """The blocks as given with performance, and as the synthesis sees them (complex)."""
+    """The blocks as given with performance, and as the synthesis sees them: complex, and many of them with one number
+    for the scaling of each."""
     uncertainty = BlockStructure.of(blocks)
     n_w, n_z = P.ninputs - ncon - uncertainty.n_w, P.noutputs - nmeas - uncertainty.n_z
     if n_w < 1 or n_z < 1:
@@ -160,7 +161,7 @@ def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: 
             f"{P.ninputs - ncon} inputs (w_delta, w) and {P.noutputs - nmeas} outputs (z_delta, z); "
             "at least one of each must be left for performance", field="blocks")
     full = uncertainty.with_performance(n_w, n_z)
-    return full, full.complexified()
+    return full, full.simplified() if full.many else full.complexified()
 
 
 def _named(P: StateSpace, K: StateSpace, nmeas: int, ncon: int) -> StateSpace:

@@ -119,7 +119,13 @@ def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -
     the uncertainty is felt by a controller that does its work, while large uncertainty unscaled forbids any work.
     """
     state, failure = State(), None
-    for kind, make in _candidates(problem, starts, options):
+    many = problem.structure.many
+    candidates = _candidates(problem, starts, options)
+    # With many blocks unscaled, that of the plant as it is does nothing, and takes longest: only where the ones given,
+    # or that of the nominal plant, do not stabilise.
+    for kind, make in reversed(candidates) if many else candidates:
+        if many and kind != GIVEN and state.best is not None:
+            break
         began = time.monotonic()
         try:
             loop, points = _start(problem, make())

@@ -20,6 +20,8 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 # Beyond this a d(s) adds states to the controller faster than it lowers mu.
 MAX_ORDER = 6
+# Combinations of a group's signals that are smaller than this, relative to the largest, are round-off.
+RANK = 1e-10
 Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -259,10 +261,15 @@ Part = ScalarScaling | MatrixScaling
 
 @dataclass(frozen=True, eq=False)
 class Scalings:
-    """One scaling a block of the structure; the last block is the performance and has d = 1."""
+    """One scaling a block of the structure; the last block is the performance and has d = 1.
+
+    groups : number of the group of each block; the scalings of a group, all of them scalar, have the same roots, and
+        their signals share the states where they depend on each other. Empty: each block by itself.
+    """
 
     structure: BlockStructure
     parts: tuple[Part, ...]
+    groups: tuple[int, ...] = ()
 
     @staticmethod
     def identity(structure: BlockStructure) -> Scalings:
@@ -282,8 +289,30 @@ class Scalings:
         return tuple(part.order for part in self.parts)
 
     @property
+    def members(self) -> tuple[tuple[int, ...], ...]:
+        """The blocks of each group, all but the performance."""
+        found: dict[int, list[int]] = {}
+        for k in range(len(self.parts) - 1):
+            found.setdefault(self.groups[k] if self.groups else k, []).append(k)
+        return tuple(tuple(blocks) for blocks in found.values())
+
+    def places(self) -> list[np.ndarray]:
+        """Where each block but the performance has its parameters in the vector of all: its gain, then the roots, which
+        are those of its group."""
+        found: list[np.ndarray] = [np.zeros(0, int)] * (len(self.parts) - 1)
+        first = {k: blocks[0] for blocks in self.members for k in blocks}
+        size = 0
+        for k, part in enumerate(self.parts[:-1]):
+            own = 1 if first[k] != k else part.scalar.theta.size
+            found[k] = np.arange(size, size + own)
+            if first[k] != k:
+                found[k] = np.concatenate([found[k], found[first[k]][1:]])
+            size += own
+        return found
+
+    @property
     def added_states(self) -> int:
-        """States the scaled plant has more than the plant."""
+        """Most states the scaled plant has more than the plant."""
         return sum(part.order * (2 if isinstance(part, MatrixScaling) else block.rows + block.cols)
                    for part, block in zip(self.parts, self.structure.blocks, strict=True))
 
@@ -320,8 +349,8 @@ class Scalings:
     def scale(self, P: StateSpace) -> StateSpace:
         """diag(D_z, I) P diag(D_w^-1, I): the plant whose H-infinity problem is the K-step."""
         z, w = self.structure.n_z, self.structure.n_w
-        Al, Bl, Cl, Dl = self._diagonal(inverse=False)
-        Ar, Br, Cr, Dr = self._diagonal(inverse=True)
+        Al, Bl, Cl, Dl = self._diagonal(inverse=False, through=np.hstack([P.C, P.D])[:z])
+        Ar, Br, Cr, Dr = self._diagonal(inverse=True, through=np.vstack([P.B, P.D])[:, :w].T)
         C = np.vstack([Dl @ P.C[:z], P.C[z:]])
         B = np.hstack([P.B[:, :w] @ Dr, P.B[:, w:]])
         D = P.D.copy()
@@ -342,7 +371,8 @@ class Scalings:
 
     def as_dicts(self) -> list[dict[str, Any]]:
         """JSON form of the parts."""
-        return [part.as_dict() for part in self.parts]
+        groups = [{"group": number} for number in self.groups] or [{} for _ in self.parts]
+        return [part.as_dict() | group for part, group in zip(self.parts, groups, strict=True)]
 
     @staticmethod
     def from_dicts(structure: BlockStructure, items: Sequence[dict[str, Any]]) -> Scalings:
@@ -355,23 +385,42 @@ class Scalings:
             return MatrixScaling(StateSpace(np.reshape(item["A"], (n, n)), np.reshape(item["B"], (n, D.shape[1])),
                                             np.reshape(item["C"], (D.shape[0], n)), D),
                                  ScalarScaling(np.array(item["factor"])))
-        return Scalings(structure, tuple(part(item) for item in items))
+        return Scalings(structure, tuple(part(item) for item in items),
+                        tuple(int(item["group"]) for item in items if "group" in item))
 
-    def _diagonal(self, inverse: bool) -> Matrices:
-        """Block-diagonal A, B, C, D of D_z, or of the inverse of D_w."""
-        stack: list[Matrices] = []
-        for part, block in zip(self.parts, self.structure.blocks, strict=True):
-            one = part.inverse().matrices if inverse else part.matrices
-            copies = 1 if isinstance(part, MatrixScaling) else block.rows if inverse else block.cols
-            stack += [one] * copies
-        states, signals = sum(A.shape[0] for A, *_ in stack), sum(D.shape[0] for *_, D in stack)
-        whole = (np.zeros((states, states)), np.zeros((states, signals)), np.zeros((signals, states)),
-                 np.zeros((signals, signals)))
-        x = v = 0
-        for one in stack:
-            n, m = one[1].shape
-            at, to = slice(x, x + n), slice(v, v + m)
-            for target, place, matrix in zip(whole, ((at, at), (at, to), (to, at), (to, to)), one, strict=True):
-                target[place] = matrix
-            x, v = x + n, v + m
-        return whole
+    def _diagonal(self, inverse: bool, through: np.ndarray | None = None) -> Matrices:
+        """Block-diagonal A, B, C, D of D_z, or of the inverse of D_w.
+
+        through (n_signals, n) : what its signals are made of. Where those of a group depend on each other, d(s) is
+        realised once for each independent combination: exact for these signals only.
+        """
+        stack: list[tuple[np.ndarray, Matrices]] = []
+        at = [np.arange(w.start, w.stop) if inverse else np.arange(z.start, z.stop)
+              for _, w, z in self.structure.slices()]
+        parts = [part.inverse() if inverse else part for part in self.parts]
+        for blocks in (*self.members, (len(parts) - 1,)):
+            first = parts[blocks[0]]
+            if isinstance(first, MatrixScaling):
+                stack.append((at[blocks[0]], first.matrices))
+            elif len(blocks) == 1 or through is None:
+                stack += [([signal], parts[k].matrices) for k in blocks for signal in at[k]]
+            else:
+                # d_k(s) = g_k d(s) with d(inf) = 1
+                signals = np.concatenate([at[k] for k in blocks])
+                gains = np.exp(np.concatenate([np.full(at[k].size, parts[k].scalar.theta[0]) for k in blocks]))
+                U, sizes, _ = np.linalg.svd(gains[:, None] * through[signals], full_matrices=False)
+                U = U[:, sizes > RANK * sizes[0]]
+                common = ScalarScaling(np.concatenate([[0.0], first.scalar.theta[1:]])).matrices
+                a, b, c = (np.kron(one, np.eye(U.shape[1])) for one in common[:3])
+                own = (a, b @ (U.T * gains), U @ c, np.diag(gains)) if not inverse else (
+                    a, b @ U.T, gains[:, None] * (U @ c), np.diag(gains))
+                stack.append((signals, own))
+        states, signals_all = sum(one[0].shape[0] for _, one in stack), sum(len(to) for to, _ in stack)
+        A, B, C, D = (np.zeros(shape) for shape in ((states, states), (states, signals_all), (signals_all, states),
+                                                    (signals_all, signals_all)))
+        x = 0
+        for to, (a, b, c, d) in stack:
+            x_to = np.arange(x, x + a.shape[0])
+            A[np.ix_(x_to, x_to)], B[np.ix_(x_to, to)], C[np.ix_(to, x_to)], D[np.ix_(to, to)] = a, b, c, d
+            x += a.shape[0]
+        return A, B, C, D

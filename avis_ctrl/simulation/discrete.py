@@ -18,7 +18,7 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.connect import connect
-from avis_ctrl.lti.realisation import discretise
+from avis_ctrl.lti.realisation import discretise, with_rate_input
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.nonlinear import RigArrays, rig_arrays
@@ -107,15 +107,18 @@ def linear_part(loop: SampledLoop) -> StateSpace:
     """
     eom = loop.plant.mounted_body().equations_of_motion()
     sensor_names, H = loop.plant.sensor_rows()
-    parts = {"table": _table(eom, H, sensor_names, loop.sensors.quantities)}
+    tilt = loop.plant.tilt_rows() if loop.gravity else np.zeros_like(H)
+    parts = {"table": _table(eom, H, tilt, sensor_names, loop.sensors.quantities)}
     # Where drives couple, what leaves an amplifier is not yet what acts.
     made = eom.actuators if loop.drive_coupling is None else tuple(f"{name}_alone" for name in eom.actuators)
     for name, alone, drive in zip(eom.actuators, made, loop.drives(), strict=True):
         parts[f"drive {name}"] = drive.renamed([f"{name}_dac"], [alone])
     if loop.drive_coupling is not None:
         parts["drive coupling"] = loop.drive_coupling.renamed(list(made), list(eom.actuators))
-    for name, chain in zip(sensor_names, loop.sensors.chains, strict=True):
-        parts[f"sensor {name}"] = chain.renamed([f"{name}_motion"], [f"{name}_volt"])
+    for name, chain, kind in zip(sensor_names, loop.sensors.chains, loop.sensors.quantities, strict=True):
+        chain = chain.renamed([f"{name}_motion"], [f"{name}_volt"])
+        felt = loop.gravity and kind == "velocity"
+        parts[f"sensor {name}"] = with_rate_input(chain, f"{name}_tilt", 1) if felt else chain
     inputs = [f"{name}_dac" for name in eom.actuators]
     inputs += [f"floor_{c}_dot" for c in COORDINATES] + [f"excess_{c}" for c in COORDINATES]
     outputs = [*eom.actuators, *(f"{c}_ddot" for c in COORDINATES), *(f"{c}_dot" for c in COORDINATES),
@@ -123,8 +126,12 @@ def linear_part(loop: SampledLoop) -> StateSpace:
     return connect(parts, inputs, outputs)
 
 
-def _table(eom: EquationsOfMotion, H: np.ndarray, sensors: tuple[str, ...], quantities: tuple[str, ...]) -> StateSpace:
-    """M q'' = -C q' - K q + K_f q_f + C_f q_f' + T u + M excess, with states (q, q', q_f)."""
+def _table(eom: EquationsOfMotion, H: np.ndarray, tilt: np.ndarray, sensors: tuple[str, ...],
+           quantities: tuple[str, ...]) -> StateSpace:
+    """M q'' = -C q' - K q + K_f q_f + C_f q_f' + T u + M excess, with states (q, q', q_f).
+
+    "NAME_motion" along each sensor; what gravity feigns, tilt q, is in acceleration and beside velocity ("NAME_tilt").
+    """
     n_u, zero, one = len(eom.actuators), np.zeros((N_Q, N_Q)), np.eye(N_Q)
     acceleration_x = la.solve(eom.M, np.hstack([-eom.K, -eom.C, eom.K_floor]))
     acceleration_e = np.hstack([la.solve(eom.M, np.hstack([eom.T, eom.C_floor])), zero])
@@ -137,12 +144,14 @@ def _table(eom: EquationsOfMotion, H: np.ndarray, sensors: tuple[str, ...], quan
     felt = {"velocity": (velocity_x, none), "acceleration": (acceleration_x, acceleration_e + excess),
             "displacement": (np.hstack([one, zero, -one]), none)}
     seen = {kind: (H @ by_x, H @ by_e) for kind, (by_x, by_e) in felt.items()}
+    tilted = tilt @ np.hstack([one, zero, zero])
+    seen["acceleration"] = seen["acceleration"][0] + tilted, seen["acceleration"][1]
     motion_x, motion_e = (np.array([seen[kind][part][k] for k, kind in enumerate(quantities)]) for part in (0, 1))
-    C = np.vstack([acceleration_x, velocity_x, motion_x])
-    D = np.vstack([acceleration_e, none, motion_e])
+    C = np.vstack([acceleration_x, velocity_x, motion_x, tilted])
+    D = np.vstack([acceleration_e, none, motion_e, np.zeros_like(motion_e)])
     inputs = (*eom.actuators, *(f"floor_{c}_dot" for c in COORDINATES), *(f"excess_{c}" for c in COORDINATES))
     outputs = (*(f"{c}_ddot" for c in COORDINATES), *(f"{c}_dot" for c in COORDINATES),
-               *(f"{name}_motion" for name in sensors))
+               *(f"{name}_{kind}" for kind in ("motion", "tilt") for name in sensors))
     return StateSpace(A, B, C, D, 0.0, inputs, outputs)
 
 

@@ -3,8 +3,9 @@
     floor --> table --> sensors --> noise, converter --> controller --> limit --> delay, hold --> drives --> table
 
 The controller knows `rig`; the table that moves is `plant`, which may differ from it. Sensors see the payload's motion
-along axes fixed in space: that they turn with it is left out, parts per million at micrometre amplitudes, and so is the
-gravity that a tilted horizontal sensor feels, which neither source models.
+along axes fixed in space: that they turn with it is left out, parts per million at micrometre amplitudes. Not left out,
+where `gravity` says so, is what their proof masses feel of gravity when the payload tilts: neither source models it,
+but at low frequency it is most of what a horizontal sensor shows.
 """
 
 from __future__ import annotations
@@ -140,6 +141,7 @@ class SampledLoop:
     amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
     sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage. By
         default each drive has its own limit; a given limit_V, other than the rig's largest, is for all drives.
+    gravity : whether the proof masses of tilted sensors feel gravity (`Rig.tilt_rows`).
 
     Raises
     ------
@@ -159,6 +161,7 @@ class SampledLoop:
     sample_rate_Hz: float = _AS_RIG
     loop_delay_s: float = _AS_RIG
     limit_V: float = _AS_RIG
+    gravity: bool = False
     name: str = "nominal"
     digital: StateSpace | None = None
     substeps: int = field(init=False, default=1)

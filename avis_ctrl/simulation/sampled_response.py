@@ -124,6 +124,9 @@ def _image(loop: SampledLoop, image: np.ndarray) -> list[np.ndarray]:
     n = len(COORDINATES)
     # Position sensors measure relative to the chassis, which moves with the floor, here held as sampled.
     moved = H @ velocity
+    if loop.gravity:
+        # An acceleration, as the velocity that a proof mass takes it for.
+        moved = moved + loop.plant.tilt_rows() @ velocity / s ** 2
     against = np.array([kind == "displacement" for kind in loop.sensors.quantities])
     moved[:, against, :n] -= H[against] * (sinc ** 2)[:, None, None]
     power = np.array([ORDER[kind] - 1 for kind in loop.sensors.quantities])

@@ -62,7 +62,7 @@ def _reduced(plant: DesignPlant, rig: Rig, made: MuSynthesis, cost: float, offse
              ) -> tuple[StateSpace, str]:
     """The controller of lowest order whose complex mu grows by no more than the cost, and a note that says so."""
     P = plant.synthesis
-    blocks = P.all_blocks.complexified()
+    blocks = P.all_blocks.simplified() if P.all_blocks.many else P.all_blocks.complexified()
     omega = reduction_grid(plant, made.omega_peak)
 
     def peak_on_grid(K: StateSpace) -> float:

@@ -189,7 +189,7 @@ class SimulationSection(Section):
 
 Quantity = Literal["mu_upper", "mu_gap_percent", "worst_case_peak_transmissibility_dB",
                    "worst_case_band_transmissibility_dB", "passive_peak_transmissibility_dB",
-                   "advantage_over_skyhook_dB", "fastest_controller_pole_Hz"]
+                   "advantage_over_skyhook_dB", "advantage_on_each_axis_dB", "fastest_controller_pole_Hz"]
 UNITS: dict[str, str] = {"mu_upper": "", "mu_gap_percent": "%", "fastest_controller_pole_Hz": "Hz"}
 
 
@@ -271,9 +271,9 @@ def design_from_table(table: dict, file: object = None) -> Design:
 
 def _require_rival(design: Design) -> None:
     """An advantage over a skyhook needs that skyhook."""
-    wanted = any(one.quantity == "advantage_over_skyhook_dB" for one in design.requirement)
+    wanted = [one.quantity for one in design.requirement if one.quantity.startswith("advantage")]
     if wanted and "skyhook" not in design.compare_with:
-        raise InputError('expected "skyhook" among them: the requirement advantage_over_skyhook_dB compares with it',
+        raise InputError(f'expected "skyhook" among them: the requirement {wanted[0]} compares with it',
                          field="compare_with", value=design.compare_with)
 
 

@@ -167,6 +167,24 @@ class Simulated:
 
 
 @dataclass(frozen=True)
+class AxisGain:
+    """Worst-case velocity of one axis in the design's band, over the floor's velocity in any direction.
+
+    mu : upper bound, proved over the whole set, of the mu controller. skyhook : lower bound of the tuned skyhook, which
+        a plant of the set reaches; nan where the design has none, inf where a plant makes it unstable.
+    """
+
+    axis: str
+    mu: float
+    skyhook: float
+
+    @property
+    def advantage(self) -> float:
+        """Skyhook over mu; nan, never met, without a rival: what some plant destabilises is no baseline."""
+        return self.skyhook / self.mu if np.isfinite(self.skyhook) else np.nan
+
+
+@dataclass(frozen=True)
 class Requirement:
     """A line of the verdict table."""
 
@@ -194,7 +212,7 @@ class DesignResult:
     """Everything that `avis design` found.
 
     loop : the sampled loop of all axes: the other axes' loops, simulation, why it is unstable, if it is.
-    failed : controllers for comparison that could not be designed or analysed.
+    failed : controllers for comparison that could not be designed or analysed. by_axis : mu against skyhook.
     """
 
     design: Design
@@ -210,6 +228,7 @@ class DesignResult:
     seconds: float
     notes: tuple[str, ...] = field(default=())
     failed: tuple[FailedController, ...] = ()
+    by_axis: tuple[AxisGain, ...] = ()
 
     @property
     def simulation(self) -> SimulationCheck | None:

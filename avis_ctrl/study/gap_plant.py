@@ -79,7 +79,7 @@ def plant_of(design: Design, model: TableModel, wiring: Wiring | None = None, wh
     rig, asked = _loop(model.effective.rig, design, model)
     if wiring is not None:
         wiring = replace(wiring, decoding=wiring.decoding * model.sensors.sensitivity)
-    plant = build_plant(asked, rig, wiring, fit)
+    plant = build_plant(asked, rig, wiring, fit, gravity=False)
     if not model.effects:
         return plant, asked, rig
     wrapped = with_effects(plant.rig.system, model, asked.keep, when)

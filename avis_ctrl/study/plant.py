@@ -17,12 +17,13 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.connect import summing_junction
 from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.realisation import with_rate_input
 from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.rigs.actuator import pade_delay
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel, shipped_spectrum
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.rigs.rigid_body import COORDINATES, GRAVITY
 from avis_ctrl.rigs.sensing import NoiseGroup, Sensing, sensing
 from avis_ctrl.study.design_file import ChainUncertainty, Design, EffortSection
 from avis_ctrl.study.identified_uncertainty import RESPONSE, InDesign, in_design
@@ -116,11 +117,12 @@ class Wiring:
     decoding: np.ndarray
 
 
-def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Sequence[Uncertain] = ()) -> DesignPlant:
+def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Sequence[Uncertain] = (),
+                gravity: bool = True) -> DesignPlant:
     """The generalized plant of a design.
 
     wiring : of a controller that knows another rig; by default that for this one. fit : uncertain beside what the
-        design says.
+        design says. gravity : whether tilt of the kept axes is felt by the sensors of horizontal motion.
 
     Raises
     ------
@@ -146,8 +148,9 @@ def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Seq
     if wiring is not None:
         decoding = np.zeros_like(decoding)
         decoding[:, [decoder.sensors.index(name) for name in wiring.sensors]] = wiring.decoding
-    # Motion that each sensor measures per unit of the kept axes, rotations at the edge.
-    rows = decoder.matrix[:, [COORDINATES.index(name) for name in design.keep]] / lever
+    # Motion that each sensor measures per unit of the kept axes, rotations at the edge, and what gravity feigns.
+    kept = [COORDINATES.index(name) for name in design.keep]
+    rows, tilt = decoder.matrix[:, kept] / lever, rig.tilt_rows()[:, kept] / lever * gravity
 
     diagram = Diagram()
     weights: dict[str, Weight] = {}
@@ -158,7 +161,7 @@ def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Seq
     reference = floor.rms(low, high) / np.sqrt(high - low)
     errors = design.uncertainty.sensor_chains
     flicker = [FlickerNoise(one.flicker, design.floor.band_Hz[0]) for one in seen.noise]
-    noises = _sensor_side(diagram, axes, seen, decoding, rows, flicker, reference, errors is not None)
+    noises = _sensor_side(diagram, axes, seen, decoding, (rows, tilt), flicker, reference, errors is not None)
     weights |= {f"{NOISE}{one.tag}": one.weight for one in noises if one.weight.flicker}
     if errors is not None:
         _sensor_errors(diagram, errors, axes, decoder.sensors, rows, decoding, weights)
@@ -310,9 +313,12 @@ def _offset(effort: EffortSection, group: NoiseGroup, noise: FlickerNoise, axes:
     return float(spread * group.offset_rtHz * reference / allowed / noise.magnitude(np.zeros(1))[0])
 
 
-def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decoding: np.ndarray, rows: np.ndarray,
-                 flicker: Sequence[FlickerNoise], reference: float, uncertain: bool) -> list[_Noise]:
+def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decoding: np.ndarray,
+                 rows: tuple[np.ndarray, np.ndarray], flicker: Sequence[FlickerNoise], reference: float,
+                 uncertain: bool) -> list[_Noise]:
     """Sensor chains of the logical axes (alike, so that decoding and chain commute) and their noise.
+
+    rows : (n_s, n_axes) each, from the axes' motion to that along each sensor, and to what gravity feigns there.
 
     One unit of noise is what accompanies 1 m/s of floor velocity: sensor density over floor density.
     """
@@ -320,7 +326,8 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decodin
               for k, (group, weight) in enumerate(zip(seen.noise, flicker, strict=True))]
     inertial = seen.decoder.inertial
     # The decoding applied to motion in space and to motion relative to the chassis.
-    by_velocity, by_relative = decoding[:, inertial] @ rows[inertial], decoding[:, ~inertial] @ rows[~inertial]
+    by_velocity, by_relative = (decoding[:, one] @ rows[0][one] for one in (inertial, ~inertial))
+    by_tilt = decoding @ rows[1]
     for k, axis in enumerate(axes):
         both = ((by_velocity[k], "dot", seen.chain, f"sensor chain {axis}", f"{axis}_in_space"),
                 (by_relative[k], "rel", seen.relative_chain, f"position chain {axis}", f"{axis}_against_chassis"))
@@ -328,7 +335,8 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decodin
         clean = f"clean_{axis}_dot"
         for row, of, chain, label, made in ways:
             assert chain is not None
-            _chain_of(diagram, axes, k, row, of, chain, label, clean if len(ways) == 1 else made)
+            tilt = by_tilt[k] if of == "dot" else np.zeros(len(axes))
+            _chain_of(diagram, axes, k, (row, tilt), of, chain, label, clean if len(ways) == 1 else made)
         if len(ways) > 1:
             diagram.add(f"motion sum {axis}", summing_junction(clean, [made for *_, made in ways]), "sum")
         own = [one for one in groups if axis in one.axes]
@@ -345,16 +353,23 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decodin
     return groups
 
 
-def _chain_of(diagram: Diagram, axes: tuple[str, ...], k: int, row: np.ndarray, of: str, chain: StateSpace, label: str,
-              made: str) -> None:
-    """The common chain of an axis' channels, applied to the motion that they decode: row (n_axes,)."""
-    read = f"{axes[k]}_{of}"
+def _chain_of(diagram: Diagram, axes: tuple[str, ...], k: int, rows: tuple[np.ndarray, np.ndarray], of: str,
+              chain: StateSpace, label: str, made: str) -> None:
+    """The common chain of an axis' channels, applied to the motion that they decode, and to gravity: (n_axes,) each."""
+    read, (row, tilt) = f"{axes[k]}_{of}", rows
     if np.max(np.abs(row - np.eye(len(axes))[k])) > 1e-9:
         felt = [a for a in range(len(axes)) if abs(row[a]) > 1e-9]
         read = f"{made}_motion"
         diagram.add(f"motion of {label}", gain(row[None, felt], [f"{axes[a]}_{of}" for a in felt], [read]), "sum")
         diagram.means(read, "motion decoded for this axis, before the sensor chain", "m/s" if of == "dot" else "m")
-    diagram.add(label, chain.renamed([read], [made]), "sensor")
+    system = chain.renamed([read], [made])
+    if felt := [a for a in range(len(axes)) if abs(tilt[a]) > 1e-9 * GRAVITY]:
+        # Of the acceleration that a tilt feigns, the chain sees the velocity: the tilt's rate twice integrated.
+        diagram.add(f"gravity in {label}", gain(tilt[None, felt], [f"{axes[a]}_dot" for a in felt], [f"{made}_tilt"]),
+                    "sum")
+        diagram.means(f"{made}_tilt", "rate of what gravity adds to the measured acceleration", "m/s^3")
+        system = with_rate_input(system, f"{made}_tilt", 2)
+    diagram.add(label, system, "sensor")
     diagram.means(made, "velocity as the sensors' band shows it", "m/s")
 
 

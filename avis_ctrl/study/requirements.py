@@ -10,7 +10,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.simulation.design_check import SimulationCheck
 from avis_ctrl.study.at_rest import AtRest
 from avis_ctrl.study.design_file import Design, Quantity
-from avis_ctrl.study.design_result import ControllerResult, Requirement
+from avis_ctrl.study.design_result import AxisGain, ControllerResult, Requirement
 from avis_ctrl.study.limits import no_better_than_none
 
 
@@ -50,7 +50,8 @@ def judge_loop(check: SimulationCheck, rest: AtRest | None = None, offset_percen
             rest.percent <= offset_percent, "at most", rest.words()),)))
 
 
-def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requirement, ...]:
+def judge(design: Design, controllers: Sequence[ControllerResult], by_axis: Sequence[AxisGain] = ()
+          ) -> tuple[Requirement, ...]:
     """One line a requirement of the design file, in its order."""
     by_name = {c.name: c for c in controllers}
     mu, skyhook, passive = (by_name.get(name) for name in ("mu", "skyhook", "passive"))
@@ -78,6 +79,10 @@ def judge(design: Design, controllers: Sequence[ControllerResult]) -> tuple[Requ
             lambda: _advantage(skyhook, mu) if skyhook else np.nan,
             f"worst case of the skyhook: {decibel(skyhook.worst_band.lower):+.1f} dB in this band, "
             f"{decibel(skyhook.worst_peak.lower):+.1f} dB at its peak" if skyhook else "no skyhook to compare with"),
+        "advantage_on_each_axis_dB": (
+            f"worst case {band}: least improvement of any axis on the tuned skyhook",
+            lambda: min((decibel(one.advantage) for one in by_axis), default=np.nan),
+            ", ".join(f"{one.axis} {decibel(one.advantage):+.1f} dB" for one in by_axis)),
         "fastest_controller_pole_Hz": ("fastest pole of the mu controller",
                                       lambda: np.nan if idle else mu.fastest_pole_Hz,
                                       "no controller better than none was found" if idle else ""),

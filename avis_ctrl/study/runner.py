@@ -14,15 +14,23 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError
+from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import MuSynthesis
 from avis_ctrl.robust.musyn_state import STARTS
-from avis_ctrl.study.analysis import analyse
+from avis_ctrl.study.analysis import analyse, worst_by_axis
 from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.design_result import Candidate, ControllerResult, DesignResult, FailedController, Simulated
+from avis_ctrl.study.design_result import (
+    AxisGain,
+    Candidate,
+    ControllerResult,
+    DesignResult,
+    FailedController,
+    Simulated,
+)
 from avis_ctrl.study.limits import best_found
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.provenance import provenance
@@ -59,11 +67,13 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Controllers in the report's order, those that failed with their reasons, and the loop of all axes."""
+    """Controllers in the report's order, those that failed with their reasons, the loop of all axes, and each axis of
+    the design against the skyhook."""
 
     controllers: tuple[ControllerResult, ...]
     failed: tuple[FailedController, ...]
     loop: Simulated
+    by_axis: tuple[AxisGain, ...] = ()
 
 
 def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress = lambda text: None,
@@ -115,9 +125,10 @@ def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesi
         notes = tuple(text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.remarks())
                       if text)
     requirements = (*judge_loop(compared.loop.check, compared.loop.rest, design.control_effort.offset_percent),
-                    *judge(design, controllers))
+                    *judge(design, controllers, compared.by_axis))
     return DesignResult(design, rig, plant, controllers, synthesis.history, requirements, reduction, six_dof,
-                        compared.loop, design_provenance(design, source, rig, seconds), seconds, notes, compared.failed)
+                        compared.loop, design_provenance(design, source, rig, seconds), seconds, notes, compared.failed,
+                        compared.by_axis)
 
 
 ORDER = ("passive", "skyhook_classical", "skyhook", "hinf", "mu")
@@ -153,23 +164,36 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
         # The best one found is delivered, whatever its name; the skyhook's limit follows from it.
         mu = best_of(mu, [one for one in found.values() if isinstance(one, ControllerResult)])
         simulation = workers.submit(simulate_study, design, rig, plant, mu)
+        by_axis = workers.submit(_worst_by_axis, design, plant, mu.K, True)
         jobs = {}
         if "skyhook" in design.compare_with:
             jobs = {workers.submit(_tuned, design, plant, rig, skyhook_limit(design, mu), samples): "skyhook"}
         gather()
         loop = simulation.result()
+        proved = by_axis.result()
         progress(f"  done: {design.simulation.random_plants + 2} nonlinear plants")
         found["mu"] = mu
         if isinstance(skyhook := found.get("skyhook"), ControllerResult) and best_of(mu, [skyhook]) is not mu:
             found["mu"] = mu = best_of(mu, [skyhook])
-            loop = simulate_study(design, rig, plant, mu)
+            loop, proved = simulate_study(design, rig, plant, mu), _worst_by_axis(design, plant, mu.K, True)
+        rival = np.full(len(plant.axes), np.nan)
+        if isinstance(skyhook, ControllerResult):
+            stable = np.isfinite(skyhook.worst_peak.upper)
+            rival = _worst_by_axis(design, plant, skyhook.K, False) if stable else np.full(len(plant.axes), np.inf)
     if isinstance(rest := found["passive"], FailedController):
         raise ComputationError(f"the table without control could not be analysed: {rest.reason}")
     every = [*failed, *(one for one in found.values() if isinstance(one, FailedController))]
     measured = {name: replace(one, rest=at_rest(bare_loop(design, rig, plant, one.K)) if one.K is not None else None)
                 for name, one in found.items() if isinstance(one, ControllerResult)}
     return Compared(tuple(measured[name] for name in ORDER if name in measured),
-                    tuple(sorted(every, key=lambda one: ORDER.index(one.name))), loop)
+                    tuple(sorted(every, key=lambda one: ORDER.index(one.name))), loop,
+                    tuple(AxisGain(axis, float(mine), float(its)) for axis, mine, its in
+                          zip(plant.axes, proved, rival, strict=True)))
+
+
+def _worst_by_axis(design: Design, plant: DesignPlant, K: StateSpace | None, proved: bool) -> np.ndarray:
+    with threadpool_limits(1):
+        return worst_by_axis(design, plant, K, proved)
 
 
 def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndarray

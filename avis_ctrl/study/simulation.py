@@ -58,7 +58,7 @@ def bare_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None
     if K is None:
         K = gain(np.zeros((len(design.keep), len(design.keep))))
     return SampledLoop(rig, K, tuple(design.keep), {}, sensor_bank(design, rig),
-                       floor_by_coordinate(design, rig, plant.floor), name="nominal",
+                       floor_by_coordinate(design, rig, plant.floor), name="nominal", gravity=True,
                        amplifier_corner_Hz=design.loop.amplifier_corner_Hz)
 
 

@@ -7,8 +7,7 @@ import numpy as np
 from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, Table, Values, register
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.rigs.rig import Rig
-
-GRAVITY = 9.80665
+from avis_ctrl.rigs.rigid_body import GRAVITY
 
 
 def second_order(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, controller_style, decibels, hertz
-from avis_ctrl.report.pieces import Section
+from avis_ctrl.report.pieces import Section, Table, table
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
 GAIN_DB = (-60.0, 40.0)
@@ -15,7 +15,18 @@ GAIN_DB = (-60.0, 40.0)
 def transmissibility(result: DesignResult) -> Section:
     """The figures of transmissibility."""
     figures = (_nominal(result), _uncertain(result), _by_axis(result), _six_dof(result))
-    return Section("Transmissibility", "transmissibility", figures)
+    tables = (_against_skyhook(result),) if result.by_axis else ()
+    return Section("Transmissibility", "transmissibility", (*figures[:3], *tables, *figures[3:]))
+
+
+def _against_skyhook(result: DesignResult) -> Table:
+    low, high = result.design.transmissibility.band_Hz
+    rows = [(words.axis(one.axis), words.decibel(one.mu), words.decibel(one.skyhook), words.decibel(one.advantage))
+            for one in result.by_axis]
+    return table(f"Worst case of each axis over {low:g} to {high:g} Hz, for a floor that moves in any direction: upper "
+                 "bound of the mu controller over the whole set, and what a plant of the set makes of the tuned "
+                 "skyhook, which may have the same worst-case peak.",
+                 ("axis", "mu synthesis, at most", "skyhook, at least", "improvement, at least"), rows, "lrrr")
 
 
 def asked_dB(result: DesignResult, omega: np.ndarray) -> np.ndarray:
