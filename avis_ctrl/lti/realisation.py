@@ -109,7 +109,7 @@ def with_rate_input(system: StateSpace, name: str, times: int) -> StateSpace:
 
     Raises InputError where the system has fewer zeros there, or a pole.
     """
-    B, D, size = system.B, system.D, float(np.max(np.abs(system.frequency_response([1.0]))))
+    B, D, size = system.B, system.D, float(np.max(np.abs(system.frequency_response(np.ones(1)))))
     for _ in range(times):
         try:
             B = np.linalg.solve(system.A, B)

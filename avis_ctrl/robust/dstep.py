@@ -10,7 +10,9 @@ block by block, may cost far more than a common one of the same order.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.cluster.hierarchy as hierarchy
@@ -110,14 +112,21 @@ class DStep:
     cost: float
 
 
-def d_step(points: PointwiseScalings, loop: StateSpace, start: Scalings, allowed_cost: float = 0.01,
-           max_states: int = 60) -> DStep:
+def d_steps(points: PointwiseScalings, loop: StateSpace, start: Scalings, floors: Sequence[float] = (BROAD_FLOOR,),
+            allowed_cost: float = 0.01, max_states: int = 60) -> Iterator[DStep]:
     """Scalings of the loop N(s) chosen on the grid and measured between its points: peaks there are added to it.
 
-    Measured so, the result never costs more than `start`, the scalings that the loop was made with.
+    For each floor, fitted anew, and fitted on from `start`, the scalings that the loop was made with; the first that
+    costs no more than allowed is the last. Measured so, none costs more than `start`. Where none follows the best
+    scalings of all frequencies, their costs do not tell which one allows the better controller.
     """
-    step = choose_scalings(points, allowed_cost, max_states, start)
-    return _settled(points, loop, step, start, allowed_cost, max_states)
+    for floor in floors:
+        at = replace(points, floor=floor)
+        for chosen in (partial(_anew, at), partial(_continued, at, start)):
+            step = _settled(at, loop, chosen(allowed_cost, max_states), start, allowed_cost, max_states)
+            yield step
+            if step.cost <= allowed_cost:
+                return
 
 
 def tightened(points: PointwiseScalings, loop: StateSpace, start: Scalings, allowed_cost: float,
@@ -164,18 +173,13 @@ def _measured(points: PointwiseScalings, loop: StateSpace, dense: np.ndarray, re
     return DStep(scalings, max(step.peak, float(np.max(sigma))), cost), omega[at], M[at]
 
 
-def choose_scalings(points: PointwiseScalings, allowed_cost: float = 0.01, max_states: int = 60,
-                    start: Scalings | None = None) -> DStep:
+def _anew(points: PointwiseScalings, allowed_cost: float, max_states: int) -> DStep:
     """Greedy search for the smallest orders whose realised scalings cost less than `allowed_cost` of peak mu.
 
-    All orders start at zero; the blocks whose misfit accounts for most of the excess get one more, as long as
-    the scaled plant gains at most `max_states` states. Where that ends short of the allowed cost, the search goes on
-    from `start`, the scalings that the loop was made with: the result never costs more than they do.
+    All orders start at zero; the blocks whose misfit accounts for most of the excess get one more, as long as the
+    scaled plant gains at most `max_states` states.
     """
-    fresh = _grown(points, _evaluated(points, _refined(points, _constants(points))), allowed_cost, max_states)
-    if start is None or fresh.cost <= allowed_cost:
-        return fresh
-    return min(fresh, _continued(points, start, allowed_cost, max_states), key=lambda step: step.cost)
+    return _grown(points, _evaluated(points, _refined(points, _constants(points))), allowed_cost, max_states)
 
 
 def _continued(points: PointwiseScalings, start: Scalings, allowed_cost: float, max_states: int) -> DStep:

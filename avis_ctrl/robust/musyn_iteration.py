@@ -13,7 +13,7 @@ ends: a short run is the beginning of a long one.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, gain, hinf_norm, lft_lower
-from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, band_of, d_step
+from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, band_of, d_steps
 from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
 from avis_ctrl.robust.gamma_descent import ScaledProblem, descend, grown
 from avis_ctrl.robust.hinfsyn import Synthesis, hinfsyn
@@ -91,12 +91,11 @@ def iterate(problem: Problem, state: State, starts: tuple[StateSpace, ...], opti
         if status := _no_further(state, options):
             return state, status
         began = time.monotonic()
-        proposal = _proposed(problem, state, options)
-        synthesis = _k_step(problem, state, proposal, options) if proposal else None
-        if proposal is None or synthesis is None:
+        step = _k_step(problem, state, _proposed(problem, state, options), options)
+        if step is None:
             state = _moved_on(problem, state)
             continue
-        scalings, cost, kind = proposal
+        (scalings, cost, kind), synthesis = step
         points = analysed(problem.P, synthesis.K, problem.structure, _next_grid(state, synthesis.closed_loop))
         loop = Loop(synthesis.K, scalings, synthesis.gamma, points.peak)
         row = Iteration(len(state.history), synthesis.gamma, points.peak, synthesis.K.nstates, cost,
@@ -172,13 +171,26 @@ def _start(problem: Problem, K: StateSpace) -> tuple[Loop, PointwiseScalings]:
     return Loop(K, Scalings.identity(problem.structure), hinf_norm(closed).gain, points.peak), points
 
 
-def _k_step(problem: Problem, state: State, proposal: Proposal, options: Options) -> Synthesis | None:
-    """H-infinity controller of the scaled plant; None where scalings, not the plant, make it fail."""
-    try:
-        return hinfsyn(proposal.scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff,
-                       gamma_hint=state.path.gamma if state.path else None)
-    except ComputationError:
-        return None
+def _k_step(problem: Problem, state: State, proposals: Iterable[Proposal], options: Options
+            ) -> tuple[Proposal, Synthesis] | None:
+    """The scalings of least H-infinity optimum and their controller; None where scalings, not the plant, make all fail.
+
+    The fit of scalings to the last loop does not tell what the next one will be; one test of gamma does.
+    """
+    best: tuple[Proposal, Synthesis] | None = None
+    scaled = ScaledProblem.of(problem.P, problem.nmeas, problem.ncon)
+    hint = state.path.gamma if state.path else None
+    for proposal in proposals:
+        try:
+            if best and not scaled.reaches(proposal.scalings, (1 - SETTINGS.stall) * best[1].gamma_optimal_bounds[1]):
+                continue
+            made = hinfsyn(proposal.scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff,
+                           gamma_hint=best[1].gamma if best else hint)
+        except ComputationError:
+            continue
+        if best is None or made.gamma < best[1].gamma:
+            best = proposal, made
+    return best
 
 
 def _no_further(state: State, options: Options) -> str:
@@ -203,32 +215,35 @@ class Proposal(NamedTuple):
     kind: str
 
 
-def _proposed(problem: Problem, state: State, options: Options) -> Proposal | None:
-    """The next scalings; None where the phase has nothing more to offer."""
+def _proposed(problem: Problem, state: State, options: Options) -> Iterator[Proposal]:
+    """The next scalings to choose from; none where the phase has nothing more to offer."""
     assert state.last is not None and state.path is not None and state.points is not None
     if "start" in state.phase:
         tried = any(row.kind == "start" for row in state.history)
-        return None if tried else _other_constants(problem, state.path.gamma, options)
+        if not tried and (found := _other_constants(problem, state.path.gamma, options)):
+            yield found
+        return
     if state.phase == "D-K":
-        points = replace(state.points, floor=BROAD_FLOOR if _falls_fast(state) else DETAILED_FLOOR)
+        floors = (BROAD_FLOOR, DETAILED_FLOOR) if _falls_fast(state) else (DETAILED_FLOOR, BROAD_FLOOR)
         try:
-            step = d_step(points, lft_lower(problem.P, state.last.K), state.last.scalings,
-                          max_states=options.max_added_states)
+            for step in d_steps(state.points, lft_lower(problem.P, state.last.K), state.last.scalings, floors,
+                                max_states=options.max_added_states):
+                yield Proposal(step.scalings, step.cost, "D-K")
         except np.linalg.LinAlgError:
             # A loop that no decomposition takes (entries beyond all scale) ends the D-K phase, not the synthesis.
-            return None
-        return Proposal(step.scalings, step.cost, "D-K")
+            return
+        return
     band = band_of(state.points.omega)
     start = min(state.last, state.path, key=lambda loop: loop.gamma).scalings
     if state.phase == "growth":
         larger = grown(problem.P, problem.nmeas, problem.ncon, start, band, options.max_added_states)
         if larger is None:
-            return None
+            return
         start = larger
     try:
-        return Proposal(descend(problem.P, problem.nmeas, problem.ncon, start, band).scalings, 0.0, state.phase)
+        yield Proposal(descend(problem.P, problem.nmeas, problem.ncon, start, band).scalings, 0.0, state.phase)
     except ComputationError:
-        return None
+        return
 
 
 def _at_rest(problem: Problem, omega: np.ndarray, mu: float) -> bool:

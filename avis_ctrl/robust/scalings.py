@@ -403,7 +403,7 @@ class Scalings:
             if isinstance(first, MatrixScaling):
                 stack.append((at[blocks[0]], first.matrices))
             elif len(blocks) == 1 or through is None:
-                stack += [([signal], parts[k].matrices) for k in blocks for signal in at[k]]
+                stack += [(np.array([signal]), parts[k].matrices) for k in blocks for signal in at[k]]
             else:
                 # d_k(s) = g_k d(s) with d(inf) = 1
                 signals = np.concatenate([at[k] for k in blocks])

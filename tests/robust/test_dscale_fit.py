@@ -15,7 +15,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, append, gain
 from avis_ctrl.robust.dscale_fit import fit_magnitude, stable_roots
 from avis_ctrl.robust.dscale_matrix import fit_hermitian
-from avis_ctrl.robust.dstep import CHECKED_POINTS, PointwiseScalings, d_step, tightened
+from avis_ctrl.robust.dstep import CHECKED_POINTS, PointwiseScalings, d_steps, tightened
 from avis_ctrl.robust.scalings import MatrixScaling, ScalarScaling, Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar
 
@@ -245,8 +245,8 @@ def test_the_four_highest_peaks_between_the_points_become_points(added):
     N = StateSpace(A, B, C, np.full((2, 2), 0.1))
     structure = BlockStructure.of([ComplexFull(1, 1)]).with_performance(1, 1)
     coarse, dense = np.geomspace(0.01, 1000, 16), np.geomspace(0.01, 1000, CHECKED_POINTS)
-    step = d_step(PointwiseScalings.of(coarse, N.frequency_response(coarse), structure), N,
-                  Scalings.identity(structure))
+    step = next(d_steps(PointwiseScalings.of(coarse, N.frequency_response(coarse), structure), N,
+                        Scalings.identity(structure)))
     sigma = np.linalg.norm(N.frequency_response(dense), ord=2, axis=(1, 2))
     peaks = find_peaks(sigma)[0]
     highest = peaks[np.argsort(sigma[peaks])[-4:]]
@@ -279,8 +279,8 @@ def test_a_repeated_block_is_fitted_where_its_misfit_costs_most():
     N = StateSpace(pair.A, pair.B, pair.C, pair.D + 0.05)
     structure = BlockStructure.of([ComplexScalar(2), ComplexFull(1, 1)]).with_performance(1, 1)
     omega = np.geomspace(1e-3, 1e3, 40)
-    step = d_step(PointwiseScalings.of(omega, N.frequency_response(omega), structure), N,
-                  Scalings.identity(structure), allowed_cost=0.05)
+    *_, step = d_steps(PointwiseScalings.of(omega, N.frequency_response(omega), structure), N,
+                       Scalings.identity(structure), allowed_cost=0.05)
     assert step.cost < 0.05 and min(step.scalings.orders[:2]) > 0
 
 
